@@ -1,0 +1,88 @@
+"""`aw`: parse, call, print. A command's module is imported only when that command runs."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+
+import click
+
+from ambiguous_wild import __version__
+from ambiguous_wild.core.errors import AwError, unknown
+
+# command -> (module, one line of help); the help line stands here so that `aw --help` imports nothing.
+COMMANDS = {
+    "doctor": ("doctor", "What is installed, what is missing, and the command that brings it."),
+    "simulate": ("simulate", "Make a capture with exact truth: poses, distractor masks, clean views."),
+    "build-scene": ("build_scene", "From a folder of photos to a scene: check, COLMAP, downsample, split."),
+    "ambiguity-report": ("ambiguity_report", "How hard are this scene's distractors to tell apart?"),
+    "bench": ("bench", "Train methods on scenes and measure them."),
+    "table": ("table", "Compare runs: Markdown, CSV, LaTeX."),
+    "methods": ("methods", "List the methods there are."),
+}
+
+
+class _LazyGroup(click.Group):
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
+        if name not in COMMANDS:
+            return None
+        return importlib.import_module(f"ambiguous_wild.cli.{COMMANDS[name][0]}").command
+
+    def resolve_command(self, ctx: click.Context, args: list[str]):  # type: ignore[no-untyped-def]
+        if args and args[0] not in COMMANDS:
+            raise unknown("command", args[0], COMMANDS, "'aw --help' lists them")
+        return super().resolve_command(ctx, args)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
+
+
+@click.command(cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.version_option(__version__, prog_name="aw")
+def cli() -> None:
+    """Distractor-free 3D Gaussian Splatting where the distractor looks like the scene.
+
+    \b
+    aw simulate courtyard -o raw        a capture with exact truth, or use your own photos
+    aw build-scene raw -o scene         check, COLMAP, downsample, split
+    aw bench --method 3dgs --method refinesplat --scene scene -o runs
+    aw table runs                       compare
+    """
+
+
+def main() -> None:
+    """Run the command line: one red line and exit code 2 for what the user can mend."""
+    try:
+        cli.main(standalone_mode=False)
+    except AwError as error:
+        _fail(str(error))
+    except click.ClickException as error:
+        _fail(_click_message(error))
+    except (click.Abort, KeyboardInterrupt):
+        click.secho("interrupted; run the same command again to continue", fg="yellow", err=True)
+        sys.exit(130)
+    except BrokenPipeError:
+        # The reader of our output left (`aw table | head`): not an error of ours.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(0)
+
+
+def _click_message(error: click.ClickException) -> str:
+    message = error.format_message()
+    if isinstance(error, click.UsageError) and error.ctx is not None:
+        message += f" (see '{error.ctx.command_path} --help')"
+    return message
+
+
+def _fail(message: str) -> None:
+    click.secho("error: " + " ".join(message.split()), fg="red", err=True)
+    sys.exit(AwError.exit_code)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,135 @@
+"""Frozen dataclasses as configs: strict keys, plain-data form, a hash that is their identity."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import types
+import typing
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+from ambiguous_wild.core.errors import AwError, unknown
+
+T = TypeVar("T")
+
+
+def to_plain(config: Any) -> Any:
+    """The config as dicts, lists and scalars, ready for YAML or JSON."""
+    if dataclasses.is_dataclass(config) and not isinstance(config, type):
+        return {f.name: to_plain(getattr(config, f.name)) for f in dataclasses.fields(config)}
+    if isinstance(config, Mapping):
+        return {str(k): to_plain(v) for k, v in config.items()}
+    if isinstance(config, (list, tuple)):
+        return [to_plain(v) for v in config]
+    return config
+
+
+def config_hash(config: Any) -> str:
+    """sha256 over the canonical JSON of the config: 64 hex digits."""
+    text = json.dumps(to_plain(config), sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def from_plain(cls: type[T], data: Mapping[str, Any], where: str = "config") -> T:
+    """Build the dataclass from plain data; an unknown key or a wrong type is an error that names it.
+
+    Raises:
+        AwError: unknown key (with the nearest known one), or a value of the wrong type.
+    """
+    hints = typing.get_type_hints(cls)
+    names = [f.name for f in dataclasses.fields(cls)]  # type: ignore[arg-type]
+    values: dict[str, Any] = {}
+    for key, value in data.items():
+        if key not in names:
+            raise unknown(f"key in {where}", str(key), names)
+        values[key] = _coerce(hints[key], value, f"{where}.{key}")
+    return cls(**values)
+
+
+def with_options(config: T, options: Mapping[str, str], where: str = "option") -> T:
+    """The config with ``key=value`` strings of the command line applied; dots reach nested configs.
+
+    Raises:
+        AwError: unknown key, or a value that does not parse as the key's type.
+    """
+    for key, text in options.items():
+        config = _with_option(config, key, text, where)
+    return config
+
+
+def _with_option(config: Any, key: str, text: str, where: str) -> Any:
+    head, _, rest = key.partition(".")
+    names = [f.name for f in dataclasses.fields(config)]
+    if head not in names:
+        raise unknown(where, key, names)
+    if rest:
+        inner = getattr(config, head)
+        if not dataclasses.is_dataclass(inner):
+            raise AwError(f"{where} {key!r}: {head!r} has no keys of its own")
+        return dataclasses.replace(config, **{head: _with_option(inner, rest, text, f"{where} {head}")})
+    hint = typing.get_type_hints(type(config))[head]
+    return dataclasses.replace(config, **{head: _coerce(hint, _parse(text), f"{where} {key}")})
+
+
+def _parse(text: str) -> Any:
+    lowered = text.strip().lower()
+    if lowered in ("none", "null", ""):
+        return None
+    if lowered in ("true", "false"):
+        return lowered == "true"
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    if "," in text:
+        return [_parse(part) for part in text.split(",")]
+    return text
+
+
+def _coerce(hint: Any, value: Any, where: str) -> Any:
+    origin = typing.get_origin(hint)
+    if origin in (typing.Union, types.UnionType):
+        options = typing.get_args(hint)
+        if value is None and type(None) in options:
+            return None
+        for option in options:
+            if option is type(None):
+                continue
+            try:
+                return _coerce(option, value, where)
+            except AwError:
+                continue
+        raise _wrong(hint, value, where)
+    if origin is typing.Literal:
+        if value in typing.get_args(hint):
+            return value
+        raise unknown(where, str(value), [str(v) for v in typing.get_args(hint)])
+    if dataclasses.is_dataclass(hint) and isinstance(value, Mapping):
+        return from_plain(typing.cast(type, hint), value, where)
+    if origin is tuple:
+        args = typing.get_args(hint)
+        items = value if isinstance(value, (list, tuple)) else [value]
+        if len(args) == 2 and args[1] is Ellipsis:
+            return tuple(_coerce(args[0], v, where) for v in items)
+        if len(args) != len(items):
+            raise _wrong(hint, value, where)
+        return tuple(_coerce(a, v, where) for a, v in zip(args, items))
+    if origin in (dict, Mapping) or hint in (dict, Any):
+        return value
+    if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+        return float(value)
+    if hint is int and isinstance(value, float) and value.is_integer():
+        return int(value)
+    if isinstance(hint, type) and isinstance(value, hint) and not (hint is int and isinstance(value, bool)):
+        return value
+    if hint is str and isinstance(value, (int, float)):
+        return str(value)
+    raise _wrong(hint, value, where)
+
+
+def _wrong(hint: Any, value: Any, where: str) -> AwError:
+    name = getattr(hint, "__name__", str(hint))
+    return AwError(f"{where}: expected {name}, got {value!r}")

@@ -31,7 +31,13 @@ class Gaussians:
 
     def __post_init__(self) -> None:
         n = self.means.shape[0]
-        expected = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "opacity_logits": (n,), "sh0": (n, 3)}
+        expected = {
+            "means": (n, 3),
+            "quats": (n, 4),
+            "log_scales": (n, 3),
+            "opacity_logits": (n,),
+            "sh0": (n, 3),
+        }
         for name, shape in expected.items():
             if tuple(getattr(self, name).shape) != shape:
                 raise AwError(f"{name} must be {list(shape)}, got {list(getattr(self, name).shape)}")
@@ -97,7 +103,9 @@ class Gaussians:
         from scipy.spatial import cKDTree
 
         if len(xyz) < 4:
-            raise AwError(f"cannot start from {len(xyz)} points: at least 4 are needed; check the sparse model")
+            raise AwError(
+                f"cannot start from {len(xyz)} points: at least 4 are needed; check the sparse model"
+            )
         distances, _ = cKDTree(xyz).query(xyz, k=4)
         scale = np.sqrt((distances[:, 1:] ** 2).mean(axis=1)).clip(min=min_scale)
         n = len(xyz)

@@ -1,0 +1,228 @@
+"""3DGS's adaptive density control: clone, split, prune, and an opacity reset that fires.
+
+Source: 3D Gaussian Splatting (Kerbl et al. 2023), section 5; constants as in gsplat's DefaultStrategy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.render import Gradients
+
+if TYPE_CHECKING:
+    from ambiguous_wild.splat.optim import SplatAdam
+    from ambiguous_wild.splat.parts import Step
+
+
+@dataclass(frozen=True)
+class DensityConfig:
+    """Times in nominal iterations (of 30 000); the `min_` fields are real iterations of the run."""
+
+    start: float = 500.0
+    stop: float = 15_000.0
+    every: float = 100.0
+    min_every: int = 50  # a short run densifies less often, so that each decision averages enough views
+    resets: tuple[float, ...] = (3000.0, 6000.0, 9000.0, 12_000.0)
+    min_reset_spacing: int = 1000  # real iterations a reset needs to heal before the next one
+    grow_grad: float = 2e-4  # mean norm of dL/d(u, v), scaled to half the image size
+    grow_scale: float = 0.01  # of the scene extent: clone below, split above
+    prune_opacity: float = 0.005
+    prune_scale: float = 0.1  # of the scene extent, applied after the first reset
+    reset_opacity: float = 0.01
+    max_gaussians: int = 1_000_000  # growth stops here: the largest gradients go first
+
+
+class DensityControl:
+    """Accumulates the screen-space statistic and changes the set of Gaussians on schedule.
+
+    Override `statistic` to decide by another gradient, `after_growth` to do more once a round is over.
+    """
+
+    def __init__(self, config: DensityConfig, extent: float, seed: int) -> None:
+        self.config = config
+        self.extent = extent
+        self.rng = np.random.default_rng([seed, 0xD3])
+        self.grad_sum = torch.zeros(0)  # [N] sum of the statistic's norm over views that saw the row
+        self.seen = torch.zeros(0)  # [N] number of those views
+        self.last_growth = 0  # iteration
+        self.last_reset = 0  # iteration
+        self.resets_done = 0
+
+    def statistic(self, gradients: Gradients) -> Tensor:
+        """The screen-space gradient [N, 2] in 1/px that decides growth."""
+        return gradients.screen
+
+    def wants_extra(self) -> bool:
+        """Whether `statistic` reads `screen_extra`."""
+        return False
+
+    @torch.no_grad()
+    def observe(self, step: Step, gradients: Gradients) -> None:
+        """Add one view's statistic, scaled to half the image size so that it is resolution-free."""
+        if step.nominal > self.config.stop:
+            return
+        self._match(step.gaussians)
+        scale = self.statistic(gradients).new_tensor([step.camera.width / 2, step.camera.height / 2])
+        visible = step.rendered.visible
+        norms = torch.linalg.vector_norm(self.statistic(gradients) * scale, dim=1)
+        self.grad_sum += torch.where(visible, norms, torch.zeros_like(norms))
+        self.seen += visible.to(self.seen.dtype)
+
+    @torch.no_grad()
+    def refine(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> tuple[Gaussians, list[str]]:
+        """Grow, prune and reset if it is time.
+
+        Returns:
+            The Gaussians to go on with and what happened: any of "grow", "reset".
+        """
+        events: list[str] = []
+        config = self.config
+        due = step.iteration - self.last_growth >= config.min_every
+        due = due and step.nominal >= config.start and step.nominal <= config.stop
+        due = due and self._crossed(step, config.every)
+        if due:
+            self._match(gaussians)
+            # Lazily stepped rows are brought up to date first: growth copies parameters.
+            optimiser.flush()
+            gaussians = self._grow(gaussians, optimiser)
+            gaussians = self._prune(gaussians, optimiser)
+            gaussians = self.after_growth(step, gaussians, optimiser)
+            self._clear(gaussians)
+            self.last_growth = step.iteration
+            events.append("grow")
+        if self._reset_due(step):
+            gaussians.opacity_logits.clamp_(max=_logit(config.reset_opacity))
+            optimiser.reset_moments(["opacity_logits"])
+            self.last_reset = step.iteration
+            events.append("reset")
+        return gaussians, events
+
+    def after_growth(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> Gaussians:
+        """Hook: change the set once more after growth and pruning (merging, for one)."""
+        return gaussians
+
+    def clone_offset(self, gaussians: Gaussians, rows: Tensor) -> Tensor | None:
+        """Hook: where copies go relative to their originals, [len(rows), 3]; None = the same place."""
+        return None
+
+    def _crossed(self, step: Step, every: float) -> bool:
+        # `every` nominal iterations since the last round; in short runs `min_every` dominates.
+        scale = step.nominal / step.iteration
+        return (step.iteration - self.last_growth) * scale >= every - 1e-6
+
+    def _reset_due(self, step: Step) -> bool:
+        config = self.config
+        while self.resets_done < len(config.resets) and step.nominal >= config.resets[self.resets_done]:
+            self.resets_done += 1
+            if step.iteration - self.last_reset >= config.min_reset_spacing:
+                return True
+        return False
+
+    def _grow(self, gaussians: Gaussians, optimiser: SplatAdam) -> Gaussians:
+        config = self.config
+        score = self.grad_sum / self.seen.clamp(min=1)
+        chosen = score > config.grow_grad
+        room = max(config.max_gaussians - len(gaussians), 0)
+        if int(chosen.sum()) > room:
+            # stable sort: ties are broken by row, so the same seed gives the same set
+            order = torch.argsort(
+                torch.where(chosen, score, torch.full_like(score, -1.0)), descending=True, stable=True
+            )
+            chosen = torch.zeros_like(chosen)
+            chosen[order[:room]] = True
+        largest = gaussians.log_scales.exp().amax(dim=1)
+        small = largest <= config.grow_scale * self.extent
+        clones = torch.nonzero(chosen & small).squeeze(1)
+        splits = torch.nonzero(chosen & ~small).squeeze(1)
+
+        copies = gaussians.select(clones)
+        offset = self.clone_offset(gaussians, clones)
+        if offset is not None:
+            copies.means += offset
+        halves = [self._split_half(gaussians.select(splits)) for _ in range(2)]
+        stay = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.device)
+        stay[splits] = False
+        optimiser.select(stay)
+        self._select(stay)
+        new = copies.cat(halves[0]).cat(halves[1])
+        gaussians = gaussians.select(stay).cat(new)
+        optimiser.append(len(new))
+        self._match(gaussians)
+        return gaussians
+
+    def _split_half(self, parents: Gaussians) -> Gaussians:
+        """One of two samples drawn from each parent, 1.6 times smaller."""
+        noise = torch.from_numpy(self.rng.standard_normal((len(parents), 3)).astype(np.float32))
+        local = noise.to(parents.device) * parents.log_scales.exp()
+        parents.means += (rotation_matrices(parents.quats) @ local[:, :, None]).squeeze(2)
+        parents.log_scales -= float(np.log(1.6))
+        return parents
+
+    def _prune(self, gaussians: Gaussians, optimiser: SplatAdam) -> Gaussians:
+        config = self.config
+        drop = torch.sigmoid(gaussians.opacity_logits) < config.prune_opacity
+        drop |= ~torch.isfinite(gaussians.means).all(dim=1)
+        if self.last_reset:
+            drop |= gaussians.log_scales.exp().amax(dim=1) > config.prune_scale * self.extent
+        if not bool(drop.any()) or bool(drop.all()):
+            # An empty model cannot learn again: a round that would remove everything removes nothing.
+            return gaussians
+        return self.keep_rows(gaussians, optimiser, ~drop)
+
+    def keep_rows(self, gaussians: Gaussians, optimiser: SplatAdam, stay: Tensor) -> Gaussians:
+        """Drop rows everywhere at once: parameters, moments, statistics."""
+        optimiser.select(stay)
+        self._select(stay)
+        return gaussians.select(stay)
+
+    def _select(self, stay: Tensor) -> None:
+        self.grad_sum, self.seen = self.grad_sum[stay], self.seen[stay]
+
+    def _match(self, gaussians: Gaussians) -> None:
+        """Pad the statistics with zeros for new rows."""
+        missing = len(gaussians) - len(self.seen)
+        if missing > 0:
+            pad = torch.zeros(missing, device=gaussians.device)
+            self.grad_sum = torch.cat([self.grad_sum.to(gaussians.device), pad])
+            self.seen = torch.cat([self.seen.to(gaussians.device), pad])
+
+    def _clear(self, gaussians: Gaussians) -> None:
+        self.grad_sum = torch.zeros(len(gaussians), device=gaussians.device)
+        self.seen = torch.zeros(len(gaussians), device=gaussians.device)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {
+            "grad_sum": self.grad_sum,
+            "seen": self.seen,
+            "last_growth": self.last_growth,
+            "last_reset": self.last_reset,
+            "resets_done": self.resets_done,
+            "rng": self.rng.bit_generator.state,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.grad_sum, self.seen = state["grad_sum"], state["seen"]
+        self.last_growth, self.last_reset = state["last_growth"], state["last_reset"]
+        self.resets_done = state["resets_done"]
+        self.rng.bit_generator.state = state["rng"]
+
+
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """Rotation matrices [N, 3, 3] of quaternions [N, 4] (w, x, y, z), normalised here."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, dim=1).reshape(-1, 3, 3)
+
+
+def _logit(p: float) -> float:
+    return float(np.log(p / (1 - p)))

@@ -1,0 +1,119 @@
+"""The places of the training loop a method can fill, and what each is shown.
+
+The loop is short and fixed (see `trainer.py`). A method is a set of parts that fill its places; a part
+that is not there is never called and allocates nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from ambiguous_wild.core import Camera, Scene
+from ambiguous_wild.splat.density import DensityConfig, DensityControl
+from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.render import Rendered
+
+State = dict[str, Any]  # nested dicts of tensors and plain values, see checkpoint.py
+
+NOMINAL_ITERATIONS = 30_000  # every schedule is written for this length and scales with the run
+
+
+@dataclass(frozen=True)
+class TrainData:
+    """What every part may look at: the training side of the scene, never the test side."""
+
+    scene: Scene
+    photos: list[Tensor]  # of the train views: [H, W, 3] float32 in [0, 1], sRGB, on `device`
+    cameras: list[Camera]  # of the train views, matching the photos
+    user_keep: list[Tensor | None]  # [H, W] float32, 1 = static; the capture's own masks
+    device: torch.device
+    seed: int
+    cache_dir: Path  # features and instance masks that survive the run; shared between runs
+
+
+@dataclass(frozen=True)
+class Step:
+    """One training step, after the render and before the loss."""
+
+    iteration: int  # counts from 1
+    nominal: float  # progress of the run times NOMINAL_ITERATIONS: the unit schedules are written in
+    view: int  # index into TrainData.photos
+    divisor: int  # image side is the photo's divided by this (resolution schedule)
+    photo: Tensor  # [H, W, 3] at the resolution of this step
+    camera: Camera  # at the resolution of this step
+    rendered: Rendered
+    gaussians: Gaussians
+
+
+class MaskPolicy:
+    """Decides which pixels of a photo show the static scene. This one keeps everything.
+
+    Subclass it and override `keep`; everything else is optional. Keep maps are [H, W] float32 at the
+    step's resolution, 1 = static, 0 = transient; `None` means all of it.
+    """
+
+    def setup(self, data: TrainData) -> None:
+        """Called once before the first step (and again when a run resumes): frozen inputs, own nets."""
+
+    def keep(self, step: Step) -> Tensor | None:
+        """The keep map that weighs this step's loss. May train nets of its own."""
+        return None
+
+    def cotangent(self, step: Step, keep: Tensor | None) -> Tensor | None:
+        """dL/dimage [H, W, 3] of losses of the method's own; kept apart for density control."""
+        return None
+
+    def predict(self, step: Step) -> Tensor | None:
+        """The keep map for pictures and mask metrics: as `keep`, but nothing is learnt or cached."""
+        return self.keep(step)
+
+    def on_opacity_reset(self, step: Step) -> None:
+        """Opacities were just clamped: renders mean little for a while."""
+
+    def facts(self) -> dict[str, Any]:
+        """Plain values worth a line in the run's metrics, e.g. the share of pixels masked."""
+        return {}
+
+    def state_dict(self) -> State:
+        return {}
+
+    def load_state_dict(self, state: State) -> None:
+        """Restore what `state_dict` returned; exact, so that a resumed run gives the same bits."""
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Learning rates and lengths, in nominal iterations (of 30 000)."""
+
+    lr_means: float = 1.6e-4  # times the scene extent
+    lr_means_final: float = 1.6e-6  # exponential decay to here at the end
+    lr_means_final_short: float = 1.6e-5  # instead, in runs below `short_below` iterations
+    lr_sh0: float = 2.5e-3
+    lr_sh_rest: float = 1.25e-4
+    lr_opacity: float = 0.05
+    lr_scales: float = 5e-3
+    lr_quats: float = 1e-3
+    sh_every: float = 1000.0  # one SH degree more each
+    short_below: int = 15_000  # iterations; a run of fewer uses the short-run rates
+    resolution: Literal["full", "coarse-to-fine"] = "full"
+
+
+@dataclass(frozen=True)
+class Parts:
+    """A method, ready to train: what fills each place of the loop."""
+
+    mask: MaskPolicy = field(default_factory=MaskPolicy)
+    density: type[DensityControl] = DensityControl
+    density_config: DensityConfig = field(default_factory=DensityConfig)
+    schedule: Schedule = field(default_factory=Schedule)
+    lambda_dssim: float = 0.2
+    weighting: Literal["map", "images"] = "map"  # how the keep map enters SSIM, see losses.photometric
+    sh_degree: int = 3
+    antialias: bool = False
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    start_opacity: float = 0.1

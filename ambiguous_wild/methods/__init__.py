@@ -1,0 +1,5 @@
+"""Methods are recipes of parts on one shared trainer."""
+
+from ambiguous_wild.methods.registry import MethodEntry, all_methods, get_method, load_plugin, register
+
+__all__ = ["MethodEntry", "all_methods", "get_method", "load_plugin", "register"]

@@ -1,0 +1,130 @@
+"""Which methods there are. Listing them imports neither torch nor any method's code.
+
+A method of one's own is found in three ways: `register(...)`, the entry-point group
+`ambiguous_wild.methods`, or a file given as `--plugin my_method.py` (see docs/add-a-method.md).
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import importlib.util
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ambiguous_wild.core.errors import AwError, unknown
+
+if TYPE_CHECKING:
+    from ambiguous_wild.splat.parts import Parts
+
+ENTRY_POINTS = "ambiguous_wild.methods"
+
+
+@dataclass(frozen=True)
+class MethodEntry:
+    """One line of `aw methods` and the way to the recipe.
+
+    `recipe` is "module:function" or a function; it takes the options and returns `Parts`. `config` is
+    "module:Class" or a frozen dataclass: the options of the method, all with defaults.
+    """
+
+    name: str
+    summary: str
+    recipe: str | Callable[[Any], Parts]
+    config: str | type | None = None
+    paper: str = ""
+    needs: str = ""  # extras, weights or hardware; empty = nothing beyond the core
+
+    def options(self) -> Any:
+        """The method's options at their defaults (a frozen dataclass instance)."""
+        cls = _resolve(self.config) if self.config else NoOptions
+        return cls()
+
+    def build(self, options: Any) -> Parts:
+        """The parts that fill the training loop."""
+        return _resolve(self.recipe)(options)
+
+
+@dataclass(frozen=True)
+class NoOptions:
+    """A method without options of its own."""
+
+
+BUILTIN = (
+    MethodEntry(
+        name="3dgs",
+        summary="plain 3D Gaussian Splatting: no masks, every photo believed",
+        recipe="ambiguous_wild.methods.threedgs:build",
+        paper="Kerbl et al., SIGGRAPH 2023",
+    ),
+    MethodEntry(
+        name="refinesplat",
+        summary="entropy-aware masks, density control and merging for ambiguous distractors",
+        recipe="ambiguous_wild.methods.refinesplat.recipe:build",
+        config="ambiguous_wild.methods.refinesplat.recipe:Config",
+        paper="Rectifying Mask via Entropy for Distractor-Free 3DGS in Ambiguous Scenarios",
+    ),
+)
+
+_registered: dict[str, MethodEntry] = {}
+
+
+def register(entry: MethodEntry) -> MethodEntry:
+    """Add a method; a later one of the same name replaces the earlier."""
+    if not entry.name or any(c in entry.name for c in "/\\\0") or entry.name.startswith("."):
+        raise AwError(f"method name {entry.name!r} cannot name a folder: leave out '/' and a leading '.'")
+    _registered[entry.name] = entry
+    return entry
+
+
+def all_methods() -> dict[str, MethodEntry]:
+    """Every method by name: built in, installed as entry points, registered."""
+    methods = {entry.name: entry for entry in BUILTIN}
+    for point in importlib.metadata.entry_points(group=ENTRY_POINTS):
+        methods.setdefault(point.name, point.load())
+    return methods | _registered
+
+
+def get_method(name: str) -> MethodEntry:
+    """The method of that name.
+
+    Raises:
+        AwError: there is none; names the nearest.
+    """
+    methods = all_methods()
+    if name not in methods:
+        raise unknown("method", name, methods, "'aw methods' lists them")
+    return methods[name]
+
+
+def load_plugin(path: Path | str) -> list[str]:
+    """Import a Python file that calls `register`; returns the names it added.
+
+    Raises:
+        AwError: no such file, or it registers nothing.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise AwError(f"no plugin file {path}: give the path of a .py file that calls register(...)")
+    before = dict(_registered)
+    name = f"aw_plugin_{path.stem}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise AwError(f"plugin {path} is no Python file: its name must end in .py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    added = [key for key, entry in _registered.items() if before.get(key) is not entry]
+    if not added:
+        raise AwError(f"plugin {path} registers no method: call register(MethodEntry(...)) in it")
+    return added
+
+
+def _resolve(target: Any) -> Any:
+    if not isinstance(target, str):
+        return target
+    module, _, attribute = target.partition(":")
+    return getattr(importlib.import_module(module), attribute)

@@ -1,0 +1,88 @@
+"""Exact snapshots of a run: nested dicts of tensors and plain values in one safetensors file.
+
+safetensors holds no code, so a checkpoint from a stranger cannot run any. Plain values travel as JSON in
+the file's metadata; Python's floats and big integers survive it exactly.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.io.atomic import atomic_path
+
+FORMAT = "ambiguous_wild/1"
+_TENSOR = "@tensor"  # stands in the plain tree where a tensor was
+
+
+def save(path: Path | str, tree: Mapping[str, Any]) -> None:
+    """Write a nested dict of tensors, arrays, numbers, strings, lists and None, atomically.
+
+    Raises:
+        TypeError: a value that is none of these.
+    """
+    tensors: dict[str, torch.Tensor] = {}
+    plain = _split(tree, "", tensors)
+    with atomic_path(path) as temporary:
+        save_file(tensors, temporary, metadata={"format": FORMAT, "plain": json.dumps(plain)})
+
+
+def load(path: Path | str) -> dict[str, Any]:
+    """Read what `save` wrote; tensors land on the CPU.
+
+    Raises:
+        AwError: not such a file, or damaged.
+    """
+    try:
+        with safe_open(str(path), framework="pt", device="cpu") as f:
+            metadata = f.metadata() or {}
+            if metadata.get("format") != FORMAT:
+                raise AwError(
+                    f"{path} is no checkpoint of this version (format {metadata.get('format')!r}, "
+                    f"expected {FORMAT!r}); train again with --overwrite always"
+                )
+            tensors = {key: f.get_tensor(key) for key in f.keys()}  # noqa: SIM118 - not a dict
+        return _join(json.loads(metadata["plain"]), "", tensors)
+    except (SafetensorError, OSError, KeyError, ValueError) as error:
+        raise AwError(
+            f"cannot read checkpoint {path}: {error}; delete it or train with --overwrite always"
+        ) from None
+
+
+def _split(value: Any, key: str, tensors: dict[str, torch.Tensor]) -> Any:
+    if isinstance(value, Mapping):
+        for name in value:
+            if not isinstance(name, str) or "/" in name:
+                raise TypeError(f"checkpoint keys are strings without '/', got {name!r} under {key!r}")
+        return {name: _split(item, f"{key}/{name}", tensors) for name, item in value.items()}
+    if isinstance(value, np.ndarray):
+        value = torch.from_numpy(np.ascontiguousarray(value))
+    if isinstance(value, torch.Tensor):
+        # A copy: two names may share storage, which safetensors refuses.
+        tensors[key] = value.detach().to("cpu", copy=True).contiguous()
+        return _TENSOR
+    if isinstance(value, (list, tuple)):
+        return [_split(item, f"{key}/{i}", tensors) for i, item in enumerate(value)]
+    if isinstance(value, np.generic):
+        return value.item()
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    raise TypeError(f"cannot store {type(value).__name__} at {key!r} in a checkpoint")
+
+
+def _join(plain: Any, key: str, tensors: dict[str, torch.Tensor]) -> Any:
+    if plain == _TENSOR:
+        return tensors[key]
+    if isinstance(plain, dict):
+        return {name: _join(item, f"{key}/{name}", tensors) for name, item in plain.items()}
+    if isinstance(plain, list):
+        return [_join(item, f"{key}/{i}", tensors) for i, item in enumerate(plain)]
+    return plain

@@ -1,0 +1,241 @@
+"""Scene folders: ours (with scene.json), and any plain COLMAP scene as gsplat and 3DGS read it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal
+
+import numpy as np
+
+from ambiguous_wild.core import AwError, Camera, Points, Scene, View
+from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.core.scene import Split
+from ambiguous_wild.io.colmap_model import Model, ModelImage, read_model
+from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.io.images import image_size
+
+SCENE_SCHEMA = 1  # of scene.json; raised when a reader of the old one would be wrong
+TEST_EVERY = 8  # the 3DGS and gsplat habit for scenes that bring no lists
+
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
+
+
+def load_scene(
+    path: Path | str,
+    *,
+    factor: int | None = None,
+    verify: bool | Literal["quick"] = True,
+) -> Scene:
+    """Open a scene folder; no pixels are read.
+
+    Args:
+        path: our scene folder, or a plain COLMAP scene (``images/`` and ``sparse/0``).
+        factor: 1 takes ``images/``, n takes ``images_n/``; None takes what the scene was built for.
+        verify: True compares the sha256 of every file scene.json lists, "quick" their sizes,
+            False nothing. A folder without scene.json has nothing to compare with.
+
+    Returns:
+        The scene: views ordered by name, intrinsics at the size of the loaded files, points with
+        tracks in px of those files. ``info["warnings"]`` says what the lists name and the model lacks.
+
+    Raises:
+        AwError: the folder is no scene, a file changed, lists and model do not fit.
+    """
+    root = Path(path)
+    if not root.is_dir():
+        raise AwError(f"there is no scene folder {root}; 'aw build-scene PHOTOS -o {root}' makes one")
+    info = read_scene_json(root)
+    if info is not None and verify:
+        verify_files(root, info, quick=verify == "quick")
+    chosen = _default_factor(root, info) if factor is None else factor
+    folder = _image_folder(root, chosen)
+    model = read_model(_model_folder(root))
+    info = {} if info is None else dict(info)
+    info["loaded_factor"] = chosen
+    split, missing = _split(root, [image.name for image in model.images.values()])
+    info["missing"] = missing
+    info["warnings"] = [
+        f"{len(names)} {side} photos of the list are not in the model: {shortlist(names)}"
+        for side, names in missing.items()
+        if names
+    ]
+    views = tuple(
+        _view(root, folder, model, image, split[image.name])
+        for image in sorted(model.images.values(), key=lambda i: i.name)
+        if image.name in split
+    )
+    if not any(v.split == "train" for v in views):
+        raise AwError(f"{root} has no training photo: none of train_list.txt is in the model")
+    return Scene(root, str(info.get("name") or root.resolve().name), views, _points(model, views), info)
+
+
+def read_scene_json(root: Path | str) -> dict[str, Any] | None:
+    """scene.json as a dict, or None where there is none.
+
+    Raises:
+        AwError: it does not parse, or is of a newer schema than this version knows.
+    """
+    path = Path(root) / "scene.json"
+    if not path.is_file():
+        return None
+    try:
+        info = json.loads(path.read_text(encoding="utf-8"))
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise AwError(f"{path} is damaged ({error}); build the scene again with 'aw build-scene'") from error
+    version = info.get("schema_version") if isinstance(info, dict) else None
+    if not isinstance(version, int):
+        raise AwError(f"{path} has no schema_version, so it is not a scene.json of 'aw build-scene'")
+    if version > SCENE_SCHEMA:
+        raise AwError(
+            f"{path} has schema {version}, this version reads up to {SCENE_SCHEMA}: update ambiguous-wild"
+        )
+    return info
+
+
+def verify_files(root: Path | str, info: dict[str, Any], *, quick: bool = False) -> None:
+    """Compare the files scene.json lists with what lies there; quick compares sizes only.
+
+    Raises:
+        AwError: names the files that are missing or changed.
+    """
+    base, files = Path(root), info.get("files")
+    if not isinstance(files, dict):
+        raise AwError(f"{base}/scene.json lists no files; build the scene again with 'aw build-scene'")
+    wrong = []
+    for name, known in files.items():
+        path = base / _inside(name, base)
+        if not path.is_file():
+            wrong.append(f"{name} (missing)")
+        elif path.stat().st_size != known["bytes"] or (not quick and sha256_file(path) != known["sha256"]):
+            wrong.append(f"{name} (changed)")
+    if wrong:
+        raise AwError(
+            f"{len(wrong)} of {len(files)} files of {base} are not what scene.json recorded: {shortlist(wrong)}; "
+            "restore them, or build the scene again with 'aw build-scene PHOTOS -o SCENE --overwrite'"
+        )
+
+
+def read_list(path: Path) -> list[str]:
+    """Names of a split list, one a line; empty lines are skipped."""
+    lines = path.read_text(encoding="utf-8", errors="surrogateescape").splitlines()
+    return [line.strip() for line in lines if line.strip()]
+
+
+def _inside(name: str, root: Path) -> str:
+    pure = PurePosixPath(name)
+    if pure.is_absolute() or ".." in pure.parts or not pure.parts:
+        raise AwError(f"{root} names a file outside itself: {name!r}; do not use this scene")
+    return name
+
+
+def _model_folder(root: Path) -> Path:
+    for folder in (root / "sparse" / "0", root / "sparse", root / "colmap" / "sparse" / "0"):
+        if (folder / "cameras.bin").is_file() or (folder / "cameras.txt").is_file():
+            return folder
+    raise AwError(
+        f"{root} is no scene: neither sparse/0 nor sparse holds a COLMAP model; "
+        f"if it holds photos, build one with 'aw build-scene {root} -o SCENE'"
+    )
+
+
+def _default_factor(root: Path, info: dict[str, Any] | None) -> int:
+    if info is not None:
+        return int(info["factor"])
+    found = _factors(root)
+    return found[0] if len(found) == 1 and not (root / "images").is_dir() else 1
+
+
+def _factors(root: Path) -> list[int]:
+    tails = (p.name.removeprefix("images_") for p in root.glob("images_*") if p.is_dir())
+    return sorted(int(t) for t in tails if t.isdigit())
+
+
+def _image_folder(root: Path, factor: int) -> Path:
+    folder = root / ("images" if factor == 1 else f"images_{factor}")
+    if factor < 1 or not folder.is_dir():
+        have = (["1 (images)"] if (root / "images").is_dir() else []) + [str(f) for f in _factors(root)]
+        raise AwError(
+            f"{root} has no images at factor {factor}; it has factor {', '.join(have) or 'none'}; "
+            f"pass one of those or build with 'aw build-scene --factor {max(factor, 1)}'"
+        )
+    return folder
+
+
+def _split(root: Path, registered: list[str]) -> tuple[dict[str, Split], dict[str, list[str]]]:
+    """name -> side for the registered photos, and the listed names the model lacks, per side."""
+    paths: dict[Split, Path] = {"train": root / "train_list.txt", "test": root / "test_list.txt"}
+    present = [p for p in paths.values() if p.is_file()]
+    if not present:
+        ordered = sorted(registered)
+        return {n: "train" if i % TEST_EVERY else "test" for i, n in enumerate(ordered)}, {}
+    if len(present) == 1:
+        raise AwError(f"{root} has {present[0].name} but not the other list; write both or neither")
+    # Some releases list names with their extension, some without.
+    by_stem = {str(PurePosixPath(n).with_suffix("")): n for n in registered}
+    known, split, missing = set(registered), {}, {}
+    for side, path in paths.items():
+        missing[side] = []
+        for name in read_list(path):
+            match = name if name in known else by_stem.get(name)
+            if match is None:
+                missing[side].append(name)
+            elif split.setdefault(match, side) != side:
+                raise AwError(f"{root}: {name!r} is in train_list.txt and in test_list.txt; keep it in one")
+    return split, missing  # type: ignore[return-value]
+
+
+def _view(root: Path, folder: Path, model: Model, image: ModelImage, side: Split) -> View:
+    path = _image_path(folder, _inside(image.name, root))
+    width, height = image_size(path)
+    full = model.cameras[image.camera_id]
+    fx, fy, cx, cy = full.pinhole()
+    if abs(width * full.height / full.width - height) > max(2.0, 0.02 * height):
+        raise AwError(
+            f"{path} is {width}x{height}, but its camera in the model is {full.width}x{full.height}: another "
+            "shape, so the photo was cropped or turned; use the photos the model was made from"
+        )
+    camera = Camera(full.width, full.height, fx, fy, cx, cy, image.cam_from_world()).resized(width, height)
+    stem = str(PurePosixPath(image.name).with_suffix(""))
+    keep = root / "masks" / "train" / f"{stem}.png"
+    keep_path = keep if side == "train" and keep.is_file() else None
+    return View(image.name, path, camera, side, keep_path, image.image_id)
+
+
+def _image_path(folder: Path, name: str) -> Path:
+    # Downsampled copies often change extension (gsplat writes PNG next to JPEG models).
+    candidates = [folder / name, *((folder / name).with_suffix(s) for s in _SUFFIXES)]
+    for path in candidates:
+        if path.is_file():
+            return path
+    raise AwError(f"{folder} lacks {name}, which the model registers; restore it or build the scene again")
+
+
+def _points(model: Model, views: tuple[View, ...]) -> Points:
+    """The model's points with tracks in view indices and px of the loaded files."""
+    points = model.points
+    count = len(points.track_image_ids)
+    track_views = np.full(count, -1, dtype=np.int32)
+    track_xy = np.zeros((count, 2), dtype=np.float32)
+    order = np.argsort(points.track_image_ids, kind="stable")
+    ids = points.track_image_ids[order]
+    scaled = {v.image_id: (i, v) for i, v in enumerate(views)}
+    for image_id, image in model.images.items():
+        rows = order[np.searchsorted(ids, image_id) : np.searchsorted(ids, image_id, side="right")]
+        index = points.track_point2d[rows]
+        if len(index) and (index.min() < 0 or index.max() >= len(image.xys)):
+            raise AwError(f"the model's tracks and its image {image.name!r} contradict each other: damaged")
+        scale = np.ones(2)
+        if image_id in scaled:
+            position, view = scaled[image_id]
+            full = model.cameras[image.camera_id]
+            scale = np.array([view.camera.width / full.width, view.camera.height / full.height])
+            track_views[rows] = position
+        track_xy[rows] = image.xys[index] * scale
+    return Points(points.xyz, points.rgb, points.error_px, points.track_offsets, track_views, track_xy)
+
+
+def without_keep(scene: Scene) -> Scene:
+    """The scene as if nobody had drawn masks: for methods that must find distractors themselves."""
+    return replace(scene, views=tuple(replace(v, keep_path=None) for v in scene.views))

@@ -112,8 +112,8 @@ def verify_files(root: Path | str, info: dict[str, Any], *, quick: bool = False)
             wrong.append(f"{name} (changed)")
     if wrong:
         raise AwError(
-            f"{len(wrong)} of {len(files)} files of {base} are not what scene.json recorded: {shortlist(wrong)}; "
-            "restore them, or build the scene again with 'aw build-scene PHOTOS -o SCENE --overwrite'"
+            f"{len(wrong)} of {len(files)} files of {base} are not what scene.json recorded: "
+            f"{shortlist(wrong)}; restore them, or build the scene again with 'aw build-scene PHOTOS -o SCENE --overwrite'"
         )
 
 
@@ -174,7 +174,9 @@ def _split(root: Path, registered: list[str]) -> tuple[dict[str, Split], dict[st
         raise AwError(f"{root} has {present[0].name} but not the other list; write both or neither")
     # Some releases list names with their extension, some without.
     by_stem = {str(PurePosixPath(n).with_suffix("")): n for n in registered}
-    known, split, missing = set(registered), {}, {}
+    known = set(registered)
+    split: dict[str, Split] = {}
+    missing: dict[str, list[str]] = {}
     for side, path in paths.items():
         missing[side] = []
         for name in read_list(path):
@@ -183,7 +185,7 @@ def _split(root: Path, registered: list[str]) -> tuple[dict[str, Split], dict[st
                 missing[side].append(name)
             elif split.setdefault(match, side) != side:
                 raise AwError(f"{root}: {name!r} is in train_list.txt and in test_list.txt; keep it in one")
-    return split, missing  # type: ignore[return-value]
+    return split, missing
 
 
 def _view(root: Path, folder: Path, model: Model, image: ModelImage, side: Split) -> View:

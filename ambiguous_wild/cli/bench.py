@@ -1,0 +1,218 @@
+"""`aw bench`: train methods on scenes and measure them."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ambiguous_wild.core.errors import AwError
+
+if TYPE_CHECKING:
+    from ambiguous_wild.harness.run import Cell, CellReport
+    from ambiguous_wild.splat.trainer import Trainer
+
+_UNITS = {"s": 1, "m": 60, "min": 60, "h": 3600}
+
+
+def parse_budget(text: str) -> float:
+    """ "90s", "10m", "1.5h" in seconds.
+
+    Raises:
+        AwError: it is none of these.
+    """
+    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*(s|m|min|h)\s*", text)
+    if not match or float(match[1]) <= 0:
+        raise AwError(f"budget {text!r} is no duration: write 90s, 10m or 1.5h")
+    return float(match[1]) * _UNITS[match[2]]
+
+
+# fmt: off
+@click.command(name="bench")
+@click.option("--method", "methods", multiple=True, required=True, help="A name of 'aw methods'; repeatable.")
+@click.option("--scene", "scenes", multiple=True, required=True, type=click.Path(path_type=Path), help="A scene folder; repeatable.")
+@click.option("--seed", "seeds", multiple=True, type=int, default=(0,), show_default=True, help="Repeatable.")
+@click.option("--iterations", type=click.IntRange(1), help="Length of the training.  [default: 30000]")
+@click.option("--budget", help="Training time instead: 90s, 10m, 1.5h. Schedules scale with it.")
+@click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True)
+@click.option("--threads", type=click.IntRange(1), help="CPU threads; the result does not depend on it.")
+@click.option("--factor", type=click.IntRange(1), help="Train on images_N.  [default: what the scene was built for]")
+@click.option("--resolution", type=click.Choice(["auto", "full", "coarse-to-fine"]), default="auto", show_default=True, help="auto: coarse-to-fine under a budget, else full.")
+@click.option("--max-gaussians", type=click.IntRange(4), help="Growth stops here.  [default: the method's own]")
+@click.option("--set", "settings", multiple=True, metavar="METHOD.KEY=VALUE", help="An option of a method; repeatable.")
+@click.option("--plugin", "plugins", multiple=True, type=click.Path(path_type=Path), help="A Python file that registers methods of your own.")
+@click.option("-o", "--output", type=click.Path(path_type=Path), default=Path("runs"), show_default=True)
+@click.option("--overwrite", type=click.Choice(["never", "missing", "always"]), default="missing", show_default=True, help="missing: keep what is finished, resume what stopped.")
+@click.option("--cache", type=click.Path(path_type=Path), help="Features and instance masks.  [default: OUTPUT/.cache]")
+@click.option("--checkpoint-every", type=click.FloatRange(min=0.0, min_open=True), default=60.0, show_default=True, help="Seconds between checkpoints.")
+@click.option("--json", "as_json", is_flag=True, help="Print the outcome of every run as JSON.")
+# fmt: on
+def command(
+    methods: tuple[str, ...],
+    scenes: tuple[Path, ...],
+    seeds: tuple[int, ...],
+    iterations: int | None,
+    budget: str | None,
+    device: str,
+    threads: int | None,
+    factor: int | None,
+    resolution: str,
+    max_gaussians: int | None,
+    settings: tuple[str, ...],
+    plugins: tuple[Path, ...],
+    output: Path,
+    overwrite: str,
+    cache: Path | None,
+    checkpoint_every: float,
+    as_json: bool,
+) -> None:
+    """Train METHODs on SCENEs and measure them on the test views.
+
+    \b
+    aw bench --method 3dgs --method refinesplat --scene scene -o runs
+    aw bench --method refinesplat --scene scene --budget 10m --set refinesplat.alpha_1=0.1
+    """
+    if iterations is not None and budget is not None:
+        raise AwError("--iterations and --budget exclude each other: a run is as long as one of them says")
+    seconds = None if budget is None else parse_budget(budget)
+
+    from ambiguous_wild.methods.registry import get_method, load_plugin
+
+    for plugin in plugins:
+        load_plugin(plugin)
+    for name in methods:
+        get_method(name)  # a misspelt name is answered before torch is imported
+
+    from ambiguous_wild.harness.grid import plan_cells, run_cells
+    from ambiguous_wild.splat.trainer import TrainConfig
+
+    chosen = choose_device(device)
+    train = TrainConfig(
+        iterations=iterations or TrainConfig.iterations,
+        budget_s=seconds,
+        resolution=resolution,  # type: ignore[arg-type]
+        max_gaussians=max_gaussians,
+        checkpoint_every_s=checkpoint_every,
+    )
+    cells = plan_cells(
+        methods, scenes, seeds, train, settings=settings, device=chosen, factor=factor
+    )  # fmt: skip
+    if chosen == "cpu":
+        prepare_cpu(threads)
+    progress = _Progress(len(cells))
+    reports = run_cells(
+        cells,
+        output,
+        overwrite=overwrite,  # type: ignore[arg-type]
+        cache_dir=cache,
+        tick=progress.tick,
+        on_start=progress.start,
+        on_end=progress.end,
+    )
+    _finish(reports, output, as_json)
+
+
+def choose_device(device: str) -> str:
+    """"auto" is the GPU where torch and gsplat can both use one.
+
+    Raises:
+        AwError: cuda was asked for and is not usable; says what is missing.
+    """
+    if device == "cpu":
+        return "cpu"
+    import importlib.util
+
+    import torch
+
+    has_gpu = torch.cuda.is_available()
+    has_gsplat = importlib.util.find_spec("gsplat") is not None
+    if has_gpu and has_gsplat:
+        return "cuda"
+    if device == "auto":
+        return "cpu"
+    what = "torch sees no GPU" if not has_gpu else "gsplat is not installed: pip install 'ambiguous-wild[cuda]'"
+    raise AwError(f"--device cuda: {what}; 'aw doctor' tells more, --device cpu runs without")
+
+
+def prepare_cpu(threads: int | None) -> None:
+    """Set the threads of the kernels and compile them, once per machine."""
+    from ambiguous_wild.splat.cpu import set_threads
+    from ambiguous_wild.splat.cpu.warmup import warm_up
+
+    if threads is not None:
+        set_threads(threads)
+    warm_up(lambda text: click.echo(text, err=True))
+
+
+class _Progress:
+    """A bar a cell; on stderr, so that stdout stays clean for results."""
+
+    def __init__(self, cells: int) -> None:
+        self.cells, self.index = cells, 0
+        self.bar: Any = None
+
+    def start(self, cell: Cell, folder: Path) -> None:
+        self.index += 1
+        self.title = f"[{self.index}/{self.cells}] {cell.method.name} on {cell.scene.name}, seed {cell.train.seed}"
+        click.echo(f"{self.title} -> {folder}", err=True)
+
+    def tick(self, trainer: Trainer) -> None:
+        from tqdm import tqdm
+
+        if self.bar is None:
+            budget = trainer.config.budget_s
+            self.bar = tqdm(
+                total=100.0 if budget is not None else trainer.config.iterations,
+                unit="%" if budget is not None else "it",
+                bar_format="{l_bar}{bar}| {n:.0f}/{total:.0f}{unit} [{elapsed}<{remaining}]{postfix}",
+                mininterval=1.0,
+                disable=None if sys.stderr.isatty() else True,
+                file=sys.stderr,
+            )
+        done = 100.0 * trainer.progress(trainer.iteration) if trainer.config.budget_s else trainer.iteration
+        if trainer.iteration % 25 == 0 or trainer.done:
+            self.bar.set_postfix_str(
+                f"{trainer.ms_per_iteration:.0f} ms/it, {len(trainer.gaussians):,} Gaussians", refresh=False
+            )
+        self.bar.update(done - self.bar.n)
+
+    def end(self, cell: Cell, report: CellReport) -> None:
+        if self.bar is not None:
+            self.bar.close()
+            self.bar = None
+        click.echo(f"    {_outcome_line(report)}", err=True)
+
+
+def _outcome_line(report: CellReport) -> str:
+    if report.outcome == "kept":
+        return "finished before, kept"
+    if report.outcome == "skipped":
+        return "exists, left as it is (--overwrite never)"
+    if report.outcome == "failed":
+        return "failed: " + " ".join(report.error.split())
+    cost, images = report.result["cost"], report.result["per_image"]
+    values = [float(row["psnr"]) for row in images]
+    psnr = f"PSNR {sum(values) / len(values):.2f} dB over {len(values)} test views, " if values else ""
+    return (
+        f"{psnr}{cost['train_s']:.0f} s training, {cost['ms_per_iteration']:.1f} ms/iteration, "
+        f"{cost['gaussians']:,} Gaussians"
+    )
+
+
+def _finish(reports: list[CellReport], output: Path, as_json: bool) -> None:
+    counts = Counter(report.outcome for report in reports)
+    summary = ", ".join(f"{n} {name}" for name, n in counts.items())
+    if as_json:
+        rows = [{"folder": str(r.folder), "outcome": r.outcome, "error": r.error or None} for r in reports]
+        click.echo(json.dumps(rows, indent=2))
+    click.echo(f"{len(reports)} runs: {summary}; compare them with: aw table {output}", err=True)
+    failed = [report for report in reports if report.outcome == "failed"]
+    if len(failed) == len(reports) == 1:
+        raise AwError(failed[0].error)
+    if failed:
+        raise AwError(f"{len(failed)} of {len(reports)} runs failed: " + failed[0].error)

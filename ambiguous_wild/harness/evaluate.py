@@ -1,0 +1,124 @@
+"""Renders, masks and numbers of a trained model; every number comes from the saved 8-bit images."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ambiguous_wild.core import Camera, Scene, View
+from ambiguous_wild.io.atomic import atomic_dir
+from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
+from ambiguous_wild.metrics import image as image_metrics
+from ambiguous_wild.metrics import lpips
+from ambiguous_wild.metrics import masks as mask_metrics
+from ambiguous_wild.splat.trainer import Trainer
+
+FPS_SECONDS = 2.0  # long enough to average over scheduling noise
+
+
+@dataclass(frozen=True)
+class TestPhoto:
+    """A test view with its photo, [H, W, 3] uint8."""
+
+    __test__ = False  # the name is the field's term, not a pytest class
+
+    view: View
+    photo: np.ndarray
+
+
+def load_test_photos(scene: Scene) -> list[TestPhoto]:
+    """The test views' photos as 8-bit RGB."""
+    return [TestPhoto(view, read_png_rgb(view.image_path)) for view in scene.test]
+
+
+def to_uint8(image: np.ndarray) -> np.ndarray:
+    """[H, W, 3] float to 8 bits, clipped to [0, 1] and rounded to nearest."""
+    return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+
+
+def mean_psnr(truth: list[TestPhoto], draw: Callable[[Camera], np.ndarray]) -> float:
+    """Mean PSNR in dB over the test views, from 8-bit images."""
+    return float(np.mean([image_metrics.psnr(to_uint8(draw(t.view.camera)), t.photo) for t in truth]))
+
+
+def render_and_measure(
+    trainer: Trainer, truth: list[TestPhoto], folder: Path
+) -> tuple[list[dict[str, Any]], dict[str, str]]:
+    """Render the test views to PNG and measure what was written.
+
+    Returns:
+        Per-image metrics, and for each metric that is missing the reason.
+    """
+    missing = {name: reason for name, reason in lpips.available().items() if reason is not None}
+    if not truth:
+        missing |= dict.fromkeys(image_metrics.METRICS, "the scene has no test views")
+        return [], missing
+    names = [name for name in lpips.available() if name not in missing]
+    networks = {name: lpips.load(name) for name in names}
+    rows = []
+    with atomic_dir(folder) as temporary:
+        for t in truth:
+            path = temporary / Path(t.view.name).with_suffix(".png")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_png(path, to_uint8(trainer.render(t.view.camera).image.cpu().numpy()))
+            drawn = read_png_rgb(path)
+            row: dict[str, Any] = {"name": t.view.name}
+            row |= {name: metric(drawn, t.photo) for name, metric in image_metrics.METRICS.items()}
+            row |= {name: network(drawn, t.photo) for name, network in networks.items()}
+            rows.append(row)
+    return rows, missing
+
+
+def write_masks(trainer: Trainer, folder: Path) -> dict[str, Any] | None:
+    """Write every train view's keep map (white = keep) and score it where the truth is known.
+
+    Returns:
+        Mean IoU, precision and recall of the distractor pixels over photos, or None without truth.
+    """
+    scores = []
+    with atomic_dir(folder) as temporary:
+        for index, view in enumerate(trainer.data.scene.train):
+            step = trainer.make_step(max(trainer.iteration, 1), index, divisor=1)
+            keep = trainer.combine_user_keep(step, trainer.parts.mask.predict(step))
+            if keep is None:
+                continue
+            binary = (keep > 0.5).cpu().numpy()
+            path = temporary / Path(view.name).with_suffix(".png")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_png(path, binary.astype(np.uint8) * 255)
+            truth = true_distractor(trainer.data.scene, view)
+            if truth is not None:
+                scores.append(mask_metrics.mask_scores(~binary, truth))
+    if not scores:
+        return None
+    mean = {key: float(np.nanmean([s[key] for s in scores])) for key in ("iou", "precision", "recall")}
+    return mean | {"images": len(scores)}
+
+
+def true_distractor(scene: Scene, view: View) -> np.ndarray | None:
+    """[H, W] bool, True on distractors, where the capture brought the truth."""
+    path = scene.root / "truth" / "distractor" / Path(view.name).with_suffix(".png").name
+    if not path.exists():
+        return None
+    mask = read_gray(path) >= 128
+    return mask if mask.shape == (view.camera.height, view.camera.width) else None
+
+
+def frames_per_second(trainer: Trainer) -> float:
+    """Rendered frames a second over the views of the scene, after a warm-up round."""
+    cameras = [v.camera for v in (trainer.data.scene.test or trainer.data.scene.train)]
+    for camera in cameras[:3]:
+        trainer.render(camera)
+    frames, begin = 0, time.perf_counter()
+    while True:
+        # .cpu() waits for a GPU; on the CPU it costs nothing.
+        trainer.render(cameras[frames % len(cameras)]).image.cpu()
+        frames += 1
+        seconds = time.perf_counter() - begin
+        if seconds >= FPS_SECONDS:
+            return frames / seconds

@@ -1,0 +1,138 @@
+"""Many cells, one after the other: a cell that fails does not take the others with it."""
+
+from __future__ import annotations
+
+import dataclasses
+import traceback
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.core.config import with_options
+from ambiguous_wild.core.errors import unknown
+from ambiguous_wild.harness.run import (
+    RESULT,
+    Cell,
+    CellReport,
+    Overwrite,
+    failed_result,
+    refuse_other_config,
+    run_cell,
+    scene_identity,
+)
+from ambiguous_wild.harness.store import write_result
+from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.methods.registry import get_method
+from ambiguous_wild.splat.trainer import TrainConfig
+
+
+def plan_cells(
+    methods: Sequence[str],
+    scenes: Sequence[Path],
+    seeds: Sequence[int],
+    train: TrainConfig,
+    *,
+    settings: Iterable[str] = (),
+    device: str = "cpu",
+    factor: int | None = None,
+) -> list[Cell]:
+    """Every method on every scene with every seed; all names and options are checked before any training.
+
+    Args:
+        methods: names of `aw methods`.
+        scenes: scene folders.
+        seeds: seeds of training.
+        train: length and bookkeeping; its seed is replaced.
+        settings: "method.key=value" strings.
+        device: "cpu" or "cuda".
+        factor: which images_N; None = what the scene was built for.
+
+    Raises:
+        AwError: unknown method, option or scene; two scenes of the same name.
+    """
+    by_method = _settings_by_method(settings, methods)
+    entries = [(get_method(name), by_method.get(name, {})) for name in dict.fromkeys(methods)]
+    loaded = [load_scene(path, factor=factor) for path in scenes]
+    names = [scene.name for scene in loaded]
+    twice = {name for name in names if names.count(name) > 1}
+    if twice:
+        raise AwError(
+            f"two scenes are called {', '.join(sorted(twice))}: their runs would share a folder; "
+            "rename one in its scene.json or bench them into different -o"
+        )
+    cells = []
+    for scene in loaded:
+        identity = scene_identity(scene)
+        for entry, options in entries:
+            resolved = with_options(entry.options(), options, f"option of {entry.name}")
+            for seed in dict.fromkeys(seeds):
+                config = dataclasses.replace(train, seed=seed)
+                cells.append(Cell(entry, resolved, scene, identity, config, device))
+    return cells
+
+
+def _settings_by_method(settings: Iterable[str], methods: Sequence[str]) -> dict[str, dict[str, str]]:
+    grouped: dict[str, dict[str, str]] = {}
+    for setting in settings:
+        key, equals, value = setting.partition("=")
+        method, dot, option = key.partition(".")
+        if not equals or not dot:
+            raise AwError(f"--set {setting!r}: write METHOD.KEY=VALUE, e.g. refinesplat.alpha_1=0.1")
+        if method not in methods:
+            raise unknown("method in --set", method, methods)
+        grouped.setdefault(method, {})[option] = value
+    return grouped
+
+
+def cell_folder(output: Path, cell: Cell) -> Path:
+    """OUTPUT/<scene>/<method>/seed<k>."""
+    return output / cell.scene.name / cell.method.name / f"seed{cell.train.seed}"
+
+
+def run_cells(
+    cells: Sequence[Cell],
+    output: Path,
+    *,
+    overwrite: Overwrite = "missing",
+    cache_dir: Path | None = None,
+    tick: Callable[[Any], None] | None = None,
+    on_start: Callable[[Cell, Path], None] | None = None,
+    on_end: Callable[[Cell, CellReport], None] | None = None,
+) -> list[CellReport]:
+    """Run what is missing; a cell's error becomes its result and the next cell goes on.
+
+    Raises:
+        AwError: a run folder holds another configuration (found before anything is trained).
+    """
+    folders = [cell_folder(output, cell) for cell in cells]
+    if overwrite == "missing":
+        for cell, folder in zip(cells, folders):
+            if folder.exists():
+                refuse_other_config(folder, cell)
+    reports = []
+    for cell, folder in zip(cells, folders):
+        if on_start is not None:
+            on_start(cell, folder)
+        report = _isolated(cell, folder, cache_dir or output / ".cache", overwrite, tick)
+        if on_end is not None:
+            on_end(cell, report)
+        reports.append(report)
+    return reports
+
+
+def _isolated(
+    cell: Cell, folder: Path, cache_dir: Path, overwrite: Overwrite, tick: Callable[[Any], None] | None
+) -> CellReport:
+    try:
+        return run_cell(cell, folder, cache_dir=cache_dir, overwrite=overwrite, tick=tick)
+    except AwError as error:
+        message = str(error)
+    except Exception as error:
+        # Ours, not the user's: the whole story goes beside the run, one line into the table.
+        message = f"{type(error).__name__}: {error}"
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "traceback.txt").write_text(traceback.format_exc(), encoding="utf-8")
+    if not (folder / RESULT).exists() and (folder / "config.yaml").exists():
+        write_result(folder / "failed.json", failed_result(cell, message))
+    return CellReport(folder, "failed", error=message)

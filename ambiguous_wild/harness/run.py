@@ -1,0 +1,258 @@
+"""One method on one scene with one seed: train, render the test views, measure, write the run folder."""
+
+from __future__ import annotations
+
+import dataclasses
+import resource
+import shutil
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+import yaml
+
+from ambiguous_wild import __version__
+from ambiguous_wild.core import AwError, Camera, Scene
+from ambiguous_wild.core.config import config_hash, to_plain
+from ambiguous_wild.harness import evaluate
+from ambiguous_wild.harness.environment import environment
+from ambiguous_wild.harness.store import write_result
+from ambiguous_wild.io.atomic import write_json, write_text
+from ambiguous_wild.io.lock import folder_lock
+from ambiguous_wild.io.ply import write_splat_ply
+from ambiguous_wild.methods.registry import MethodEntry
+from ambiguous_wild.splat.data import load_train_data
+from ambiguous_wild.splat.trainer import TrainConfig, Trainer
+
+Overwrite = Literal["never", "missing", "always"]
+Outcome = Literal["trained", "kept", "skipped", "failed"]
+RESULT = "metrics.json"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What one run is: two cells with the same hash give the same result on the same machine."""
+
+    method: MethodEntry
+    options: Any  # the method's frozen dataclass
+    scene: Scene
+    scene_id: str  # sha256 of what the scene was built from, see `scene_identity`
+    train: TrainConfig
+    device: str = "cpu"
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The resolved configuration, as written to config.yaml."""
+        train = to_plain(self.train)
+        return {
+            "method": self.method.name,
+            "options": to_plain(self.options),
+            "train": train,
+            "scene": {"name": self.scene.name, "sha256": self.scene_id},
+            "device": self.device,
+            "version": __version__,
+        }
+
+    @property
+    def identity(self) -> str:
+        """Hash of everything that decides the result; how often it is saved does not."""
+        config = self.config
+        train = {k: v for k, v in config["train"].items() if k not in ("checkpoint_every_s", "probes")}
+        return config_hash(config | {"train": train})
+
+
+@dataclass
+class CellReport:
+    """What became of a cell."""
+
+    folder: Path
+    outcome: Outcome
+    error: str = ""
+    result: dict[str, Any] = field(default_factory=dict)
+
+
+def run_cell(
+    cell: Cell,
+    folder: Path,
+    *,
+    cache_dir: Path,
+    overwrite: Overwrite = "missing",
+    tick: Callable[[Trainer], None] | None = None,
+) -> CellReport:
+    """Train and measure, or find that it is done.
+
+    Args:
+        cell: what to run.
+        folder: the run folder.
+        cache_dir: for features and instance masks shared between runs.
+        overwrite: "missing" keeps a finished run and resumes a stopped one, "always" starts anew,
+            "never" leaves a folder that exists as it is.
+        tick: called after every iteration.
+
+    Raises:
+        AwError: the folder holds a run of another configuration, or is in use.
+    """
+    if folder.exists() and overwrite == "never":
+        return CellReport(folder, "skipped")
+    with folder_lock(folder, f"aw bench --method {cell.method.name}"):
+        if overwrite == "always" and folder.exists():
+            shutil.rmtree(folder)
+        elif folder.exists():
+            refuse_other_config(folder, cell)
+            if (folder / RESULT).exists():
+                return CellReport(folder, "kept")
+        folder.mkdir(parents=True, exist_ok=True)
+        config = cell.config | {"config_hash": cell.identity}
+        write_text(folder / "config.yaml", yaml.safe_dump(config, sort_keys=False, allow_unicode=True))
+        write_json(folder / "env.json", environment(cell.device))
+        result = _train_and_measure(cell, folder, cache_dir, tick)
+        write_result(folder / RESULT, result)
+    return CellReport(folder, "trained", result=result)
+
+
+def refuse_other_config(folder: Path, cell: Cell) -> None:
+    """Raise AwError if the folder was made by another configuration; names the keys that differ."""
+    path = folder / "config.yaml"
+    if not path.exists():
+        if any(folder.iterdir()):
+            raise AwError(f"{folder} is not empty and no run of ours (no config.yaml); choose another -o")
+        return
+    try:
+        old = yaml.safe_load(path.read_text(encoding="utf-8"))
+        if not isinstance(old, dict):
+            raise ValueError("not a mapping")
+    except (yaml.YAMLError, ValueError) as error:
+        raise AwError(f"{path} is damaged ({error}); start anew with --overwrite always") from None
+    if old.get("config_hash") == cell.identity:
+        return
+    ignored = {"train.checkpoint_every_s", "train.probes", "config_hash"}
+    before, now = _flat(old), _flat(cell.config)
+    names = [
+        k for k in sorted(before.keys() | now.keys()) if before.get(k) != now.get(k) and k not in ignored
+    ]
+    shown = ", ".join(f"{k} was {before.get(k)}, is {now.get(k)}" for k in names[:4]) or "its hash"
+    raise AwError(
+        f"{folder} holds a run of another configuration ({shown}); "
+        "choose another -o, or replace it with --overwrite always"
+    )
+
+
+def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            flat |= _flat(value, f"{prefix}{key}.")
+        else:
+            flat[prefix + key] = value
+    return flat
+
+
+def _train_and_measure(
+    cell: Cell, folder: Path, cache_dir: Path, tick: Callable[[Trainer], None] | None
+) -> dict[str, Any]:
+    device = torch.device(cell.device)
+    data = load_train_data(cell.scene, device=device, seed=cell.train.seed, cache_dir=cache_dir)
+    parts = cell.method.build(cell.options)
+    truth = evaluate.load_test_photos(cell.scene)
+
+    def probe(draw: Callable[[Camera], torch.Tensor]) -> float:
+        return evaluate.mean_psnr(truth, lambda camera: draw(camera).cpu().numpy())
+
+    before = time.perf_counter()
+    trainer = Trainer(data, parts, cell.train, folder=folder, probe=probe if truth else None)
+    # Frozen inputs, instance masks and identities are part of what a method costs.
+    setup_s = time.perf_counter() - before
+    trainer.resume()
+    trainer.train(tick=tick)
+
+    write_splat_ply(folder / "point_cloud.ply", {k: v.cpu().numpy() for k, v in trainer.gaussians.items()})
+    per_image, missing = evaluate.render_and_measure(trainer, truth, folder / "renders" / "test")
+    masks = evaluate.write_masks(trainer, folder / "masks")
+    return {
+        "schema": 1,
+        "method": cell.method.name,
+        "scene": cell.scene.name,
+        "seed": cell.train.seed,
+        "status": "ok",
+        "error": None,
+        "options": to_plain(cell.options),
+        "per_image": per_image,
+        "missing": missing,
+        "masks": masks,
+        "facts": trainer.parts.mask.facts() | {"skipped_views": trainer.skipped_views},
+        "cost": _cost(cell, trainer, folder, setup_s),
+        "config_hash": cell.identity,
+        "scene_hash": cell.scene_id,
+        "version": __version__,
+    }
+
+
+def _cost(cell: Cell, trainer: Trainer, folder: Path, setup_s: float) -> dict[str, Any]:
+    n = max(trainer.iteration, 1)
+    return {
+        "train_s": trainer.clock.now(),
+        "setup_s": setup_s,
+        "iterations": trainer.iteration,
+        "ms_per_iteration": trainer.ms_per_iteration,
+        "ms_parts": {name: 1e3 * seconds / n for name, seconds in trainer.clock.parts_s.items()},
+        "fps": evaluate.frames_per_second(trainer),
+        "gaussians": len(trainer.gaussians),
+        "model_mb": (folder / "point_cloud.ply").stat().st_size / 1e6,
+        "peak_rss_mb": _peak_rss_mb(),
+        "device": cell.device,
+        "threads": _threads(),
+    }
+
+
+def _peak_rss_mb() -> float:
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 1e6 if sys.platform == "darwin" else peak / 1e3  # bytes there, kB elsewhere
+
+
+def _threads() -> int:
+    import numba
+
+    return int(numba.get_num_threads())
+
+
+def scene_identity(scene: Scene) -> str:
+    """sha256 that stands for the scene: over its files' hashes, its split and the size it is loaded at."""
+    files = scene.info.get("files")
+    known = {name: entry["sha256"] for name, entry in files.items()} if isinstance(files, dict) else {}
+    split = [(v.name, v.split, v.camera.width, v.camera.height) for v in scene.views]
+    if not known:
+        # A plain COLMAP scene lists no hashes: cameras and points stand for it.
+        poses = np.concatenate([v.camera.cam_from_world.ravel() for v in scene.views])
+        known = {"poses": poses.round(9).tolist(), "points": len(scene.points)}
+    return config_hash({"files": known, "split": split})
+
+
+def failed_result(cell: Cell, error: str) -> dict[str, Any]:
+    """The result of a cell that failed: its error is what it has to show."""
+    return {
+        "schema": 1,
+        "method": cell.method.name,
+        "scene": cell.scene.name,
+        "seed": cell.train.seed,
+        "status": "failed",
+        "error": error,
+        "options": to_plain(cell.options),
+        "per_image": [],
+        "missing": {},
+        "masks": None,
+        "facts": {},
+        "cost": {},
+        "config_hash": cell.identity,
+        "scene_hash": cell.scene_id,
+        "version": __version__,
+    }
+
+
+def with_seed(config: TrainConfig, seed: int) -> TrainConfig:
+    """The same training with another seed."""
+    return dataclasses.replace(config, seed=seed)

@@ -32,26 +32,63 @@ def parse_budget(text: str) -> float:
     return float(match[1]) * _UNITS[match[2]]
 
 
-# fmt: off
 @click.command(name="bench")
 @click.option("--method", "methods", multiple=True, required=True, help="A name of 'aw methods'; repeatable.")
-@click.option("--scene", "scenes", multiple=True, required=True, type=click.Path(path_type=Path), help="A scene folder; repeatable.")
+@click.option(
+    "--scene",
+    "scenes",
+    multiple=True,
+    required=True,
+    type=click.Path(path_type=Path),
+    help="A scene folder; repeatable.",
+)
 @click.option("--seed", "seeds", multiple=True, type=int, default=(0,), show_default=True, help="Repeatable.")
 @click.option("--iterations", type=click.IntRange(1), help="Length of the training.  [default: 30000]")
 @click.option("--budget", help="Training time instead: 90s, 10m, 1.5h. Schedules scale with it.")
 @click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True)
 @click.option("--threads", type=click.IntRange(1), help="CPU threads; the result does not depend on it.")
-@click.option("--factor", type=click.IntRange(1), help="Train on images_N.  [default: what the scene was built for]")
-@click.option("--resolution", type=click.Choice(["auto", "full", "coarse-to-fine"]), default="auto", show_default=True, help="auto: coarse-to-fine under a budget, else full.")
-@click.option("--max-gaussians", type=click.IntRange(4), help="Growth stops here.  [default: the method's own]")
-@click.option("--set", "settings", multiple=True, metavar="METHOD.KEY=VALUE", help="An option of a method; repeatable.")
-@click.option("--plugin", "plugins", multiple=True, type=click.Path(path_type=Path), help="A Python file that registers methods of your own.")
+@click.option(
+    "--factor", type=click.IntRange(1), help="Train on images_N.  [default: what the scene was built for]"
+)
+@click.option(
+    "--resolution",
+    type=click.Choice(["auto", "full", "coarse-to-fine"]),
+    default="auto",
+    show_default=True,
+    help="auto: coarse-to-fine under a budget, else full.",
+)
+@click.option(
+    "--max-gaussians", type=click.IntRange(4), help="Growth stops here.  [default: the method's own]"
+)
+@click.option(
+    "--set", "settings", multiple=True, metavar="METHOD.KEY=VALUE", help="An option of a method; repeatable."
+)
+@click.option(
+    "--plugin",
+    "plugins",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    help="A Python file that registers methods of your own.",
+)
 @click.option("-o", "--output", type=click.Path(path_type=Path), default=Path("runs"), show_default=True)
-@click.option("--overwrite", type=click.Choice(["never", "missing", "always"]), default="missing", show_default=True, help="missing: keep what is finished, resume what stopped.")
-@click.option("--cache", type=click.Path(path_type=Path), help="Features and instance masks.  [default: OUTPUT/.cache]")
-@click.option("--checkpoint-every", type=click.FloatRange(min=0.0, min_open=True), default=60.0, show_default=True, help="Seconds between checkpoints.")
+@click.option(
+    "--overwrite",
+    type=click.Choice(["never", "missing", "always"]),
+    default="missing",
+    show_default=True,
+    help="missing: keep what is finished, resume what stopped.",
+)
+@click.option(
+    "--cache", type=click.Path(path_type=Path), help="Features and instance masks.  [default: OUTPUT/.cache]"
+)
+@click.option(
+    "--checkpoint-every",
+    type=click.FloatRange(min=0.0, min_open=True),
+    default=60.0,
+    show_default=True,
+    help="Seconds between checkpoints.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print the outcome of every run as JSON.")
-# fmt: on
 def command(
     methods: tuple[str, ...],
     scenes: tuple[Path, ...],
@@ -99,9 +136,7 @@ def command(
         max_gaussians=max_gaussians,
         checkpoint_every_s=checkpoint_every,
     )
-    cells = plan_cells(
-        methods, scenes, seeds, train, settings=settings, device=chosen, factor=factor
-    )  # fmt: skip
+    cells = plan_cells(methods, scenes, seeds, train, settings=settings, device=chosen, factor=factor)
     if chosen == "cpu":
         prepare_cpu(threads)
     progress = _Progress(len(cells))
@@ -118,7 +153,7 @@ def command(
 
 
 def choose_device(device: str) -> str:
-    """"auto" is the GPU where torch and gsplat can both use one.
+    """ "auto" is the GPU where torch and gsplat can both use one.
 
     Raises:
         AwError: cuda was asked for and is not usable; says what is missing.
@@ -135,7 +170,9 @@ def choose_device(device: str) -> str:
         return "cuda"
     if device == "auto":
         return "cpu"
-    what = "torch sees no GPU" if not has_gpu else "gsplat is not installed: pip install 'ambiguous-wild[cuda]'"
+    what = (
+        "torch sees no GPU" if not has_gpu else "gsplat is not installed: pip install 'ambiguous-wild[cuda]'"
+    )
     raise AwError(f"--device cuda: {what}; 'aw doctor' tells more, --device cpu runs without")
 
 
@@ -158,7 +195,9 @@ class _Progress:
 
     def start(self, cell: Cell, folder: Path) -> None:
         self.index += 1
-        self.title = f"[{self.index}/{self.cells}] {cell.method.name} on {cell.scene.name}, seed {cell.train.seed}"
+        self.title = (
+            f"[{self.index}/{self.cells}] {cell.method.name} on {cell.scene.name}, seed {cell.train.seed}"
+        )
         click.echo(f"{self.title} -> {folder}", err=True)
 
     def tick(self, trainer: Trainer) -> None:

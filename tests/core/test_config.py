@@ -1,0 +1,74 @@
+"""Configs refuse what they do not know and survive the trip through plain data."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import pytest
+
+from ambiguous_wild.core.config import config_hash, from_plain, to_plain, with_options
+from ambiguous_wild.core.errors import AwError
+
+
+@dataclass(frozen=True)
+class Inner:
+    width: int = 3
+    sizes: tuple[float, ...] = (1.0, 2.0)
+
+
+@dataclass(frozen=True)
+class Outer:
+    name: str = "a"
+    rate: float = 0.5
+    mode: Literal["sum", "mean"] = "sum"
+    limit: int | None = None
+    on: bool = True
+    inner: Inner = field(default_factory=Inner)
+
+
+def test_plain_data_round_trip():
+    config = Outer(name="b", limit=4, inner=Inner(7, (3.0,)))
+    assert from_plain(Outer, to_plain(config)) == config
+
+
+def test_hash_depends_on_every_value_and_on_nothing_else():
+    assert config_hash(Outer()) == config_hash(Outer())
+    changed = [Outer(name="b"), Outer(rate=0.25), Outer(mode="mean"), Outer(inner=Inner(width=4))]
+    assert len({config_hash(c) for c in [Outer(), *changed]}) == 5
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"rate": "2"}, Outer(rate=2.0)),
+        ({"limit": "none"}, Outer()),
+        ({"limit": "12"}, Outer(limit=12)),
+        ({"on": "false"}, Outer(on=False)),
+        ({"inner.width": "9"}, Outer(inner=Inner(width=9))),
+        ({"inner.sizes": "4,5.5"}, Outer(inner=Inner(sizes=(4.0, 5.5)))),
+        ({"mode": "mean"}, Outer(mode="mean")),
+    ],
+)
+def test_options_of_the_command_line(options, expected):
+    assert with_options(Outer(), options) == expected
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"raet": "2"}, "did you mean 'rate'"),
+        ({"inner.widht": "2"}, "did you mean 'width'"),
+        ({"rate": "fast"}, "expected float, got 'fast'"),
+        ({"mode": "maen"}, "did you mean 'mean'"),
+        ({"rate.x": "1"}, "no keys of its own"),
+        ({"limit": "1.5"}, "limit"),
+        ({"on": "2"}, "expected bool"),
+    ],
+)
+def test_what_does_not_fit_is_named(options, message):
+    with pytest.raises(AwError, match=message):
+        with_options(Outer(), options)
+
+
+def test_unknown_key_of_a_file_names_the_nearest():
+    with pytest.raises(AwError, match="did you mean 'inner'"):
+        from_plain(Outer, {"iner": {}})

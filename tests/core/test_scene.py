@@ -1,0 +1,69 @@
+"""Cameras and scenes."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ambiguous_wild.core import AwError, Camera, Points, Scene, View
+
+
+def camera_at(x: float, width: int = 40, height: int = 30) -> Camera:
+    pose = np.eye(4)
+    pose[0, 3] = -x
+    return Camera(width, height, 50.0, 52.0, 20.5, 14.0, pose)
+
+
+def project(camera: Camera, point: np.ndarray) -> np.ndarray:
+    x, y, z = camera.cam_from_world[:3, :3] @ point + camera.cam_from_world[:3, 3]
+    return np.array([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
+
+
+def test_resizing_scales_every_projection_per_axis():
+    camera, point = camera_at(0.3), np.array([0.2, -0.1, 4.0])
+    small = camera.resized(20, 10)
+    assert np.allclose(project(small, point), project(camera, point) * [20 / 40, 10 / 30])
+
+
+def test_center_is_where_the_camera_stands():
+    assert np.allclose(camera_at(2.5).center, [2.5, 0, 0])
+
+
+def test_pose_cannot_be_changed_behind_ones_back():
+    with pytest.raises(ValueError, match="read-only"):
+        camera_at(0).cam_from_world[0, 0] = 2
+
+
+@pytest.mark.parametrize("bad", [{"width": 0}, {"fx": -1.0}, {"cam_from_world": np.eye(3)}])
+def test_impossible_cameras_are_refused(bad):
+    values = dict(width=4, height=4, fx=1.0, fy=1.0, cx=2.0, cy=2.0, cam_from_world=np.eye(4)) | bad
+    with pytest.raises(AwError):
+        Camera(**values)
+
+
+def scene_of(positions: list[tuple[float, str]], points: np.ndarray | None = None) -> Scene:
+    views = tuple(
+        View(f"{i}.png", Path(f"{i}.png"), camera_at(x), split)  # type: ignore[arg-type]
+        for i, (x, split) in enumerate(positions)
+    )
+    xyz = np.zeros((0, 3)) if points is None else points
+    n = len(xyz)
+    empty = Points(
+        xyz,
+        np.zeros((n, 3), np.uint8),
+        np.zeros(n),
+        np.zeros(n + 1, np.int64),
+        np.zeros(0, np.int32),
+        np.zeros((0, 2), np.float32),
+    )
+    return Scene(Path(), "s", views, empty)
+
+
+def test_extent_reads_training_cameras_only():
+    assert scene_of([(0, "train"), (2, "train"), (100, "test")]).extent == pytest.approx(1.1)
+
+
+def test_extent_of_a_capture_from_one_spot_is_positive():
+    spread = np.array([[0, 0, 5.0], [0, 1, 5.0], [1, 0, 5.0]])
+    assert scene_of([(0, "train"), (0, "train")], spread).extent > 1.0
+    assert scene_of([(0, "train")]).extent == 1.0

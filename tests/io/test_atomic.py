@@ -1,0 +1,70 @@
+"""Nothing half-written stays behind."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.io.atomic import atomic_dir, atomic_path, write_json, write_text
+from ambiguous_wild.io.lock import folder_lock
+
+
+def test_a_failing_write_leaves_the_old_file(tmp_path):
+    target = tmp_path / "a.txt"
+    write_text(target, "old")
+    with pytest.raises(RuntimeError), atomic_path(target) as temporary:
+        temporary.write_text("half")
+        raise RuntimeError
+    assert target.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_a_failing_folder_leaves_the_old_folder(tmp_path):
+    target = tmp_path / "d"
+    with atomic_dir(target) as temporary:
+        (temporary / "x").write_text("1")
+    with pytest.raises(RuntimeError), atomic_dir(target) as temporary:
+        (temporary / "y").write_text("2")
+        raise RuntimeError
+    assert [p.name for p in target.iterdir()] == ["x"]
+    assert [p.name for p in tmp_path.iterdir()] == ["d"]
+
+
+def test_a_folder_is_replaced_whole(tmp_path):
+    target = tmp_path / "d"
+    for name in ("x", "y"):
+        with atomic_dir(target) as temporary:
+            (temporary / name).write_text(name)
+    assert [p.name for p in target.iterdir()] == ["y"]
+    assert [p.name for p in tmp_path.iterdir()] == ["d"]
+
+
+def test_json_refuses_nan_and_keeps_the_old(tmp_path):
+    target = tmp_path / "a.json"
+    write_json(target, {"x": 1})
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        write_json(target, {"x": float("nan")})
+    assert json.loads(target.read_text()) == {"x": 1}
+
+
+def test_a_locked_folder_names_its_holder_and_is_freed_afterwards(tmp_path):
+    folder = tmp_path / "run"
+    script = (
+        "import sys; from ambiguous_wild.io.lock import folder_lock\n"
+        "with folder_lock(sys.argv[1], 'second'): print('got it')"
+    )
+    with folder_lock(folder, "aw bench"):
+        blocked = subprocess.run([sys.executable, "-c", script, folder], capture_output=True, text=True)
+        assert "being worked on by aw bench" in blocked.stderr
+    free = subprocess.run([sys.executable, "-c", script, folder], capture_output=True, text=True)
+    assert free.stdout.strip() == "got it"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_lock_is_freed_after_an_error(tmp_path):
+    with pytest.raises(AwError), folder_lock(tmp_path / "run", "first"):
+        raise AwError("x")
+    with folder_lock(tmp_path / "run", "second"):
+        assert (tmp_path / ".run.lock").exists()

@@ -36,9 +36,9 @@ def test_pose_cannot_be_changed_behind_ones_back():
 
 @pytest.mark.parametrize("bad", [{"width": 0}, {"fx": -1.0}, {"cam_from_world": np.eye(3)}])
 def test_impossible_cameras_are_refused(bad):
-    values = dict(width=4, height=4, fx=1.0, fy=1.0, cx=2.0, cy=2.0, cam_from_world=np.eye(4)) | bad
+    good = {"width": 4, "height": 4, "fx": 1.0, "fy": 1.0, "cx": 2.0, "cy": 2.0, "cam_from_world": np.eye(4)}
     with pytest.raises(AwError):
-        Camera(**values)
+        Camera(**(good | bad))
 
 
 def scene_of(positions: list[tuple[float, str]], points: np.ndarray | None = None) -> Scene:

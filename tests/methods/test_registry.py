@@ -3,8 +3,7 @@
 import pytest
 
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.methods import MethodEntry, all_methods, get_method, load_plugin, register
-from ambiguous_wild.methods import registry
+from ambiguous_wild.methods import MethodEntry, all_methods, get_method, load_plugin, register, registry
 
 
 @pytest.fixture(autouse=True)

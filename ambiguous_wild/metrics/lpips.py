@@ -1,0 +1,265 @@
+"""LPIPS v0.1 from weights that lie on disk: no package of its own, no torchvision, no download.
+
+Each variant needs two files: the backbone as torchvision publishes it and the learnt heads of the LPIPS
+repository. Where one is not there the metric is *missing*, with the reason; it is never 0 and never
+another variant's number. torch is imported when a network is loaded, not before.
+
+Source: Zhang et al., CVPR 2018; layout of the layers and of the files: richzhang/PerceptualSimilarity.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.core.errors import unknown
+from ambiguous_wild.metrics.image import checked_pair
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+
+Metric = Callable[[np.ndarray, np.ndarray], float]
+
+SHIFT = (-0.030, -0.088, -0.188)  # z = (x - SHIFT) / SCALE for x in [-1, 1]
+SCALE = (0.458, 0.448, 0.450)
+EPS = 1e-10  # added to the norm over channels, as in the lpips package
+
+
+@dataclass(frozen=True)
+class _Backbone:
+    """A convolutional stack; numbers in `layers` are output channels, see `_stack`."""
+
+    name: str  # folder below AW_WEIGHTS, and name in 'aw doctor'
+    file: str  # as torchvision names it
+    head_name: str
+    head_file: str
+    head_source: str
+    layers: tuple[Any, ...]  # (channels, kernel, stride, padding), or "M" for a max pool
+    pool: tuple[int, int]  # kernel, stride
+    taps: tuple[int, ...]  # index of the ReLU after which a feature is taken
+    channels: tuple[int, ...]  # of the taps
+    smallest: int  # px, shortest side that leaves every tap at least one pixel
+
+
+ALEX = _Backbone(
+    name="alexnet",
+    file="alexnet-owt-7be5be79.pth",
+    head_name="lpips-alex",
+    head_file="lpips_alex.pth",
+    head_source="lpips/weights/v0.1/alex.pth",
+    layers=((64, 11, 4, 2), "M", (192, 5, 1, 2), "M", (384, 3, 1, 1), (256, 3, 1, 1), (256, 3, 1, 1)),
+    pool=(3, 2),
+    taps=(1, 4, 7, 9, 11),
+    channels=(64, 192, 384, 256, 256),
+    smallest=31,
+)
+VGG = _Backbone(
+    name="vgg16",
+    file="vgg16-397923af.pth",
+    head_name="lpips-vgg",
+    head_file="lpips_vgg.pth",
+    head_source="lpips/weights/v0.1/vgg.pth",
+    layers=tuple(
+        "M" if c == "M" else (c, 3, 1, 1)
+        for c in (64, 64, "M", 128, 128, "M", 256, 256, 256, "M", 512, 512, 512, "M", 512, 512, 512)
+    ),
+    pool=(2, 2),
+    taps=(3, 8, 15, 22, 29),
+    channels=(64, 128, 256, 512, 512),
+    smallest=16,
+)
+# metric -> (backbone, whether [0, 1] becomes [-1, 1] first). Less means better for all of them.
+VARIANTS: dict[str, tuple[_Backbone, bool]] = {
+    "lpips_alex": (ALEX, True),
+    "lpips_vgg": (VGG, True),
+    "lpips_vgg_01": (VGG, False),
+}
+
+
+def available() -> dict[str, str | None]:
+    """Every variant with None where its files are there, else what to put where. Reads no file."""
+    return {name: _reason(backbone) for name, (backbone, _) in VARIANTS.items()}
+
+
+def load(name: str) -> Metric:
+    """The metric of that name, weights loaded (once per process and file).
+
+    Args:
+        name: a key of `VARIANTS`.
+
+    Returns:
+        A function of two pictures [H, W, 3] (uint8 or float in [0, 1]) that returns their distance.
+
+    Raises:
+        AwError: no such variant, files missing, or a file of another layout.
+    """
+    if name not in VARIANTS:
+        raise unknown("LPIPS variant", name, VARIANTS)
+    backbone, centred = VARIANTS[name]
+    reason = _reason(backbone)
+    if reason is not None:
+        raise AwError(f"{name}: {reason}")
+    paths = [_find(*pair) for pair in _files(backbone)]
+    stamps = tuple((str(p), p.stat().st_mtime_ns) for p in paths if p is not None)
+    stack, heads = _network(backbone, stamps)
+    return lambda a, b: _distance(backbone, stack, heads, a, b, centred)
+
+
+def lpips_alex(a: np.ndarray, b: np.ndarray) -> float:
+    """LPIPS with AlexNet, input scaled to [-1, 1]: the variant of NerfBaselines and most papers.
+
+    Args:
+        a: [H, W, 3] uint8 or float in [0, 1], sides of at least 31 px.
+        b: the same size.
+
+    Raises:
+        AwError: weights missing or unusable (see `available`), a picture too small, or `checked_pair`.
+    """
+    return load("lpips_alex")(a, b)
+
+
+def lpips_vgg(a: np.ndarray, b: np.ndarray) -> float:
+    """LPIPS with VGG-16, input scaled to [-1, 1]; sides of at least 16 px. See `lpips_alex`."""
+    return load("lpips_vgg")(a, b)
+
+
+def lpips_vgg_01(a: np.ndarray, b: np.ndarray) -> float:
+    """LPIPS with VGG-16 fed [0, 1] without scaling: what the original 3DGS code reports as LPIPS.
+
+    Halves the contrast the network was calibrated for: comparable only with itself. See `lpips_alex`.
+    """
+    return load("lpips_vgg_01")(a, b)
+
+
+def _distance(
+    backbone: _Backbone,
+    stack: nn.Sequential,
+    heads: list[Tensor],
+    a: np.ndarray,
+    b: np.ndarray,
+    centred: bool,
+) -> float:
+    import torch
+
+    left, right = checked_pair(a, b)
+    if min(left.shape[:2]) < backbone.smallest:
+        raise AwError(
+            f"picture of {left.shape[1]}x{left.shape[0]} px is too small for LPIPS with {backbone.name}: "
+            f"the shorter side must be at least {backbone.smallest} px"
+        )
+    with torch.inference_mode():
+        total = 0.0
+        # One picture at a time: half the memory of a batch of two, and both take the same arithmetic.
+        features = [_features(backbone, stack, image, centred) for image in (left, right)]
+        for head, f, g in zip(heads, *features):
+            # Mean of the weighted sum over channels, equation (1) of the paper; accumulated in float64.
+            total += float(((f - g) ** 2 * head).sum(dim=1).mean(dtype=torch.float64))
+    return total
+
+
+def _features(backbone: _Backbone, stack: nn.Sequential, image: np.ndarray, centred: bool) -> list[Tensor]:
+    """Channel-normalised features of the taps: [1, C, h, w] each."""
+    import torch
+
+    x = torch.from_numpy(image.astype(np.float32)).permute(2, 0, 1)[None]
+    if centred:
+        x = 2.0 * x - 1.0
+    x = (x - torch.tensor(SHIFT)[:, None, None]) / torch.tensor(SCALE)[:, None, None]
+    found = []
+    for index, layer in enumerate(stack):
+        x = layer(x)
+        if index in backbone.taps:
+            norm = x.square().sum(dim=1, keepdim=True).sqrt()
+            found.append(x / (norm + EPS))
+    return found
+
+
+@lru_cache(maxsize=4)
+def _network(backbone: _Backbone, stamps: tuple[tuple[str, int], ...]) -> tuple[nn.Sequential, list[Tensor]]:
+    """The stack and the heads [C, 1, 1]; `stamps` are the two files with their times, so that a file
+    that was replaced is read again."""
+    trunk, head = (Path(path) for path, _ in stamps)
+    stack = _stack(backbone)
+    weights = {k.removeprefix("features."): v for k, v in _read(trunk).items() if k.startswith("features.")}
+    try:
+        stack.load_state_dict(weights, strict=True)
+    except RuntimeError as error:
+        raise AwError(f"{trunk} is not {backbone.name}: {error}; replace the file") from None
+    stack.eval().requires_grad_(False)
+    expected = {f"lin{i}.model.1.weight": (1, c, 1, 1) for i, c in enumerate(backbone.channels)}
+    linear = _read(head)
+    found = {key: tuple(value.shape) for key, value in linear.items()}
+    if found != expected:
+        raise AwError(
+            f"{head} does not hold the LPIPS heads of {backbone.name} (five of [1, C, 1, 1]); "
+            f"replace it by {backbone.head_source} of the LPIPS repository"
+        )
+    return stack, [linear[key][0].float() for key in expected]
+
+
+def _stack(backbone: _Backbone) -> nn.Sequential:
+    """The convolutions with the indices that the published files use."""
+    from torch import nn
+
+    layers: list[nn.Module] = []
+    channels = 3
+    for entry in backbone.layers:
+        if entry == "M":
+            layers.append(nn.MaxPool2d(*backbone.pool))
+            continue
+        out, kernel, stride, padding = entry
+        layers += [nn.Conv2d(channels, out, kernel, stride, padding), nn.ReLU()]
+        channels = out
+    return nn.Sequential(*layers)
+
+
+def _read(path: Path) -> dict[str, Tensor]:
+    import torch
+
+    try:
+        data = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch raises many kinds for a damaged file, none of them documented
+        line = (str(error).splitlines() or [type(error).__name__])[0]
+        raise AwError(f"{path} cannot be read as weights ({line}); replace the file") from None
+    if not isinstance(data, dict) or not all(isinstance(v, torch.Tensor) for v in data.values()):
+        raise AwError(f"{path} holds no table of tensors; replace the file")
+    return data
+
+
+def _files(backbone: _Backbone) -> tuple[tuple[str, str], tuple[str, str]]:
+    return (backbone.name, backbone.file), (backbone.head_name, backbone.head_file)
+
+
+def _find(name: str, file: str) -> Path | None:
+    return next((folder / file for folder in _folders(name) if (folder / file).is_file()), None)
+
+
+def _folders(name: str) -> list[Path]:
+    """$AW_WEIGHTS/<name>, $AW_WEIGHTS, torch hub's checkpoints: the places `vision/weights.py` names."""
+    own = os.environ.get("AW_WEIGHTS", "").strip()
+    folders = [Path(own).expanduser() / name, Path(own).expanduser()] if own else []
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
+    home = Path(os.environ.get("TORCH_HOME") or cache / "torch").expanduser()
+    return [*folders, home / "hub" / "checkpoints"]
+
+
+def _reason(backbone: _Backbone) -> str | None:
+    """None where both files are there, else what goes where."""
+    (name, file), (head_name, head_file) = _files(backbone)
+    need = []
+    if _find(name, file) is None:
+        need.append(f"{file} (torchvision's {name})")
+    if _find(head_name, head_file) is None:
+        need.append(f"{head_file} ({backbone.head_source} of the LPIPS repository, renamed)")
+    if not need:
+        return None
+    own = os.environ.get("AW_WEIGHTS", "").strip()
+    target = str(Path(own).expanduser()) if own else "a folder, and set AW_WEIGHTS to it"
+    return f"weights missing: put {' and '.join(need)} into {target}"

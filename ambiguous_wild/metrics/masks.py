@@ -1,0 +1,148 @@
+"""How well predicted keep maps match the truth, and PSNR on kept pixels.
+
+Keep maps are 1 on static pixels and 0 on transient ones. The class that is scored is *transient*: a
+map that keeps everything finds nothing. Counts are pooled over a scene's photos before the ratio, so that
+a photo without distractors weighs by its pixels and has no ratio of its own to invent.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.metrics.image import checked_pair, psnr_from_mse
+
+
+@dataclass(frozen=True)
+class Confusion:
+    """Pixel counts; positive = transient."""
+
+    true_positive: int = 0  # transient, and masked
+    false_positive: int = 0  # static, but masked
+    false_negative: int = 0  # transient, but kept
+    true_negative: int = 0  # static, and kept
+
+    def __add__(self, other: Confusion) -> Confusion:
+        return Confusion(
+            self.true_positive + other.true_positive,
+            self.false_positive + other.false_positive,
+            self.false_negative + other.false_negative,
+            self.true_negative + other.true_negative,
+        )
+
+    @property
+    def iou(self) -> float:
+        """Intersection over union of the transient class in [0, 1]; NaN where nothing is transient."""
+        return _ratio(self.true_positive, self.true_positive + self.false_positive + self.false_negative)
+
+    @property
+    def precision(self) -> float:
+        """Share of the masked pixels that are transient; NaN where nothing is masked."""
+        return _ratio(self.true_positive, self.true_positive + self.false_positive)
+
+    @property
+    def recall(self) -> float:
+        """Share of the transient pixels that are masked; NaN where nothing is transient."""
+        return _ratio(self.true_positive, self.true_positive + self.false_negative)
+
+
+def confusion(
+    keep: np.ndarray,  # [H, W] bool, uint8 {0, 255} or float in [0, 1]; predicted, 1 = static
+    truth: np.ndarray,  # [H, W] the same kinds; true
+    *,
+    known: np.ndarray | None = None,  # [H, W] bool; pixels whose truth is known, default all
+) -> Confusion:
+    """Pixel counts of one predicted keep map against the true one; soft maps are cut at one half.
+
+    Raises:
+        AwError: maps of different size, or not two-dimensional.
+    """
+    masked, transient = ~as_keep(keep, "predicted"), ~as_keep(truth, "true")
+    _same_size(masked, transient)
+    if known is not None:
+        _same_size(masked, np.asarray(known))
+        masked, transient = masked[known.astype(bool)], transient[known.astype(bool)]
+    return Confusion(
+        true_positive=int((masked & transient).sum()),
+        false_positive=int((masked & ~transient).sum()),
+        false_negative=int((~masked & transient).sum()),
+        true_negative=int((~masked & ~transient).sum()),
+    )
+
+
+def mask_scores(
+    distractor: np.ndarray,  # [H, W] bool, predicted; True = transient
+    truth: np.ndarray,  # [H, W] bool, true; True = transient
+) -> dict[str, float]:
+    """IoU, precision and recall of the transient pixels of one photo; NaN where not defined.
+
+    Raises:
+        AwError: maps of different size, or not two-dimensional.
+    """
+    counts = confusion(~np.asarray(distractor, dtype=bool), ~np.asarray(truth, dtype=bool))
+    return {"iou": counts.iou, "precision": counts.precision, "recall": counts.recall}
+
+
+def pooled(counts: Iterable[Confusion]) -> Confusion:
+    """The sum of the counts of several photos."""
+    return sum(counts, Confusion())
+
+
+def psnr_valid(
+    a: np.ndarray,  # [H, W, 3] uint8 or float in [0, 1]
+    b: np.ndarray,  # [H, W, 3] the same size
+    keep: np.ndarray,  # [H, W] bool, uint8 {0, 255} or float in [0, 1]; 1 = measured
+) -> float:
+    """PSNR in dB over the kept pixels alone: the squared error is divided by their number.
+
+    (Multiplying both pictures by the map and averaging over all pixels, as NerfBaselines does, adds
+    -10 log10(kept share).) No pixel kept: NaN, which means missing. Identical there: ``inf``.
+
+    Raises:
+        AwError: sizes that differ; see `checked_pair`.
+    """
+    left, right = checked_pair(a, b)
+    kept = as_keep(keep, "keep")
+    _same_size(kept, left[..., 0])
+    if not kept.any():
+        return math.nan
+    return psnr_from_mse(float(((left - right)[kept] ** 2).mean()))
+
+
+def as_keep(keep: np.ndarray, which: str) -> np.ndarray:
+    """A keep map as [H, W] bool: float above or at 0.5, uint8 at or above 128.
+
+    Raises:
+        AwError: not two-dimensional, or another number type.
+    """
+    keep = np.asarray(keep)
+    if keep.ndim != 2:
+        raise AwError(f"the {which} keep map must be [H, W], got {list(keep.shape)}")
+    if keep.dtype == bool:
+        return keep
+    if keep.dtype == np.uint8:
+        # 0/1 maps are common slips: 1 would count as transient without a word.
+        if keep.max(initial=0) == 1:
+            raise AwError(f"the {which} keep map is uint8 with values 0 and 1: give bool, or 0 and 255")
+        return keep >= 128
+    if np.issubdtype(keep.dtype, np.floating):
+        if not bool(((keep >= 0.0) & (keep <= 1.0)).all()):
+            raise AwError(f"the {which} keep map has values outside [0, 1] or not finite")
+        return keep >= 0.5
+    raise AwError(f"the {which} keep map must be bool, uint8 or floating point, got {keep.dtype}")
+
+
+def _same_size(a: np.ndarray, b: np.ndarray) -> None:
+    if a.shape != b.shape:
+        raise AwError(
+            f"maps of different size: {a.shape[1]}x{a.shape[0]} and {b.shape[1]}x{b.shape[0]}; "
+            "resize the prediction (nearest) first"
+        )
+
+
+def _ratio(part: int, whole: int) -> float:
+    return part / whole if whole else math.nan

@@ -1,0 +1,106 @@
+"""Means and bootstrap intervals that keep what is missing missing.
+
+A missing value is NaN (``None`` in a result file). A mean over cells of which one is missing is missing:
+a method must not gain by failing on the hard picture.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ambiguous_wild.core import AwError
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A mean and its percentile bootstrap interval; NaN = missing or not defined."""
+
+    mean: float
+    low: float
+    high: float
+    count: int  # values it rests on
+
+
+def mean(values: Sequence[float] | np.ndarray) -> float:
+    """Arithmetic mean; NaN if any value is, or if there is none; ``inf`` stays ``inf``."""
+    array = _checked(values)
+    return float(array.mean()) if len(array) and not np.isnan(array).any() else math.nan
+
+
+def spread(values: Sequence[float] | np.ndarray) -> float:
+    """Sample standard deviation (n - 1); NaN for fewer than two values, or where one is not finite."""
+    array = _checked(values)
+    if len(array) < 2 or not np.isfinite(array).all():
+        return math.nan
+    return float(array.std(ddof=1))
+
+
+def bootstrap_interval(
+    values: Sequence[float] | np.ndarray,  # [n], one per image
+    *,
+    level: float = 0.95,  # coverage
+    resamples: int = 2000,
+    seed: int = 0,
+) -> Interval:
+    """Percentile bootstrap interval of the mean over images (Efron 1979).
+
+    The ends are resampled means themselves, not interpolated, so that ``inf`` among the values needs no
+    special case. One image has a mean and no interval. Any NaN: everything is NaN.
+
+    Args:
+        values: one per image.
+        level: in (0, 1).
+        resamples: how many; at least 100.
+        seed: same values and seed, same interval.
+
+    Raises:
+        AwError: no value, or a level or number of resamples that makes no sense.
+    """
+    array = _checked(values)
+    if not len(array):
+        raise AwError("a bootstrap interval needs at least one value, got none")
+    if not 0.0 < level < 1.0 or resamples < 100:
+        raise AwError(f"level must lie in (0, 1) and resamples be 100 or more, got {level}, {resamples}")
+    if np.isnan(array).any():
+        return Interval(math.nan, math.nan, math.nan, len(array))
+    if len(array) == 1:
+        return Interval(float(array[0]), math.nan, math.nan, 1)
+    rows = np.random.default_rng(seed).integers(0, len(array), size=(resamples, len(array)))
+    means = np.sort(array[rows].mean(axis=1))
+    tail = (1.0 - level) / 2.0
+    low = means[math.floor(tail * (resamples - 1))]
+    high = means[math.ceil((1.0 - tail) * (resamples - 1))]
+    return Interval(float(array.mean()), float(low), float(high), len(array))
+
+
+def paired_interval(
+    a: Sequence[float] | np.ndarray,  # [n], one per image
+    b: Sequence[float] | np.ndarray,  # [n], the same images in the same order
+    *,
+    level: float = 0.95,
+    resamples: int = 2000,
+    seed: int = 0,
+) -> Interval:
+    """Bootstrap interval of mean(a - b) over the same images: narrower than two separate intervals.
+
+    Raises:
+        AwError: different lengths, or see `bootstrap_interval`.
+    """
+    first, second = _checked(a), _checked(b)
+    if len(first) != len(second):
+        raise AwError(f"paired values must be of the same images: {len(first)} and {len(second)} values")
+    # inf - inf: both pictures are perfect, the difference is none.
+    with np.errstate(invalid="ignore"):
+        difference = np.where(first == second, 0.0, first - second)
+    return bootstrap_interval(difference, level=level, resamples=resamples, seed=seed)
+
+
+def _checked(values: Sequence[float] | np.ndarray) -> np.ndarray:
+    array = np.asarray([math.nan if v is None else v for v in values], dtype=np.float64)
+    if array.ndim != 1:
+        raise AwError(f"values must be one per image, got shape {list(array.shape)}")
+    return array

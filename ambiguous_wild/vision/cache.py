@@ -34,7 +34,9 @@ def cache_key(kind: str, backend: str, settings: Any, *arrays: np.ndarray) -> st
     return f"{kind}-{digest.hexdigest()[:32]}"
 
 
-def cached(folder: Path, key: str, expected: Mapping[str, type | str], compute: Callable[[], Arrays]) -> Arrays:
+def cached(
+    folder: Path, key: str, expected: Mapping[str, type | str], compute: Callable[[], Arrays]
+) -> Arrays:
     """The arrays stored under `key`, or computed and stored.
 
     Args:

@@ -61,7 +61,9 @@ class LabHog:
         """
         if not photos:
             raise AwError("cannot fit features to a scene without training photos")
-        chosen = [photos[i] for i in sorted({round(k * (len(photos) - 1) / max(most - 1, 1)) for k in range(most)})]
+        chosen = [
+            photos[i] for i in sorted({round(k * (len(photos) - 1) / max(most - 1, 1)) for k in range(most)})
+        ]
         pairs = [_blocks(photo) for photo in chosen]
         hogs = torch.cat([hog.reshape(-1, HOG_CHANNELS) for _, hog in pairs]).double()
         device = photos[0].device
@@ -89,7 +91,9 @@ class LabHog:
             raise AwError(f"features need an image of [H, W, 3], at least 8x8 px, got {list(image.shape)}")
         lab, hog = _blocks(image)
         weights = self.weights.to(image.dtype).sqrt()
-        return torch.cat([self._unit_block(lab, 0) * weights[0], self._unit_block(hog, 1) * weights[1]], dim=2)
+        return torch.cat(
+            [self._unit_block(lab, 0) * weights[0], self._unit_block(hog, 1) * weights[1]], dim=2
+        )
 
     def _unit_block(self, block: Tensor, which: int) -> Tensor:
         if which == 1:

@@ -52,7 +52,7 @@ def segment(lab: np.ndarray, config: SegmentConfig) -> np.ndarray:
     stays below it, which is right: it has no segments to find.
     """
     growth = lab.shape[0] * lab.shape[1] / _REFERENCE_PIXELS
-    smallest = max(int(round(config.min_size * growth)), 1)
+    smallest = max(round(config.min_size * growth), 1)
     log_k, step = math.log(config.k * max(growth, 1e-3)), math.log(4.0)
     best: np.ndarray | None = None
     best_miss = math.inf

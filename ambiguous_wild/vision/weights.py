@@ -116,7 +116,9 @@ def _places(weight: Weight) -> list[Path]:
 
 def _searched(weight: Weight) -> list[Path]:
     own = weights_folder()
-    return ([own / weight.name] if own else []) + [torch_hub_folder() if weight.kind == "file" else hub_folder()]
+    return ([own / weight.name] if own else []) + [
+        torch_hub_folder() if weight.kind == "file" else hub_folder()
+    ]
 
 
 def _bring(weight: Weight) -> str:

@@ -1,0 +1,132 @@
+"""Entropy-aware density control (RefineSplat, section 4.2): what decides growth, where clones go, merging."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ambiguous_wild.core.errors import unknown
+from ambiguous_wild.methods.refinesplat.merging import MergeConfig, clusters, merge_members, merge_pairs
+from ambiguous_wild.splat.density import DensityConfig, DensityControl, rotation_matrices
+from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.render import Gradients
+
+if TYPE_CHECKING:
+    from ambiguous_wild.splat.optim import SplatAdam
+    from ambiguous_wild.splat.parts import Step
+
+Decides = Literal["total", "photometric", "entropy"]
+
+
+@dataclass(frozen=True)
+class EntropyDensityConfig(DensityConfig):
+    """RobustSplat's delayed growth: the static scene and the masks stand before anything is added."""
+
+    start: float = 10_000.0
+    stop: float = 20_000.0
+    resets: tuple[float, ...] = (15_000.0, 18_000.0)
+    decides: Decides = "total"  # the gradient that grows: of L, of L_GS alone, of the entropy terms alone
+    clone_shift: float = 0.5  # a clone lies this many of its standard deviations down the gradient; 0 = on it
+    merge_every: float = 1000.0  # nominal iterations between merges; 0 = never
+    merge_grad: float = 5e-5  # tau_e: only Gaussians whose mean statistic is below it may merge
+    merge: MergeConfig = field(default_factory=MergeConfig)
+
+
+class EntropyAwareDensity(DensityControl):
+    """Grows by the gradient of the whole loss, entropy terms included, and merges what overlaps."""
+
+    config: EntropyDensityConfig
+
+    def __init__(self, config: DensityConfig, extent: float, seed: int) -> None:
+        if not isinstance(config, EntropyDensityConfig):
+            raise TypeError(f"entropy-aware density control needs EntropyDensityConfig, got {type(config)}")
+        if config.decides not in ("total", "photometric", "entropy"):
+            raise unknown("gradient", config.decides, ("total", "photometric", "entropy"))
+        super().__init__(config, extent, seed)
+        self.downhill = torch.zeros(0, 3)  # [N, 3] sum of -dL/dmean over views, world
+        self.last_merge = 0.0  # nominal
+        self.merged = 0  # Gaussians that merging removed so far
+
+    def statistic(self, gradients: Gradients) -> Tensor:
+        extra = gradients.screen_extra
+        if extra is None:  # a step without entropy terms
+            extra = torch.zeros_like(gradients.screen)
+        if self.config.decides == "total":
+            return gradients.screen + extra
+        return gradients.screen if self.config.decides == "photometric" else extra
+
+    def wants_extra(self) -> bool:
+        return self.config.decides != "photometric"
+
+    @torch.no_grad()
+    def observe(self, step: Step, gradients: Gradients) -> None:
+        super().observe(step, gradients)
+        if step.nominal <= self.config.stop:
+            self.downhill -= gradients.means
+
+    def clone_offset(self, gaussians: Gaussians, rows: Tensor) -> Tensor | None:
+        """Down the entropy-aware gradient (Fig. 3b), a share of the Gaussian's own standard deviation there."""
+        if self.config.clone_shift <= 0 or not len(rows):
+            return None
+        direction = self.downhill[rows]
+        norm = torch.linalg.vector_norm(direction, dim=1, keepdim=True)
+        direction = torch.where(norm > 0, direction / norm.clamp(min=1e-30), torch.zeros_like(direction))
+        rotation = rotation_matrices(gaussians.quats[rows])
+        local = (rotation.transpose(1, 2) @ direction[:, :, None]).squeeze(2)
+        # sqrt(d^T Sigma d): the offset never leaves the Gaussian
+        sigma = torch.linalg.vector_norm(local * gaussians.log_scales[rows].exp(), dim=1, keepdim=True)
+        return self.config.clone_shift * sigma * direction
+
+    def after_growth(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> Gaussians:
+        """Algorithm 1, every `merge_every` nominal iterations."""
+        config = self.config
+        if config.merge_every <= 0 or step.nominal - self.last_merge < config.merge_every:
+            return gaussians
+        self.last_merge = step.nominal
+        # rows that no view has seen since the last round (fresh copies above all) have no statistic to judge
+        score = self.grad_sum / self.seen.clamp(min=1)
+        candidates = (self.seen > 0) & (score < config.merge_grad)
+        pairs = merge_pairs(gaussians, candidates.cpu().numpy(), config.merge)
+        if not len(pairs):
+            return gaussians
+        cluster = clusters(len(gaussians), pairs, config.merge.most)
+        joined = np.bincount(cluster, minlength=len(cluster))[cluster] > 1
+        rows = torch.from_numpy(np.flatnonzero(joined)).to(gaussians.device)
+        new = merge_members(gaussians.select(rows), cluster[joined])
+        gaussians = self.keep_rows(gaussians, optimiser, torch.from_numpy(~joined).to(gaussians.device))
+        gaussians = gaussians.cat(new)
+        optimiser.append(len(new))  # their moments start at zero
+        self._match(gaussians)
+        self.merged += len(rows) - len(new)
+        return gaussians
+
+    def _select(self, stay: Tensor) -> None:
+        super()._select(stay)
+        self.downhill = self.downhill[stay]
+
+    def _match(self, gaussians: Gaussians) -> None:
+        super()._match(gaussians)
+        missing = len(gaussians) - len(self.downhill)
+        if missing > 0:
+            pad = torch.zeros(missing, 3, device=gaussians.device)
+            self.downhill = torch.cat([self.downhill.to(gaussians.device), pad])
+
+    def _clear(self, gaussians: Gaussians) -> None:
+        super()._clear(gaussians)
+        self.downhill = torch.zeros(len(gaussians), 3, device=gaussians.device)
+
+    def state_dict(self) -> dict[str, Any]:
+        return super().state_dict() | {
+            "downhill": self.downhill,
+            "last_merge": self.last_merge,
+            "merged": self.merged,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        super().load_state_dict(state)
+        self.downhill = state["downhill"]
+        self.last_merge, self.merged = state["last_merge"], state["merged"]

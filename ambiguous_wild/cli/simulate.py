@@ -1,0 +1,73 @@
+"""`aw simulate`: a capture with exact truth."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+
+@click.command("simulate")
+@click.argument("name", required=False)
+@click.option("-o", "--out", type=click.Path(path_type=Path, file_okay=False), help="Folder to write.")
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="World, walk and distractors.")
+@click.option("--views", type=int, help="Train photos; test photos in proportion.")
+@click.option("--width", type=int, help="Width of a photo in px, 16:9.")
+@click.option("--depth", is_flag=True, help="Also write depth maps of the static scene.")
+@click.option("--overwrite", is_flag=True, help="Replace an earlier capture in this folder.")
+@click.option("--list", "listing", is_flag=True, help="List the captures there are.")
+@click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
+def command(
+    name: str | None,
+    out: Path | None,
+    seed: int,
+    views: int | None,
+    width: int | None,
+    depth: bool,
+    overwrite: bool,
+    listing: bool,
+    as_json: bool,
+) -> None:
+    """Make the capture NAME: photos with distractors, clean test photos, and the exact truth."""
+    from ambiguous_wild.core.errors import AwError
+    from ambiguous_wild.simulate.presets import PRESETS, preset, resized
+
+    if listing:
+        _print_list(PRESETS.values(), as_json)
+        return
+    if name is None:
+        raise AwError("name a capture: " + ", ".join(PRESETS) + " ('aw simulate --list' describes them)")
+    spec = resized(preset(name), views, width)
+    if out is None:
+        raise AwError(f"say where to write: aw simulate {name} -o raw")
+
+    from tqdm import tqdm
+
+    from ambiguous_wild.simulate.capture import simulate
+
+    def bar(shots: list) -> tqdm:  # type: ignore[type-arg]
+        return tqdm(shots, unit="photo", desc=f"simulate {name}", disable=as_json)
+
+    facts = simulate(spec, out, seed, depth, overwrite, bar)
+    if as_json:
+        click.echo(json.dumps({k: v for k, v in facts.items() if k not in ("files", "photos")}, indent=2))
+        return
+    share = facts["occlusion"]
+    state = "already there, unchanged" if facts["reused"] else "wrote"
+    click.echo(
+        f"{state}: {out}: {spec.train_views} train and {spec.test_views} test photos of "
+        f"{spec.width}x{spec.height}; {len(spec.distractors)} distractors cover "
+        f"{100 * share['min']:.0f} to {100 * share['max']:.0f} % (mean {100 * share['mean']:.1f} %) of a train photo"
+    )
+    click.echo(f"next: aw build-scene {out} -o {out.parent / (out.name + '-scene')}")
+
+
+def _print_list(specs, as_json: bool) -> None:  # type: ignore[no-untyped-def]
+    rows = [(s.name, f"{s.train_views}+{s.test_views}", f"{s.width}x{s.height}", s.summary) for s in specs]
+    if as_json:
+        keys = ("name", "views", "size", "summary")
+        click.echo(json.dumps([dict(zip(keys, row)) for row in rows], indent=2))
+        return
+    for name, count, size, summary in rows:
+        click.echo(f"{name:18s} {count:>6s}  {size:9s} {summary}")

@@ -1,0 +1,149 @@
+"""What moves between the shots: figures and parcels put into the world anew for every photo.
+
+They are shapes like any other, so that perspective, occlusion and the shadow that falls on them are
+right. They throw no shadow on the static world: outside their own pixels the clean and the
+distracted photo are the same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ambiguous_wild.core.camera import Camera
+from ambiguous_wild.simulate.presets import CaptureSpec, Distractor
+from ambiguous_wild.simulate.tracer import BOX, ELLIPSOID, ShapeTable, trace
+from ambiguous_wild.simulate.world import (
+    BACK_M,
+    FRONT_M,
+    HALF_WIDTH_M,
+    Shape,
+    World,
+    figure,
+    placed,
+    shape_table,
+)
+
+_TRIES = 80  # layouts drawn for a photo before the best of them is taken
+_SAME_PLACE_M = 0.6  # closer than this is the same place
+_SAME_PLACE_SHARE = 0.15  # of the photos in which one distractor may stand at the same place
+_APART_M = 0.75
+_PREVIEW_PX = 96
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where one distractor stands in one photo."""
+
+    which: int  # index into the spec's distractors
+    x_m: float
+    y_m: float
+    yaw_deg: float
+    pose: float  # 0 to 1: stride and arm of a figure
+
+
+def shapes_of(distractor: Distractor, placement: Placement) -> list[Shape]:
+    """The distractor's shapes in the world, owned by ``placement.which + 1``."""
+    at = (placement.x_m, placement.y_m, 0.0)
+    texture = distractor.texture
+    if distractor.kind == "visitor":
+        parts = figure(texture, texture if texture != "brick" else "skin", 0.06 + 0.26 * placement.pose, placement.pose)
+    elif distractor.kind == "twin":
+        base = Shape(BOX, (0, 0, 0.06), (0.33, 0.33, 0.06), texture, offset=(0.4, 0.2))
+        parts = [base, *placed(figure(texture, texture, 0.07, 0.8), (0, 0, 0.12), 0.0)]
+    elif distractor.kind == "parcel":
+        parts = [
+            Shape(BOX, (0, 0, 0.35), (0.36, 0.28, 0.35), texture),
+            *placed([Shape(BOX, (0, 0, 0.2), (0.24, 0.22, 0.2), texture, offset=(0.3, 0.6))], (0.05, 0, 0.7), 30.0),
+        ]
+    else:
+        parts = [Shape(ELLIPSOID, (0, 0, 0.4), (0.4, 0.4, 0.4), texture)]
+    return [replace(s, owner=placement.which + 1) for s in placed(parts, at, placement.yaw_deg)]
+
+
+def movers(spec: CaptureSpec, placements: tuple[Placement, ...], world: World) -> ShapeTable:
+    """All distractors of one photo as a table for the ray caster."""
+    shapes = [s for p in placements for s in shapes_of(spec.distractors[p.which], p)]
+    return shape_table(shapes, world.atlas)
+
+
+def lay_out(
+    spec: CaptureSpec, cameras: list[Camera], world: World, rng: np.random.Generator
+) -> list[tuple[Placement, ...]]:
+    """Place the distractors of every train photo.
+
+    Positions are drawn until the photo's occlusion (seen in a small preview) lies in ``spec.occlusion``;
+    where no draw does, the nearest one is taken. No distractor returns to one place in more than 15 %
+    of the photos: what stays is part of the scene.
+    """
+    chosen: list[tuple[Placement, ...]] = []
+    static = world.table()
+    light = replace(world.light, sun=np.ascontiguousarray(world.light.sun[:1]))  # one sample a pixel
+    low, high = spec.occlusion
+    for camera in cameras:
+        if not spec.distractors:
+            chosen.append(())
+            continue
+        small = camera.resized(_PREVIEW_PX, max(1, round(_PREVIEW_PX * camera.height / camera.width)))
+        best, best_gap = (), np.inf
+        aim = rng.uniform(low, high)  # so that the shares spread over the whole band
+        for attempt in range(_TRIES):
+            layout = _draw(spec, camera, world, chosen, rng)
+            share = float(np.mean(trace(small, static, movers(spec, layout, world), world.atlas, light).owner > 0))
+            tolerance = (high - low) * (0.1 + 0.4 * attempt / _TRIES)
+            gap = max(abs(share - aim) - tolerance, 0.0) + 10 * max(low - share, share - high, 0.0)
+            if gap < best_gap:
+                best, best_gap = layout, gap
+            if gap == 0.0:
+                break
+        chosen.append(best)
+    return chosen
+
+
+def _draw(
+    spec: CaptureSpec,
+    camera: Camera,
+    world: World,
+    earlier: list[tuple[Placement, ...]],
+    rng: np.random.Generator,
+) -> tuple[Placement, ...]:
+    layout: list[Placement] = []
+    for which, distractor in enumerate(spec.distractors):
+        if rng.random() > distractor.presence:
+            continue
+        for _ in range(12):
+            place = _place(which, distractor, camera, rng)
+            if _free(place, world, layout) and _fresh(place, earlier, spec.train_views):
+                layout.append(place)
+                break
+    return tuple(layout)
+
+
+def _place(which: int, distractor: Distractor, camera: Camera, rng: np.random.Generator) -> Placement:
+    """A point on the ground somewhere across the picture, at the distractor's distance."""
+    column = rng.uniform(0.06, 0.94) * camera.width
+    direction = camera.cam_from_world[:3, :3].T @ np.array([(column - camera.cx) / camera.fx, 0.0, 1.0])
+    flat = direction[:2] / np.linalg.norm(direction[:2])
+    x, y = camera.center[:2] + rng.uniform(*distractor.distance_m) * flat
+    return Placement(which, float(x), float(y), float(rng.uniform(-180, 180)), float(rng.random()))
+
+
+def _free(place: Placement, world: World, others: list[Placement]) -> bool:
+    if abs(place.x_m) > HALF_WIDTH_M - 0.6 or not FRONT_M + 0.6 < place.y_m < BACK_M - 0.6:
+        return False
+    away = np.hypot(world.keep_out[:, 0] - place.x_m, world.keep_out[:, 1] - place.y_m) - world.keep_out[:, 2]
+    if away.min(initial=np.inf) < 0.3:
+        return False
+    return all(np.hypot(o.x_m - place.x_m, o.y_m - place.y_m) > _APART_M for o in others)
+
+
+def _fresh(place: Placement, earlier: list[tuple[Placement, ...]], photos: int) -> bool:
+    same = [
+        p
+        for layout in earlier
+        for p in layout
+        if p.which == place.which and np.hypot(p.x_m - place.x_m, p.y_m - place.y_m) < _SAME_PLACE_M
+    ]
+    return len(same) + 1 <= max(1, int(_SAME_PLACE_SHARE * photos))
+

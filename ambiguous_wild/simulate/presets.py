@@ -1,0 +1,116 @@
+"""Named captures as frozen dataclasses: what stands where, how often, and what makes it hard."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from ambiguous_wild.core.errors import AwError, unknown
+
+Kind = Literal["visitor", "twin", "parcel", "ball"]
+Ambiguity = Literal["colour", "semantic", "none"]
+
+
+@dataclass(frozen=True)
+class Distractor:
+    """Something that stands elsewhere in every photo."""
+
+    name: str
+    kind: Kind
+    texture: str  # a sheet of the world: stone, foliage, timber, brick, gravel, vivid
+    ambiguity: Ambiguity  # why it is hard: the background's colour, the statue's shape, or not at all
+    presence: float = 0.85  # share of the train photos in which it is put
+    distance_m: tuple[float, float] = (1.9, 4.5)  # from the camera
+
+
+@dataclass(frozen=True)
+class CaptureSpec:
+    """A capture to make. The same spec and seed give the same bytes."""
+
+    name: str
+    summary: str
+    distractors: tuple[Distractor, ...] = ()
+    occlusion: tuple[float, float] = (0.10, 0.25)  # share of a train photo's pixels, between which it is kept
+    train_views: int = 30
+    test_views: int = 8
+    width: int = 960  # px; a factor of 4 gives 240 x 135
+    height: int = 540  # px
+    samples: int = 4  # rays a pixel, a square number
+    detail_px_per_m: float = 110.0  # resolution of the textures
+    focal_35mm: float = 26.0  # mm, the equivalent that phones state (CIPA: same diagonal angle)
+    arc_deg: float = 104.0  # how far around the statue the walk goes
+    radius_m: tuple[float, float] = (4.2, 5.3)  # distance from the statue during the walk
+    eye_m: tuple[float, float] = (1.3, 1.8)  # height of the phone
+
+
+VISITOR = Distractor("visitor in brick", "visitor", "brick", "colour")
+TWIN = Distractor("second statue", "twin", "stone", "semantic")
+PARCEL = Distractor("bright parcel", "parcel", "vivid", "none", distance_m=(1.8, 3.6))
+
+PRESETS = {
+    spec.name: spec
+    for spec in (
+        CaptureSpec(
+            "courtyard",
+            "a visitor dressed like the wall, a second statue, a bright parcel",
+            (VISITOR, TWIN, PARCEL),
+        ),
+        CaptureSpec(
+            "courtyard-colour",
+            "three distractors that wear the background's own texture",
+            (
+                VISITOR,
+                Distractor("visitor in leaves", "visitor", "foliage", "colour"),
+                Distractor("parcel in gravel", "parcel", "gravel", "colour", distance_m=(1.8, 3.6)),
+            ),
+        ),
+        CaptureSpec(
+            "courtyard-twin",
+            "two statues like the one that stands still",
+            (TWIN, replace(TWIN, name="third statue")),
+        ),
+        CaptureSpec("courtyard-clean", "nobody there: the upper bound", occlusion=(0.0, 0.0)),
+        CaptureSpec(
+            "tiny",
+            "the courtyard in small, for tests",
+            (VISITOR, TWIN, PARCEL),
+            train_views=12,
+            test_views=3,
+            width=320,
+            height=180,
+            detail_px_per_m=48.0,
+            arc_deg=70.0,
+        ),
+    )
+}
+
+
+def preset(name: str) -> CaptureSpec:
+    """The named capture.
+
+    Raises:
+        AwError: there is none of that name; the nearest one is named.
+    """
+    if name not in PRESETS:
+        raise unknown("capture", name, PRESETS, "'aw simulate --list' lists them")
+    return PRESETS[name]
+
+
+def resized(spec: CaptureSpec, views: int | None = None, width: int | None = None) -> CaptureSpec:
+    """The spec with another number of train photos or another picture width (16:9, textures to match).
+
+    Raises:
+        AwError: fewer than 3 photos, or a width outside 64 to 4096 px.
+    """
+    if views is not None:
+        if not 3 <= views <= 2000:
+            raise AwError(f"--views {views}: a capture has 3 to 2000 train photos")
+        test = max(2, round(views * spec.test_views / spec.train_views))
+        spec = replace(spec, train_views=views, test_views=test)
+    if width is not None:
+        if not 64 <= width <= 4096:
+            raise AwError(f"--width {width}: a photo is 64 to 4096 px wide")
+        detail = min(spec.detail_px_per_m * max(width / spec.width, 0.3), 220.0)
+        height = max(2, 2 * round(width * spec.height / spec.width / 2))
+        spec = replace(spec, width=width, height=height, detail_px_per_m=detail)
+    return spec

@@ -1,0 +1,317 @@
+"""Textures: photographs that scikit-image ships, baked into surfaces that never repeat, as mip pyramids.
+
+Every surface gets its own picture. A tiled photograph would make COLMAP match one brick with its
+neighbour's copy; noise at three scales between the tiles makes each square metre its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from ambiguous_wild.core.errors import AwError
+
+# CC0, public domain or without known restrictions by the docstrings of skimage.data; all in its wheel.
+PHOTOGRAPHS = {
+    "brick": "brick.png",
+    "camera": "camera.png",
+    "chelsea": "chelsea.png",
+    "coffee": "coffee.png",
+    "coins": "coins.png",
+    "grass": "grass.png",
+    "gravel": "gravel.png",
+    "hubble": "hubble_deep_field.jpg",
+    "retina": "retina.jpg",
+    "rocket": "rocket.jpg",
+}
+_MAX_LEVELS = 12
+
+
+@dataclass(frozen=True)
+class Atlas:
+    """Mip pyramids of all textures in one flat array; level l of texture t starts at ``offset[t, l]``."""
+
+    texels: np.ndarray  # [N, 3] float32, linear light
+    offset: np.ndarray  # [T, L] int64
+    width: np.ndarray  # [T, L] int32
+    height: np.ndarray  # [T, L] int32
+    levels: np.ndarray  # [T] int32
+    index: Mapping[str, int]
+
+
+def srgb_to_linear(image: np.ndarray) -> np.ndarray:
+    """sRGB in [0, 1] to linear light (IEC 61966-2-1)."""
+    return np.where(image <= 0.04045, image / 12.92, ((image + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def linear_to_srgb(image: np.ndarray) -> np.ndarray:
+    """Linear light to sRGB, clipped to [0, 1] (IEC 61966-2-1)."""
+    clipped = np.clip(image, 0.0, 1.0)
+    return np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)
+
+
+@cache
+def photograph(name: str) -> np.ndarray:
+    """A shipped photograph, [H, W, 3] float32 in [0, 1], sRGB; read only.
+
+    Raises:
+        AwError: this scikit-image has no such file.
+    """
+    import skimage
+
+    path = Path(skimage.__file__).parent / "data" / PHOTOGRAPHS[name]
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR) if path.is_file() else None
+    if image is None:
+        raise AwError(
+            f"texture {path.name} is not in scikit-image {skimage.__version__} at {path.parent}: "
+            "the wheels of 0.24 to 0.26 carry it; install one of those"
+        )
+    rgb = np.ascontiguousarray(image[:, :, ::-1]).astype(np.float32) / 255.0
+    rgb.setflags(write=False)
+    return rgb
+
+
+def noise(rng: np.random.Generator, height: int, width: int, cell_px: float) -> np.ndarray:
+    """Smooth value noise, [H, W] float32 in [0, 1]: a random grid of `cell_px` cells, cubic between."""
+    rows, cols = int(np.ceil(height / cell_px)) + 3, int(np.ceil(width / cell_px)) + 3
+    grid = rng.random((rows, cols), dtype=np.float32)
+    size = (round(cols * cell_px), round(rows * cell_px))
+    smooth = cv2.resize(grid, size, interpolation=cv2.INTER_CUBIC)
+    start = round(cell_px)
+    return np.clip(smooth[start : start + height, start : start + width], 0.0, 1.0)
+
+
+def octaves(rng: np.random.Generator, height: int, width: int, cell_px: float, count: int = 4) -> np.ndarray:
+    """Value noise at `count` scales, each half the last in size and strength; [H, W] float32 in [0, 1]."""
+    total = np.zeros((height, width), np.float32)
+    weight = 0.0
+    for k in range(count):
+        if cell_px / 2**k < 2:
+            break
+        total += noise(rng, height, width, cell_px / 2**k) * 0.6**k
+        weight += 0.6**k
+    return np.asarray(total / weight, dtype=np.float32)
+
+
+def _step(low: float, high: float, x: np.ndarray) -> np.ndarray:
+    t = np.clip((x - low) / (high - low), 0.0, 1.0)
+    return (t * t * (3 - 2 * t))[..., None]
+
+
+def _laid(
+    name: str, height: int, width: int, px_per_m: float, tile_m: float, angle_deg: float, shift: np.ndarray
+) -> np.ndarray:
+    """The photograph's brightness laid over a surface, mirrored at its seams: [H, W, 1], mean 1."""
+    grey = photograph(name).mean(axis=2)
+    grey = np.ascontiguousarray(grey / grey.mean())
+    scale = grey.shape[1] / (tile_m * px_per_m)
+    if scale > 1:  # the surface is coarser than the photograph: blur first, or it would alias
+        grey = cv2.GaussianBlur(grey, (0, 0), 0.5 * scale)
+    v, u = np.mgrid[0:height, 0:width].astype(np.float32)
+    c, s = np.cos(np.deg2rad(angle_deg)), np.sin(np.deg2rad(angle_deg))
+    x = (c * u - s * v) * scale + float(shift[0]) * grey.shape[1]
+    y = (s * u + c * v) * scale + float(shift[1]) * grey.shape[0]
+    laid = cv2.remap(
+        grey, _mirrored(x, grey.shape[1]), _mirrored(y, grey.shape[0]), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
+    )
+    return np.asarray(laid[..., None])
+
+
+def _mirrored(x: np.ndarray, size: int) -> np.ndarray:
+    period = 2 * (size - 1)
+    folded = np.mod(x, period)
+    return np.where(folded > size - 1, period - folded, folded).astype(np.float32)
+
+
+def _scattered(
+    name: str, rng: np.random.Generator, height: int, width: int, px_per_m: float, tile_m: float
+) -> np.ndarray:
+    """Three layings of one photograph at other angles and sizes, joined along noise: no two spots alike."""
+    layers = [
+        _laid(name, height, width, px_per_m, tile_m * size, angle + 40 * rng.random(), rng.random(2))
+        for size, angle in ((1.0, 0), (1.27, 70), (0.85, 150))
+    ]
+    first = _step(0.45, 0.55, octaves(rng, height, width, 0.9 * px_per_m))
+    second = _step(0.45, 0.55, octaves(rng, height, width, 0.7 * px_per_m))
+    return layers[0] * (1 - first) + first * (layers[1] * (1 - second) + layers[2] * second)
+
+
+def gravel_ground(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: float) -> np.ndarray:
+    """Gravel with worn grass and a paved way through the middle, [H, W, 3] linear light."""
+    h, w = round(height_m * px_per_m), round(width_m * px_per_m)
+    stones = _scattered("gravel", rng, h, w, px_per_m, 2.2) * _tint(rng, h, w, px_per_m, (0.36, 0.32, 0.26), 0.35)
+    lawn = _scattered("grass", rng, h, w, px_per_m, 1.8) * _tint(rng, h, w, px_per_m, (0.13, 0.2, 0.06), 0.5)
+    paving = _laid("brick", h, w, px_per_m, 2.6, 8.0, rng.random(2))
+    paving = paving * _tint(rng, h, w, px_per_m, (0.3, 0.27, 0.25), 0.5)
+    patches = octaves(rng, h, w, 1.6 * px_per_m, 6)
+    ground = stones + (lawn - stones) * _step(0.52, 0.6, patches)
+    x = (np.arange(w, dtype=np.float32) / px_per_m - width_m / 2)[None] + 1.6 * (octaves(rng, h, w, 180.0) - 0.5)
+    edge = np.abs(x + 0.3) + 0.35 * (octaves(rng, h, w, 22.0, 3) - 0.5)
+    return np.asarray(ground + (paving - ground) * (1 - _step(0.75, 0.85, edge)), dtype=np.float32)
+
+
+def _tint(
+    rng: np.random.Generator, h: int, w: int, px_per_m: float, colour: tuple[float, float, float], strength: float
+) -> np.ndarray:
+    """A colour that drifts over metres and centimetres, [H, W, 3] linear light."""
+    wide = octaves(rng, h, w, 1.5 * px_per_m) - 0.5
+    fine = octaves(rng, h, w, 0.25 * px_per_m, 3) - 0.5
+    hue = octaves(rng, h, w, 0.8 * px_per_m) - 0.5
+    value = np.clip(1 + strength * (2 * wide + fine), 0.2, 2.0)[..., None]
+    return np.asarray(np.array(colour, np.float32) * value * (1 + 0.5 * hue[..., None] * np.array([1, 0, -1])))
+
+
+def brick_wall(
+    rng: np.random.Generator,
+    width_m: float,
+    height_m: float,
+    px_per_m: float,
+    colour: tuple[float, float, float] = (0.3, 0.14, 0.085),
+    foot: bool = True,
+) -> np.ndarray:
+    """Old brickwork: drifting colour, fallen plaster, moss from below, soot from above; row 0 is the foot.
+
+    Without `foot` it is a piece from the wall's middle: hardly any moss or plaster.
+    """
+    h, w = round(height_m * px_per_m), round(width_m * px_per_m)
+    courses = _laid("brick", h, w, px_per_m, 1.9, 90.0, rng.random(2)) ** 1.2
+    wall = courses * _tint(rng, h, w, px_per_m, colour, 0.55)
+    height = (np.arange(h, dtype=np.float32) / px_per_m)[:, None]
+    plaster = _scattered("gravel", rng, h, w, px_per_m, 5.0) ** 0.35
+    plaster = plaster * _tint(rng, h, w, px_per_m, (0.46, 0.4, 0.3), 0.25)
+    wall = wall + (plaster - wall) * _step(0.585, 0.605, octaves(rng, h, w, 1.1 * px_per_m, 6) - (not foot) * 0.06)
+    moss = _scattered("grass", rng, h, w, px_per_m, 1.2) * np.array([0.09, 0.13, 0.04], np.float32)
+    damp = octaves(rng, h, w, 0.6 * px_per_m, 5) + (0.35 * np.exp(-height / 0.4) - 0.05 if foot else -0.1)
+    wall = wall + 0.85 * (moss - wall) * _step(0.58, 0.68, damp)
+    streaks = cv2.GaussianBlur(rng.random((h, w), dtype=np.float32), (0, 0), 2.0, sigmaY=0.5 * px_per_m) - 0.5
+    soot = 1 + 6.0 * streaks * np.clip(height / height_m, 0, 1)
+    return np.asarray(wall * np.clip(soot, 0.5, 1.4)[..., None], dtype=np.float32)
+
+
+def stone(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: float) -> np.ndarray:
+    """Weathered sandstone with some lichen, [H, W, 3] linear light."""
+    h, w = round(height_m * px_per_m), round(width_m * px_per_m)
+    grain = _scattered("gravel", rng, h, w, px_per_m, 0.9) ** 0.7
+    body = grain * _tint(rng, h, w, px_per_m * 0.3, (0.40, 0.36, 0.28), 0.4)
+    lichen = grain * np.array([0.26, 0.26, 0.15], np.float32)
+    body = body + 0.7 * (lichen - body) * _step(0.6, 0.7, octaves(rng, h, w, 0.2 * px_per_m, 6))
+    runs = cv2.GaussianBlur(rng.random((h, w), dtype=np.float32), (0, 0), 1.5, sigmaY=0.1 * px_per_m) - 0.5
+    dark = _step(0.52, 0.75, octaves(rng, h, w, 0.25 * px_per_m, 6) + 1.5 * runs)
+    return np.asarray(body * (1 - 0.55 * dark), dtype=np.float32)
+
+
+def foliage(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: float) -> np.ndarray:
+    """Leaves, [H, W, 3] linear light."""
+    h, w = round(height_m * px_per_m), round(width_m * px_per_m)
+    leaves = _scattered("grass", rng, h, w, px_per_m, 0.9) ** 1.5
+    clumps = 0.5 + 1.1 * _step(0.35, 0.65, octaves(rng, h, w, 0.2 * px_per_m, 4))
+    return np.asarray(leaves * clumps * _tint(rng, h, w, px_per_m * 0.5, (0.12, 0.19, 0.05), 0.6), dtype=np.float32)
+
+
+def timber(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: float) -> np.ndarray:
+    """Boards: the brick photograph's long edges stretched into planks, streaked along the grain."""
+    h, w = round(height_m * px_per_m), round(width_m * px_per_m)
+    board = (np.arange(h) / (0.14 * px_per_m)).astype(int)
+    tone = (0.7 + 0.6 * rng.random(board.max() + 1)).astype(np.float32)[board][:, None]
+    grain = cv2.GaussianBlur(rng.random((h, w), dtype=np.float32), (0, 0), 0.12 * px_per_m, sigmaY=0.8) - 0.5
+    joint = np.abs((np.arange(h) / (0.14 * px_per_m)) % 1.0 - 0.5)[:, None] > 0.46
+    value = tone * (1 + 4.0 * grain) * np.where(joint, 0.25, 1.0)
+    rough = _scattered("gravel", rng, h, w, px_per_m, 2.0) ** 0.5
+    return np.asarray(
+        np.clip(value, 0.1, 2)[..., None] * rough * _tint(rng, h, w, px_per_m, (0.3, 0.19, 0.1), 0.3), dtype=np.float32
+    )
+
+
+def clay(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: float) -> np.ndarray:
+    """Fired clay, [H, W, 3] linear light."""
+    return stone(rng, width_m, height_m, px_per_m) * np.array([1.0, 0.5, 0.3], np.float32)
+
+
+def skin(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: float) -> np.ndarray:
+    """Even, slightly mottled skin, [H, W, 3] linear light."""
+    return stone(rng, width_m, height_m, px_per_m) ** 0.3 * np.array([0.62, 0.42, 0.32], np.float32)
+
+
+def brick(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: float) -> np.ndarray:
+    """The walls' brickwork as cloth, [H, W, 3] linear light."""
+    return brick_wall(rng, width_m, height_m, px_per_m, foot=False)
+
+
+def gravel(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: float) -> np.ndarray:
+    """The ground's gravel as cloth, [H, W, 3] linear light."""
+    h, w = round(height_m * px_per_m), round(width_m * px_per_m)
+    stones = _scattered("gravel", rng, h, w, px_per_m, 2.2)
+    return np.asarray(stones * _tint(rng, h, w, px_per_m, (0.36, 0.32, 0.26), 0.35), dtype=np.float32)
+
+
+def vivid(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: float) -> np.ndarray:
+    """Saturated bands of magenta, cyan and yellow that nothing in the place has, [H, W, 3] linear light."""
+    h, w = round(height_m * px_per_m), round(width_m * px_per_m)
+    colours = np.array([[0.75, 0.03, 0.4], [0.02, 0.45, 0.75], [0.85, 0.6, 0.02]], np.float32)
+    wave = np.arange(w, dtype=np.float32)[None] / px_per_m + 0.4 * octaves(rng, h, w, 0.3 * px_per_m, 3)
+    band = (wave / 0.16).astype(int) % 3
+    grain = _scattered("gravel", rng, h, w, px_per_m, 1.5) ** 0.25
+    return np.asarray(colours[band] * grain, dtype=np.float32)
+
+
+def sky(rng: np.random.Generator, height: int = 512, width: int = 2048) -> np.ndarray:
+    """A backdrop around the place: crowns of trees, haze, clouds; row 0 is the horizon's foot."""
+    elevation = np.linspace(0.0, np.pi / 2, height, dtype=np.float32)[:, None]
+    blue = np.array([0.20, 0.36, 0.66], np.float32) * (1 - 0.35 * elevation[..., None])
+    haze = np.array([0.52, 0.56, 0.62], np.float32)
+    image = blue + (haze - blue) * np.exp(-elevation / 0.25)[..., None]
+    image = image + (np.array([0.74, 0.73, 0.71], np.float32) - image) * _step(
+        0.42, 0.7, _round(octaves(rng, height, width // 2, 110.0, 7))
+    )
+    image = image * (0.8 + 0.4 * _round(octaves(rng, height, width // 2, 60.0, 5)))[..., None]
+    crowns = _round(octaves(rng, height, width // 2, 130.0, 6)[height // 2][None])
+    ragged = _round(octaves(rng, height, width // 2, 12.0, 3))
+    line = 0.12 + 0.9 * (crowns - 0.25) + 0.16 * (ragged - 0.5)
+    light = (0.2 + 1.6 * _round(octaves(rng, height, width // 2, 30.0, 5)) ** 2)[..., None]
+    leaves = light * np.array([0.10, 0.15, 0.05], np.float32)
+    return np.asarray(image + (leaves - image) * (1 - _step(-0.004, 0.004, elevation - line)), dtype=np.float32)
+
+
+def _round(half: np.ndarray) -> np.ndarray:
+    """The left half and its mirror image, so that the seam of a full turn closes."""
+    return np.concatenate([half, half[:, ::-1]], axis=1)
+
+
+def poster(name: str) -> np.ndarray:
+    """A photograph with a white border, row 0 at the foot, [H, W, 3] linear light."""
+    image = photograph(name)
+    scale = 512 / image.shape[1]
+    resized = cv2.resize(image, (512, round(image.shape[0] * scale)), interpolation=cv2.INTER_AREA)
+    framed = cv2.copyMakeBorder(resized, 18, 18, 18, 18, cv2.BORDER_CONSTANT, value=(0.93, 0.92, 0.88))
+    return srgb_to_linear(framed[::-1]) * np.float32(0.85)
+
+
+def build_atlas(textures: Mapping[str, np.ndarray]) -> Atlas:
+    """Mip pyramids by area averaging, in linear light.
+
+    Args:
+        textures: name -> [H, W, 3] float32, linear light.
+    """
+    count = len(textures)
+    offset = np.zeros((count, _MAX_LEVELS), np.int64)
+    width = np.ones((count, _MAX_LEVELS), np.int32)
+    height = np.ones((count, _MAX_LEVELS), np.int32)
+    levels = np.zeros(count, np.int32)
+    chunks: list[np.ndarray] = []
+    used = 0
+    for t, image in enumerate(textures.values()):
+        level = np.ascontiguousarray(np.clip(image, 0.0, None), np.float32)
+        for k in range(_MAX_LEVELS):
+            h, w = level.shape[:2]
+            offset[t, k], width[t, k], height[t, k], levels[t] = used, w, h, k + 1
+            chunks.append(level.reshape(-1, 3))
+            used += h * w
+            if min(h, w) == 1:
+                break
+            level = cv2.resize(level, (max(w // 2, 1), max(h // 2, 1)), interpolation=cv2.INTER_AREA)
+    return Atlas(np.concatenate(chunks), offset, width, height, levels, {n: i for i, n in enumerate(textures)})

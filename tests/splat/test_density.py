@@ -1,0 +1,171 @@
+"""Density control keeps parameters, moments and statistics on the same rows."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from ambiguous_wild.splat.optim import SplatAdam
+
+from ambiguous_wild.splat.density import DensityConfig, DensityControl, rotation_matrices
+from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.render import Gradients
+
+RATES = {
+    "means": 1e-3,
+    "quats": 1e-3,
+    "log_scales": 5e-3,
+    "opacity_logits": 0.05,
+    "sh0": 2.5e-3,
+    "sh_rest": 1e-4,
+}
+
+
+def model(n: int = 8, seed: int = 0) -> Gaussians:
+    rng = np.random.default_rng(seed)
+    return Gaussians.from_points(rng.uniform(-1, 1, (n, 3)), rng.integers(0, 255, (n, 3)).astype(np.uint8))
+
+
+def gradients(gaussians: Gaussians, screen: torch.Tensor) -> Gradients:
+    zeros = {name: torch.zeros_like(tensor) for name, tensor in gaussians.items()}
+    return Gradients(**zeros, screen=screen)
+
+
+def step_at(gaussians, iteration, nominal, *, ceiling=1000, visible=None, width=2, height=2):
+    visible = torch.ones(len(gaussians), dtype=torch.bool) if visible is None else visible
+    return SimpleNamespace(
+        iteration=iteration,
+        nominal=nominal,
+        ceiling=ceiling,
+        gaussians=gaussians,
+        camera=SimpleNamespace(width=width, height=height),
+        rendered=SimpleNamespace(visible=visible),
+    )
+
+
+def refined(gaussians, screen, *, extent=10.0, ceiling=1000, config=None):
+    """One observation and one round of growth."""
+    density = DensityControl(config or DensityConfig(), extent=extent, seed=0)
+    optimiser = SplatAdam(gaussians, RATES)
+    step = step_at(gaussians, 600, 600.0, ceiling=ceiling)
+    density.observe(step, gradients(gaussians, screen))
+    after, events = density.refine(step, gaussians, optimiser)
+    return after, events, density, optimiser
+
+
+def test_small_ones_with_large_gradients_are_cloned_in_place():
+    before = model()
+    screen = torch.zeros(8, 2)
+    screen[3] = torch.tensor([3e-4, 0.0])
+    after, events, _, _ = refined(before, screen, extent=1000.0)
+    assert events == ["grow"]
+    assert len(after) == 9
+    assert torch.equal(after.means[8], before.means[3])
+    assert torch.equal(after.means[:8], before.means)
+
+
+def test_large_ones_are_split_in_two_smaller_and_the_parent_goes():
+    before = model()
+    screen = torch.zeros(8, 2)
+    screen[3] = torch.tensor([3e-4, 0.0])
+    after, _, _, _ = refined(before, screen, extent=1e-3, config=DensityConfig(prune_scale=1e9))
+    assert len(after) == 9
+    parent = before.means[3]
+    assert not (after.means == parent).all(dim=1).any()
+    assert torch.allclose(
+        after.log_scales[7:].exp() * 1.6, before.log_scales[3].exp().expand(2, 3), rtol=1e-5
+    )
+    assert (after.means[7:] - parent).norm(dim=1).max() < 6 * before.log_scales[3].exp().max()
+
+
+def test_the_statistic_does_not_depend_on_the_resolution():
+    scores = []
+    for size, factor in ((2, 1.0), (4, 0.5)):
+        gaussians = model()
+        density = DensityControl(DensityConfig(), extent=1.0, seed=0)
+        step = step_at(gaussians, 10, 600.0, width=size, height=size)
+        density.observe(step, gradients(gaussians, torch.full((8, 2), 1e-4 * factor)))
+        scores.append(density.grad_sum / density.seen)
+    assert torch.allclose(scores[0], scores[1])
+
+
+def test_rows_that_no_view_saw_do_not_dilute_the_mean():
+    gaussians = model()
+    density = DensityControl(DensityConfig(), extent=1.0, seed=0)
+    seen = torch.zeros(8, dtype=torch.bool)
+    seen[2] = True
+    density.observe(step_at(gaussians, 1, 600.0, visible=seen), gradients(gaussians, torch.full((8, 2), 1.0)))
+    density.observe(
+        step_at(gaussians, 2, 600.0, visible=~seen), gradients(gaussians, torch.full((8, 2), 0.0))
+    )
+    assert density.seen.tolist() == [1] * 8
+    assert density.grad_sum[2] == pytest.approx(2**0.5)
+
+
+def test_the_ceiling_lets_the_largest_gradients_through():
+    before = model()
+    screen = torch.zeros(8, 2)
+    screen[:, 0] = torch.linspace(3e-4, 9e-4, 8)
+    after, _, _, _ = refined(before, screen, extent=1000.0, ceiling=10)
+    assert len(after) == 10
+    assert torch.equal(after.means[8:], before.means[[7, 6]])
+
+
+def test_transparent_ones_are_pruned_and_everything_keeps_its_row():
+    before = model()
+    before.opacity_logits[5] = -9.0
+    screen = torch.zeros(8, 2)
+    screen[1] = torch.tensor([1e-2, 0.0])
+    after, _, density, optimiser = refined(before, screen, extent=1000.0)
+    assert len(after) == 8
+    assert len(density.seen) == len(density.grad_sum) == 8
+    zero = {name: torch.zeros_like(tensor) for name, tensor in after.items()}
+    optimiser.step(Gradients(**zero, screen=torch.zeros(8, 2)), torch.ones(8, dtype=torch.bool), RATES)
+
+
+def test_a_round_that_would_remove_everything_removes_nothing():
+    before = model()
+    before.opacity_logits[:] = -9.0
+    after, _, _, _ = refined(before, torch.zeros(8, 2))
+    assert len(after) == 8
+
+
+def test_non_finite_rows_are_removed():
+    before = model()
+    before.means[2, 1] = float("nan")
+    after, _, _, _ = refined(before, torch.zeros(8, 2))
+    assert len(after) == 7
+    assert torch.isfinite(after.means).all()
+
+
+def test_opacity_resets_fire_once_each_and_never_too_close():
+    gaussians = model()
+    config = DensityConfig(start=1e9, stop=1e9, min_reset_spacing=1000)
+    density, optimiser = DensityControl(config, extent=1.0, seed=0), SplatAdam(gaussians, RATES)
+    fired = []
+    for iteration in range(1, 6000, 10):
+        # a run of 6000 iterations: nominal time runs five times faster
+        _, events = density.refine(step_at(gaussians, iteration, iteration * 5.0), gaussians, optimiser)
+        fired += [iteration] if "reset" in events else []
+    assert [round(i, -2) for i in fired] == [1200, 2400]
+    assert torch.sigmoid(gaussians.opacity_logits).max() <= 0.01 + 1e-6
+
+
+def test_state_goes_on_with_the_same_random_numbers():
+    runs = []
+    for interrupted in (False, True):
+        density = DensityControl(DensityConfig(), extent=1e-3, seed=4)
+        first = density._split_half(model())
+        if interrupted:
+            other = DensityControl(DensityConfig(), extent=1e-3, seed=99)
+            other.load_state_dict(density.state_dict())
+            density = other
+        runs.append((first.means, density._split_half(model()).means))
+    assert torch.equal(runs[0][1], runs[1][1])
+    assert not torch.equal(runs[0][0], runs[0][1])
+
+
+def test_rotations_are_orthonormal_for_any_norm():
+    quats = torch.randn(50, 4) * torch.logspace(-3, 3, 50)[:, None]
+    product = rotation_matrices(quats) @ rotation_matrices(quats).transpose(1, 2)
+    assert torch.allclose(product, torch.eye(3).expand(50, 3, 3), atol=1e-5)

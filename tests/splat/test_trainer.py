@@ -1,0 +1,249 @@
+"""The training loop: learns, repeats bit for bit, resumes, and counts only its own time."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.methods import get_method
+from ambiguous_wild.splat import checkpoint
+from ambiguous_wild.splat.cpu import set_threads
+from ambiguous_wild.splat.data import load_train_data, shrink, shrink_keep
+from ambiguous_wild.splat.parts import MaskPolicy, Parts
+from ambiguous_wild.splat.resolution import Level, ceiling_at, coarse_to_fine, divisor_at
+from ambiguous_wild.splat.trainer import TrainConfig, Trainer
+from tests.tiny_scene import write_tiny_scene
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return load_scene(write_tiny_scene(tmp_path_factory.mktemp("data") / "scene"))
+
+
+def trainer_for(scene, folder, *, parts=None, probe=None, **config) -> Trainer:
+    config = {"iterations": 120, "probes": 4} | config
+    data = load_train_data(scene, device=torch.device("cpu"), seed=config.get("seed", 0), cache_dir=folder)
+    return Trainer(data, parts or Parts(), TrainConfig(**config), folder=folder, probe=probe)
+
+
+def bits(trainer: Trainer) -> dict[str, bytes]:
+    return {name: tensor.numpy().tobytes() for name, tensor in trainer.gaussians.items()}
+
+
+def trained(scene, folder, **kw) -> Trainer:
+    trainer = trainer_for(scene, folder, **kw)
+    trainer.train()
+    return trainer
+
+
+def test_training_learns_the_scene(tmp_path):
+    scene = load_scene(write_tiny_scene(tmp_path / "scene", distractors=False))
+    trainer = trained(scene, tmp_path / "run", iterations=300)
+    errors = [
+        float((trainer.render(camera).image - photo).square().mean())
+        for camera, photo in zip(trainer.data.cameras, trainer.data.photos)
+    ]
+    assert -10 * np.log10(np.mean(errors)) > 25
+    losses = [row["loss"] for row in trainer.timeline]
+    assert losses[-1] < 0.5 * losses[0]
+
+
+@pytest.mark.parametrize("method", ["3dgs", "refinesplat"])
+def test_same_seed_same_bits_for_one_and_two_threads(scene, tmp_path, method):
+    entry = get_method(method)
+    results = []
+    try:
+        for threads in (1, 2):
+            set_threads(threads)
+            parts = entry.build(entry.options())
+            results.append(bits(trained(scene, tmp_path / str(threads), parts=parts)))
+    finally:
+        set_threads(2)
+    assert results[0] == results[1]
+
+
+def test_another_seed_gives_other_bits(scene, tmp_path):
+    assert bits(trained(scene, tmp_path / "a", seed=0)) != bits(trained(scene, tmp_path / "b", seed=1))
+
+
+@pytest.mark.parametrize("method", ["3dgs", "refinesplat"])
+def test_a_resumed_run_equals_an_undisturbed_one(scene, tmp_path, method):
+    entry = get_method(method)
+    whole = trained(scene, tmp_path / "whole", parts=entry.build(entry.options()))
+    first = trainer_for(scene, tmp_path / "parts", parts=entry.build(entry.options()))
+    while first.iteration < 71:
+        first.step()
+    first.save()
+    second = trainer_for(scene, tmp_path / "parts", parts=entry.build(entry.options()))
+    assert second.resume()
+    assert second.iteration == 71
+    second.train()
+    assert bits(second) == bits(whole)
+
+
+SCRIPT = """
+import sys, torch
+from pathlib import Path
+from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.splat.data import load_train_data
+from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.trainer import TrainConfig, Trainer
+scene, folder = load_scene(sys.argv[1]), Path(sys.argv[2])
+data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=folder)
+config = TrainConfig(iterations=400, checkpoint_every_s=0.05, probes=0)
+trainer = Trainer(data, Parts(), config, folder=folder)
+trainer.resume()
+trainer.train()
+"""
+
+
+def test_kill_in_mid_training_then_again_gives_the_same_checkpoint(scene, tmp_path):
+    """kill -9 after the first checkpoint appeared; the same command ends with the same state."""
+    for name in ("whole", "killed"):
+        command = [sys.executable, "-c", SCRIPT, str(scene.root), str(tmp_path / name)]
+        if name == "killed":
+            process = subprocess.Popen(command, cwd=Path(__file__).parents[2])
+            saved = tmp_path / name / "checkpoint" / "last.safetensors"
+            deadline = time.monotonic() + 60
+            while not saved.exists() and time.monotonic() < deadline:
+                time.sleep(0.005)
+            os.kill(process.pid, signal.SIGKILL)
+            process.wait()
+            assert checkpoint.load(saved)["iteration"] < 400
+        subprocess.run(command, check=True, cwd=Path(__file__).parents[2])
+    whole, killed = (
+        checkpoint.load(tmp_path / n / "checkpoint" / "last.safetensors") for n in ("whole", "killed")
+    )
+    for part in ("gaussians", "optimiser", "density"):
+        assert same(whole[part], killed[part]), part
+
+
+def same(a, b) -> bool:
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(same(a[k], b[k]) for k in a)
+    if isinstance(a, list):
+        return len(a) == len(b) and all(map(same, a, b))
+    return torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
+
+
+def test_probing_changes_nothing_and_costs_no_training_time(scene, tmp_path):
+    def slow_probe(draw):
+        for view in scene.test:
+            draw(view.camera)
+        time.sleep(0.5)
+        return 12.5
+
+    without = trained(scene, tmp_path / "a", probes=0)
+    probed = trained(scene, tmp_path / "b", probes=4, probe=slow_probe)
+    assert bits(without) == bits(probed)
+    values = [row["psnr_probe"] for row in probed.timeline if row["psnr_probe"] is not None]
+    assert values == [12.5] * 4
+    assert probed.clock.now() < without.clock.now() + 1.5  # four probes slept two seconds
+
+
+def test_the_timeline_is_a_table(scene, tmp_path):
+    import pandas as pd
+
+    trainer = trained(scene, tmp_path)
+    table = pd.read_csv(tmp_path / "timeline.csv")
+    assert table["iteration"].is_monotonic_increasing
+    assert table["iteration"].iloc[-1] == 120
+    assert {"wall_s", "loss", "gaussians", "ms_render", "ms_backward"} <= set(table.columns)
+    assert table["gaussians"].iloc[-1] == len(trainer.gaussians)
+
+
+class _AllMasked(MaskPolicy):
+    def keep(self, step):
+        return torch.zeros(step.photo.shape[:2])
+
+
+def test_photos_that_are_all_masked_teach_nothing_and_are_named(scene, tmp_path):
+    trainer = trainer_for(scene, tmp_path, parts=Parts(mask=_AllMasked()), iterations=12)
+    before = bits(trainer)
+    trainer.train()
+    assert bits(trainer) == before
+    assert trainer.skipped_views == [v.name for v in scene.train]
+
+
+class _Counting(MaskPolicy):
+    calls: dict[str, int]
+
+    def __init__(self):
+        self.calls = {"keep": 0, "predict": 0}
+
+    def keep(self, step):
+        self.calls["keep"] += 1
+
+    def predict(self, step):
+        self.calls["predict"] += 1
+
+
+def test_each_place_is_called_once_an_iteration_and_never_otherwise(scene, tmp_path):
+    policy = _Counting()
+    trained(scene, tmp_path, parts=Parts(mask=policy), iterations=30)
+    assert policy.calls == {"keep": 30, "predict": 0}
+
+
+def test_a_users_mask_is_obeyed(scene, tmp_path):
+    trainer = trainer_for(scene, tmp_path)
+    user = torch.ones(trainer.data.photos[0].shape[:2])
+    user[:10] = 0
+    trainer.data.user_keep[0] = user
+    step = trainer.make_step(1, 0)
+    assert torch.equal(trainer.combine_user_keep(step, None), user)
+    half = torch.full_like(user, 0.5)
+    assert torch.equal(trainer.combine_user_keep(step, half), user * 0.5)
+    assert trainer.combine_user_keep(trainer.make_step(1, 1), None) is None
+
+
+def test_a_budget_scales_the_schedule_and_is_kept(scene, tmp_path):
+    trainer = trained(scene, tmp_path, budget_s=1.5, probes=0)
+    assert trainer.progress(trainer.iteration) == 1.0
+    assert 1.5 <= trainer.clock.now() < 3.0
+    assert trainer.iteration > 20
+
+
+def test_every_view_once_an_epoch(scene, tmp_path):
+    trainer = trainer_for(scene, tmp_path)
+    order = [trainer._view_at(i) for i in range(1, 13)]
+    assert sorted(order[:6]) == sorted(order[6:]) == list(range(6))
+
+
+def test_coarse_to_fine_follows_the_photos_spectrum():
+    rng = np.random.default_rng(0)
+    noise = rng.random((400, 400, 3))
+    smooth = np.cumsum(np.cumsum(noise - 0.5, 0), 1)
+    rough_levels, smooth_levels = coarse_to_fine([noise]), coarse_to_fine([smooth])
+    assert [level.divisor for level in rough_levels] == [4, 2, 1]
+    assert all(0 <= a.begin < b.begin <= 0.4 for a, b in pairwise(rough_levels))
+    assert [level.divisor for level in smooth_levels] == [4, 2, 1]
+    assert coarse_to_fine([np.full((400, 400, 3), 0.5)]) == (Level(0.0, 1),)
+    assert coarse_to_fine([noise[:80, :80]]) == (Level(0.0, 1),)
+    assert [divisor_at(rough_levels, p) for p in (0.0, 0.5, 1.0)] == [4, 1, 1]
+
+
+def test_the_count_ceiling_rises_with_the_resolution():
+    values = [
+        ceiling_at(1000, 50_000, d, p, 0.4) for d, p in ((4, 0.0), (4, 0.2), (2, 0.2), (2, 0.4), (1, 0.4))
+    ]
+    assert values == sorted(values)
+    assert values[0] == 1000 + 49_000 // 16
+    assert values[-1] == 50_000
+
+
+def test_shrinking_averages_photos_and_keeps_only_whole_blocks():
+    photo = torch.arange(4 * 6 * 3, dtype=torch.float32).reshape(4, 6, 3)
+    small = shrink(photo, 2)
+    assert small.shape == (2, 3, 3)
+    assert torch.allclose(small[0, 0], photo[:2, :2].mean(dim=(0, 1)))
+    keep = torch.ones(4, 6)
+    keep[0, 1] = 0
+    assert shrink_keep(keep, 2).tolist() == [[0, 1, 1], [1, 1, 1]]

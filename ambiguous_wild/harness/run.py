@@ -22,7 +22,7 @@ from ambiguous_wild.core.config import config_hash, to_plain
 from ambiguous_wild.harness import evaluate
 from ambiguous_wild.harness.environment import environment
 from ambiguous_wild.harness.store import write_result
-from ambiguous_wild.io.atomic import write_json, write_text
+from ambiguous_wild.io.atomic import sweep, write_json, write_text
 from ambiguous_wild.io.lock import folder_lock
 from ambiguous_wild.io.ply import write_splat_ply
 from ambiguous_wild.methods.registry import MethodEntry
@@ -107,6 +107,7 @@ def run_cell(
             if (folder / RESULT).exists():
                 return CellReport(folder, "kept")
         folder.mkdir(parents=True, exist_ok=True)
+        sweep(folder)
         config = cell.config | {"config_hash": cell.identity}
         write_text(folder / "config.yaml", yaml.safe_dump(config, sort_keys=False, allow_unicode=True))
         write_json(folder / "env.json", environment(cell.device))

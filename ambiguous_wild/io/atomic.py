@@ -62,6 +62,15 @@ def atomic_dir(path: Path | str) -> Iterator[Path]:
         raise
 
 
+def sweep(folder: Path | str) -> None:
+    """Remove what a killed process left of the writes above; call it only while holding the folder."""
+    for left in sorted(Path(folder).rglob(".*.tmp*")) + sorted(Path(folder).rglob(".*.old-*")):
+        if left.is_dir():
+            shutil.rmtree(left, ignore_errors=True)
+        else:
+            left.unlink(missing_ok=True)
+
+
 def write_text(path: Path | str, text: str) -> None:
     """Write UTF-8 text atomically."""
     with atomic_path(path) as temporary:

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.io.atomic import atomic_dir, atomic_path, write_json, write_text
+from ambiguous_wild.io.atomic import atomic_dir, atomic_path, sweep, write_json, write_text
 from ambiguous_wild.io.lock import folder_lock
 
 
@@ -68,3 +68,17 @@ def test_a_lock_is_freed_after_an_error(tmp_path):
         raise AwError("x")
     with folder_lock(tmp_path / "run", "second"):
         assert (tmp_path / ".run.lock").exists()
+
+
+def test_what_a_killed_process_left_is_swept_and_nothing_else(tmp_path):
+    script = (
+        "import os, sys\nfrom ambiguous_wild.io.atomic import atomic_dir, atomic_path\n"
+        "with atomic_path(sys.argv[1] + '/a.txt') as a, atomic_dir(sys.argv[1] + '/d') as d:\n"
+        "    a.write_text('half'); (d / 'x').write_text('half'); os._exit(9)"
+    )
+    (tmp_path / "mine.txt").write_text("keep")
+    (tmp_path / ".hidden").write_text("keep")
+    subprocess.run([sys.executable, "-c", script, tmp_path])
+    assert len(list(tmp_path.iterdir())) == 4
+    sweep(tmp_path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == [".hidden", "mine.txt"]

@@ -1,0 +1,102 @@
+"""`aw bench` as it is typed."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from ambiguous_wild.cli.bench import parse_budget
+from ambiguous_wild.core import AwError
+from tests.tiny_scene import write_tiny_scene
+
+ROOT = Path(__file__).parents[2]
+
+
+def aw(*arguments, **kw) -> subprocess.CompletedProcess:
+    command = [sys.executable, "-m", "ambiguous_wild.cli.main", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, **kw)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
+
+
+@pytest.mark.parametrize(("text", "seconds"), [("90s", 90), ("10m", 600), ("1.5h", 5400), (" 2 min ", 120)])
+def test_budgets(text, seconds):
+    assert parse_budget(text) == seconds
+
+
+@pytest.mark.parametrize("text", ["", "10", "m", "-3m", "0s", "10m30", "1e3s"])
+def test_what_is_no_budget(text):
+    with pytest.raises(AwError, match="no duration"):
+        parse_budget(text)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--method", "refinsplat"], "did you mean 'refinesplat'"),
+        (["--method", "3dgs", "--iterations", "5", "--budget", "1m"], "exclude each other"),
+        (["--method", "3dgs", "--iterations", "0"], "--iterations"),
+        (["--method", "3dgs", "--overwrite", "perhaps"], "'never', 'missing', 'always'"),
+        (["--method", "3dgs", "--itterations", "5"], "--iterations"),
+        (["--method", "refinesplat", "--set", "refinesplat.apha_1=1"], "did you mean 'alpha_1'"),
+        (["--method", "3dgs", "--plugin", "absent.py"], "no plugin file"),
+    ],
+)
+def test_mistakes_get_one_line_and_exit_code_2(scene, tmp_path, arguments, message):
+    done = aw("bench", "--scene", scene, "-o", tmp_path / "runs", *arguments)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "runs").exists()
+
+
+def test_no_scene_there(tmp_path):
+    done = aw("bench", "--method", "3dgs", "--scene", tmp_path / "nothing", "-o", tmp_path / "runs")
+    assert done.returncode == 2
+    assert "there is no scene folder" in done.stderr
+    assert not (tmp_path / "runs").exists()
+
+
+def test_killed_in_mid_training_the_same_command_ends_with_the_same_renders(scene, tmp_path):
+    """kill -9 once a checkpoint is there; the second command resumes and equals an undisturbed run."""
+    arguments = ["bench", "--method", "3dgs", "--scene", scene, "--iterations", "1500"]
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    assert aw(*arguments, "-o", whole).returncode == 0
+
+    often = [*arguments, "-o", killed, "--checkpoint-every", "0.05"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "ambiguous_wild.cli.main", *map(str, often)],
+        cwd=ROOT,
+        stderr=subprocess.DEVNULL,
+    )
+    run = killed / "scene" / "3dgs" / "seed0"
+    deadline = time.monotonic() + 60
+    while not (run / "checkpoint" / "last.safetensors").exists() and time.monotonic() < deadline:
+        time.sleep(0.005)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert not (run / "metrics.json").exists()
+
+    done = aw(*often)
+    assert done.returncode == 0, done.stderr
+    undisturbed = whole / "scene" / "3dgs" / "seed0"
+    for name in ("point_cloud.ply", "renders/test/test_0.png", "renders/test/test_1.png"):
+        assert (run / name).read_bytes() == (undisturbed / name).read_bytes(), name
+    assert list(killed.rglob(".*.tmp*")) == []
+
+
+def test_outcomes_as_json(scene, tmp_path):
+    arguments = ["bench", "--method", "3dgs", "--scene", scene, "--iterations", "20", "-o", tmp_path / "runs"]
+    first, second = aw(*arguments, "--json"), aw(*arguments, "--json")
+    assert json.loads(first.stdout)[0]["outcome"] == "trained"
+    assert json.loads(second.stdout)[0]["outcome"] == "kept"
+    assert "aw table" in second.stderr

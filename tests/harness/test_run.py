@@ -1,0 +1,141 @@
+"""A run folder holds everything, is refused for another configuration, and resumes."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from ambiguous_wild.harness.store import read_result
+from ambiguous_wild.io.ply import read_splat_ply
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.grid import cell_folder, plan_cells, run_cells
+from ambiguous_wild.io.images import read_gray, read_png_rgb
+from ambiguous_wild.methods import MethodEntry, register, registry
+from ambiguous_wild.metrics.image import psnr
+from ambiguous_wild.splat.parts import MaskPolicy, Parts
+from ambiguous_wild.splat.trainer import TrainConfig
+from tests.tiny_scene import TEST, TRAIN, write_tiny_scene
+
+SHORT = TrainConfig(iterations=60, probes=2)
+
+
+class TruthMask(MaskPolicy):
+    """The exact masks, read from the scene: what a perfect policy would say."""
+
+    def setup(self, data):
+        root = data.scene.root / "truth" / "distractor"
+        self.masks = [torch.from_numpy(read_gray(root / v.name) < 128).float() for v in data.scene.train]
+
+    def keep(self, step):
+        return self.masks[step.view]
+
+
+def explode(options):
+    raise RuntimeError("boom")
+
+
+@pytest.fixture(autouse=True)
+def _methods(monkeypatch):
+    monkeypatch.setattr(registry, "_registered", {})
+    register(MethodEntry("truth", "exact masks", lambda options: Parts(mask=TruthMask())))
+    register(MethodEntry("broken", "fails", explode))
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
+
+
+def bench(scene, output, *methods, train=SHORT, overwrite="missing", **kw):
+    cells = plan_cells(methods, [scene], kw.pop("seeds", [0]), train, **kw)
+    return cells, run_cells(cells, output, overwrite=overwrite)
+
+
+def test_a_run_folder_holds_everything_and_the_numbers_follow_from_it(scene, tmp_path):
+    (cell,), (report,) = bench(scene, tmp_path, "truth")
+    assert report.outcome == "trained", report.error
+    run = cell_folder(tmp_path, cell)
+    assert run == tmp_path / "scene" / "truth" / "seed0"
+    names = {str(p.relative_to(run)) for p in run.rglob("*") if p.is_file()}
+    expected = {"config.yaml", "env.json", "timeline.csv", "point_cloud.ply", "metrics.json"}
+    expected |= {"checkpoint/last.safetensors"} | {f"renders/test/{n}" for n in TEST}
+    assert names == expected | {f"masks/{n}" for n in TRAIN}
+
+    result = read_result(run / "metrics.json")
+    for row in result["per_image"]:
+        drawn = read_png_rgb(run / "renders" / "test" / row["name"])
+        assert row["psnr"] == pytest.approx(psnr(drawn, read_png_rgb(scene / "images" / row["name"])))
+    assert result["masks"] == {"iou": 1.0, "precision": 1.0, "recall": 1.0, "images": 6}
+    assert result["cost"]["gaussians"] == len(read_splat_ply(run / "point_cloud.ply")["means"])
+    assert "lpips_alex" in result["missing"] or "lpips_alex" in result["per_image"][0]
+    assert yaml.safe_load((run / "config.yaml").read_text())["train"]["iterations"] == 60
+
+
+def test_exact_masks_beat_none(scene, tmp_path):
+    train = dataclasses.replace(SHORT, iterations=400)
+    _, reports = bench(scene, tmp_path, "3dgs", "truth", train=train)
+    plain, masked = (np.mean([row["psnr"] for row in r.result["per_image"]]) for r in reports)
+    assert masked > plain + 1.0
+
+
+def test_a_finished_run_is_kept_and_a_deleted_result_is_made_again(scene, tmp_path):
+    (cell,), _ = bench(scene, tmp_path, "3dgs")
+    result = cell_folder(tmp_path, cell) / "metrics.json"
+    before = json.loads(result.read_text())
+    assert bench(scene, tmp_path, "3dgs")[1][0].outcome == "kept"
+    result.unlink()
+    assert bench(scene, tmp_path, "3dgs")[1][0].outcome == "trained"
+    assert json.loads(result.read_text())["per_image"] == before["per_image"]
+
+
+def test_another_configuration_is_refused_by_name_and_replaced_on_request(scene, tmp_path):
+    bench(scene, tmp_path, "3dgs")
+    longer = dataclasses.replace(SHORT, iterations=61)
+    with pytest.raises(AwError, match=r"train\.iterations was 60, is 61"):
+        bench(scene, tmp_path, "3dgs", train=longer)
+    assert bench(scene, tmp_path, "3dgs", train=longer, overwrite="never")[1][0].outcome == "skipped"
+    assert bench(scene, tmp_path, "3dgs", train=longer, overwrite="always")[1][0].outcome == "trained"
+
+
+def test_how_often_a_run_is_saved_does_not_make_it_another(scene, tmp_path):
+    bench(scene, tmp_path, "3dgs")
+    often = dataclasses.replace(SHORT, checkpoint_every_s=1.0, probes=0)
+    assert bench(scene, tmp_path, "3dgs", train=often)[1][0].outcome == "kept"
+
+
+def test_a_folder_that_is_not_ours_is_left_alone(scene, tmp_path):
+    mine = tmp_path / "scene" / "3dgs" / "seed0" / "thesis.txt"
+    mine.parent.mkdir(parents=True)
+    mine.write_text("all I have")
+    with pytest.raises(AwError, match="no run of ours"):
+        bench(scene, tmp_path, "3dgs")
+    assert mine.read_text() == "all I have"
+
+
+def test_a_failing_cell_does_not_take_the_others_with_it(scene, tmp_path):
+    cells, reports = bench(scene, tmp_path, "broken", "3dgs")
+    assert [r.outcome for r in reports] == ["failed", "trained"]
+    assert reports[0].error == "RuntimeError: boom"
+    folder = cell_folder(tmp_path, cells[0])
+    assert read_result(folder / "failed.json")["status"] == "failed"
+    assert "boom" in (folder / "traceback.txt").read_text()
+
+
+def test_options_reach_the_method_and_unknown_ones_are_named(scene):
+    (cell,) = plan_cells(["refinesplat"], [scene], [0], SHORT, settings=["refinesplat.alpha_1=0.1"])
+    assert cell.options.alpha_1 == 0.1
+    with pytest.raises(AwError, match="did you mean 'alpha_1'"):
+        plan_cells(["refinesplat"], [scene], [0], SHORT, settings=["refinesplat.alpha1=0.1"])
+    with pytest.raises(AwError, match=r"write METHOD\.KEY=VALUE"):
+        plan_cells(["refinesplat"], [scene], [0], SHORT, settings=["alpha_1=0.1"])
+    with pytest.raises(AwError, match="method in --set"):
+        plan_cells(["3dgs"], [scene], [0], SHORT, settings=["refinesplat.alpha_1=0.1"])
+
+
+def test_scenes_of_one_name_are_refused(scene, tmp_path):
+    other = write_tiny_scene(tmp_path / "scene")
+    with pytest.raises(AwError, match="two scenes are called scene"):
+        plan_cells(["3dgs"], [scene, other], [0], SHORT)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -28,6 +29,10 @@ class Gaussians:
     opacity_logits: Tensor  # [N]
     sh0: Tensor  # [N, 3] coefficient of the constant harmonic
     sh_rest: Tensor  # [N, (D + 1)^2 - 1, 3] the others, D = largest degree (0 to 3)
+
+    # Set on an instance by an optimiser that postpones updates of rows nobody sees: the renderer calls it
+    # with the rows about to be drawn before it reads their harmonics. Copies do not carry it.
+    before_colours: ClassVar[Callable[[np.ndarray], Any] | None] = None
 
     def __post_init__(self) -> None:
         n = self.means.shape[0]

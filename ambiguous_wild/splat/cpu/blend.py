@@ -1,0 +1,361 @@
+"""Blending, tile by tile and sixteen pixels at a time, and its way back.
+
+Forward: front to back with the state of a tile in the first-level cache. Backward: back to front from the
+last Gaussian a pixel drew; the transmittance is recovered by dividing by 1 - alpha, never below 0.01, so
+its relative error stays that of the forward product and what lies behind is a sum without cancellation.
+Each (tile, Gaussian) writes one row of sums; `reverse.py` adds the rows of a Gaussian in a fixed order.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from ambiguous_wild.splat.cpu.bins import TILE
+from ambiguous_wild.splat.cpu.project import (
+    BLUE,
+    CURVE_X,
+    CURVE_Y,
+    DEPTH,
+    EXTENT_Y,
+    GREEN,
+    LOG2_OPACITY,
+    MX,
+    MY,
+    RED,
+    SLANT,
+)
+from ambiguous_wild.splat.cpu.simd import (
+    any_lane,
+    exp2,
+    fma,
+    lane_centres,
+    load,
+    magnitude,
+    negated_magnitude,
+    select,
+    splat,
+    store,
+    sum_lanes,
+)
+
+PIXELS = TILE * TILE
+MAX_ALPHA = np.float32(0.99)
+STOP = np.float32(1e-4)  # a Gaussian that would bring the transmittance to or below it is not drawn
+LOG2_MIN_ALPHA = np.float32(-math.log2(255.0))
+_ZERO = np.float32(0.0)
+_ONE = np.float32(1.0)
+
+# Columns of a row of sums: h = e dL/dalpha where nothing is clamped, u and dy as in project.py.
+SUM_H, SUM_U, SUM_UU, SUM_Y, SUM_UY, SUM_YY, SUM_RED, SUM_GREEN, SUM_BLUE, SUM_DEPTH = range(10)
+EXTRA_U, EXTRA_Y, ABS_U, ABS_V = range(10, 14)
+ROW = 16
+
+
+@numba.njit(cache=True)
+def row_range(record, top, rows):
+    """First row and one past the last row of a tile whose pixel centres lie within the y extent."""
+    low = math.ceil(record[MY] - record[EXTENT_Y] - np.float32(0.501) - top)
+    high = math.floor(record[MY] + record[EXTENT_Y] - np.float32(0.499) - top)
+    return int(max(low, 0.0)), int(min(high, rows - 1.0)) + 1
+
+
+@numba.njit(cache=True)
+def _forward_tile(records, slots, begin, end, left, top, width, height, state):
+    """Blend a tile's list into `state` = (T, red, green, blue, depth, last); returns how far it got.
+
+    T carries a sign: negative once the pixel has stopped (or lies outside the image).
+    """
+    transmittance, red, green, blue, depth, last = state
+    rows = min(TILE, height - top)
+    lanes = lane_centres()
+    start = select(lanes <= np.float32(width - left), _ONE, _ZERO)
+    for y in range(TILE):
+        at = y * TILE
+        store(transmittance, at, start)
+        store(red, at, splat(_ZERO))
+        store(green, at, splat(_ZERO))
+        store(blue, at, splat(_ZERO))
+        store(depth, at, splat(_ZERO))
+        store(last, at, splat(np.float32(-1.0)))
+    open_rows = (1 << rows) - 1
+    for k in range(begin, end):
+        record = records[slots[k]]
+        index = np.float32(k - begin)
+        low, high = row_range(record, top, rows)
+        my = record[MY] - np.float32(top)
+        mx = record[MX] - np.float32(left)
+        slant, curve_x, curve_y = record[SLANT], record[CURVE_X], record[CURVE_Y]
+        level = record[LOG2_OPACITY]
+        r, g, b, z = record[RED], record[GREEN], record[BLUE], record[DEPTH]
+        for y in range(low, high):
+            if not (open_rows >> y) & 1:
+                continue
+            at = y * TILE
+            dy = np.float32(y) + np.float32(0.5) - my
+            u = lanes - (mx + slant * dy)
+            exponent = fma(u * u, curve_x, level + curve_y * (dy * dy))
+            drawn = exponent >= LOG2_MIN_ALPHA
+            e = exp2(exponent)
+            alpha = select(drawn, select(e <= MAX_ALPHA, e, MAX_ALPHA), _ZERO)
+            before = load(transmittance, at)
+            weight = before * alpha
+            after = before - weight
+            live = after > STOP
+            if not any_lane(live):
+                open_rows &= ~(1 << y)
+            weight = select(live, weight, _ZERO)
+            store(transmittance, at, select(live, after, negated_magnitude(before)))
+            store(red, at, fma(weight, r, load(red, at)))
+            store(green, at, fma(weight, g, load(green, at)))
+            store(blue, at, fma(weight, b, load(blue, at)))
+            store(depth, at, fma(weight, z, load(depth, at)))
+            store(last, at, select(live & drawn, index, load(last, at)))
+        if open_rows == 0:
+            return k + 1
+    return end
+
+
+@numba.njit(cache=True)
+def _forward_worker(
+    worker, records, tile_slots, starts, tile_order, workers, width, height, background, image, alpha, depth, kept
+):  # fmt: skip
+    columns = (width + TILE - 1) // TILE
+    state = (
+        np.empty(PIXELS, np.float32),
+        np.empty(PIXELS, np.float32),
+        np.empty(PIXELS, np.float32),
+        np.empty(PIXELS, np.float32),
+        np.empty(PIXELS, np.float32),
+        np.empty(PIXELS, np.float32),
+    )
+    for position in range(worker, tile_order.shape[0], workers):
+        tile = tile_order[position]
+        top = tile // columns * TILE
+        left = tile % columns * TILE
+        _forward_tile(records, tile_slots, starts[tile], starts[tile + 1], left, top, width, height, state)
+        kept[tile, 0, :] = state[0]
+        kept[tile, 1, :] = state[5]
+        across = min(TILE, width - left)
+        for y in range(min(TILE, height - top)):
+            for x in range(across):
+                at = y * TILE + x
+                through = abs(state[0][at])
+                image[top + y, left + x, 0] = state[1][at] + through * background[0]
+                image[top + y, left + x, 1] = state[2][at] + through * background[1]
+                image[top + y, left + x, 2] = state[3][at] + through * background[2]
+                alpha[top + y, left + x] = _ONE - through
+                depth[top + y, left + x] = state[4][at]
+
+
+@numba.njit(cache=True, parallel=True)
+def forward(
+    records, tile_slots, starts, tile_order, workers, width, height, background, image, alpha, depth, kept
+):
+    """Blend every tile.
+
+    Args:
+        records: [N, 16].
+        tile_slots: [I] int32, lists of the tiles.
+        starts: [tiles + 1] int64.
+        tile_order: [tiles] int32, longest list first; worker i takes every `workers`-th from the i-th.
+        background: [3] float32.
+        image, alpha, depth: [H, W, 3], [H, W], [H, W] out.
+        kept: [tiles, 2, 256] float32 out: final transmittance (sign: see `_forward_tile`), last index drawn.
+    """
+    for worker in numba.prange(workers):
+        _forward_worker(
+            worker, records, tile_slots, starts, tile_order, workers, width, height, background, image, alpha,
+            depth, kept,
+        )  # fmt: skip
+
+
+@numba.njit(cache=True)
+def _backward_tile(
+    records, slots, instances, begin, end, top, left, rows, planes, extra, with_extra, with_depth, absolute, sums
+):  # fmt: skip
+    """Walk a tile's list back to front; planes = (T, last, behind, red, green, blue, alpha, depth cotangents).
+
+    `extra` = (behind, red, green, blue) of the second cotangent. What is None of `with_extra`,
+    `with_depth` and `absolute` is compiled away.
+    """
+    transmittance, last, behind, d_red, d_green, d_blue, d_alpha, depths = planes
+    lanes = lane_centres()
+    zero = splat(_ZERO)
+    furthest = np.empty(TILE, np.int64)
+    final = np.int64(-1)
+    for y in range(TILE):
+        reach = np.float32(-1.0)
+        for x in range(TILE):
+            reach = max(reach, last[y * TILE + x])
+        furthest[y] = np.int64(reach)
+        final = max(final, furthest[y])
+    for k in range(begin + final + 1, end):
+        store(sums, instances[k] * ROW, zero)
+    for k in range(begin + final, begin - 1, -1):
+        record = records[slots[k]]
+        index = np.float32(k - begin)
+        low, high = row_range(record, top, rows)
+        my = record[MY] - np.float32(top)
+        mx = record[MX] - np.float32(left)
+        slant, curve_x, curve_y = record[SLANT], record[CURVE_X], record[CURVE_Y]
+        level = record[LOG2_OPACITY]
+        r, g, b, z = record[RED], record[GREEN], record[BLUE], record[DEPTH]
+        s_h = zero
+        s_u = zero
+        s_uu = zero
+        s_y = zero
+        s_uy = zero
+        s_yy = zero
+        s_red = zero
+        s_green = zero
+        s_blue = zero
+        s_depth = zero
+        x_u = zero
+        x_y = zero
+        a_u = zero
+        a_v = zero
+        for y in range(low, high):
+            if k - begin > furthest[y]:
+                continue
+            at = y * TILE
+            dy = np.float32(y) + np.float32(0.5) - my
+            u = lanes - (mx + slant * dy)
+            exponent = fma(u * u, curve_x, level + curve_y * (dy * dy))
+            drawn = (exponent >= LOG2_MIN_ALPHA) & (load(last, at) >= index)
+            e = exp2(exponent)
+            free = e <= MAX_ALPHA
+            alpha = select(drawn, select(free, e, MAX_ALPHA), _ZERO)
+            inverse = _ONE / (_ONE - alpha)
+            before = load(transmittance, at) * inverse
+            weight = before * alpha
+            store(transmittance, at, before)
+            h_scale = select(drawn & free, e, _ZERO)
+
+            red = load(d_red, at)
+            green = load(d_green, at)
+            blue = load(d_blue, at)
+            shade = fma(red, r, fma(green, g, fma(blue, b, load(d_alpha, at))))
+            if with_depth is not None:
+                d_depth = load(depths, at)
+                shade = fma(d_depth, z, shade)
+                s_depth = fma(weight, d_depth, s_depth)
+            hidden = load(behind, at)
+            h = h_scale * (before * shade - hidden * inverse)
+            store(behind, at, fma(weight, shade, hidden))
+            if absolute is not None:
+                hu_main = h * u
+                a_u = a_u + magnitude(hu_main)
+                # dsigma/dv apart from constants that the reduction multiplies in.
+                a_v = a_v + magnitude(fma(hu_main, curve_x * slant, h * (-curve_y * dy)))
+            if with_extra is not None:
+                red2 = load(extra[1], at)
+                green2 = load(extra[2], at)
+                blue2 = load(extra[3], at)
+                shade2 = fma(red2, r, fma(green2, g, blue2 * b))
+                hidden2 = load(extra[0], at)
+                h2 = h_scale * (before * shade2 - hidden2 * inverse)
+                store(extra[0], at, fma(weight, shade2, hidden2))
+                x_u = fma(h2, u, x_u)
+                x_y = fma(h2, dy, x_y)
+                h = h + h2
+                red = red + red2
+                green = green + green2
+                blue = blue + blue2
+            hu = h * u
+            s_h = s_h + h
+            s_u = s_u + hu
+            s_uu = fma(hu, u, s_uu)
+            s_y = fma(h, dy, s_y)
+            s_uy = fma(hu, dy, s_uy)
+            s_yy = fma(h, dy * dy, s_yy)
+            s_red = fma(weight, red, s_red)
+            s_green = fma(weight, green, s_green)
+            s_blue = fma(weight, blue, s_blue)
+        row = sum_lanes(
+            (s_h, s_u, s_uu, s_y, s_uy, s_yy, s_red, s_green, s_blue, s_depth, x_u, x_y, a_u, a_v)
+        )
+        store(sums, instances[k] * ROW, row)
+
+
+@numba.njit(cache=True)
+def _backward_worker(
+    worker, records, tile_slots, tile_instances, starts, tile_order, workers, width, height, background, kept,
+    d_image, d_alpha, d_depth, d_extra, absolute, sums,
+):  # fmt: skip
+    columns = (width + TILE - 1) // TILE
+    planes = (
+        np.empty(PIXELS, np.float32),
+        np.empty(PIXELS, np.float32),
+        np.empty(PIXELS, np.float32),
+        np.zeros(PIXELS, np.float32),
+        np.zeros(PIXELS, np.float32),
+        np.zeros(PIXELS, np.float32),
+        np.zeros(PIXELS, np.float32),
+        np.zeros(PIXELS, np.float32),
+    )
+    extra = (
+        np.zeros(PIXELS, np.float32),
+        np.zeros(PIXELS, np.float32),
+        np.zeros(PIXELS, np.float32),
+        np.zeros(PIXELS, np.float32),
+    )
+    for position in range(worker, tile_order.shape[0], workers):
+        tile = tile_order[position]
+        top = tile // columns * TILE
+        left = tile % columns * TILE
+        rows = min(TILE, height - top)
+        across = min(TILE, width - left)
+        for at in range(PIXELS):
+            planes[0][at] = abs(kept[tile, 0, at])
+            planes[1][at] = kept[tile, 1, at]
+        for y in range(rows):
+            for x in range(across):
+                at = y * TILE + x
+                red = d_image[top + y, left + x, 0]
+                green = d_image[top + y, left + x, 1]
+                blue = d_image[top + y, left + x, 2]
+                planes[3][at] = red
+                planes[4][at] = green
+                planes[5][at] = blue
+                shade = red * background[0] + green * background[1] + blue * background[2]
+                planes[2][at] = planes[0][at] * shade
+                if d_alpha is not None:
+                    planes[6][at] = d_alpha[top + y, left + x]
+                if d_depth is not None:
+                    planes[7][at] = d_depth[top + y, left + x]
+                if d_extra is not None:
+                    red = d_extra[top + y, left + x, 0]
+                    green = d_extra[top + y, left + x, 1]
+                    blue = d_extra[top + y, left + x, 2]
+                    extra[1][at] = red
+                    extra[2][at] = green
+                    extra[3][at] = blue
+                    shade = red * background[0] + green * background[1] + blue * background[2]
+                    extra[0][at] = planes[0][at] * shade
+        _backward_tile(
+            records, tile_slots, tile_instances, starts[tile], starts[tile + 1], top, left, rows,
+            planes, extra, d_extra, d_depth, absolute, sums,
+        )  # fmt: skip
+
+
+@numba.njit(cache=True, parallel=True)
+def backward(
+    records, tile_slots, tile_instances, starts, tile_order, workers, width, height, background, kept,
+    d_image, d_alpha, d_depth, d_extra, absolute, sums,
+):  # fmt: skip
+    """Row of sums of every (tile, Gaussian).
+
+    Args:
+        d_image: [H, W, 3]; d_alpha, d_depth: [H, W] or None; d_extra: [H, W, 3] or None.
+        absolute: True or None.
+        sums: [I * 16] float32 out, row `tile_instances[k]` for list entry k.
+        others: as in `forward`.
+    """
+    for worker in numba.prange(workers):
+        _backward_worker(
+            worker, records, tile_slots, tile_instances, starts, tile_order, workers, width, height, background,
+            kept, d_image, d_alpha, d_depth, d_extra, absolute, sums,
+        )  # fmt: skip

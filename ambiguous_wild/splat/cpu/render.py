@@ -1,0 +1,208 @@
+"""`render_cpu`: raw parameters to pictures and back with the kernels of this package."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ambiguous_wild.core import AwError, Camera
+from ambiguous_wild.splat.cpu import bins, blend, harmonics, project, reverse
+from ambiguous_wild.splat.cpu.buffers import Pool
+from ambiguous_wild.splat.cpu.threads import threads
+from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.render import Gradients
+
+_pool = Pool()
+
+
+def camera_vector(camera: Camera) -> np.ndarray:
+    """[22] float64: pose, intrinsics, size, and the limits of x/z and y/z in the Jacobian (card gsplat.md, 3)."""
+    out = np.empty(22)
+    out[:12] = camera.cam_from_world[:3].ravel()
+    out[12:18] = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
+    for k, (size, f, c) in enumerate(
+        ((camera.width, camera.fx, camera.cx), (camera.height, camera.fy, camera.cy))
+    ):
+        margin = 0.3 * 0.5 * size / f
+        out[18 + 2 * k] = -c / f - margin
+        out[19 + 2 * k] = (size - c) / f + margin
+    return out
+
+
+@dataclass
+class _Lists:
+    """What the backward pass needs of the forward pass."""
+
+    cam: np.ndarray
+    centre: np.ndarray
+    degree: int
+    antialias: bool
+    background: np.ndarray
+    records: np.ndarray
+    ids: np.ndarray
+    counts: np.ndarray
+    order: np.ndarray
+    offsets: np.ndarray
+    starts: np.ndarray
+    tile_order: np.ndarray
+    tile_slots: np.ndarray
+    tile_instances: np.ndarray
+    kept: np.ndarray
+
+
+class RenderedCpu:
+    """Pictures of one camera and the way back to the parameters; see `render.Rendered`."""
+
+    def __init__(
+        self, gaussians: Gaussians, camera: Camera, arrays: tuple[np.ndarray, ...], lists: _Lists
+    ) -> None:
+        self.image, self.alpha, self.depth, self.visible, self.radii = (torch.from_numpy(a) for a in arrays)
+        self._gaussians = gaussians
+        self._camera = camera
+        self._lists = lists
+
+    def backward(
+        self,
+        d_image: Tensor,  # [H, W, 3]
+        *,
+        d_image_extra: Tensor | None = None,  # [H, W, 3]
+        d_alpha: Tensor | None = None,  # [H, W]
+        d_depth: Tensor | None = None,  # [H, W]
+        absolute: bool = False,
+    ) -> Gradients:
+        """Gradients of sum(d_image * image) + ... for every raw parameter; may be called more than once.
+
+        The Gaussians must hold the values they were rendered with.
+
+        Raises:
+            AwError: a cotangent of another shape than its picture.
+        """
+        height, width = self._camera.height, self._camera.width
+        shape = (height, width, 3)
+        sums = self._sums(
+            _cotangent("d_image", d_image, shape),
+            _optional("d_alpha", d_alpha, shape[:2]),
+            _optional("d_depth", d_depth, shape[:2]),
+            _optional("d_image_extra", d_image_extra, shape),
+            True if absolute else None,
+        )
+        return self._chain(sums, d_image_extra is not None, absolute)
+
+    def _sums(self, d_image: Any, d_alpha: Any, d_depth: Any, d_extra: Any, absolute: Any) -> np.ndarray:
+        s = self._lists
+        sums = _pool.take("sums", (int(s.offsets[-1]) * blend.ROW,), slack=0.25)
+        blend.backward(
+            s.records, s.tile_slots, s.tile_instances, s.starts, s.tile_order, threads(),
+            self._camera.width, self._camera.height, s.background, s.kept,
+            d_image, d_alpha, d_depth, d_extra, absolute, sums,
+        )  # fmt: skip
+        return sums
+
+    def _chain(self, sums: np.ndarray, extra: bool, absolute: bool) -> Gradients:
+        s, g = self._lists, self._gaussians
+        n = len(g)
+        ranks = _pool.take("ranks", (max(n, 1),), np.int32)
+        ranks[s.order] = np.arange(len(s.order), dtype=np.int32)
+        out = {name: np.empty(tuple(t.shape), np.float32) for name, t in g.items() if name != "sh_rest"}
+        rest = np.zeros(tuple(g.sh_rest.shape), np.float32)
+        screen = np.empty((n, 2), np.float32)
+        screen_extra = np.empty((n, 2), np.float32) if extra else None
+        screen_abs = np.empty((n, 2), np.float32) if absolute else None
+        reverse.reverse(
+            *(_array(t) for t in (g.means, g.quats, g.log_scales, g.opacity_logits, g.sh_rest)),
+            s.degree, s.cam, s.centre, s.antialias, s.records, s.ids, s.counts, ranks, s.offsets, sums,
+            out["means"], out["quats"], out["log_scales"], out["opacity_logits"], out["sh0"], rest,
+            np.zeros(n, np.bool_), screen, screen_extra, screen_abs,
+        )  # fmt: skip
+        return Gradients(
+            **{name: torch.from_numpy(a) for name, a in out.items()},
+            sh_rest=torch.from_numpy(rest),
+            screen=torch.from_numpy(screen),
+            screen_extra=None if screen_extra is None else torch.from_numpy(screen_extra),
+            screen_abs=None if screen_abs is None else torch.from_numpy(screen_abs),
+        )
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    if tensor.dtype != torch.float32 or not tensor.is_contiguous():
+        tensor = tensor.to(torch.float32).contiguous()
+    return tensor.detach().numpy()
+
+
+def _cotangent(name: str, value: Tensor, shape: tuple[int, ...]) -> np.ndarray:
+    if tuple(value.shape) != shape:
+        raise AwError(f"{name} must be {list(shape)} as the picture, got {list(value.shape)}")
+    return _array(value)
+
+
+def _optional(name: str, value: Tensor | None, shape: tuple[int, ...]) -> np.ndarray | None:
+    return None if value is None else _cotangent(name, value, shape)
+
+
+def render_cpu(
+    gaussians: Gaussians,
+    camera: Camera,
+    *,
+    sh_degree: int = 3,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    antialias: bool = False,
+) -> RenderedCpu:
+    """Render on the CPU; arguments and conventions as in `splat.render.render`.
+
+    Between the projection and the colours `gaussians.before_colours(rows)` is called if it is set: the
+    optimiser brings the harmonics of the rows about to be seen up to date there.
+
+    Raises:
+        AwError: `sh_degree` is not between 0 and what the Gaussians hold.
+    """
+    if not 0 <= sh_degree <= gaussians.sh_degree:
+        raise AwError(
+            f"sh_degree must be 0 to {gaussians.sh_degree}, which the Gaussians hold; got {sh_degree}"
+        )
+    n = len(gaussians)
+    width, height = camera.width, camera.height
+    cam = camera_vector(camera)
+    centre = camera.center
+    means, quats, log_scales, logits, sh0, sh_rest = (_array(t) for _, t in gaussians.items())
+    chunks = -(-n // project.CHUNK)
+    records = np.empty((n, project.RECORD), np.float32)
+    ids = np.empty(n, np.int32)
+    counts = np.zeros(chunks, np.int32)
+    radii = np.empty(n, np.float32)
+    project.project(means, quats, log_scales, logits, cam, antialias, records, ids, counts, radii)
+    slots = bins.visible_slots(ids, counts)
+    if gaussians.before_colours is not None:
+        gaussians.before_colours(ids[slots])
+    harmonics.colours(means, sh0, sh_rest, sh_degree, centre, records, ids, counts, radii)
+    slots = bins.visible_slots(ids, counts)
+    order = bins.depth_order(slots, records)
+
+    columns, rows = -(-width // bins.TILE), -(-height // bins.TILE)
+    instances = np.empty(len(order), np.int32)
+    histogram = np.empty((bins.PARTS, columns * rows), np.int32)
+    bins.count_tiles(order, records, width, height, columns, instances, histogram)
+    offsets = np.empty(len(order) + 1, np.int64)
+    starts = np.empty(columns * rows + 1, np.int64)
+    bins.prefix(instances, offsets, histogram, starts)
+    tile_slots = _pool.take("tile_slots", (int(starts[-1]),), np.int32, slack=0.25)
+    tile_instances = _pool.take("tile_instances", (int(starts[-1]),), np.int32, slack=0.25)
+    bins.scatter(order, records, width, height, columns, offsets, histogram, tile_slots, tile_instances)
+
+    tile_order = np.argsort(-np.diff(starts), kind="stable").astype(np.int32)
+    image = np.empty((height, width, 3), np.float32)
+    alpha = np.empty((height, width), np.float32)
+    depth = np.empty((height, width), np.float32)
+    kept = np.empty((columns * rows, 2, blend.PIXELS), np.float32)
+    behind = np.asarray(background, np.float32)
+    blend.forward(
+        records, tile_slots, starts, tile_order, threads(), width, height, behind, image, alpha, depth, kept
+    )
+    lists = _Lists(
+        cam, centre, sh_degree, antialias, behind, records, ids, counts, order, offsets, starts, tile_order,
+        tile_slots, tile_instances, kept,
+    )  # fmt: skip
+    return RenderedCpu(gaussians, camera, (image, alpha, depth, radii > 0, radii), lists)

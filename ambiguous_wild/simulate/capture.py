@@ -100,7 +100,7 @@ def plan_cameras(spec: CaptureSpec, world: World, rng: np.random.Generator) -> t
 
 
 def plan(spec: CaptureSpec, seed: int) -> tuple[World, list[Shot]]:
-    """Build the world and decide every shot; the four draws are independent streams of the seed."""
+    """Build the world and decide every shot; world, walk and layout draw from independent streams."""
     paint, walk, stand = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(3))
     world = courtyard(paint, spec.detail_px_per_m, spec.samples)
     train, test = plan_cameras(spec, world, walk)
@@ -132,7 +132,7 @@ def simulate(
     Raises:
         AwError: `out` holds something else.
     """
-    identity = config_hash({"spec": to_plain(spec), "seed": seed, "depth": depth, "version": __version__})
+    identity = config_hash({"spec": to_plain(spec), "seed": seed, "depth": depth, "code": _code_hash()})
     earlier = _earlier(out, identity, overwrite)
     if earlier is not None:
         return {**earlier, "reused": True}
@@ -203,6 +203,12 @@ def _facts(spec: CaptureSpec, seed: int, identity: str, photos: dict[str, Any]) 
     }
 
 
+def _code_hash() -> str:
+    """What the simulator is, so that a capture of an older one is not taken for this one's."""
+    sources = sorted(Path(__file__).parent.glob("*.py"))
+    return config_hash([__version__, *(sha256_file(p) for p in sources)])
+
+
 def _camera_json(camera: Camera) -> dict[str, Any]:
     keys = ("width", "height", "fx", "fy", "cx", "cy")
     return {**{k: getattr(camera, k) for k in keys}, "cam_from_world": camera.cam_from_world.tolist()}
@@ -226,7 +232,7 @@ def _earlier(out: Path, identity: str, overwrite: bool) -> dict[str, Any] | None
         return dict(facts)
     if overwrite:
         return None
-    why = "with files changed since" if same else "of other settings"
+    why = "with files changed since" if same else "of other settings or another version"
     raise AwError(f"{out} holds a capture ({made}) {why}; add --overwrite to replace it or choose another -o")
 
 

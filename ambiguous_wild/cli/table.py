@@ -1,0 +1,65 @@
+"""`aw table`: compare runs."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+import click
+
+
+@click.command(name="table")
+@click.argument("runs", type=click.Path(path_type=Path))
+@click.option("--format", "style", type=click.Choice(["text", "markdown", "csv", "latex"]), default="text",
+              show_default=True)  # fmt: skip
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path, dir_okay=False), help="Write to a file instead."
+)
+@click.option(
+    "--metric", "metrics", multiple=True, help="Only this column; repeatable.  [default: all measured]"
+)
+@click.option("--scene", "scenes", multiple=True, help="Only this scene; repeatable.  [default: all]")
+def command(
+    runs: Path, style: str, output: Path | None, metrics: tuple[str, ...], scenes: tuple[str, ...]
+) -> None:
+    """Compare the runs below the folder RUNS: quality, cost and masks, method by method.
+
+    Means are over images, then seeds, then scenes. What is missing, failed or not comparable stands below
+    the table (for CSV: on standard error).
+
+    \b
+    aw table runs
+    aw table runs --format latex --metric psnr --metric ssim -o table.tex
+    """
+    from ambiguous_wild.harness.render_tables import RENDERERS, plain
+    from ambiguous_wild.harness.store import read_runs
+    from ambiguous_wild.harness.tables import comparison
+    from ambiguous_wild.io.atomic import write_text
+
+    table = comparison(read_runs(runs), metrics=metrics, scenes=scenes)
+    made_by = "made by: " + command_line(runs, style, metrics, scenes)
+    if style == "csv":
+        for note in (*table.notes, made_by):
+            click.echo(plain(note), err=True)
+    else:
+        table = table.with_note(made_by)
+    color = style == "text" and output is None and click.get_text_stream("stdout").isatty()
+    text = RENDERERS[style](table, color=color)
+    if output is None:
+        click.echo(text, nl=False)
+        return
+    write_text(output, text)
+    rows = len(table.blocks[0].rows)
+    click.echo(
+        f"wrote {output}: {rows} methods, {len(table.scenes)} scenes, {len(table.columns)} columns", err=True
+    )
+
+
+def command_line(runs: Path, style: str, metrics: tuple[str, ...], scenes: tuple[str, ...]) -> str:
+    """The command that makes this table again."""
+    words = ["aw", "table", str(runs)]
+    words += ["--format", style] if style != "text" else []
+    for flag, values in (("--metric", metrics), ("--scene", scenes)):
+        for value in values:
+            words += [flag, value]
+    return shlex.join(words)

@@ -113,7 +113,8 @@ def verify_files(root: Path | str, info: dict[str, Any], *, quick: bool = False)
     if wrong:
         raise AwError(
             f"{len(wrong)} of {len(files)} files of {base} are not what scene.json recorded: "
-            f"{shortlist(wrong)}; restore them, or build the scene again with 'aw build-scene PHOTOS -o SCENE --overwrite'"
+            f"{shortlist(wrong)}; restore them, or build the scene again with "
+            "'aw build-scene PHOTOS -o SCENE --overwrite'"
         )
 
 

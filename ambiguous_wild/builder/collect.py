@@ -1,0 +1,156 @@
+"""First stage: which photos there are, what they will be called, what truth lies beside them."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import unicodedata
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from ambiguous_wild.core.errors import AwError, shortlist
+from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.io.photos import PHOTO_SUFFIXES
+
+MIN_PHOTOS = 3  # two views fix no scale against a third; COLMAP's smallest useful model
+_MAX_STEM_BYTES = 120  # leaves room for prefixes of temporary files under the usual 255
+
+
+@dataclass(frozen=True)
+class Source:
+    """One photo of the capture and the name it has in the scene."""
+
+    path: Path  # absolute
+    relative: str  # to the capture folder, as reported
+    stem: str  # unique in the scene; its files are <stem>.png
+    side: Literal["train", "test"] | None  # from the sub-folder, if the capture has them
+    sha256: str
+
+    @property
+    def work_name(self) -> str:
+        """Name under which structure from motion sees the photo."""
+        return self.stem + self.path.suffix.lower()
+
+
+@dataclass(frozen=True)
+class Capture:
+    """What the user's folder holds; nothing in it is changed."""
+
+    root: Path
+    sources: tuple[Source, ...]  # natural order of their relative names
+    has_sides: bool  # train/ and test/ sub-folders
+    truth: Path | None  # truth/ of a simulated capture
+    ignored: tuple[str, ...]  # names of files that are no photos
+
+
+def collect(raw: Path | str, jobs: int = 1) -> Capture:
+    """List the photos of a capture folder: directly in it, in images/, or in train/ and test/.
+
+    Raises:
+        AwError: no folder, no photo, too few photos, or only one of train/ and test/.
+    """
+    root = Path(raw).resolve()
+    if not root.is_dir():
+        what = "is a file; give the folder of photos" if root.exists() else "does not exist"
+        raise AwError(f"capture {raw} {what}")
+    folders = _photo_folders(root)
+    files: list[tuple[Path, Literal["train", "test"] | None]] = []
+    ignored: list[str] = []
+    for folder, side in folders:
+        for path in sorted(folder.iterdir(), key=lambda p: natural_key(p.name)):
+            if path.name.startswith(".") or not path.is_file():
+                continue
+            if path.suffix.lower() in PHOTO_SUFFIXES:
+                files.append((path, side))
+            else:
+                ignored.append(path.name)
+    if len(files) < MIN_PHOTOS:
+        raise AwError(_too_few(root, len(files), ignored))
+    with ThreadPoolExecutor(jobs) as pool:
+        digests = list(pool.map(lambda item: sha256_file(item[0]), files))
+    stems = _unique_stems(files)
+    sources = tuple(
+        Source(path, path.relative_to(root).as_posix(), stem, side, digest)
+        for (path, side), stem, digest in zip(files, stems, digests)
+    )
+    truth = root / "truth"
+    return Capture(
+        root, sources, folders[0][1] is not None, truth if truth.is_dir() else None, tuple(sorted(ignored))
+    )
+
+
+def natural_key(name: str) -> list[tuple[int, int, str]]:
+    """Sort key that puts IMG_2 before IMG_10."""
+    parts = re.split(r"(\d+)", name)
+    return [(1, int(p), p) if p.isascii() and p.isdigit() else (0, 0, p.casefold()) for p in parts]
+
+
+def identical(capture: Capture) -> list[list[str]]:
+    """Groups of photos with the same bytes."""
+    groups: dict[str, list[str]] = {}
+    for source in capture.sources:
+        groups.setdefault(source.sha256, []).append(source.relative)
+    return [names for names in groups.values() if len(names) > 1]
+
+
+def _photo_folders(root: Path) -> list[tuple[Path, Literal["train", "test"] | None]]:
+    train, test = root / "train", root / "test"
+    if train.is_dir() and test.is_dir():
+        return [(train, "train"), (test, "test")]
+    if train.is_dir() or test.is_dir():
+        there, other = ("train", "test") if train.is_dir() else ("test", "train")
+        raise AwError(f"{root} has {there}/ but no {other}/: add it, or give one flat folder of photos")
+    if not _has_photos(root) and _has_photos(root / "images"):
+        return [(root / "images", None)]
+    return [(root, None)]
+
+
+def _has_photos(folder: Path) -> bool:
+    return folder.is_dir() and any(p.suffix.lower() in PHOTO_SUFFIXES for p in folder.iterdir())
+
+
+def _too_few(root: Path, count: int, ignored: list[str]) -> str:
+    known = ", ".join(s.lstrip(".") for s in PHOTO_SUFFIXES)
+    found = f"; it holds {shortlist(ignored)}" if ignored else ""
+    nested = [p.name for p in sorted(root.iterdir()) if _has_photos(p)]
+    if count == 0 and nested:
+        return f"{root} holds no photos itself, but {shortlist(nested)} does: give that folder"
+    if count == 0:
+        return f"{root} holds no photos ({known}){found}"
+    what = "one photo" if count == 1 else f"{count} photos"
+    return f"{root} holds {what}; at least {MIN_PHOTOS} that overlap are needed, 20 or more are better"
+
+
+def _unique_stems(files: list[tuple[Path, Literal["train", "test"] | None]]) -> list[str]:
+    """Scene names without spaces; where two photos share one, the side and the format tell them apart."""
+    stems = [_clean(path.stem) for path, _ in files]
+    for attempt in ("side", "suffix"):
+        seen = Counter(s.casefold() for s in stems)
+        for i, (path, side) in enumerate(files):
+            if seen[stems[i].casefold()] > 1:
+                if attempt == "side" and side:
+                    stems[i] = f"{side}_{stems[i]}"
+                elif attempt == "suffix":
+                    stems[i] = f"{stems[i]}_{path.suffix.lower().lstrip('.')}"
+    taken: set[str] = set()
+    for i, stem in enumerate(stems):  # what is left differs in case alone
+        number, free = 2, stem
+        while free.casefold() in taken:
+            free, number = f"{stem}_{number}", number + 1
+        stems[i] = free
+        taken.add(free.casefold())
+    return stems
+
+
+def _clean(stem: str) -> str:
+    """No white space (text models split on it), no control characters, not too long; letters stay."""
+    text = unicodedata.normalize("NFC", stem)
+    text = "".join("_" if c.isspace() or not c.isprintable() or c in '\\:*?"<>|' else c for c in text)
+    data = text.encode("utf-8", errors="surrogateescape")
+    if len(data) <= _MAX_STEM_BYTES:
+        return text
+    digest = hashlib.sha256(data).hexdigest()[:8]
+    return data[: _MAX_STEM_BYTES - 9].decode("utf-8", errors="ignore") + "_" + digest

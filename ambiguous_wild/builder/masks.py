@@ -1,0 +1,86 @@
+"""The user's keep masks, checked before structure from motion sees them.
+
+COLMAP drops a photo whose mask is missing without a word, and a mask of the wrong size removes most of
+its features. Both are refused here, by name. White is kept, black is ignored: COLMAP's convention and ours.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from ambiguous_wild.core.errors import AwError, shortlist
+from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.io.images import read_gray, write_png
+
+
+def find_masks(folder: Path, facts: list[dict[str, Any]], missing: str) -> dict[str, Path]:
+    """Mask file of each photo, by stem.
+
+    Looked for as COLMAP names them (`a.jpg.png`) and as `a.png`, under the photo's path in the capture
+    and directly in `folder`.
+
+    Args:
+        folder: the user's mask folder.
+        facts: screened photos.
+        missing: "error", or "keep": a photo without a mask is used whole.
+
+    Raises:
+        AwError: no such folder, photos without a mask, masks of another size.
+    """
+    if not folder.is_dir():
+        raise AwError(f"mask folder {folder} does not exist")
+    found: dict[str, Path] = {}
+    lacking, misfits = [], []
+    for fact in facts:
+        path = _candidate(folder, fact["source"])
+        if path is None:
+            lacking.append(fact["source"])
+            continue
+        height, width = read_gray(path).shape
+        if (width, height) != (fact["width"], fact["height"]):
+            misfits.append(f"{path.name} is {width}x{height} but its photo {fact['width']}x{fact['height']}")
+        found[fact["stem"]] = path
+    if misfits:
+        raise AwError(
+            f"{len(misfits)} of {len(found)} masks in {folder} have another size than their photo: "
+            f"{shortlist(misfits, 3)}; resize them without smoothing"
+        )
+    if lacking and (missing == "error" or not found):
+        raise AwError(
+            f"{len(lacking)} of {len(facts)} photos have no mask: {shortlist(lacking)}; add them under "
+            f"{folder} as NAME.png, or pass --masks-missing keep to use those photos whole"
+        )
+    return found
+
+
+def lay_out_masks(folder: Path, found: dict[str, Path], facts: list[dict[str, Any]]) -> dict[str, Any]:
+    """Write every photo's mask as COLMAP wants it, `folder/masks/<work name>.png`, strictly 0 and 255."""
+    (folder / "masks").mkdir()
+    shares = {}
+    for fact in facts:
+        path = found.get(fact["stem"])
+        if path is None:
+            mask = np.full((fact["height"], fact["width"]), 255, np.uint8)
+        else:
+            mask = np.where(read_gray(path) >= 128, 255, 0).astype(np.uint8)
+            shares[fact["stem"]] = round(float((mask > 0).mean()), 4)
+        write_png(folder / "masks" / f"{fact['work_name']}.png", mask)
+    return {"kept_share": shares}
+
+
+def mask_hashes(found: dict[str, Path]) -> dict[str, str]:
+    """sha256 of each mask file, by stem."""
+    return {stem: sha256_file(path) for stem, path in sorted(found.items())}
+
+
+def _candidate(folder: Path, source: str) -> Path | None:
+    relative = PurePosixPath(source)
+    inner = PurePosixPath(*relative.parts[1:]) if relative.parts[0] == "images" else relative
+    for base in dict.fromkeys((relative, inner, PurePosixPath(relative.name))):
+        for path in (folder / f"{base}.png", folder / base.with_suffix(".png")):
+            if path.is_file():
+                return path
+    return None

@@ -1,0 +1,49 @@
+"""One progress bar on standard error, safe to step from threads; silent where nobody watches."""
+
+from __future__ import annotations
+
+import sys
+import threading
+
+import click
+from tqdm import tqdm
+
+
+class Bar:
+    """A bar that stages restart; `enabled=False` makes every call a no-op."""
+
+    def __init__(self, enabled: bool = True) -> None:
+        self.enabled = enabled
+        self._bar: tqdm | None = None
+        self._lock = threading.Lock()
+
+    def start(self, what: str, total: int | None) -> None:
+        """Begin a bar of `total` steps; None where the number is not known."""
+        self.finish()
+        if self.enabled:
+            self._bar = tqdm(total=total, desc=what, file=sys.stderr, leave=False, disable=None)
+
+    def step(self, count: int = 1) -> None:
+        """Advance by `count`."""
+        with self._lock:
+            if self._bar is not None:
+                self._bar.update(count)
+
+    def at(self, position: int) -> None:
+        """Set the position; never moves back."""
+        with self._lock:
+            if self._bar is not None and position > self._bar.n:
+                self._bar.update(position - int(self._bar.n))
+
+    def finish(self) -> None:
+        """Close the bar."""
+        with self._lock:
+            if self._bar is not None:
+                self._bar.close()
+                self._bar = None
+
+    def say(self, text: str) -> None:
+        """A line that stays, on standard error."""
+        self.finish()
+        if self.enabled:
+            click.echo(text, err=True)

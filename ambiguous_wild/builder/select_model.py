@@ -1,0 +1,181 @@
+"""Which of COLMAP's models becomes the scene; what was lost and why; when to give up, and the reason."""
+
+from __future__ import annotations
+
+import math
+import sqlite3
+from collections import Counter
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ambiguous_wild.builder.collect import MIN_PHOTOS
+from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.io.colmap_model import Model, read_model
+from ambiguous_wild.io.safe_pycolmap import pycolmap
+
+MIN_SHARE = 0.3  # of the readable photos; below it a scene would not show the place
+_STRONG_PAIRS = 60  # looked at for the diagnosis
+_MAX_PAIR_ID = 2147483647  # COLMAP: pair id = id1 * this + id2
+
+
+@dataclass(frozen=True)
+class PairFacts:
+    """What matching found, measured on the database."""
+
+    features: float  # median a photo
+    tried: int
+    verified: int
+    inliers: float  # median over verified pairs
+    degenerate: float  # share of verified pairs that a homography explains
+    forward: float  # median |t_z| / |t| of the strongest pairs; 1 = straight along the view axis
+    angle_deg: float  # median triangulation angle of the strongest pairs
+
+    def sentence(self) -> str:
+        """The figures, for a message."""
+        text = f"median {self.features:.0f} features a photo, {self.verified} of {self.tried} pairs verified"
+        if self.verified:
+            text += f" (median {self.inliers:.0f} inliers)"
+        if math.isfinite(self.forward):
+            text += f", motion {100 * self.forward:.0f} % along the view, parallax {self.angle_deg:.1f} deg"
+        return text
+
+    def reason(self, photos: int) -> str:
+        """The likeliest cause and what to try."""
+        if self.features < 200:
+            return "too little texture or too much blur; try --max-features 8000 or sharper photos"
+        if self.verified < photos - 1:
+            return "photos overlap too little; take more photos, each sharing two thirds with the next"
+        if math.isfinite(self.forward) and self.forward > 0.8:
+            return (
+                "the camera moved straight ahead, which fixes no depth; walk sideways or round the subject, "
+                "or try --mapper global"
+            )
+        if self.degenerate > 0.8 or (math.isfinite(self.angle_deg) and self.angle_deg < 2.0):
+            return "a flat scene or a camera that only turned; move the camera between photos"
+        return "matched pairs do not chain; add photos between the ones that fail, or try --max-features 8000"
+
+
+def choose_model(folder: Path, listing: list[dict[str, Any]]) -> tuple[int, Model]:
+    """Number and content of the largest model: most photos, then most points, then the first.
+
+    Raises:
+        AwError: COLMAP found none.
+    """
+    if not listing:
+        raise AwError("no model")
+    best = max(listing, key=lambda m: (m["images"], m["points"], -m["model"]))
+    return best["model"], read_model(folder / str(best["model"]))
+
+
+def check_registered(
+    listing: list[dict[str, Any]], photos: int, skipped: int, database: Path, matches: dict[str, Any]
+) -> None:
+    """Refuse a reconstruction that holds too few photos to be a scene.
+
+    Raises:
+        AwError: how many of how many, the figures, the likely reason, what to try.
+    """
+    registered = max((m["images"] for m in listing), default=0)
+    needed = max(MIN_PHOTOS, math.ceil(MIN_SHARE * photos))
+    if registered >= needed:
+        return
+    facts = pair_facts(database, matches["pairs"])
+    others = sum(m["images"] for m in listing) - registered
+    split = f" ({others} more in {len(listing) - 1} other models)" if len(listing) > 1 else ""
+    unread = f", {skipped} could not be read" if skipped else ""
+    raise AwError(
+        f"structure from motion placed {registered} of {photos} photos{split}{unread}; a scene needs "
+        f"{needed}: {facts.sentence()}; likely {facts.reason(photos)}"
+    )
+
+
+def pair_facts(database: Path, tried: int) -> PairFacts:
+    """Measure features, matches and motion between the strongest pairs."""
+    with closing(sqlite3.connect(database)) as db:
+        features = [r[0] for r in db.execute("SELECT rows FROM keypoints")]
+        pairs = db.execute(
+            "SELECT pair_id, rows, config FROM two_view_geometries WHERE rows > 0 ORDER BY rows DESC, pair_id"
+        ).fetchall()
+    # 4, 5, 6: planar, panoramic, planar or panoramic in COLMAP's TwoViewGeometry
+    degenerate = float(np.mean([config in (4, 5, 6) for _, _, config in pairs])) if pairs else math.nan
+    forward, angles = _motion(database, [pair_id for pair_id, _, _ in pairs[:_STRONG_PAIRS]])
+    return PairFacts(
+        features=float(np.median(features)) if features else 0.0,
+        tried=tried,
+        verified=len(pairs),
+        inliers=float(np.median([rows for _, rows, _ in pairs])) if pairs else 0.0,
+        degenerate=degenerate,
+        forward=float(np.median(forward)) if forward else math.nan,
+        angle_deg=float(np.median(angles)) if angles else math.nan,
+    )
+
+
+def lost_photos(
+    facts: list[dict[str, Any]],
+    chosen: Model,
+    others: dict[int, Model],
+    database: Path,
+    features: dict[str, int],
+) -> list[dict[str, str]]:
+    """Why each readable photo is not in the scene."""
+    inside = {image.name for image in chosen.images.values()}
+    elsewhere = {i.name: number for number, model in others.items() for i in model.images.values()}
+    partners = _partners(database, inside)
+    lost = []
+    for fact in facts:
+        name = fact["work_name"]
+        if name in inside:
+            continue
+        if name in elsewhere:
+            size = len(others[elsewhere[name]].images)
+            reason = f"in another model of {size} photos that nothing joins to this one"
+        elif features.get(name, 0) < 50:
+            reason = f"only {features.get(name, 0)} features"
+        elif not partners[name]:
+            reason = "no matches with the photos of the scene"
+        else:
+            reason = f"matches {partners[name]} photos of the scene, too weakly to be placed"
+        lost.append({"source": fact["source"], "reason": reason})
+    return lost
+
+
+def _partners(database: Path, inside: set[str]) -> Counter[str]:
+    """How many photos of the scene each photo has a verified pair with."""
+    counts: Counter[str] = Counter()
+    with closing(sqlite3.connect(database)) as db:
+        names = dict(db.execute("SELECT image_id, name FROM images").fetchall())
+        pairs = db.execute("SELECT pair_id FROM two_view_geometries WHERE rows > 0").fetchall()
+    for (pair_id,) in pairs:
+        first, second = (names[i] for i in divmod(pair_id, _MAX_PAIR_ID))
+        counts[first] += second in inside
+        counts[second] += first in inside
+    return counts
+
+
+def _motion(database: Path, pair_ids: list[int]) -> tuple[list[float], list[float]]:
+    """|t_z| / |t| and triangulation angle in degrees for the pairs a relative pose can be found for."""
+    forward, angles = [], []
+    db = pycolmap.Database.open(str(database))
+    try:
+        for pair_id in pair_ids:
+            first, second = (db.read_image(i) for i in divmod(pair_id, _MAX_PAIR_ID))
+            geometry = db.read_two_view_geometry(first.image_id, second.image_id)
+            points = [db.read_keypoints(i.image_id)[:, :2].astype(np.float64) for i in (first, second)]
+            cameras = [db.read_camera(i.camera_id) for i in (first, second)]
+            posed = pycolmap.estimate_two_view_geometry_pose(
+                cameras[0], points[0], cameras[1], points[1], geometry
+            )
+            if not posed or geometry.cam2_from_cam1 is None:
+                continue
+            translation = np.asarray(geometry.cam2_from_cam1.translation)
+            length = float(np.linalg.norm(translation))
+            if length > 0:
+                forward.append(abs(float(translation[2])) / length)
+                angles.append(math.degrees(geometry.tri_angle))
+    finally:
+        db.close()
+    return forward, angles

@@ -1,0 +1,37 @@
+"""Every setting of a build, one frozen dataclass; what it holds is what scene.json records."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from ambiguous_wild.core.errors import AwError
+
+CameraMode = Literal["auto", "single", "per-image"]
+Matcher = Literal["auto", "exhaustive", "sequential"]
+Mapper = Literal["incremental", "global"]
+
+
+@dataclass(frozen=True)
+class BuildSettings:
+    """Settings of `build_scene`; nothing here changes with the machine."""
+
+    factor: int | None = None  # downsampling; None: of 1, 2, 4, 8 the one that leaves just over 480 px
+    camera: CameraMode = "auto"  # auto: one camera if EXIF and size agree, else one per photo
+    matcher: Matcher = "auto"  # auto: exhaustive up to 200 photos, sequential above
+    mapper: Mapper = "incremental"  # global is faster on many photos, weaker on few
+    max_features: int = 3000  # SIFT features a photo
+    max_side: int = 1600  # px; photos are reduced to this for SIFT only
+    seed: int = 0  # of every random choice inside COLMAP
+    masks_missing: Literal["error", "keep"] = "error"  # a photo without a mask: refuse, or use it whole
+    strict: bool = False  # refuse the capture if one photo cannot be read
+    name: str = ""  # of the scene; empty: the output folder's name
+    license: str = ""  # of the photos, as the user states it
+
+    def __post_init__(self) -> None:
+        if self.factor is not None and not 1 <= self.factor <= 64:
+            raise AwError(f"--factor must be between 1 and 64, got {self.factor}")
+        if self.max_features < 100:
+            raise AwError(f"--max-features must be at least 100 to match anything, got {self.max_features}")
+        if not 0 <= self.seed < 2**31:
+            raise AwError(f"--seed must be between 0 and 2147483647, got {self.seed}")

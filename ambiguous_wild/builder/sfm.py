@@ -1,0 +1,216 @@
+"""Structure from motion: three stages (features, matches, mapping), each in a process of its own."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from ambiguous_wild.builder.pairs import EXHAUSTIVE_LIMIT, sequential_pairs
+from ambiguous_wild.builder.progress import Bar
+from ambiguous_wild.builder.settings import BuildSettings
+from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.io.atomic import write_json
+
+LOG = "colmap.log"
+DATABASE = "database.db"
+_POLL_S = 0.25
+
+
+class SfmCrash(AwError):
+    """COLMAP ended without a result; the work folder stays, so the same command goes on from there."""
+
+
+def choose_camera(photos: list[dict[str, Any]], wanted: str) -> str:
+    """ "single" or "per-image".
+
+    One camera needs one size and, where EXIF speaks, one model and one focal length. Photos without any
+    EXIF and of one size count as frames of one camera; internet photos differ in size.
+    """
+    if wanted != "auto":
+        return wanted
+    kinds = {
+        (p["width"], p["height"], p["camera"], p["exif"].get("focal_mm"), p["exif"].get("focal_35mm"))
+        for p in photos
+    }
+    return "single" if len(kinds) == 1 else "per-image"
+
+
+def choose_matcher(count: int, wanted: str) -> str:
+    """ "exhaustive" or "sequential"."""
+    if wanted != "auto":
+        return wanted
+    return "exhaustive" if count <= EXHAUSTIVE_LIMIT else "sequential"
+
+
+def extract_features(
+    folder: Path,
+    photos: Path,
+    facts: list[dict[str, Any]],
+    settings: BuildSettings,
+    jobs: int,
+    camera: str,
+    masks: Path | None,
+    bar: Bar,
+) -> dict[str, Any]:
+    """SIFT features of every photo into `folder/database.db`.
+
+    Returns:
+        Facts: the camera mode and the number of features of each photo.
+    """
+    database = folder / DATABASE
+    bar.start("features", len(facts))
+    job = {
+        "task": "features",
+        "database": str(database),
+        "photos": str(photos),
+        "names": [f["work_name"] for f in facts],
+        "camera": camera,
+        "masks": str(masks) if masks else None,
+        "max_features": settings.max_features,
+        "max_side": settings.max_side,
+        "seed": settings.seed,
+        "jobs": jobs,
+    }
+    _run(job, folder, lambda: bar.at(_count(database, "keypoints")))
+    bar.finish()
+    with closing(sqlite3.connect(database)) as db:
+        rows = db.execute(
+            "SELECT images.name, keypoints.rows FROM images LEFT JOIN keypoints USING (image_id)"
+        ).fetchall()
+    features = {name: int(count or 0) for name, count in rows}
+    lost = [f["source"] for f in facts if f["work_name"] not in features]
+    if lost:
+        raise SfmCrash(
+            f"COLMAP dropped {len(lost)} photos without a word, the first is {lost[0]}; see --keep-work"
+        )
+    return {"camera": camera, "features": features}
+
+
+def match(
+    folder: Path,
+    features: Path,
+    facts: list[dict[str, Any]],
+    settings: BuildSettings,
+    jobs: int,
+    matcher: str,
+    bar: Bar,
+) -> dict[str, Any]:
+    """Match and verify on a copy of the features' database.
+
+    Returns:
+        Facts: pairs tried, pairs verified, their inliers.
+    """
+    database = folder / DATABASE
+    shutil.copyfile(features / DATABASE, database)
+    names = [f["work_name"] for f in facts]
+    test_names = [f["work_name"] for f in facts if f["side"] == "test"]
+    if matcher == "exhaustive":
+        pairs = len(names) * (len(names) - 1) // 2
+    else:
+        pairs = len(sequential_pairs(names, set(test_names)))
+    bar.start("matching pairs", pairs)
+    job = {
+        "task": "matches",
+        "database": str(database),
+        "names": names,
+        "test_names": test_names,
+        "matcher": matcher,
+        "seed": settings.seed,
+        "jobs": jobs,
+    }
+    _run(job, folder, lambda: bar.at(_count(database, "two_view_geometries")))
+    bar.finish()
+    with closing(sqlite3.connect(database)) as db:
+        inliers = [r[0] for r in db.execute("SELECT rows FROM two_view_geometries WHERE rows > 0")]
+    return {"matcher": matcher, "pairs": pairs, "verified": len(inliers)}
+
+
+def map_scene(
+    folder: Path, matches: Path, photos: Path, count: int, settings: BuildSettings, bar: Bar
+) -> dict[str, Any]:
+    """Build the models into `folder/0`, `folder/1`, ...
+
+    Returns:
+        Facts: one row a model: images, points, mean reprojection error in px.
+    """
+    progress = folder / "progress"
+    bar.start("placing photos", count if settings.mapper == "incremental" else None)
+    database = folder / DATABASE
+    shutil.copyfile(matches / DATABASE, database)  # the mapper may write to it
+    job = {
+        "task": "mapping",
+        "database": str(database),
+        "photos": str(photos),
+        "output": str(folder),
+        "progress": str(progress),
+        "mapper": settings.mapper,
+        "seed": settings.seed,
+    }
+    _run(job, folder, lambda: bar.at(_number(progress)))
+    bar.finish()
+    database.unlink()
+    progress.unlink(missing_ok=True)
+    listing = json.loads((folder / "models.json").read_text(encoding="utf-8"))
+    return {"models": listing}
+
+
+def _run(job: dict[str, Any], folder: Path, watch: Callable[[], None]) -> None:
+    """Run one task of the worker; `watch` is called while it runs."""
+    write_json(folder / "job.json", job)
+    log = folder / LOG
+    with open(log, "ab") as sink:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "ambiguous_wild.builder.sfm_worker", str(folder / "job.json")],
+            stdin=subprocess.DEVNULL,
+            stdout=sink,
+            stderr=sink,
+        )
+        try:
+            while True:
+                try:
+                    code = process.wait(_POLL_S)
+                    break
+                except subprocess.TimeoutExpired:
+                    watch()
+        finally:
+            if process.poll() is None:
+                process.kill()
+                process.wait()
+    (folder / "job.json").unlink()
+    if code != 0:
+        kept = folder.parent / LOG
+        shutil.copyfile(log, kept)
+        raise SfmCrash(
+            f"COLMAP ended with code {code} while computing {job['task']}: {_last_line(log)} (log: {kept}); "
+            "the same command continues before this step"
+        )
+
+
+def _last_line(log: Path) -> str:
+    lines = [s for s in log.read_text(encoding="utf-8", errors="replace").splitlines() if s.strip()]
+    return lines[-1][-200:] if lines else "it says nothing"
+
+
+def _count(database: Path, table: str) -> int:
+    """Rows of a table another process is writing; 0 while it is locked or not there yet."""
+    if not database.is_file():
+        return 0
+    try:
+        with closing(sqlite3.connect(f"file:{database}?mode=ro", uri=True, timeout=0)) as db:
+            return int(db.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
+    except sqlite3.Error:
+        return 0
+
+
+def _number(path: Path) -> int:
+    try:
+        return int(path.read_text())
+    except (OSError, ValueError):
+        return 0

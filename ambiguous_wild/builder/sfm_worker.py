@@ -1,0 +1,146 @@
+"""Structure from motion in a process of its own: `python -m ambiguous_wild.builder.sfm_worker JOB.json`.
+
+COLMAP is noisy, cannot be interrupted from Python and may crash; apart from the command it can do all
+three. Every seed is fixed. Features and matches repeat with any number of threads; bundle adjustment
+sums in the order of its threads, so mapping runs on one (measured on 40 photos: 11.5 s on one thread,
+12.0-14.4 s on two, and the same bits each time on one alone).
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+from ambiguous_wild.builder.pairs import sequential_pairs
+from ambiguous_wild.io.atomic import write_json
+from ambiguous_wild.io.safe_pycolmap import pycolmap
+
+_MIN_MODEL = 3  # images; smaller models are not reported
+_PR_SET_PDEATHSIG = 1
+
+
+def run_features(job: dict[str, Any]) -> None:
+    """SIFT on the CPU into a new database, then cameras."""
+    options = pycolmap.FeatureExtractionOptions()
+    options.use_gpu = False
+    options.num_threads = job["jobs"]
+    options.max_image_size = job["max_side"]
+    options.sift.max_num_features = job["max_features"]
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = "SIMPLE_RADIAL"
+    if job["masks"]:
+        reader.mask_path = job["masks"]
+    single = job["camera"] == "single"
+    pycolmap.extract_features(
+        job["database"],
+        job["photos"],
+        image_names=job["names"],
+        camera_mode=pycolmap.CameraMode.SINGLE if single else pycolmap.CameraMode.PER_IMAGE,
+        reader_options=reader,
+        extraction_options=options,
+    )
+
+
+def run_matches(job: dict[str, Any]) -> None:
+    """Match and verify pairs: all, or neighbours in order plus every test photo against all."""
+    options = pycolmap.FeatureMatchingOptions()
+    options.use_gpu = False
+    options.num_threads = job["jobs"]
+    verify = pycolmap.TwoViewGeometryOptions()
+    verify.ransac.random_seed = job["seed"]
+    if job["matcher"] == "exhaustive":
+        pycolmap.match_exhaustive(job["database"], matching_options=options, verification_options=verify)
+        return
+    listed = Path(job["database"]).with_name("pairs.txt")
+    pairs = sequential_pairs(job["names"], set(job["test_names"]))
+    listed.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="utf-8")
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = str(listed)
+    pycolmap.match_image_pairs(
+        job["database"], matching_options=options, pairing_options=pairing, verification_options=verify
+    )
+
+
+def run_mapping(job: dict[str, Any]) -> None:
+    """Build every model COLMAP finds; `models.json` lists them."""
+    output = Path(job["output"])
+    if job["mapper"] == "global":
+        models = _map_globally(job, output)
+    else:
+        models = _map_incrementally(job, output)
+    listing = []
+    for number, model in sorted(models.items()):
+        folder = output / str(number)
+        folder.mkdir(exist_ok=True)
+        model.write(str(folder))
+        listing.append(
+            {
+                "model": number,
+                "images": model.num_reg_images(),
+                "points": model.num_points3D(),
+                "error_px": round(model.compute_mean_reprojection_error(), 4),
+                "track_length": round(model.compute_mean_track_length(), 3),
+            }
+        )
+    write_json(output / "models.json", listing)
+
+
+def _map_incrementally(job: dict[str, Any], output: Path) -> dict[int, Any]:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = 1
+    options.ba_min_num_residuals_for_cpu_multi_threading = 10**9
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = job["seed"]
+    options.min_model_size = _MIN_MODEL
+    counter = Path(job["progress"])
+    state = {"best": 0, "now": 0}
+
+    def first() -> None:
+        state["now"] = 2
+
+    def following() -> None:
+        # A second model starts again at two: the bar shows the best so far.
+        state["now"] += 1
+        state["best"] = max(state["best"], state["now"])
+        counter.write_text(str(state["best"]))
+
+    return pycolmap.incremental_mapping(
+        job["database"],
+        job["photos"],
+        str(output),
+        options=options,
+        initial_image_pair_callback=first,
+        next_image_callback=following,
+    )
+
+
+def _map_globally(job: dict[str, Any], output: Path) -> dict[int, Any]:
+    options = pycolmap.GlobalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = 1
+    options.random_seed = options.mapper.random_seed = job["seed"]
+    options.mapper.rotation_averaging.random_seed = job["seed"]
+    options.mapper.global_positioning.random_seed = job["seed"]
+    options.mapper.global_positioning.use_gpu = False
+    options.mapper.retriangulation.random_seed = job["seed"]
+    adjustment = options.mapper.bundle_adjustment.ceres
+    adjustment.use_gpu = False
+    adjustment.min_num_residuals_for_cpu_multi_threading = 10**9
+    options.min_model_size = _MIN_MODEL
+    return pycolmap.global_mapping(job["database"], job["photos"], str(output), options=options)
+
+
+def main() -> None:
+    """Read the job file and run its task."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides, and ends this process
+    if sys.platform == "linux":  # no orphan keeps both cores busy after a kill of the parent
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    job = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
+    pycolmap.set_random_seed(job["seed"])
+    {"features": run_features, "matches": run_matches, "mapping": run_mapping}[job["task"]](job)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,79 @@
+"""Which photos train and which test: always lists of names."""
+
+from __future__ import annotations
+
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from ambiguous_wild.core.errors import AwError, shortlist, unknown
+from ambiguous_wild.io.scene_folder import TEST_EVERY, read_list
+
+
+def split_photos(
+    facts: list[dict[str, Any]], registered: set[str], test_stems: set[str] | None
+) -> tuple[list[str], list[str], str, list[str]]:
+    """Names of the training and the test photos.
+
+    Args:
+        facts: screened photos.
+        registered: stems in the model.
+        test_stems: from the user's test list, or None.
+
+    Returns:
+        (train, test, how the split came about, warnings); names are ``<stem>.png``, sorted.
+
+    Raises:
+        AwError: no training photo, or a test set of which nothing was placed.
+    """
+    inside = sorted(f["stem"] for f in facts if f["stem"] in registered)
+    warnings = []
+    if test_stems is not None:
+        how, test = "list", [s for s in inside if s in test_stems]
+        wanted = len(test_stems)
+    elif any(f["side"] for f in facts):
+        sides = {f["stem"]: f["side"] for f in facts}
+        how, test = "folders", [s for s in inside if sides[s] == "test"]
+        wanted = sum(f["side"] == "test" for f in facts)
+    else:
+        how, test = f"every-{TEST_EVERY}", inside[::TEST_EVERY]
+        wanted = len(test)
+        warnings.append(
+            f"no test set given, so every {TEST_EVERY}th photo tests: if those hold distractors, the "
+            "scores reward painting them; give clean photos in test/, or --test-list FILE"
+        )
+    train = sorted(set(inside) - set(test))
+    if wanted and not test:
+        raise AwError(
+            f"none of the {wanted} test photos could be placed among the training photos: they show "
+            "another place or too little overlap; take them nearer to the training views"
+        )
+    if len(train) < 2:
+        raise AwError(f"only {len(train)} training photos could be placed; a scene needs at least 2")
+    if len(test) < wanted:
+        warnings.append(f"{wanted - len(test)} of {wanted} test photos are lost: scores cover {len(test)}")
+    return [f"{s}.png" for s in train], [f"{s}.png" for s in test], how, warnings
+
+
+def read_test_list(path: Path, facts: list[dict[str, Any]]) -> set[str]:
+    """Stems of the photos a test list names: by path in the capture, by name, or without extension.
+
+    Raises:
+        AwError: the file cannot be read, or names what is no photo of the capture.
+    """
+    try:
+        names = read_list(path)
+    except (OSError, UnicodeDecodeError) as error:
+        raise AwError(f"cannot read the test list {path}: {error}") from error
+    known: dict[str, str] = {}
+    for fact in facts:
+        source = PurePosixPath(fact["source"])
+        for key in (str(source), source.name, source.stem, fact["stem"], fact["stem"] + ".png"):
+            known.setdefault(key, fact["stem"])
+    strangers = [n for n in names if n not in known]
+    if len(strangers) == 1:
+        raise unknown(f"photo in {path}", strangers[0], (f["source"] for f in facts))
+    if strangers:
+        raise AwError(f"{path} names {len(strangers)} photos that are not there: {shortlist(strangers)}")
+    if not names:
+        raise AwError(f"{path} is empty; list test photos one a line, or leave out --test-list")
+    return {known[n] for n in names}

@@ -1,0 +1,141 @@
+"""Photos, masks and truth brought to pinhole cameras, all by one map a camera.
+
+The pinhole camera is COLMAP's choice (no blank pixels); the resampling is ours, so that masks (nearest)
+and photos (bicubic, in one pass, without another JPEG) go through the same map.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from ambiguous_wild.builder.progress import Bar
+from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.io import colmap_binary
+from ambiguous_wild.io.colmap_model import Model, ModelCamera, ModelImage
+from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
+from ambiguous_wild.io.safe_pycolmap import pycolmap
+
+TRUTH_PARTS = ("distractor", "clean")
+
+
+@dataclasses.dataclass(frozen=True)
+class Lens:
+    """A distorted camera, its pinhole replacement, and the map between their pixels."""
+
+    camera: Any  # pycolmap.Camera
+    pinhole: ModelCamera
+    map_xy: tuple[np.ndarray, np.ndarray]  # [H, W] float32 each: source pixel index of every pixel
+
+    def remap(self, image: np.ndarray, *, nearest: bool) -> np.ndarray:
+        """[H, W] or [H, W, 3] of the distorted camera, as the pinhole camera sees it."""
+        how = cv2.INTER_NEAREST if nearest else cv2.INTER_CUBIC
+        # Reflection only fills the half pixel the map may reach over the border.
+        return cv2.remap(image, *self.map_xy, how, borderMode=cv2.BORDER_REFLECT_101)
+
+    def undistort_points(self, xys: np.ndarray) -> np.ndarray:
+        """[K, 2] px of the distorted camera to px of the pinhole camera."""
+        if not len(xys):
+            return xys
+        fx, fy, cx, cy = self.pinhole.pinhole()
+        rays = np.asarray(self.camera.cam_from_img(np.ascontiguousarray(xys)))
+        return rays * [fx, fy] + [cx, cy]
+
+
+def make_lens(camera: ModelCamera) -> Lens:
+    """Choose the pinhole camera and compute the map; source: COLMAP's undistort_camera."""
+    lens = pycolmap.Camera(
+        model=camera.model, width=camera.width, height=camera.height, params=list(camera.params)
+    )
+    flat = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), lens)
+    pinhole = ModelCamera(
+        camera.camera_id, "PINHOLE", flat.width, flat.height, tuple(float(v) for v in flat.params)
+    )
+    fx, fy, cx, cy = pinhole.pinhole()
+    u, v = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
+    rays = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones_like(u)], axis=-1).reshape(-1, 3)
+    source = np.asarray(lens.img_from_cam(rays)).reshape(pinhole.height, pinhole.width, 2) - 0.5
+    return Lens(lens, pinhole, (source[..., 0].astype(np.float32), source[..., 1].astype(np.float32)))
+
+
+def undistort(
+    folder: Path,
+    model: Model,
+    facts: list[dict[str, Any]],
+    read: Callable[[dict[str, Any]], np.ndarray],
+    masks: Path | None,
+    truth: Path | None,
+    *,
+    jobs: int,
+    bar: Bar,
+) -> dict[str, Any]:
+    """Write `images/`, `masks/`, `truth/` at full size and `sparse/0` of the registered photos.
+
+    Args:
+        folder: of the stage.
+        model: the chosen model, named by work names.
+        facts: screened photos.
+        read: gives a photo's pixels, [H, W, 3] uint8, upright.
+        masks: folder of `<work name>.png`, or None.
+        truth: the capture's truth folder, or None.
+        jobs: threads.
+        bar: progress.
+
+    Returns:
+        Facts: how many photos have which part of the truth.
+    """
+    by_name = {f["work_name"]: f for f in facts}
+    lenses: dict[int, Lens] = {}
+    shared = len(model.cameras) < len(model.images)
+    if shared:
+        lenses = {number: make_lens(camera) for number, camera in model.cameras.items()}
+    bar.start("undistorting", len(model.images))
+
+    def one(image: ModelImage) -> tuple[ModelImage, ModelCamera, list[str]]:
+        fact = by_name[image.name]
+        lens = lenses[image.camera_id] if shared else make_lens(model.cameras[image.camera_id])
+        name = fact["stem"] + ".png"
+        write_png(folder / "images" / name, lens.remap(read(fact), nearest=False))
+        if masks is not None:
+            mask = read_gray(masks / f"{image.name}.png")
+            write_png(folder / "masks" / name, lens.remap(mask, nearest=True))
+        parts = _truth(folder, lens, fact, truth) if truth is not None else []
+        bar.step()
+        flat = dataclasses.replace(image, name=name, xys=lens.undistort_points(image.xys))
+        return flat, lens.pinhole, parts
+
+    with ThreadPoolExecutor(jobs) as pool:
+        done = list(pool.map(one, model.images.values()))
+    bar.finish()
+    sparse = folder / "sparse" / "0"
+    colmap_binary.write_cameras(sparse / "cameras.bin", {c.camera_id: c for _, c, _ in done}.values())
+    colmap_binary.write_images(sparse / "images.bin", [image for image, _, _ in done])
+    colmap_binary.write_points(sparse / "points3D.bin", model.points)
+    found = {part: sum(part in parts for _, _, parts in done) for part in TRUTH_PARTS}
+    return {"truth": found if truth is not None else None}
+
+
+def _truth(folder: Path, lens: Lens, fact: dict[str, Any], truth: Path) -> list[str]:
+    """The truth of one photo: the distractor mask by nearest pixel, the clean view like the photo."""
+    original = fact["source"].rsplit("/", 1)[-1].rsplit(".", 1)[0]
+    found = []
+    for part in TRUTH_PARTS:
+        path = truth / part / f"{original}.png"
+        if not path.is_file():
+            continue
+        pixels = read_gray(path) if part == "distractor" else read_png_rgb(path)
+        if pixels.shape[:2] != (fact["height"], fact["width"]):
+            raise AwError(
+                f"{path} is {pixels.shape[1]}x{pixels.shape[0]} but its photo "
+                f"{fact['width']}x{fact['height']}: the truth belongs to another capture; remove truth/ or simulate again"
+            )
+        flat = lens.remap(pixels, nearest=part == "distractor")
+        write_png(folder / "truth" / part / f"{fact['stem']}.png", flat)
+        found.append(part)
+    return found

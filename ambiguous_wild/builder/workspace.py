@@ -1,0 +1,108 @@
+"""The hidden work folder of a build: one folder a stage, whole or absent, so that a kill costs one stage.
+
+A stage's folder carries a key: the hash of its inputs, its settings, the code's version and the keys
+of the stages it reads. A changed setting changes the keys after it and nothing before it.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.io.atomic import atomic_dir, write_json
+
+_RESULT = "stage.json"
+
+
+def content_key(*parts: Any) -> str:
+    """sha256 of the parts as canonical JSON, 64 hex digits."""
+    text = json.dumps(parts, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode("utf-8", errors="surrogateescape")).hexdigest()
+
+
+@dataclass(frozen=True)
+class StageResult:
+    """A finished stage: where its files are, what it found, what it took."""
+
+    name: str
+    key: str
+    folder: Path
+    facts: dict[str, Any]
+    seconds: float
+    reused: bool
+
+
+class Workspace:
+    """Runs stages inside one folder and remembers the finished ones."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.results: list[StageResult] = []
+        root.mkdir(parents=True, exist_ok=True)
+        for leftover in root.glob(".*.tmp-*"):  # a stage that was killed
+            shutil.rmtree(leftover, ignore_errors=True)
+
+    def run(self, name: str, inputs: Any, work: Callable[[Path], dict[str, Any]]) -> StageResult:
+        """Run `work(folder)` unless its result is there already.
+
+        Args:
+            name: of the stage; part of its folder's name.
+            inputs: plain data that decides the result: settings, hashes, keys of earlier stages.
+            work: fills the folder and returns facts, JSON-able.
+        """
+        key = content_key(name, inputs)
+        folder = self.root / f"{name}-{key[:16]}"
+        reused = (folder / _RESULT).is_file()
+        if not reused:
+            started = time.perf_counter()
+            with atomic_dir(folder) as temporary:
+                facts = work(temporary)
+                spent = round(time.perf_counter() - started, 3)
+                write_json(temporary / _RESULT, {"facts": facts, "seconds": spent})
+        stored = json.loads((folder / _RESULT).read_text(encoding="utf-8"))
+        result = StageResult(name, key, folder, stored["facts"], stored["seconds"], reused)
+        self.results.append(result)
+        return result
+
+    def remove(self) -> None:
+        """Delete the work folder and everything in it."""
+        shutil.rmtree(self.root, ignore_errors=True)
+
+
+@contextmanager
+def build_lock(target: Path) -> Iterator[None]:
+    """Hold the right to build `target`; another process that tries is told who has it.
+
+    Raises:
+        AwError: somebody else is building the same folder.
+    """
+    path = target.parent / f".{target.name}.lock"
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        handle = open(path, "a+", encoding="utf-8")  # noqa: SIM115  closed below, held meanwhile
+    except OSError as error:
+        raise AwError(f"cannot write beside {target}: {error.strerror}; choose another -o") from error
+    with handle:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            handle.seek(0)
+            holder = handle.read().strip() or "another process"
+            raise AwError(f"{target} is being built by {holder}; wait for it or choose another -o") from None
+        handle.truncate(0)
+        handle.write(f"process {os.getpid()} since {time.strftime('%H:%M:%S')}")
+        handle.flush()
+        try:
+            yield
+        finally:
+            path.unlink(missing_ok=True)

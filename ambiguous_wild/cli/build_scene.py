@@ -1,0 +1,129 @@
+"""`aw build-scene`: photos in, scene out."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+
+@click.command("build-scene")
+@click.argument("raw", type=click.Path(path_type=Path))
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="Scene folder to make.")
+@click.option("--factor", type=int, help="Downsampling; default: of 1, 2, 4, 8 what leaves just over 480 px.")
+@click.option(
+    "--camera", type=click.Choice(["auto", "single", "per-image"]), default="auto", show_default=True
+)
+@click.option(
+    "--matcher", type=click.Choice(["auto", "exhaustive", "sequential"]), default="auto", show_default=True
+)
+@click.option(
+    "--mapper", type=click.Choice(["incremental", "global"]), default="incremental", show_default=True
+)
+@click.option("--max-features", type=int, default=3000, show_default=True, help="SIFT features a photo.")
+@click.option(
+    "--masks", type=click.Path(path_type=Path), help="Keep masks, white = keep: a.png or a.jpg.png."
+)
+@click.option(
+    "--masks-missing",
+    type=click.Choice(["error", "keep"]),
+    default="error",
+    show_default=True,
+    help="A photo without a mask: refuse, or use it whole.",
+)
+@click.option("--test-list", type=click.Path(path_type=Path), help="File naming the test photos, one a line.")
+@click.option("--strict", is_flag=True, help="Refuse the capture if one photo cannot be read.")
+@click.option("--jobs", type=click.IntRange(min=1), help="Threads; the result does not depend on it.")
+@click.option("--seed", type=int, default=0, show_default=True)
+@click.option("--name", default="", help="Name of the scene; default: the output folder's.")
+@click.option("--license", "license_", default="", help="Licence of the photos, recorded in scene.json.")
+@click.option("--overwrite", is_flag=True, help="Replace a scene built from something else.")
+@click.option("--keep-work", is_flag=True, help="Leave the work folder: every stage, COLMAP's log.")
+@click.option("--json", "as_json", is_flag=True, help="Print the same facts as JSON.")
+def command(
+    raw: Path,
+    output: Path,
+    factor: int | None,
+    camera: str,
+    matcher: str,
+    mapper: str,
+    max_features: int,
+    masks: Path | None,
+    masks_missing: str,
+    test_list: Path | None,
+    strict: bool,
+    jobs: int | None,
+    seed: int,
+    name: str,
+    license_: str,
+    overwrite: bool,
+    keep_work: bool,
+    as_json: bool,
+) -> None:
+    """Make a scene from the photos in RAW: check, COLMAP, undistort, downsample, split.
+
+    RAW holds photos directly, in images/, or in train/ and test/ (clean photos for testing). Nothing in
+    it is changed. Killed at any moment, the same command continues.
+    """
+    from ambiguous_wild.builder import report
+    from ambiguous_wild.builder.pipeline import build_scene
+    from ambiguous_wild.builder.settings import BuildSettings
+    from ambiguous_wild.core.config import from_plain
+    from ambiguous_wild.io.images import image_size
+
+    settings = from_plain(
+        BuildSettings,
+        {
+            "factor": factor,
+            "camera": camera,
+            "matcher": matcher,
+            "mapper": mapper,
+            "max_features": max_features,
+            "seed": seed,
+            "masks_missing": masks_missing,
+            "strict": strict,
+            "name": name,
+            "license": license_,
+        },
+    )
+    result = build_scene(
+        raw,
+        output,
+        settings,
+        masks=masks,
+        test_list=test_list,
+        overwrite=overwrite,
+        keep_work=keep_work,
+        jobs=jobs,
+        progress=True,
+    )
+    info = result.info
+    first = next(iter(sorted((result.scene / info["images"]).iterdir())))
+    size = image_size(first)
+    verdict = report.verdict(info, size, output)
+    if as_json:
+        click.echo(json.dumps(_facts(result, size, verdict), indent=2, ensure_ascii=False))
+        return
+    if result.up_to_date:
+        click.echo(f"{output} is up to date")
+    for line in report.lines(info):
+        click.echo(line)
+    if not result.up_to_date:
+        spent = ", ".join(f"{stage} {s:.1f}" for stage, s in info["seconds"].items())
+        click.echo(f"{result.seconds:.1f} s ({spent}; COLMAP {100 * report.sfm_share(info):.0f} %)")
+    click.echo(verdict)
+
+
+def _facts(result, size: tuple[int, int], verdict: str) -> dict:
+    """scene.json without its long lists, and what this call did."""
+    long = ("files", "photos", "inputs")
+    return {
+        "scene": str(result.scene),
+        "up_to_date": result.up_to_date,
+        "wall_seconds": round(result.seconds, 3),
+        "reused_stages": list(result.reused),
+        "size": list(size),
+        "verdict": verdict,
+        **{k: v for k, v in result.info.items() if k not in long},
+    }

@@ -1,0 +1,197 @@
+"""Photos as people take them: every format, orientation and defect a capture may hold.
+
+Reading goes through OpenImageIO. What comes out is always upright 8-bit RGB; what cannot be read is
+refused with the reason.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.io.exif import Exif, exif_from_spec
+
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".jp2", ".heic", ".heif")
+MAX_PIXELS = 120_000_000  # above the largest sensors in use (108 Mpx phones, 102 Mpx cameras)
+MIN_SIDE = 16  # px; nothing can be matched in less
+
+_FORMAT_OF_SUFFIX = {".jpg": "jpeg", ".jpeg": "jpeg", ".tif": "tiff", ".jp2": "jpeg2000", ".heif": "heic"}
+
+
+class UnreadablePhoto(AwError):
+    """One photo that cannot be used; `reason` is the part of the message after the name."""
+
+    def __init__(self, path: Path | str, reason: str) -> None:
+        super().__init__(f"{path}: {reason}")
+        self.reason = reason
+
+
+@dataclass(frozen=True)
+class Photo:
+    """What one photo file holds, upright."""
+
+    path: Path
+    format: str  # by content: "jpeg", "png", ...
+    width: int  # px, after EXIF orientation
+    height: int  # px, after EXIF orientation
+    exif: Exif
+    plain: bool  # 8-bit upright RGB under its right suffix: other tools read the file as we do
+    notes: tuple[str, ...]  # what was converted, e.g. "16 bits reduced to 8"
+
+
+def read_photo(
+    path: Path | str,
+) -> tuple[Photo, np.ndarray]:  # pixels [H, W, 3] uint8, sRGB, upright
+    """Read a photo whole; orientation applied, depth, grey, CMYK and alpha brought to 8-bit RGB.
+
+    Raises:
+        UnreadablePhoto: empty, cut short, no image, too large or too small, with the reason.
+    """
+    import OpenImageIO as oiio
+
+    source = Path(path)
+    form = _sniff(source)
+    _check_whole(source, form)
+    reader = oiio.ImageInput.open(str(source))
+    if reader is None:
+        raise UnreadablePhoto(source, f"damaged {form} ({_oiio_reason(oiio.geterror())})")
+    try:
+        spec = reader.spec()
+        _check_size(source, spec)
+        pixels = reader.read_image(0, 0, 0, spec.nchannels, "uint8")
+        error = reader.geterror()
+    finally:
+        reader.close()
+    if pixels is None or error:
+        raise UnreadablePhoto(source, f"damaged or cut {form} ({_oiio_reason(error)})")
+    rgb, notes = _to_rgb(source, np.asarray(pixels), spec)
+    exif = exif_from_spec(spec)
+    if exif.orientation != 1:
+        notes.append(f"turned upright (EXIF orientation {exif.orientation})")
+        rgb = _upright(rgb, exif.orientation)
+    expected = _FORMAT_OF_SUFFIX.get(source.suffix.lower(), source.suffix.lower().lstrip("."))
+    if expected != form:
+        notes.append(f"{form} data under the name {source.suffix or 'without a suffix'}")
+    height, width = rgb.shape[:2]
+    plain = not notes and form in ("jpeg", "png")
+    return Photo(source, form, width, height, exif, plain, tuple(notes)), np.ascontiguousarray(rgb)
+
+
+def _sniff(path: Path) -> str:
+    try:
+        with open(path, "rb") as f:
+            head = f.read(16)
+    except OSError as error:
+        raise UnreadablePhoto(path, f"cannot be opened ({error.strerror})") from error
+    if not head:
+        raise UnreadablePhoto(path, "empty file (0 bytes)")
+    signatures = {
+        b"\xff\xd8\xff": "jpeg",
+        b"\x89PNG\r\n\x1a\n": "png",
+        b"II*\0": "tiff",
+        b"MM\0*": "tiff",
+        b"BM": "bmp",
+        b"\0\0\0\x0cjP  ": "jpeg2000",
+    }
+    for signature, form in signatures.items():
+        if head.startswith(signature):
+            return form
+    if head[:4] == b"RIFF" and head[8:12] == b"WEBP":
+        return "webp"
+    if head[4:12] in (b"ftypheic", b"ftypheix", b"ftypmif1", b"ftypheim", b"ftypmsf1"):
+        raise UnreadablePhoto(path, "HEIC photos are not read here; export them as JPEG")
+    raise UnreadablePhoto(path, "no image (the content is of no photo format)")
+
+
+def _check_whole(path: Path, form: str) -> None:
+    """Refuse a cut file by its missing end: decoders fill the rest with grey and report success."""
+    if form == "jpeg":
+        data = path.read_bytes()
+        scan = _first_scan(data)
+        if scan < 0 or data.find(b"\xff\xd9", scan) < 0:
+            raise UnreadablePhoto(path, "cut JPEG (its end is missing)")
+    elif form == "png":
+        size = path.stat().st_size
+        with open(path, "rb") as f:
+            f.seek(max(0, size - 65536))
+            if b"IEND" not in f.read():
+                raise UnreadablePhoto(path, "cut PNG (its end is missing)")
+
+
+def _first_scan(data: bytes) -> int:
+    """Offset of the first start-of-scan marker, -1 without; thumbnails in headers are stepped over."""
+    at = 2
+    while at + 4 <= len(data):
+        if data[at] != 0xFF:
+            return -1
+        marker = data[at + 1]
+        if marker == 0xFF:  # fill byte
+            at += 1
+            continue
+        if marker == 0xDA:
+            return at
+        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return -1
+
+
+def _check_size(path: Path, spec: Any) -> None:
+    width, height = spec.width, spec.height
+    if width * height > MAX_PIXELS:
+        raise UnreadablePhoto(
+            path,
+            f"{width}x{height} is {width * height / 1e6:.0f} megapixels, more than the "
+            f"{MAX_PIXELS // 1_000_000} that are read; reduce it",
+        )
+    if min(width, height) < MIN_SIDE:
+        raise UnreadablePhoto(path, f"{width}x{height} px is too small to match (at least {MIN_SIDE} a side)")
+    if str(spec.format) not in ("uint8", "uint16"):
+        raise UnreadablePhoto(path, f"pixels of type {spec.format} are not read; export 8 or 16 bits")
+
+
+def _to_rgb(path: Path, pixels: np.ndarray, spec: Any) -> tuple[np.ndarray, list[str]]:
+    """[H, W, C] uint8 to [H, W, 3] with what was done to it."""
+    notes = []
+    if str(spec.format) == "uint16":
+        notes.append("16 bits reduced to 8")
+    names = tuple(n.upper() for n in spec.channelnames)
+    space = next((spec.getattribute(f"{f}:ColorSpace") for f in ("jpeg", "tiff", "psd")), None)
+    if spec.alpha_channel >= 0:
+        # OpenImageIO hands out colours already multiplied by alpha, which is a composite over black.
+        if int(pixels[..., spec.alpha_channel].min()) < 255:
+            notes.append("transparency composited over black")
+        else:
+            notes.append("opaque alpha channel dropped")
+        pixels = np.delete(pixels, spec.alpha_channel, axis=2)
+    channels = pixels.shape[2]
+    if channels == 1:
+        notes.append("grey repeated as RGB")
+        return np.repeat(pixels, 3, axis=2), notes
+    if channels == 4 and names[:4] in (("C", "M", "Y", "K"), ("CYAN", "MAGENTA", "YELLOW", "BLACK")):
+        ink = pixels.astype(np.uint16)
+        notes.append("CMYK converted to RGB without its profile")
+        return ((255 - ink[..., :3]) * (255 - ink[..., 3:]) // 255).astype(np.uint8), notes
+    if channels != 3:
+        raise UnreadablePhoto(path, f"{channels} channels ({', '.join(names)}) are not a photo; export RGB")
+    if space == "CMYK":
+        notes.append("CMYK converted to RGB without its profile")
+    return pixels, notes
+
+
+def _upright(image: np.ndarray, orientation: int) -> np.ndarray:
+    """Apply EXIF orientation 1..8 (EXIF 2.32, tag 274)."""
+    if orientation in (5, 6, 7, 8):
+        image = image.transpose(1, 0, 2)
+    if orientation in (2, 3, 6, 7):
+        image = image[:, ::-1]
+    if orientation in (3, 4, 7, 8):
+        image = image[::-1]
+    return image
+
+
+def _oiio_reason(text: str) -> str:
+    line = " ".join(str(text).split())
+    return line[-120:] or "OpenImageIO gives no reason"

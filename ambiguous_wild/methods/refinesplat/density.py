@@ -69,7 +69,7 @@ class EntropyAwareDensity(DensityControl):
             self.downhill -= gradients.means
 
     def clone_offset(self, gaussians: Gaussians, rows: Tensor) -> Tensor | None:
-        """Down the entropy-aware gradient (Fig. 3b), a share of the Gaussian's own standard deviation there."""
+        """Down the entropy-aware gradient (Fig. 3b), by a share of the standard deviation along it."""
         if self.config.clone_shift <= 0 or not len(rows):
             return None
         direction = self.downhill[rows]

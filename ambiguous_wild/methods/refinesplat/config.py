@@ -1,0 +1,58 @@
+"""Every hyper-parameter of RefineSplat in one place. `literal` values are the paper as printed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from ambiguous_wild.methods.refinesplat.density import EntropyDensityConfig
+from ambiguous_wild.methods.refinesplat.entropy import Statistic, Variant
+from ambiguous_wild.methods.refinesplat.identity import PsiConfig
+from ambiguous_wild.methods.refinesplat.masking import Spread
+from ambiguous_wild.methods.refinesplat.threshold import Form
+from ambiguous_wild.vision.segments import SegmentConfig
+
+
+@dataclass(frozen=True)
+class MaskConfig:
+    """From maps on the feature grid to M_final."""
+
+    variant: Variant = "softmax"  # of psi and its entropy; `sigmoid` is printed
+    statistic: Statistic = "contrast"  # per instance; `entropy` is printed
+    threshold: Form = "kapur"  # T_ent; `literal` is printed
+    gate: float = 3.0  # robust deviations an instance must stand above the photo's median; 0 = printed
+    disagree: float = 3.0  # the same for its feature distance between photo and render; 0 = printed
+    disagree_units: float = 6.0  # and at least this many units of what blur and noise make; 0 = printed
+    use_local: bool = True  # M_local; off is an ablation row
+    use_global: bool = True  # M_global; off is an ablation row
+    cosine: Literal["calibrated", "plain"] = "calibrated"  # in U; `plain` is printed
+    normal_units: float = 20.0  # distance in units at which the calibrated cosine is 0
+    box: int = 3  # cells, box filter over U / H
+    spread: Spread = "var"  # T_glb = mean + this; `var` is printed
+    global_gate: float = 6.0  # robust deviations above the median that M_global needs; 0 = printed
+    dilation: int = 5  # px at the photo's resolution; 3, 5, 7 tried in the paper
+    most: float = 0.6  # of a photo is masked at most: the surest pixels go first
+    w2: float | None = None  # fixed weight of T_ent's lower subset; None = learnt
+
+
+@dataclass(frozen=True)
+class RefineSplatConfig:
+    """Times in nominal iterations (of 30 000); the `min_` fields are real iterations of the run."""
+
+    mask: MaskConfig = field(default_factory=MaskConfig)
+    segments: SegmentConfig = field(default_factory=SegmentConfig)  # instance masks without weights
+    psi: PsiConfig = field(default_factory=PsiConfig)  # the frozen identity classifier
+    density: EntropyDensityConfig = field(default_factory=EntropyDensityConfig)  # growth and merging
+    mask_start: float = 500.0  # warm-up: before it every pixel counts
+    min_mask_start: int = 300  # a render of fewer iterations means nothing
+    reset_pause: float = 300.0  # masks are not refreshed for so long after an opacity reset
+    min_reset_pause: int = 200
+    mask_every: int = 4  # each view's mask is refreshed at every k-th of its visits
+    entropy_every: int = 4  # iterations between entropy terms, each weighing that many times as much
+    lambda_id: float = 1.0  # of L_id; 0 = off
+    lambda_cr: float = 0.2  # alpha_1, of L_cr; 0.1 to 0.3 tried in the paper; 0 = off
+    lambda_dssim: float = 0.2  # of D-SSIM in L_GS
+    identities: int = 255  # P at most
+    identity_tracks: int = 3  # SfM tracks that two instances must share to be one identity
+    identity_share: float = 0.25  # and their share of the tracks of the one with fewer
+    identity_similarity: float = 0.8  # cosine of mean features where no tracks run

@@ -1,0 +1,188 @@
+"""RefineSplat's mask policy: when masks are made and refreshed, what is learnt, what is saved."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
+from ambiguous_wild.methods.refinesplat.evidence import Masks, compare, make_masks
+from ambiguous_wild.methods.refinesplat.inputs import FrozenInputs, prepare
+from ambiguous_wild.methods.refinesplat.losses import consistency_loss, identity_loss, instance_matrix
+from ambiguous_wild.methods.refinesplat.threshold import LearntWeight, robust_floor
+from ambiguous_wild.splat.data import shrink_keep
+from ambiguous_wild.splat.parts import MaskPolicy, State, Step, TrainData
+from ambiguous_wild.vision.labhog import LabHog
+from ambiguous_wild.vision.protocols import Features, Instances
+from ambiguous_wild.vision.segments import GraphSegments
+
+
+class RefineSplatMask(MaskPolicy):
+    """Entropy-aware local and global masks, cached per view and refreshed as the render improves."""
+
+    inputs: FrozenInputs
+
+    def __init__(
+        self,
+        config: RefineSplatConfig,
+        features: Features | None = None,
+        instances: Instances | None = None,
+    ) -> None:
+        self.config = config
+        self.features = features or LabHog()
+        self.instances = instances or GraphSegments(config.segments)
+        self.weight = LearntWeight()
+        self.keeps: dict[int, Tensor] = {}  # view: [H, W] float32 at the photo's size
+        self.visits: dict[int, int] = {}  # view: steps since masks began
+        self.shares: dict[int, tuple[float, float, float, float]] = {}  # view: final, local, global, T_ent
+        self.last_reset = 0  # iteration, 0 = never
+
+    def setup(self, data: TrainData) -> None:
+        self.data = data
+        self.inputs = prepare(data, self.features, self.instances, self.config)
+
+    def keep(self, step: Step) -> Tensor | None:
+        if not self._begun(step):
+            return None
+        visit = self.visits.get(step.view, 0)
+        due = step.view not in self.keeps or visit % self.config.mask_every == 0
+        if due and not self._paused(step):
+            masks = self._masks(step)
+            if self.config.mask.w2 is None:
+                self._learn(masks)
+            self.keeps[step.view] = torch.from_numpy(masks.keep).to(self.data.device)
+            self.shares[step.view] = (
+                float(1.0 - masks.keep.mean()),
+                float(masks.local.mean()),
+                float(masks.global_.mean()),
+                masks.cut.threshold,
+            )
+        self.visits[step.view] = visit + 1
+        keep = self.keeps.get(step.view)
+        return None if keep is None else shrink_keep(keep, step.divisor)
+
+    def cotangent(self, step: Step, keep: Tensor | None) -> Tensor | None:
+        """d(lambda_id L_id + lambda_cr L_cr)/dimage through the frozen features and psi."""
+        config = self.config
+        off = config.lambda_id <= 0 and config.lambda_cr <= 0
+        if off or self.inputs.psi is None or not self._begun(step) or step.iteration % config.entropy_every:
+            return None
+        image = step.rendered.image.detach().clone().requires_grad_(True)
+        with torch.enable_grad():
+            loss = self._entropy_terms(image, step, keep)
+            (gradient,) = torch.autograd.grad(loss, image)
+        return gradient * config.entropy_every
+
+    def predict(self, step: Step) -> Tensor | None:
+        if not self._begun(step):
+            return None
+        keep = torch.from_numpy(self._masks(step).keep).to(self.data.device)
+        return shrink_keep(keep, step.divisor)
+
+    def on_opacity_reset(self, step: Step) -> None:
+        self.last_reset = step.iteration
+
+    def facts(self) -> dict[str, Any]:
+        rows = np.array([self.shares[view] for view in sorted(self.shares)], dtype=np.float64).reshape(-1, 4)
+        finite = rows[np.isfinite(rows[:, 3]), 3]
+        mean = rows[:, :3].mean(axis=0) if len(rows) else np.zeros(3)
+        return {
+            "masked_share": float(mean[0]),
+            "masked_share_local": float(mean[1]),
+            "masked_share_global": float(mean[2]),
+            "t_ent_mean": float(finite.mean()) if len(finite) else None,
+            "w2": self.w2,
+            "identities": self.inputs.found.count,
+        }
+
+    @property
+    def w2(self) -> float:
+        """Weight of T_ent's lower subset, learnt or fixed."""
+        return self.weight.value if self.config.mask.w2 is None else self.config.mask.w2
+
+    def _begun(self, step: Step) -> bool:
+        return step.nominal >= self.config.mask_start and step.iteration >= self.config.min_mask_start
+
+    def _paused(self, step: Step) -> bool:
+        if not self.last_reset:
+            return False
+        nominal_per_iteration = step.nominal / step.iteration
+        pause = max(self.config.reset_pause / nominal_per_iteration, self.config.min_reset_pause)
+        return step.iteration - self.last_reset < pause
+
+    @torch.no_grad()
+    def _masks(self, step: Step) -> Masks:
+        """Masks of the step's view at the photo's own size, from the step's render."""
+        inputs, view = self.inputs, step.view
+        image = _enlarge(step.rendered.image, self.data.photos[view])
+        maps = compare(inputs.phi[view], inputs.features(image), inputs.psi, self.config.mask)
+        unit = inputs.features.unit
+        return make_masks(maps, inputs.labels[view], inputs.counts[view], unit, self.w2, self.config.mask)
+
+    def _learn(self, masks: Masks) -> None:
+        """w2 from this photo's instances; the price of a masked pixel is a robustly high residual."""
+        price = robust_floor(masks.distances, max(self.config.mask.disagree, 1.0))
+        if len(masks.values) > 1 and np.isfinite(price):
+            self.weight.learn(masks.values, masks.distances / max(price, 1e-12), masks.areas, masks.cut.floor)
+
+    def _entropy_terms(self, image: Tensor, step: Step, keep: Tensor | None) -> Tensor:
+        inputs, config = self.inputs, self.config
+        assert inputs.psi is not None  # cotangent returned before
+        logits = inputs.psi(inputs.features(_enlarge(image, self.data.photos[step.view])))
+        h, w, channels = logits.shape
+        flat = logits.reshape(-1, channels)
+        weights = torch.ones(h * w, device=image.device)
+        if keep is not None:
+            # a cell counts only if every pixel in it is kept
+            weights = -F.adaptive_max_pool2d(-keep[None, None], (h, w)).reshape(-1)
+        variant = config.mask.variant
+        loss = (flat * 0.0).sum()
+        if config.lambda_id > 0:
+            ids = inputs.identities[step.view].reshape(-1)
+            loss = loss + config.lambda_id * identity_loss(flat, ids, weights, variant)
+        if config.lambda_cr > 0 and inputs.counts[step.view]:
+            member = instance_matrix(inputs.grid[step.view].reshape(-1), inputs.counts[step.view], weights)
+            loss = loss + config.lambda_cr * consistency_loss(flat, member, variant)
+        return loss
+
+    def state_dict(self) -> State:
+        psi = self.inputs.psi
+        return {
+            "keeps": {str(view): (keep > 0.5).to(torch.uint8) for view, keep in self.keeps.items()},
+            "visits": {str(view): count for view, count in self.visits.items()},
+            "shares": {str(view): [repr(x) for x in row] for view, row in self.shares.items()},
+            "theta": self.weight.theta,
+            "last_reset": self.last_reset,
+            # psi's training stops at a wall-clock cap: another machine must go on with the same one
+            "psi": None if psi is None else dict(psi.state_dict()),
+        }
+
+    def load_state_dict(self, state: State) -> None:
+        device = self.data.device
+        self.keeps = {int(v): keep.float().to(device) for v, keep in state["keeps"].items()}
+        self.visits = {int(v): int(count) for v, count in state["visits"].items()}
+        self.shares = {int(v): _four(row) for v, row in state["shares"].items()}
+        self.weight.theta = float(state["theta"])
+        self.last_reset = int(state["last_reset"])
+        if self.inputs.psi is not None and state["psi"] is not None:
+            self.inputs.psi.load_state_dict(state["psi"])
+
+
+def _enlarge(image: Tensor, like: Tensor) -> Tensor:
+    """A render [h, w, 3] at the size of the photo `like` [H, W, 3], bilinear."""
+    if image.shape[:2] == like.shape[:2]:
+        return image
+    chw = image.permute(2, 0, 1)[None]
+    return F.interpolate(chw, size=tuple(like.shape[:2]), mode="bilinear", align_corners=False)[0].permute(
+        1, 2, 0
+    )
+
+
+def _four(row: list[str]) -> tuple[float, float, float, float]:
+    # stored as text: T_ent is inf where nothing stands apart, and JSON has no inf
+    final, local, global_, threshold = (float(x) for x in row)
+    return final, local, global_, threshold

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
+
+if TYPE_CHECKING:
+    from ambiguous_wild.simulate.presets import CaptureSpec
 
 
 @click.command("simulate")
 @click.argument("name", required=False)
 @click.option("-o", "--out", type=click.Path(path_type=Path, file_okay=False), help="Folder to write.")
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="World, walk and distractors.")
+@click.option(
+    "--seed", type=click.IntRange(0), default=0, show_default=True, help="World, walk and distractors."
+)
 @click.option("--views", type=int, help="Train photos; test photos in proportion.")
 @click.option("--width", type=int, help="Width of a photo in px, 16:9.")
 @click.option("--depth", is_flag=True, help="Also write depth maps of the static scene.")
@@ -46,7 +53,7 @@ def command(
 
     from ambiguous_wild.simulate.capture import simulate
 
-    def bar(shots: list) -> tqdm:  # type: ignore[type-arg]
+    def bar(shots: list) -> tqdm:
         return tqdm(shots, unit="photo", desc=f"simulate {name}", disable=as_json)
 
     facts = simulate(spec, out, seed, depth, overwrite, bar)
@@ -63,7 +70,7 @@ def command(
     click.echo(f"next: aw build-scene {out} -o {out.parent / (out.name + '-scene')}")
 
 
-def _print_list(specs, as_json: bool) -> None:  # type: ignore[no-untyped-def]
+def _print_list(specs: Iterable[CaptureSpec], as_json: bool) -> None:
     rows = [(s.name, f"{s.train_views}+{s.test_views}", f"{s.width}x{s.height}", s.summary) for s in specs]
     if as_json:
         keys = ("name", "views", "size", "summary")

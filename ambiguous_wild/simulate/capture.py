@@ -1,20 +1,21 @@
 """From a spec to a folder that looks like a phone's: photos with EXIF, and beside them the exact truth.
 
-    RAW/train/IMG_0001.jpg ...        with distractors
-    RAW/test/IMG_0101.jpg ...         other viewpoints, nobody there
-    RAW/truth/cameras.json            name -> size, fx, fy, cx, cy, cam_from_world (OpenCV axes, metres)
-    RAW/truth/distractor/<stem>.png   255 where any sample of the pixel hit a distractor, else 0
-    RAW/truth/clean/<stem>.png        the train photo with nobody there, before JPEG
-    RAW/truth/depth/<stem>.png        optional: z of the static surface, 16 bit, millimetres
-    RAW/truth/capture.json            spec, seed, versions, occlusion per photo, who stands where, sha256
+RAW/train/IMG_0001.jpg ...        with distractors
+RAW/test/IMG_0101.jpg ...         other viewpoints, nobody there
+RAW/truth/cameras.json            name -> size, fx, fy, cx, cy, cam_from_world (OpenCV axes, metres)
+RAW/truth/distractor/<stem>.png   255 where any sample of the pixel hit a distractor, else 0
+RAW/truth/clean/<stem>.png        the train photo with nobody there, before JPEG
+RAW/truth/depth/<stem>.png        optional: z of the static surface, 16 bit, millimetres
+RAW/truth/capture.json            spec, seed, versions, occlusion per photo, who stands where, sha256
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +27,9 @@ from ambiguous_wild.core.config import config_hash, to_plain
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.atomic import atomic_dir, write_json
 from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.simulate.atlas import linear_to_srgb
 from ambiguous_wild.simulate.distractors import Placement, lay_out, movers
 from ambiguous_wild.simulate.presets import CaptureSpec
-from ambiguous_wild.simulate.textures import linear_to_srgb
 from ambiguous_wild.simulate.tracer import trace
 from ambiguous_wild.simulate.world import World, courtyard
 
@@ -47,8 +48,11 @@ class Shot:
     placements: tuple[Placement, ...]
 
 
+Progress = Callable[[list[Shot]], Iterable[Shot]]
+
+
 def focal_px(spec: CaptureSpec) -> float:
-    """Focal length in pixels that has the stated 35 mm equivalent: equal angle over the diagonal (CIPA DCG-001)."""
+    """Focal length in px of the stated 35 mm equivalent: the same angle over the diagonal (CIPA)."""
     return spec.focal_35mm / _FULL_FRAME_DIAGONAL_MM * float(np.hypot(spec.width, spec.height))
 
 
@@ -65,7 +69,9 @@ def look_at(eye: np.ndarray, target: np.ndarray, roll_deg: float) -> np.ndarray:
     return pose
 
 
-def plan_cameras(spec: CaptureSpec, world: World, rng: np.random.Generator) -> tuple[list[Camera], list[Camera]]:
+def plan_cameras(
+    spec: CaptureSpec, world: World, rng: np.random.Generator
+) -> tuple[list[Camera], list[Camera]]:
     """The walk: train cameras along an arc that sways near and far, high and low; test cameras inside it.
 
     Test viewpoints lie at other angles than any train photo, between the near and the far, the high and
@@ -117,9 +123,9 @@ def simulate(
     seed: int = 0,
     depth: bool = False,
     overwrite: bool = False,
-    progress: Callable[[list[Shot]], Any] = iter,
+    progress: Progress = iter,
 ) -> dict[str, Any]:
-    """Make the capture; returns what ``truth/capture.json`` says, with ``reused`` telling whether it was there.
+    """Make the capture; returns what ``truth/capture.json`` says, and whether it was there (``reused``).
 
     Args:
         spec: what to make.
@@ -150,7 +156,7 @@ def simulate(
 
 
 def _render(
-    spec: CaptureSpec, world: World, shots: list[Shot], folder: Path, depth: bool, progress: Callable[[list[Shot]], Any]
+    spec: CaptureSpec, world: World, shots: list[Shot], folder: Path, depth: bool, progress: Progress
 ) -> dict[str, Any]:
     static = world.table()
     photos: dict[str, Any] = {}
@@ -164,7 +170,8 @@ def _render(
             if shot.split == "train":
                 mask = np.where(seen.owner > 0, 255, 0).astype(np.uint8)
                 pending.append(writers.submit(_write_png, truth / "distractor" / f"{stem}.png", mask))
-                pending.append(writers.submit(_write_png, truth / "clean" / f"{stem}.png", _to_uint8(seen.clean)))
+                clean = _to_uint8(seen.clean)
+                pending.append(writers.submit(_write_png, truth / "clean" / f"{stem}.png", clean))
                 photos[shot.name] = _photo_facts(spec, shot, seen.owner)
             if depth:
                 millimetres = np.clip(np.round(1000 * seen.depth_m), 0, 65535).astype(np.uint16)
@@ -178,25 +185,23 @@ def _render(
 
 def _photo_facts(spec: CaptureSpec, shot: Shot, owner: np.ndarray) -> dict[str, Any]:
     shares = np.bincount(owner.ravel(), minlength=len(spec.distractors) + 1) / owner.size
-    standing = [
-        {"distractor": spec.distractors[p.which].name, "occlusion": round(float(shares[p.which + 1]), 6), **asdict(p)}
-        for p in shot.placements
-    ]
+    standing = []
+    for place in shot.placements:
+        what, share = spec.distractors[place.which], round(float(shares[place.which + 1]), 6)
+        standing.append({"distractor": what.name, "occlusion": share, **asdict(place)})
     return {"occlusion": round(float(shares[1:].sum()), 6), "distractors": standing}
 
 
 def _facts(spec: CaptureSpec, seed: int, identity: str, photos: dict[str, Any]) -> dict[str, Any]:
-    import skimage
-
     shares = [p["occlusion"] for p in photos.values()]
     return {
         "schema": 1,
         "preset": spec.name,
         "seed": seed,
         "identity": identity,
-        "version": {"ambiguous_wild": __version__, "scikit-image": skimage.__version__, "numpy": np.__version__},
+        "version": {"ambiguous_wild": __version__, "scikit-image": version("scikit-image")},
         "spec": to_plain(spec),
-        "mask": "255 where any sample of the pixel hit a distractor; distractors throw no shadow on the static world",
+        "mask": "255 where any sample of a pixel hit a distractor; distractors throw no shadow on the scene",
         "occlusion": {"mean": float(np.mean(shares)), "min": min(shares), "max": max(shares)},
         "photos": photos,
         "licence": "CC0; textures from photographs in scikit-image that are CC0 or in the public domain",

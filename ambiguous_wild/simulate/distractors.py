@@ -12,18 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ambiguous_wild.core.camera import Camera
+from ambiguous_wild.simulate.kernels import BOX, ELLIPSOID
 from ambiguous_wild.simulate.presets import CaptureSpec, Distractor
-from ambiguous_wild.simulate.tracer import BOX, ELLIPSOID, ShapeTable, trace
-from ambiguous_wild.simulate.world import (
-    BACK_M,
-    FRONT_M,
-    HALF_WIDTH_M,
-    Shape,
-    World,
-    figure,
-    placed,
-    shape_table,
-)
+from ambiguous_wild.simulate.shapes import Shape, figure, placed, shape_table
+from ambiguous_wild.simulate.tracer import ShapeTable, trace
+from ambiguous_wild.simulate.world import BACK_M, FRONT_M, HALF_WIDTH_M, World
 
 _TRIES = 80  # layouts drawn for a photo before the best of them is taken
 _SAME_PLACE_M = 0.6  # closer than this is the same place
@@ -48,15 +41,13 @@ def shapes_of(distractor: Distractor, placement: Placement) -> list[Shape]:
     at = (placement.x_m, placement.y_m, 0.0)
     texture = distractor.texture
     if distractor.kind == "visitor":
-        parts = figure(texture, texture if texture != "brick" else "skin", 0.06 + 0.26 * placement.pose, placement.pose)
+        parts = figure(texture, distractor.head or texture, 0.06 + 0.26 * placement.pose, placement.pose)
     elif distractor.kind == "twin":
         base = Shape(BOX, (0, 0, 0.06), (0.33, 0.33, 0.06), texture, offset=(0.4, 0.2))
         parts = [base, *placed(figure(texture, texture, 0.07, 0.8), (0, 0, 0.12), 0.0)]
     elif distractor.kind == "parcel":
-        parts = [
-            Shape(BOX, (0, 0, 0.35), (0.36, 0.28, 0.35), texture),
-            *placed([Shape(BOX, (0, 0, 0.2), (0.24, 0.22, 0.2), texture, offset=(0.3, 0.6))], (0.05, 0, 0.7), 30.0),
-        ]
+        top = Shape(BOX, (0, 0, 0.2), (0.24, 0.22, 0.2), texture, offset=(0.35, 0.6))
+        parts = [Shape(BOX, (0, 0, 0.35), (0.36, 0.28, 0.35), texture), *placed([top], (0.05, 0, 0.7), 30.0)]
     else:
         parts = [Shape(ELLIPSOID, (0, 0, 0.4), (0.4, 0.4, 0.4), texture)]
     return [replace(s, owner=placement.which + 1) for s in placed(parts, at, placement.yaw_deg)]
@@ -86,11 +77,13 @@ def lay_out(
             chosen.append(())
             continue
         small = camera.resized(_PREVIEW_PX, max(1, round(_PREVIEW_PX * camera.height / camera.width)))
-        best, best_gap = (), np.inf
+        best: tuple[Placement, ...] = ()
+        best_gap = np.inf
         aim = rng.uniform(low, high)  # so that the shares spread over the whole band
         for attempt in range(_TRIES):
             layout = _draw(spec, camera, world, chosen, rng)
-            share = float(np.mean(trace(small, static, movers(spec, layout, world), world.atlas, light).owner > 0))
+            seen = trace(small, static, movers(spec, layout, world), world.atlas, light)
+            share = float(np.mean(seen.owner > 0))
             tolerance = (high - low) * (0.1 + 0.4 * attempt / _TRIES)
             gap = max(abs(share - aim) - tolerance, 0.0) + 10 * max(low - share, share - high, 0.0)
             if gap < best_gap:
@@ -146,4 +139,3 @@ def _fresh(place: Placement, earlier: list[tuple[Placement, ...]], photos: int) 
         if p.which == place.which and np.hypot(p.x_m - place.x_m, p.y_m - place.y_m) < _SAME_PLACE_M
     ]
     return len(same) + 1 <= max(1, int(_SAME_PLACE_SHARE * photos))
-

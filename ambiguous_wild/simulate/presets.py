@@ -19,6 +19,7 @@ class Distractor:
     kind: Kind
     texture: str  # a sheet of the world: stone, foliage, timber, brick, gravel, vivid
     ambiguity: Ambiguity  # why it is hard: the background's colour, the statue's shape, or not at all
+    head: str = ""  # a visitor's head and hands, where they are not of the same sheet
     presence: float = 0.85  # share of the train photos in which it is put
     distance_m: tuple[float, float] = (1.9, 4.5)  # from the camera
 
@@ -43,7 +44,7 @@ class CaptureSpec:
     eye_m: tuple[float, float] = (1.3, 1.8)  # height of the phone
 
 
-VISITOR = Distractor("visitor in brick", "visitor", "brick", "colour")
+VISITOR = Distractor("visitor in brick", "visitor", "brick", "colour", head="skin")
 TWIN = Distractor("second statue", "twin", "stone", "semantic")
 PARCEL = Distractor("bright parcel", "parcel", "vivid", "none", distance_m=(1.8, 3.6))
 

@@ -1,4 +1,4 @@
-"""Textures: photographs that scikit-image ships, baked into surfaces that never repeat, as mip pyramids.
+"""Textures: photographs that scikit-image ships, baked into surfaces that never repeat.
 
 Every surface gets its own picture. A tiled photograph would make COLMAP match one brick with its
 neighbour's copy; noise at three scales between the tiles makes each square metre its own.
@@ -6,15 +6,15 @@ neighbour's copy; noise at three scales between the tiles makes each square metr
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.simulate.atlas import srgb_to_linear
 
 # CC0, public domain or without known restrictions by the docstrings of skimage.data; all in its wheel.
 PHOTOGRAPHS = {
@@ -29,30 +29,7 @@ PHOTOGRAPHS = {
     "retina": "retina.jpg",
     "rocket": "rocket.jpg",
 }
-_MAX_LEVELS = 12
-
-
-@dataclass(frozen=True)
-class Atlas:
-    """Mip pyramids of all textures in one flat array; level l of texture t starts at ``offset[t, l]``."""
-
-    texels: np.ndarray  # [N, 3] float32, linear light
-    offset: np.ndarray  # [T, L] int64
-    width: np.ndarray  # [T, L] int32
-    height: np.ndarray  # [T, L] int32
-    levels: np.ndarray  # [T] int32
-    index: Mapping[str, int]
-
-
-def srgb_to_linear(image: np.ndarray) -> np.ndarray:
-    """sRGB in [0, 1] to linear light (IEC 61966-2-1)."""
-    return np.where(image <= 0.04045, image / 12.92, ((image + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
-def linear_to_srgb(image: np.ndarray) -> np.ndarray:
-    """Linear light to sRGB, clipped to [0, 1] (IEC 61966-2-1)."""
-    clipped = np.clip(image, 0.0, 1.0)
-    return np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)
+Colour = tuple[float, float, float]  # linear light
 
 
 @cache
@@ -68,7 +45,7 @@ def photograph(name: str) -> np.ndarray:
     image = cv2.imread(str(path), cv2.IMREAD_COLOR) if path.is_file() else None
     if image is None:
         raise AwError(
-            f"texture {path.name} is not in scikit-image {skimage.__version__} at {path.parent}: "
+            f"texture {path.name} is not in scikit-image {version('scikit-image')} at {path.parent}: "
             "the wheels of 0.24 to 0.26 carry it; install one of those"
         )
     rgb = np.ascontiguousarray(image[:, :, ::-1]).astype(np.float32) / 255.0
@@ -116,10 +93,8 @@ def _laid(
     c, s = np.cos(np.deg2rad(angle_deg)), np.sin(np.deg2rad(angle_deg))
     x = (c * u - s * v) * scale + float(shift[0]) * grey.shape[1]
     y = (s * u + c * v) * scale + float(shift[1]) * grey.shape[0]
-    laid = cv2.remap(
-        grey, _mirrored(x, grey.shape[1]), _mirrored(y, grey.shape[0]), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
-    )
-    return np.asarray(laid[..., None])
+    x, y = _mirrored(x, grey.shape[1]), _mirrored(y, grey.shape[0])
+    return np.asarray(cv2.remap(grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)[..., None])
 
 
 def _mirrored(x: np.ndarray, size: int) -> np.ndarray:
@@ -144,26 +119,28 @@ def _scattered(
 def gravel_ground(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: float) -> np.ndarray:
     """Gravel with worn grass and a paved way through the middle, [H, W, 3] linear light."""
     h, w = round(height_m * px_per_m), round(width_m * px_per_m)
-    stones = _scattered("gravel", rng, h, w, px_per_m, 2.2) * _tint(rng, h, w, px_per_m, (0.36, 0.32, 0.26), 0.35)
+    stones = gravel(rng, width_m, height_m, px_per_m)
     lawn = _scattered("grass", rng, h, w, px_per_m, 1.8) * _tint(rng, h, w, px_per_m, (0.13, 0.2, 0.06), 0.5)
     paving = _laid("brick", h, w, px_per_m, 2.6, 8.0, rng.random(2))
     paving = paving * _tint(rng, h, w, px_per_m, (0.3, 0.27, 0.25), 0.5)
     patches = octaves(rng, h, w, 1.6 * px_per_m, 6)
     ground = stones + (lawn - stones) * _step(0.52, 0.6, patches)
-    x = (np.arange(w, dtype=np.float32) / px_per_m - width_m / 2)[None] + 1.6 * (octaves(rng, h, w, 180.0) - 0.5)
-    edge = np.abs(x + 0.3) + 0.35 * (octaves(rng, h, w, 22.0, 3) - 0.5)
+    x = (np.arange(w, dtype=np.float32) / px_per_m - width_m / 2)[None]
+    bend, ragged = octaves(rng, h, w, 1.6 * px_per_m) - 0.5, octaves(rng, h, w, 0.2 * px_per_m, 3) - 0.5
+    edge = np.abs(x + 0.3 + 1.6 * bend) + 0.35 * ragged
     return np.asarray(ground + (paving - ground) * (1 - _step(0.75, 0.85, edge)), dtype=np.float32)
 
 
 def _tint(
-    rng: np.random.Generator, h: int, w: int, px_per_m: float, colour: tuple[float, float, float], strength: float
+    rng: np.random.Generator, h: int, w: int, px_per_m: float, colour: Colour, strength: float
 ) -> np.ndarray:
     """A colour that drifts over metres and centimetres, [H, W, 3] linear light."""
     wide = octaves(rng, h, w, 1.5 * px_per_m) - 0.5
     fine = octaves(rng, h, w, 0.25 * px_per_m, 3) - 0.5
     hue = octaves(rng, h, w, 0.8 * px_per_m) - 0.5
     value = np.clip(1 + strength * (2 * wide + fine), 0.2, 2.0)[..., None]
-    return np.asarray(np.array(colour, np.float32) * value * (1 + 0.5 * hue[..., None] * np.array([1, 0, -1])))
+    turn = 1 + 0.5 * hue[..., None] * np.array([1, 0, -1], np.float32)
+    return np.asarray(np.array(colour, np.float32) * value * turn)
 
 
 def brick_wall(
@@ -171,7 +148,7 @@ def brick_wall(
     width_m: float,
     height_m: float,
     px_per_m: float,
-    colour: tuple[float, float, float] = (0.3, 0.14, 0.085),
+    colour: Colour = (0.3, 0.14, 0.085),
     foot: bool = True,
 ) -> np.ndarray:
     """Old brickwork: drifting colour, fallen plaster, moss from below, soot from above; row 0 is the foot.
@@ -182,11 +159,12 @@ def brick_wall(
     courses = _laid("brick", h, w, px_per_m, 1.9, 90.0, rng.random(2)) ** 1.2
     wall = courses * _tint(rng, h, w, px_per_m, colour, 0.55)
     height = (np.arange(h, dtype=np.float32) / px_per_m)[:, None]
+    fallen = octaves(rng, h, w, 1.1 * px_per_m, 6) - (0.0 if foot else 0.2)
     plaster = _scattered("gravel", rng, h, w, px_per_m, 5.0) ** 0.35
     plaster = plaster * _tint(rng, h, w, px_per_m, (0.46, 0.4, 0.3), 0.25)
-    wall = wall + (plaster - wall) * _step(0.585, 0.605, octaves(rng, h, w, 1.1 * px_per_m, 6) - (not foot) * 0.06)
+    wall = wall + (plaster - wall) * _step(0.585, 0.605, fallen)
     moss = _scattered("grass", rng, h, w, px_per_m, 1.2) * np.array([0.09, 0.13, 0.04], np.float32)
-    damp = octaves(rng, h, w, 0.6 * px_per_m, 5) + (0.35 * np.exp(-height / 0.4) - 0.05 if foot else -0.1)
+    damp = octaves(rng, h, w, 0.6 * px_per_m, 5) + (0.35 * np.exp(-height / 0.4) - 0.05 if foot else -0.2)
     wall = wall + 0.85 * (moss - wall) * _step(0.58, 0.68, damp)
     streaks = cv2.GaussianBlur(rng.random((h, w), dtype=np.float32), (0, 0), 2.0, sigmaY=0.5 * px_per_m) - 0.5
     soot = 1 + 6.0 * streaks * np.clip(height / height_m, 0, 1)
@@ -210,7 +188,8 @@ def foliage(rng: np.random.Generator, width_m: float, height_m: float, px_per_m:
     h, w = round(height_m * px_per_m), round(width_m * px_per_m)
     leaves = _scattered("grass", rng, h, w, px_per_m, 0.9) ** 1.5
     clumps = 0.5 + 1.1 * _step(0.35, 0.65, octaves(rng, h, w, 0.2 * px_per_m, 4))
-    return np.asarray(leaves * clumps * _tint(rng, h, w, px_per_m * 0.5, (0.12, 0.19, 0.05), 0.6), dtype=np.float32)
+    green = _tint(rng, h, w, px_per_m * 0.5, (0.12, 0.19, 0.05), 0.6)
+    return np.asarray(leaves * clumps * green, dtype=np.float32)
 
 
 def timber(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: float) -> np.ndarray:
@@ -222,9 +201,8 @@ def timber(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: 
     joint = np.abs((np.arange(h) / (0.14 * px_per_m)) % 1.0 - 0.5)[:, None] > 0.46
     value = tone * (1 + 4.0 * grain) * np.where(joint, 0.25, 1.0)
     rough = _scattered("gravel", rng, h, w, px_per_m, 2.0) ** 0.5
-    return np.asarray(
-        np.clip(value, 0.1, 2)[..., None] * rough * _tint(rng, h, w, px_per_m, (0.3, 0.19, 0.1), 0.3), dtype=np.float32
-    )
+    brown = _tint(rng, h, w, px_per_m, (0.3, 0.19, 0.1), 0.3)
+    return np.asarray(np.clip(value, 0.1, 2)[..., None] * rough * brown, dtype=np.float32)
 
 
 def clay(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: float) -> np.ndarray:
@@ -274,7 +252,8 @@ def sky(rng: np.random.Generator, height: int = 512, width: int = 2048) -> np.nd
     line = 0.12 + 0.9 * (crowns - 0.25) + 0.16 * (ragged - 0.5)
     light = (0.2 + 1.6 * _round(octaves(rng, height, width // 2, 30.0, 5)) ** 2)[..., None]
     leaves = light * np.array([0.10, 0.15, 0.05], np.float32)
-    return np.asarray(image + (leaves - image) * (1 - _step(-0.004, 0.004, elevation - line)), dtype=np.float32)
+    trees = 1 - _step(-0.004, 0.004, elevation - line)
+    return np.asarray(image + (leaves - image) * trees, dtype=np.float32)
 
 
 def _round(half: np.ndarray) -> np.ndarray:
@@ -289,29 +268,3 @@ def poster(name: str) -> np.ndarray:
     resized = cv2.resize(image, (512, round(image.shape[0] * scale)), interpolation=cv2.INTER_AREA)
     framed = cv2.copyMakeBorder(resized, 18, 18, 18, 18, cv2.BORDER_CONSTANT, value=(0.93, 0.92, 0.88))
     return srgb_to_linear(framed[::-1]) * np.float32(0.85)
-
-
-def build_atlas(textures: Mapping[str, np.ndarray]) -> Atlas:
-    """Mip pyramids by area averaging, in linear light.
-
-    Args:
-        textures: name -> [H, W, 3] float32, linear light.
-    """
-    count = len(textures)
-    offset = np.zeros((count, _MAX_LEVELS), np.int64)
-    width = np.ones((count, _MAX_LEVELS), np.int32)
-    height = np.ones((count, _MAX_LEVELS), np.int32)
-    levels = np.zeros(count, np.int32)
-    chunks: list[np.ndarray] = []
-    used = 0
-    for t, image in enumerate(textures.values()):
-        level = np.ascontiguousarray(np.clip(image, 0.0, None), np.float32)
-        for k in range(_MAX_LEVELS):
-            h, w = level.shape[:2]
-            offset[t, k], width[t, k], height[t, k], levels[t] = used, w, h, k + 1
-            chunks.append(level.reshape(-1, 3))
-            used += h * w
-            if min(h, w) == 1:
-                break
-            level = cv2.resize(level, (max(w // 2, 1), max(h // 2, 1)), interpolation=cv2.INTER_AREA)
-    return Atlas(np.concatenate(chunks), offset, width, height, levels, {n: i for i, n in enumerate(textures)})

@@ -1,0 +1,251 @@
+"""What one ray meets and what colour that is: the inner kernels of the ray caster.
+
+A table is `ShapeTable.columns()`, an atlas `(texels, offset, width, height, levels)`, a light
+`(sun directions, sun colour, sky colour, ground colour)`; points and directions are tuples of three.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+
+QUAD, BOX, ELLIPSOID, CAPSULE, CYLINDER = range(5)
+PLANAR, BY_FACE, DOME = range(3)  # how a surface point becomes a texture coordinate
+FAR = 1e30
+
+
+@numba.njit(cache=True, error_model="numpy", inline="never")
+def _intersect(kind, o, d, h, far):
+    """Distance along the local ray o + t d to the shape, or `far`. Rays inside an ellipsoid hit its wall."""
+    ox, oy, oz = o
+    dx, dy, dz = d
+    hx, hy, hz = h
+    if kind == QUAD:
+        if abs(dz) < 1e-12:
+            return far
+        t = -oz / dz
+        if t > 1e-6 and t < far and abs(ox + t * dx) <= hx and abs(oy + t * dy) <= hy:
+            return t
+        return far
+    if kind == BOX:
+        near, away = -FAR, FAR
+        for a in range(3):
+            oa = ox if a == 0 else (oy if a == 1 else oz)
+            da = dx if a == 0 else (dy if a == 1 else dz)
+            ha = hx if a == 0 else (hy if a == 1 else hz)
+            if abs(da) < 1e-12:
+                if abs(oa) > ha:
+                    return far
+                continue
+            t0, t1 = (-ha - oa) / da, (ha - oa) / da
+            if t0 > t1:
+                t0, t1 = t1, t0
+            near, away = max(near, t0), min(away, t1)
+        if near <= away and near > 1e-6 and near < far:
+            return near
+        return far
+    if kind == ELLIPSOID:
+        px, py, pz, qx, qy, qz = ox / hx, oy / hy, oz / hz, dx / hx, dy / hy, dz / hz
+        a = qx * qx + qy * qy + qz * qz
+        b = px * qx + py * qy + pz * qz
+        root = b * b - a * (px * px + py * py + pz * pz - 1.0)
+        if root < 0.0:
+            return far
+        root = math.sqrt(root)
+        t = (-b - root) / a
+        if t < 1e-6:
+            t = (-b + root) / a
+        return t if t > 1e-6 and t < far else far
+    # Capsule and capped cylinder share the tube around local z.
+    a = dx * dx + dy * dy
+    b = ox * dx + oy * dy
+    c = ox * ox + oy * oy - hx * hx
+    best = far
+    root = b * b - a * c
+    if a > 1e-12 and root >= 0.0:
+        t = (-b - math.sqrt(root)) / a
+        if t > 1e-6 and t < best and abs(oz + t * dz) <= hz:
+            best = t
+    for end in (-1.0, 1.0):
+        if kind == CAPSULE:
+            cz = oz - end * hz
+            bb = ox * dx + oy * dy + cz * dz
+            root = bb * bb - (ox * ox + oy * oy + cz * cz - hx * hx)  # d has unit length
+            if root >= 0.0:
+                t = -bb - math.sqrt(root)
+                if t > 1e-6 and t < best and end * (cz + t * dz) >= 0.0:
+                    best = t
+        elif abs(dz) > 1e-12:
+            t = (end * hz - oz) / dz
+            x, y = ox + t * dx, oy + t * dy
+            if t > 1e-6 and t < best and x * x + y * y <= hx * hx:
+                best = t
+    return best
+
+
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def _local(table, s, px, py, pz, shift):
+    r, c = table[1], table[2]
+    if shift:
+        px, py, pz = px - c[s, 0], py - c[s, 1], pz - c[s, 2]
+    return (
+        r[s, 0, 0] * px + r[s, 0, 1] * py + r[s, 0, 2] * pz,
+        r[s, 1, 0] * px + r[s, 1, 1] * py + r[s, 1, 2] * pz,
+        r[s, 2, 0] * px + r[s, 2, 1] * py + r[s, 2, 2] * pz,
+    )
+
+
+@numba.njit(cache=True, error_model="numpy", inline="never")
+def nearest(table, which, count, o, d, far):
+    """Nearest hit among the listed shapes: (distance, shape or -1)."""
+    best, hit = far, -1
+    center, radius, half, kind = table[2], table[4], table[3], table[0]
+    for k in range(count):
+        s = which[k]
+        qx, qy, qz = center[s, 0] - o[0], center[s, 1] - o[1], center[s, 2] - o[2]
+        along = qx * d[0] + qy * d[1] + qz * d[2]
+        if qx * qx + qy * qy + qz * qz - along * along > radius[s] * radius[s]:
+            continue
+        if along - radius[s] > best:
+            continue
+        h = (half[s, 0], half[s, 1], half[s, 2])
+        lo, ld = _local(table, s, o[0], o[1], o[2], True), _local(table, s, d[0], d[1], d[2], False)
+        t = _intersect(kind[s], lo, ld, h, best)
+        if t < best:
+            best, hit = t, s
+    return best, hit
+
+
+@numba.njit(cache=True, error_model="numpy", inline="never")
+def _shadowed(table, o, d):
+    center, radius, half, kind, casts = table[2], table[4], table[3], table[0], table[9]
+    for s in range(len(kind)):
+        if not casts[s]:
+            continue
+        qx, qy, qz = center[s, 0] - o[0], center[s, 1] - o[1], center[s, 2] - o[2]
+        along = qx * d[0] + qy * d[1] + qz * d[2]
+        if along < -radius[s] or qx * qx + qy * qy + qz * qz - along * along > radius[s] * radius[s]:
+            continue
+        h = (half[s, 0], half[s, 1], half[s, 2])
+        lo, ld = _local(table, s, o[0], o[1], o[2], True), _local(table, s, d[0], d[1], d[2], False)
+        if _intersect(kind[s], lo, ld, h, FAR) < FAR:
+            return True
+    return False
+
+
+@numba.njit(cache=True, error_model="numpy", inline="never")
+def _normal(kind, p, h, d):
+    """Unit normal at the local point, turned against the local ray."""
+    x, y, z = p
+    if kind == QUAD:
+        nx, ny, nz = 0.0, 0.0, 1.0
+    elif kind == BOX:
+        ax, ay, az = abs(x / h[0]), abs(y / h[1]), abs(z / h[2])
+        nx, ny, nz = 0.0, 0.0, 0.0
+        if ax >= ay and ax >= az:
+            nx = math.copysign(1.0, x)
+        elif ay >= az:
+            ny = math.copysign(1.0, y)
+        else:
+            nz = math.copysign(1.0, z)
+    elif kind == ELLIPSOID:
+        nx, ny, nz = x / h[0] ** 2, y / h[1] ** 2, z / h[2] ** 2
+    elif kind == CAPSULE:
+        nx, ny, nz = x, y, z - min(max(z, -h[2]), h[2])
+    elif h[2] - abs(z) < 1e-6:
+        nx, ny, nz = 0.0, 0.0, math.copysign(1.0, z)
+    else:
+        nx, ny, nz = x, y, 0.0
+    scale = 1.0 / math.sqrt(nx * nx + ny * ny + nz * nz)
+    if nx * d[0] + ny * d[1] + nz * d[2] > 0:
+        scale = -scale
+    return nx * scale, ny * scale, nz * scale
+
+
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def _fold(u, size):
+    """Texture coordinate to texel, mirrored at the borders so that no seam shows."""
+    u = u - 2.0 * math.floor(0.5 * u)
+    u = 2.0 - u if u > 1.0 else u
+    return min(max(u * size - 0.5, 0.0), size - 1.0)
+
+
+@numba.njit(cache=True, error_model="numpy", inline="never")
+def _bilinear(atlas, t, level, u, v):
+    texels, offset, width, height = atlas[0], atlas[1], atlas[2], atlas[3]
+    w, h, base = width[t, level], height[t, level], offset[t, level]
+    x, y = _fold(u, w), _fold(v, h)
+    x0, y0 = int(x), int(y)
+    x1, y1 = min(x0 + 1, w - 1), min(y0 + 1, h - 1)
+    fx, fy = x - x0, y - y0
+    a, b, c, e = base + y0 * w + x0, base + y0 * w + x1, base + y1 * w + x0, base + y1 * w + x1
+    wa, wb, wc, we = (1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy
+    return (
+        wa * texels[a, 0] + wb * texels[b, 0] + wc * texels[c, 0] + we * texels[e, 0],
+        wa * texels[a, 1] + wb * texels[b, 1] + wc * texels[c, 1] + we * texels[e, 1],
+        wa * texels[a, 2] + wb * texels[b, 2] + wc * texels[c, 2] + we * texels[e, 2],
+    )
+
+
+@numba.njit(cache=True, error_model="numpy", inline="never")
+def _sample(atlas, t, u, v, lod):
+    """Trilinear lookup: two mip levels around `lod`, blended."""
+    top = atlas[4][t] - 1
+    lod = min(max(lod, 0.0), float(top))
+    level = int(lod)
+    f = lod - level
+    r0, g0, b0 = _bilinear(atlas, t, level, u, v)
+    if f < 1e-3:
+        return r0, g0, b0
+    r1, g1, b1 = _bilinear(atlas, t, min(level + 1, top), u, v)
+    return r0 + f * (r1 - r0), g0 + f * (g1 - g0), b0 + f * (b1 - b0)
+
+
+@numba.njit(cache=True, error_model="numpy", inline="never")
+def shade(table, s, t, o, d, spread, atlas, light, sun, blockers, others, use_others):
+    """Colour of shape s at distance t: texture, sun with shadow, sky light from above and below."""
+    kind, half, mapping, uv, tint = table[0][s], table[3], table[6][s], table[7], table[8]
+    lo, ld = _local(table, s, o[0], o[1], o[2], True), _local(table, s, d[0], d[1], d[2], False)
+    p = (lo[0] + t * ld[0], lo[1] + t * ld[1], lo[2] + t * ld[2])
+    h = (half[s, 0], half[s, 1], half[s, 2])
+    n = _normal(kind, p, h, ld)
+    cosine = -(n[0] * ld[0] + n[1] * ld[1] + n[2] * ld[2])
+    texture = table[5][s]
+    if mapping == DOME:
+        u = math.atan2(p[1], p[0]) / (2 * math.pi) + 0.5
+        v = math.asin(min(max(p[2] / h[2], 0.0), 1.0)) / (0.5 * math.pi)
+        lod = math.log2(max(spread * atlas[2][texture, 0] / (2 * math.pi), 1e-6))
+        r, g, b = _sample(atlas, texture, u, v, lod)
+        return r * tint[s, 0], g * tint[s, 1], b * tint[s, 2]
+    a, b_ = p[0], p[1]
+    if mapping == BY_FACE:
+        ax, ay, az = abs(n[0]), abs(n[1]), abs(n[2])
+        if ax >= ay and ax >= az:
+            a, b_ = p[1], p[2]
+        elif ay >= az:
+            a, b_ = p[0], p[2]
+    u, v = a * uv[s, 0] + uv[s, 2], b_ * uv[s, 1] + uv[s, 3]
+    # The footprint of a sample on the surface; its short and long side meet in the geometric mean.
+    footprint = t * spread / math.sqrt(max(cosine, 0.04))
+    density = max(uv[s, 0] * atlas[2][texture, 0], uv[s, 1] * atlas[3][texture, 0])
+    r, g, b = _sample(atlas, texture, u, v, math.log2(max(footprint * density, 1e-6)))
+    rot = table[1]
+    wx = rot[s, 0, 0] * n[0] + rot[s, 1, 0] * n[1] + rot[s, 2, 0] * n[2]
+    wy = rot[s, 0, 1] * n[0] + rot[s, 1, 1] * n[1] + rot[s, 2, 1] * n[2]
+    wz = rot[s, 0, 2] * n[0] + rot[s, 1, 2] * n[1] + rot[s, 2, 2] * n[2]
+    up = 0.5 + 0.5 * wz
+    lit = wx * sun[0] + wy * sun[1] + wz * sun[2]
+    if lit > 0.0:
+        lift = 2e-3
+        q = (o[0] + t * d[0] + lift * wx, o[1] + t * d[1] + lift * wy, o[2] + t * d[2] + lift * wz)
+        if _shadowed(blockers, q, sun) or (use_others and _shadowed(others, q, sun)):
+            lit = 0.0
+    else:
+        lit = 0.0
+    sun_colour, sky, ground = light[1], light[2], light[3]
+    return (
+        r * tint[s, 0] * (lit * sun_colour[0] + up * sky[0] + (1 - up) * ground[0]),
+        g * tint[s, 1] * (lit * sun_colour[1] + up * sky[1] + (1 - up) * ground[1]),
+        b * tint[s, 2] * (lit * sun_colour[2] + up * sky[2] + (1 - up) * ground[2]),
+    )

@@ -103,6 +103,6 @@ def downsample(folder: Path, full: Path, factor: int, *, jobs: int, bar: Bar) ->
         return width, height
 
     with ThreadPoolExecutor(jobs) as pool:
-        sizes = Counter(pool.map(one, files))
+        sizes: Counter[tuple[int, int]] = Counter(pool.map(one, files))
     bar.finish()
     return {"size": list(max(sizes, key=lambda s: (sizes[s], s)))}

@@ -1,7 +1,7 @@
 """Structure from motion in a process of its own: `python -m ambiguous_wild.builder.sfm_worker JOB.json`.
 
 COLMAP is noisy, cannot be interrupted from Python and may crash; apart from the command it can do all
-three. Every seed is fixed. Features and matches repeat with any number of threads; bundle adjustment
+three. Every seed is fixed, so features and matches repeat with any number of threads. Bundle adjustment
 sums in the order of its threads, so mapping runs on one (measured on 40 photos: 11.5 s on one thread,
 12.0-14.4 s on two, and the same bits each time on one alone).
 """
@@ -34,12 +34,18 @@ def run_features(job: dict[str, Any]) -> None:
     reader.camera_model = "SIMPLE_RADIAL"
     if job["masks"]:
         reader.mask_path = job["masks"]
-    single = job["camera"] == "single"
+    mode = pycolmap.CameraMode.SINGLE if job["camera"] == "single" else pycolmap.CameraMode.PER_IMAGE
+    # Photos enter the database first, in the order of their names: extraction alone numbers them in the
+    # order its threads finish, and every later random choice follows the numbers.
+    pycolmap.Database.open(job["database"]).close()
+    pycolmap.import_images(
+        job["database"], job["photos"], camera_mode=mode, image_names=job["names"], options=reader
+    )
     pycolmap.extract_features(
         job["database"],
         job["photos"],
         image_names=job["names"],
-        camera_mode=pycolmap.CameraMode.SINGLE if single else pycolmap.CameraMode.PER_IMAGE,
+        camera_mode=mode,
         reader_options=reader,
         extraction_options=options,
     )

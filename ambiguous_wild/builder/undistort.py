@@ -133,7 +133,8 @@ def _truth(folder: Path, lens: Lens, fact: dict[str, Any], truth: Path) -> list[
         if pixels.shape[:2] != (fact["height"], fact["width"]):
             raise AwError(
                 f"{path} is {pixels.shape[1]}x{pixels.shape[0]} but its photo "
-                f"{fact['width']}x{fact['height']}: the truth belongs to another capture; remove truth/ or simulate again"
+                f"{fact['width']}x{fact['height']}: the truth belongs to another capture; remove truth/ "
+                "or simulate again"
             )
         flat = lens.remap(pixels, nearest=part == "distractor")
         write_png(folder / "truth" / part / f"{fact['stem']}.png", flat)

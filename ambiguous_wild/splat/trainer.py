@@ -244,6 +244,7 @@ class Trainer:
         with part("density"):
             self.density.observe(step, gradients)
             self.gaussians, events = self.density.refine(step, self.gaussians, self.optimiser)
+            self.optimiser.bind(self.gaussians)
         if "reset" in events:
             self.parts.mask.on_opacity_reset(step)
         self.iteration = iteration

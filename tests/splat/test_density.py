@@ -120,6 +120,7 @@ def test_transparent_ones_are_pruned_and_everything_keeps_its_row():
     assert len(after) == 8
     assert len(density.seen) == len(density.grad_sum) == 8
     zero = {name: torch.zeros_like(tensor) for name, tensor in after.items()}
+    optimiser.bind(after)
     optimiser.step(Gradients(**zero, screen=torch.zeros(8, 2)), torch.ones(8, dtype=torch.bool), RATES)
 
 

@@ -262,3 +262,61 @@ def sum_lanes(typingctx: Any, values: Any) -> Any:
         return rows[0]
 
     return f32x16(values), codegen
+
+
+def _masked(builder: Any, count: Any) -> Any:
+    lanes = ir.Constant(_INTS, list(range(LANES)))
+    narrow = builder.trunc(count, _I32)
+    first = builder.insert_element(ir.Constant(_INTS, ir.Undefined), narrow, ir.Constant(_I32, 0))
+    limit = builder.shuffle_vector(first, ir.Constant(_INTS, ir.Undefined), ir.Constant(_INTS, [0] * LANES))
+    return builder.icmp_signed("<", lanes, limit)
+
+
+def _masked_function(builder: Any, name: str, result: Any, arguments: list[Any]) -> Any:
+    function = builder.module.globals.get(name)
+    if function is None:
+        function = ir.Function(builder.module, ir.FunctionType(result, arguments), name)
+    return function
+
+
+@intrinsic
+def load_some(typingctx: Any, array: Any, index: Any, count: Any) -> Any:
+    """Like `load` for the first `count` lanes, the others 0 and their memory untouched."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        pointer = _pointer(context, builder, sig.args[0], args[0], args[1])
+        function = _masked_function(
+            builder, f"llvm.masked.load.v{LANES}f32.p0", _VECTOR, [pointer.type, _I32, _BITS, _VECTOR]
+        )
+        return builder.call(
+            function, [pointer, ir.Constant(_I32, 4), _masked(builder, args[2]), _constant(0.0)]
+        )
+
+    return f32x16(array, types.intp, types.intp), codegen
+
+
+@intrinsic
+def store_some(typingctx: Any, array: Any, index: Any, value: Any, count: Any) -> Any:
+    """Like `store` for the first `count` lanes."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        pointer = _pointer(context, builder, sig.args[0], args[0], args[1])
+        function = _masked_function(
+            builder, f"llvm.masked.store.v{LANES}f32.p0", ir.VoidType(), [_VECTOR, pointer.type, _I32, _BITS]
+        )
+        builder.call(function, [args[2], pointer, ir.Constant(_I32, 4), _masked(builder, args[3])])
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, f32x16, types.intp), codegen
+
+
+@intrinsic
+def square_root(typingctx: Any, value: Any) -> Any:
+    """Correctly rounded square root, lane by lane."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.call(
+            _masked_function(builder, f"llvm.sqrt.v{LANES}f32", _VECTOR, [_VECTOR]), [args[0]]
+        )
+
+    return f32x16(value), codegen

@@ -45,7 +45,9 @@ def pack(image, keep, out):
 
 
 @numba.njit(cache=True)
-def _statistics_row(y, height, width, x_rows, y_rows, taps, keep, scale, buffers, maps, weights, ssim, totals):
+def _statistics_row(
+    y, height, width, x_rows, y_rows, taps, keep, scale, buffers, maps, weights, ssim, totals
+):
     """Row y of the statistics: sums of w |x - y| and w (1 - S), and the three maps times `scale`."""
     length = x_rows.shape[1]
     flat_x = x_rows.reshape(-1)

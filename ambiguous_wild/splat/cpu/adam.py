@@ -1,0 +1,146 @@
+"""Adam's arithmetic in sixteen lanes, one definition for every row, seen or not.
+
+A row nobody sees has gradient zero: its moments decay and it moves on momentum alone. Both the dense step
+and the postponed one run `_advance`, so that postponing changes no bit.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from ambiguous_wild.splat.cpu.simd import (
+    any_lane,
+    fma,
+    load_some,
+    magnitude,
+    select,
+    splat,
+    square_root,
+    store_some,
+)
+
+# Denormal numbers cost a hundred cycles an operation and move nothing: at |m| < 1e-30 a step is below
+# 1e-15 of the learning rate even if v is 0 and only eps = 1e-15 is left below the line.
+_TINY_M = np.float32(1e-30)
+_TINY_V = np.float32(1.2e-38)
+
+
+@numba.njit(cache=True)
+def _moments(m, v, g, beta1, rest1, beta2, rest2):
+    m = fma(g, rest1, m * beta1)
+    v = fma(g * g, rest2, v * beta2)
+    return select(magnitude(m) >= _TINY_M, m, np.float32(0.0)), select(v >= _TINY_V, v, np.float32(0.0))
+
+
+@numba.njit(cache=True)
+def _change(m, v, rate, root, eps):
+    """rate m / (sqrt(v) root + eps), with rate = lr / bias1 and root = 1 / sqrt(bias2)."""
+    return m * rate / fma(square_root(v), root, eps)
+
+
+@numba.njit(cache=True)
+def _dense_part(part, parts, p, m, v, g, rate, root, beta1, rest1, beta2, rest2, eps):
+    """The part-th of `parts` slices of a flat array, one step."""
+    blocks = (p.shape[0] + 15) // 16
+    for block in range(part * blocks // parts, (part + 1) * blocks // parts):
+        at = block * 16
+        count = min(16, p.shape[0] - at)
+        mean, square = _moments(
+            load_some(m, at, count),
+            load_some(v, at, count),
+            load_some(g, at, count),
+            beta1,
+            rest1,
+            beta2,
+            rest2,
+        )
+        store_some(m, at, mean, count)
+        store_some(v, at, square, count)
+        store_some(p, at, load_some(p, at, count) - _change(mean, square, rate, root, eps), count)
+
+
+@numba.njit(cache=True, parallel=True)
+def dense(p, m, v, g, rate, root, beta1, rest1, beta2, rest2, eps, parts):
+    """One step of a flat array."""
+    for part in numba.prange(parts):
+        _dense_part(part, parts, p, m, v, g, rate, root, beta1, rest1, beta2, rest2, eps)
+
+
+@numba.njit(cache=True)
+def _advance(p, m, v, at, count, first, last, rates, roots, beta1, rest1, beta2, rest2, eps):
+    """Steps first .. last - 1 with gradient zero for up to 16 values from flat index `at`."""
+    value = load_some(p, at, count)
+    mean = load_some(m, at, count)
+    square = load_some(v, at, count)
+    zero = splat(np.float32(0.0))
+    moving = any_lane(magnitude(mean) > np.float32(0.0))
+    for k in range(first, last):
+        mean, square = _moments(mean, square, zero, beta1, rest1, beta2, rest2)
+        if moving:
+            change = _change(mean, square, rates[k], roots[k], eps)
+            value = value - change
+            # The change shrinks by beta1 / sqrt(beta2) a step: once a thousand times it would be lost in
+            # rounding, later ones are too, unless the rate rises a thousandfold.
+            if k & 7 == 7:
+                far = magnitude(change) * np.float32(1024.0)
+                moving = any_lane(magnitude(value + far - value) > np.float32(0.0)) or any_lane(
+                    magnitude(value - far - value) > np.float32(0.0)
+                )
+    store_some(p, at, value, count)
+    store_some(m, at, mean, count)
+    store_some(v, at, square, count)
+
+
+@numba.njit(cache=True)
+def _row_catch_up(row, width, p, m, v, last, now, rates, roots, beta1, rest1, beta2, rest2, eps):
+    if last[row] < now:
+        for at in range(row * width, row * width + width, 16):
+            count = min(16, row * width + width - at)
+            _advance(p, m, v, at, count, last[row], now, rates, roots, beta1, rest1, beta2, rest2, eps)
+        last[row] = now
+
+
+@numba.njit(cache=True, parallel=True)
+def catch_up(rows, width, p, m, v, last, now, rates, roots, beta1, rest1, beta2, rest2, eps, parts):
+    """Bring rows up to step `now`: last[row] counts the steps a row has taken; flat arrays of `width` a row."""
+    n = rows.shape[0]
+    for part in numba.prange(parts):
+        for k in range(part * n // parts, (part + 1) * n // parts):
+            _row_catch_up(rows[k], width, p, m, v, last, now, rates, roots, beta1, rest1, beta2, rest2, eps)
+
+
+@numba.njit(cache=True, parallel=True)
+def catch_up_all(width, p, m, v, last, now, rates, roots, beta1, rest1, beta2, rest2, eps, parts):
+    """`catch_up` of every row."""
+    n = last.shape[0]
+    for part in numba.prange(parts):
+        for row in range(part * n // parts, (part + 1) * n // parts):
+            _row_catch_up(row, width, p, m, v, last, now, rates, roots, beta1, rest1, beta2, rest2, eps)
+
+
+@numba.njit(cache=True, parallel=True)
+def sparse(visible, width, p, m, v, g, last, now, rates, roots, beta1, rest1, beta2, rest2, eps, parts):
+    """Step `now` (counted from 0) of the visible rows with their gradient; the others are left for later."""
+    n = visible.shape[0]
+    for part in numba.prange(parts):
+        for row in range(part * n // parts, (part + 1) * n // parts):
+            if not visible[row]:
+                continue
+            _row_catch_up(row, width, p, m, v, last, now, rates, roots, beta1, rest1, beta2, rest2, eps)
+            for at in range(row * width, row * width + width, 16):
+                count = min(16, row * width + width - at)
+                mean, square = _moments(
+                    load_some(m, at, count),
+                    load_some(v, at, count),
+                    load_some(g, at, count),
+                    beta1,
+                    rest1,
+                    beta2,
+                    rest2,
+                )
+                store_some(m, at, mean, count)
+                store_some(v, at, square, count)
+                change = _change(mean, square, rates[now], roots[now], eps)
+                store_some(p, at, load_some(p, at, count) - change, count)
+            last[row] = now + 1

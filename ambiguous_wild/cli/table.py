@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import sys
 from pathlib import Path
 
 import click
@@ -31,7 +32,7 @@ def command(
     aw table runs
     aw table runs --format latex --metric psnr --metric ssim -o table.tex
     """
-    from ambiguous_wild.harness.render_tables import RENDERERS, plain
+    from ambiguous_wild.harness.render_tables import RENDERERS, plain, to_text
     from ambiguous_wild.harness.store import read_runs
     from ambiguous_wild.harness.tables import comparison
     from ambiguous_wild.io.atomic import write_text
@@ -43,8 +44,8 @@ def command(
             click.echo(plain(note), err=True)
     else:
         table = table.with_note(made_by)
-    color = style == "text" and output is None and click.get_text_stream("stdout").isatty()
-    text = RENDERERS[style](table, color=color)
+    color = style == "text" and output is None and sys.stdout.isatty()
+    text = to_text(table, color=True) if color else RENDERERS[style](table)
     if output is None:
         click.echo(text, nl=False)
         return

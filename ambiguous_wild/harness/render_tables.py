@@ -11,8 +11,7 @@ import io
 import math
 import re
 import unicodedata
-from collections.abc import Sequence
-from typing import Protocol
+from collections.abc import Callable, Sequence
 
 from ambiguous_wild.harness.measures import Measure
 from ambiguous_wild.harness.tables import Block, Cell, Row, Table
@@ -48,10 +47,6 @@ def heading(table: Table, block: Block) -> str:
     return table.title if block.scene is None else block.scene
 
 
-class Renderer(Protocol):
-    def __call__(self, table: Table, *, color: bool = False) -> str: ...
-
-
 def to_text(table: Table, *, color: bool = False) -> str:
     """Aligned columns for a terminal, one block a scene; with `color`, the three best are coloured."""
     parts = []
@@ -72,7 +67,7 @@ def to_text(table: Table, *, color: bool = False) -> str:
     return "\n".join([*parts, *_below(table)]) + "\n"
 
 
-def to_markdown(table: Table, *, color: bool = False) -> str:
+def to_markdown(table: Table) -> str:
     """GitHub tables, one a block; the best of a column is bold, the three best are numbered."""
     parts = []
     for block in table.blocks:
@@ -88,7 +83,7 @@ def to_markdown(table: Table, *, color: bool = False) -> str:
     return "\n".join([*parts, *(f"- {_markdown(line)}" for line in _below(table))]) + "\n"
 
 
-def to_csv(table: Table, *, color: bool = False) -> str:
+def to_csv(table: Table) -> str:
     """One row a scene and method, plain numbers, empty = missing; the mean has an empty scene.
 
     For every column: the mean, `_std` over seeds, and for image metrics of one scene `_low` and `_high`,
@@ -111,7 +106,7 @@ def to_csv(table: Table, *, color: bool = False) -> str:
     return out.getvalue()
 
 
-def to_latex(table: Table, *, color: bool = False) -> str:
+def to_latex(table: Table) -> str:
     """A booktabs tabular laid out as in the field's papers: scenes side by side, cost at the end.
 
     Needs booktabs, graphicx and xcolor with the option `table`.
@@ -141,7 +136,7 @@ def to_latex(table: Table, *, color: bool = False) -> str:
     return "\n".join([*lines, *(f"% {plain(line)}" for line in _below(table, marks=False))]) + "\n"
 
 
-RENDERERS: dict[str, Renderer] = {
+RENDERERS: dict[str, Callable[[Table], str]] = {
     "text": to_text,
     "markdown": to_markdown,
     "csv": to_csv,

@@ -1,0 +1,59 @@
+"""`aw table`: the numbers of the files on the way out, and nothing else written."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from click.testing import CliRunner
+
+from ambiguous_wild.cli.table import command
+from ambiguous_wild.core import AwError
+from tests.harness.fake_runs import failed, fake_result, save
+
+
+def aw_table(*words: str | Path) -> tuple[str, str]:
+    done = CliRunner().invoke(command, [str(w) for w in words], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    return done.stdout, done.stderr
+
+
+def test_default_prints_a_table_and_how_it_was_made(tmp_path: Path) -> None:
+    save(tmp_path, fake_result("3dgs", psnr=(20.0,)), fake_result("b", psnr=(23.0,)), failed("c"))
+    before = sorted(tmp_path.rglob("*"))
+    out, err = aw_table(tmp_path)
+    assert "23.00 (1)" in out and "20.00 (2)" in out and "failed: c on yard" in out
+    assert f"made by: aw table {tmp_path}" in out
+    assert "missing: lpips_alex: weights missing" in out
+    assert err == "" and sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("style", ["text", "markdown", "csv", "latex"])
+def test_output_file_holds_what_would_be_printed(style: str, tmp_path: Path) -> None:
+    runs = save(tmp_path / "my runs", fake_result("3dgs"), fake_result("b", psnr=(23.0,)))
+    out, _ = aw_table(runs, "--format", style)
+    target = tmp_path / "out" / "table.x"
+    printed, err = aw_table(runs, "--format", style, "-o", target)
+    assert printed == "" and "2 methods, 1 scenes" in err
+    assert target.read_text() == out
+
+
+def test_csv_is_clean_and_notes_go_to_standard_error(tmp_path: Path) -> None:
+    save(tmp_path, fake_result("3dgs", psnr=(20.0, 21.0)), failed("c"))
+    out, err = aw_table(tmp_path, "--format", "csv", "--metric", "psnr", "--scene", "yard")
+    frame = pd.read_csv(io.StringIO(out)).set_index("method")
+    assert frame.loc["3dgs", "psnr"] == 20.5 and pd.isna(frame.loc["c", "psnr"])
+    assert "failed: c on yard" in err
+    assert f"aw table {tmp_path} --format csv --metric psnr --scene yard" in err
+
+
+def test_errors_say_what_to_do(tmp_path: Path) -> None:
+    runner = CliRunner()
+    for words, expected in (
+        ([str(tmp_path)], "aw bench"),
+        ([str(tmp_path / "absent")], "no folder of runs"),
+    ):
+        error = runner.invoke(command, words).exception
+        assert isinstance(error, AwError) and expected in str(error)

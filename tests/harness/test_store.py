@@ -1,0 +1,160 @@
+"""Result files: checked both ways, infinity kept, what is unfinished listed."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.store import read_result, read_runs, write_result
+from tests.harness.fake_runs import failed, fake_result, save
+
+
+def test_a_result_comes_back_as_it_was(tmp_path: Path) -> None:
+    result = fake_result("3dgs", psnr=(20.5, math.inf), masks={"iou": 0.5, "recall": math.nan, "images": 3})
+    before = copy.deepcopy(result)
+    write_result(tmp_path / "metrics.json", result)
+    assert result["per_image"] == before["per_image"]
+    assert '"psnr": "inf"' in (tmp_path / "metrics.json").read_text()
+    found = read_result(tmp_path / "metrics.json")
+    assert [row["psnr"] for row in found["per_image"]] == [20.5, math.inf]
+    assert found["per_image"][0]["lpips_alex"] is None
+    assert found["masks"] == {"iou": 0.5, "recall": None, "images": 3}
+    assert found["cost"] == before["cost"]
+
+
+def test_numpy_numbers_are_written_as_numbers(tmp_path: Path) -> None:
+    cost = {"fps": np.float32(2.5), "gaussians": np.int64(7), "train_s": np.float64(np.inf)}
+    write_result(tmp_path / "m.json", fake_result("3dgs", cost=cost, facts={"on": np.bool_(True)}))
+    found = read_result(tmp_path / "m.json")
+    assert found["cost"] == {"fps": 2.5, "gaussians": 7, "train_s": math.inf}
+    assert found["facts"] == {"on": True}
+
+
+@given(st.floats(allow_nan=False))
+def test_every_number_survives(value: float) -> None:
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "m.json"
+        write_result(path, fake_result("3dgs", psnr=(value,)))
+        assert read_result(path)["per_image"][0]["psnr"] == value
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"schema": 2}, "schema version 2"),
+        ({"method": ""}, "'method' is empty"),
+        ({"method": 3}, "'method' has the wrong type: 3"),
+        ({"seed": True}, "'seed' has the wrong type"),
+        ({"seed": "0"}, "'seed' has the wrong type"),
+        ({"status": "done"}, "'ok' or 'failed'"),
+        ({"status": "failed"}, "must say its error"),
+        ({"per_image": [{"psnr": 3.0}]}, "has no name"),
+        ({"per_image": [3]}, "has no name"),
+        ({"per_image": [{"name": "a"}, {"name": "a"}]}, "'a' is there twice"),
+        ({"per_image": [{"name": "a", "psnr": "high"}]}, "psnr of a is no number: 'high'"),
+        ({"per_image": [{"name": "a", "psnr": True}]}, "psnr of a is no number"),
+        ({"per_image": [{"name": "a", "psnr": [1.0]}]}, "psnr of a is no number"),
+        ({"missing": {"ssim": None}}, "reason"),
+        ({"masks": {"iou": "x"}}, "masks.iou is no number"),
+        ({"cost": {"fps": "fast"}}, "cost.fps is no number"),
+        ({"cost": []}, "'cost' has the wrong type"),
+    ],
+)
+def test_a_wrong_field_is_named_in_writing_and_in_reading(
+    change: dict[str, Any], words: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "metrics.json"
+    result = fake_result("3dgs") | change
+    with pytest.raises(AwError, match=words):
+        write_result(path, result)
+    assert not path.exists()
+    path.write_text(json.dumps(result))
+    with pytest.raises(AwError, match=words) as caught:
+        read_result(path)
+    assert str(path) in str(caught.value)
+
+
+def test_an_absent_field_is_named(tmp_path: Path) -> None:
+    result = fake_result("3dgs")
+    del result["scene_hash"]
+    with pytest.raises(AwError, match="'scene_hash' is absent"):
+        write_result(tmp_path / "m.json", result)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", "3", '{"schema": NaN}', "[" * 100_000, '{"a": "\ud800"}', "\x00"]
+)
+def test_a_damaged_file_is_named(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "metrics.json"
+    path.write_bytes(text.encode("utf-8", "surrogatepass"))
+    with pytest.raises(AwError, match=r"metrics\.json"):
+        read_result(path)
+
+
+def test_runs_are_tidy(tmp_path: Path) -> None:
+    runs = read_runs(
+        save(tmp_path, fake_result("3dgs", psnr=(20.0, 22.0)), fake_result("b", seed=1), failed("b", seed=2))
+    )
+    values = runs.images[(runs.images["method"] == "3dgs") & (runs.images["metric"] == "psnr")]
+    assert dict(zip(values["image"], values["value"])) == {"0.png": 20.0, "1.png": 22.0}
+    assert len(runs.images) == 2 * 2 * 3
+    assert runs.images.loc[runs.images["metric"] == "lpips_alex", "value"].isna().all()
+    row = runs.runs.set_index(["method", "seed"]).loc[("3dgs", 0)]
+    assert (row["gaussians"], row["device"], row["images"], row["status"]) == (1234, "cpu", 2, "ok")
+    assert list(runs.runs["status"]) == ["ok", "ok", "failed"]
+    assert set(runs.missing["metric"]) == {"lpips_alex"} and len(runs.missing) == 2
+    assert runs.incomplete == ()
+
+
+def test_a_metric_that_one_image_lacks_has_a_row(tmp_path: Path) -> None:
+    images = [{"name": "a", "psnr": 1.0, "ssim": 0.5}, {"name": "b", "psnr": 2.0}]
+    runs = read_runs(save(tmp_path, fake_result("m", per_image=images, missing={})))
+    ssim = runs.images[runs.images["metric"] == "ssim"]
+    assert list(ssim["image"]) == ["a", "b"] and list(ssim["value"].isna()) == [False, True]
+
+
+def test_unfinished_and_damaged_runs_are_listed(tmp_path: Path) -> None:
+    save(tmp_path, fake_result("3dgs"))
+    (tmp_path / "yard" / "b" / "seed0").mkdir(parents=True)
+    resumed = tmp_path / "yard" / "c" / "seed0"
+    resumed.mkdir(parents=True)
+    (resumed / "config.yaml").write_text("method: c\n")
+    damaged = tmp_path / "yard" / "d" / "seed0" / "metrics.json"
+    damaged.parent.mkdir(parents=True)
+    damaged.write_text("{")
+    hidden = tmp_path / ".cache" / "seed0"
+    hidden.mkdir(parents=True)
+    runs = read_runs(tmp_path)
+    assert [i.folder.parent.name for i in runs.incomplete] == ["b", "c", "d"]
+    assert "still running" in runs.incomplete[0].reason and "damaged" in runs.incomplete[2].reason
+    assert len(runs.runs) == 1
+
+
+def test_a_single_run_folder_can_be_read(tmp_path: Path) -> None:
+    save(tmp_path, fake_result("3dgs"))
+    assert len(read_runs(tmp_path / "yard" / "3dgs" / "seed0").runs) == 1
+
+
+def test_nothing_there_is_an_error_that_says_what_to_do(tmp_path: Path) -> None:
+    with pytest.raises(AwError, match="aw bench"):
+        read_runs(tmp_path)
+    with pytest.raises(AwError, match="no folder of runs"):
+        read_runs(tmp_path / "absent")
+
+
+def test_two_results_for_one_cell_are_refused(tmp_path: Path) -> None:
+    write_result(tmp_path / "one" / "metrics.json", fake_result("3dgs"))
+    write_result(tmp_path / "two" / "metrics.json", fake_result("3dgs"))
+    with pytest.raises(AwError, match="two results for method '3dgs' on scene 'yard' with seed 0"):
+        read_runs(tmp_path)

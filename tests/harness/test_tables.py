@@ -1,0 +1,278 @@
+"""Comparisons: what is averaged, what is missing, who is first; and four formats that keep names text."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.measures import MEASURES, measure
+from ambiguous_wild.harness.render_tables import (
+    RENDERERS,
+    plain,
+    to_csv,
+    to_latex,
+    to_markdown,
+    to_text,
+)
+from ambiguous_wild.harness.store import read_runs
+from ambiguous_wild.harness.tables import Cell, Table, comparison
+from tests.harness.fake_runs import failed, fake_result, save
+
+HOSTILE = '<script>|\\input{x}$&%#_^~"*`[a](http://b)\x1b[31m\u202e'
+
+
+def cell(table: Table, method: str, key: str, block: int = 0) -> Cell:
+    row = next(r for r in table.blocks[block].rows if r.method == method)
+    return row.cells[[c.key for c in table.columns].index(key)]
+
+
+def table_of(tmp_path: Path, *results: dict, **options) -> Table:  # type: ignore[no-untyped-def, type-arg]
+    return comparison(read_runs(save(tmp_path, *results)), **options)
+
+
+def test_mean_over_images_then_seeds_then_scenes(tmp_path: Path) -> None:
+    table = table_of(
+        tmp_path,
+        fake_result("a", "one", 0, (10.0, 20.0)),
+        fake_result("a", "one", 1, (20.0, 20.0)),
+        # Four images: a mean over all images at once would weigh this scene double.
+        fake_result("a", "two", 0, (30.0, 30.0, 30.0, 34.0)),
+        fake_result("a", "two", 1, (31.0, 31.0, 31.0, 31.0)),
+    )
+    assert [b.scene for b in table.blocks] == [None, "one", "two"]
+    assert cell(table, "a", "psnr", 1).value == 17.5
+    assert cell(table, "a", "psnr", 1).spread == pytest.approx(np.std([15.0, 20.0], ddof=1))
+    assert cell(table, "a", "psnr", 2).value == 31.0
+    mean = cell(table, "a", "psnr")
+    assert mean.value == 24.25
+    assert mean.spread == pytest.approx(np.std([(15 + 31) / 2, (20 + 31) / 2], ddof=1))
+    assert cell(table, "a", "train_s").value == 10.5
+    assert table.blocks[0].rows[0].runs == 4
+
+
+def test_one_scene_is_one_block_without_spread(tmp_path: Path) -> None:
+    table = table_of(tmp_path, fake_result("a"))
+    assert [b.scene for b in table.blocks] == ["yard"]
+    assert math.isnan(cell(table, "a", "psnr").spread)
+    assert "±" not in to_text(table)
+
+
+def test_interval_over_the_images_of_a_scene(tmp_path: Path) -> None:
+    table = table_of(tmp_path, fake_result("a", psnr=(10.0, 20.0, 30.0)), fake_result("b", psnr=(5.0,)))
+    found = cell(table, "a", "psnr")
+    assert 10.0 <= found.low < found.value == 20.0 < found.high <= 30.0
+    assert math.isnan(cell(table, "b", "psnr").low)
+
+
+@pytest.mark.parametrize(
+    ("key", "order"), [("psnr", "cbad"), ("train_s", "abcd"), ("iterations", ""), ("fps", "dcba")]
+)
+def test_first_second_third_follow_the_direction_of_merit(key: str, order: str, tmp_path: Path) -> None:
+    psnr = {"a": 20.0, "b": 21.0, "c": 22.0, "d": 19.0}
+    results = []
+    for i, (method, value) in enumerate(psnr.items()):
+        cost = {"train_s": 10.0 + i, "iterations": 100 + i, "fps": 5.0 + i}
+        results.append(fake_result(method, psnr=(value,), cost=cost))
+    table = table_of(tmp_path, *results, metrics=[key])
+    ranks = {m: cell(table, m, key).rank for m in psnr}
+    assert ranks == {m: (order.index(m) + 1 if m in order[:3] else None) for m in psnr}
+
+
+def test_equal_in_print_shares_the_rank(tmp_path: Path) -> None:
+    table = table_of(
+        tmp_path,
+        fake_result("a", psnr=(20.001,)),
+        fake_result("b", psnr=(20.002,)),
+        fake_result("c", psnr=(19.0,)),
+        metrics=["psnr", "gaussians"],
+    )
+    assert [cell(table, m, "psnr").rank for m in "abc"] == [1, 1, 3]
+    # All alike: there is no first.
+    assert [cell(table, m, "gaussians").rank for m in "abc"] == [None] * 3
+
+
+def test_infinite_psnr_stays_visible_everywhere(tmp_path: Path) -> None:
+    table = table_of(
+        tmp_path,
+        fake_result("a", "one", psnr=(math.inf, 20.0)),
+        fake_result("b", "one", psnr=(30.0, 20.0)),
+        fake_result("a", "two", psnr=(20.0,)),
+        fake_result("b", "two", psnr=(20.0,)),
+    )
+    assert cell(table, "a", "psnr").value == math.inf and cell(table, "a", "psnr").rank == 1
+    assert "inf (1)" in to_text(table)
+    assert "**inf** (1)" in to_markdown(table)
+    assert r"$\infty$" in to_latex(table)
+    assert next(csv.DictReader(io.StringIO(to_csv(table))))["psnr"] == "inf"
+
+
+def test_a_mean_over_a_missing_scene_is_missing_and_said(tmp_path: Path) -> None:
+    table = table_of(
+        tmp_path,
+        fake_result("a", "one"),
+        fake_result("a", "two"),
+        fake_result("b", "one", psnr=(40.0,)),
+    )
+    assert cell(table, "b", "psnr").state == "missing"
+    assert cell(table, "a", "psnr").rank is None  # alone: nothing to be first of
+    assert cell(table, "b", "psnr", 2).state == "absent"
+    assert cell(table, "b", "psnr", 1).rank == 1
+    assert "no result: b on two; its mean over scenes is missing" in table.notes
+
+
+def test_a_failed_seed_fails_its_cell(tmp_path: Path) -> None:
+    table = table_of(
+        tmp_path,
+        fake_result("a", "one", 0, (50.0,)),
+        failed("a", "one", 1),
+        fake_result("a", "two"),
+        fake_result("b", "one"),
+        fake_result("b", "two"),
+    )
+    assert cell(table, "a", "psnr").state == "failed" and cell(table, "a", "psnr", 1).state == "failed"
+    assert cell(table, "a", "psnr", 2).state == "ok"
+    assert cell(table, "b", "psnr", 1).rank is None
+    assert "failed: a on one, seed 1: loss is not finite" in table.notes
+    assert "failed" in to_text(table).splitlines()[3]
+
+
+def test_missing_metrics_carry_their_reason_once(tmp_path: Path) -> None:
+    table = table_of(tmp_path, fake_result("a"), fake_result("b"))
+    assert cell(table, "a", "lpips_alex").state == "missing"
+    told = [n for n in table.notes if "lpips_alex" in n]
+    assert told == ["missing: lpips_alex: weights missing: put heads.pth into W"]
+
+
+def test_a_reason_that_concerns_some_names_them(tmp_path: Path) -> None:
+    full = [{"name": "0.png", "psnr": 20.0, "ssim": 0.5, "lpips_alex": 0.2}]
+    table = table_of(tmp_path, fake_result("a"), fake_result("b", per_image=full, missing={}))
+    assert [cell(table, m, "lpips_alex").state for m in "ab"] == ["missing", "ok"]
+    assert any(n.startswith("missing: lpips_alex for a on yard: weights") for n in table.notes)
+
+
+def test_a_null_without_a_reason_is_noted(tmp_path: Path) -> None:
+    images = [{"name": "0.png", "psnr": 20.0, "ssim": 0.5}, {"name": "1.png", "psnr": 21.0, "ssim": None}]
+    table = table_of(tmp_path, fake_result("a", per_image=images, missing={}))
+    assert cell(table, "a", "ssim").state == "missing"
+    assert "missing: ssim, no reason given, for 1.png (a on yard)" in table.notes
+
+
+def test_what_cannot_be_compared_is_said(tmp_path: Path) -> None:
+    other = fake_result("c", psnr=(1.0, 2.0, 3.0), scene_hash="other", version="0.2.0")
+    other["cost"] |= {"device": "cuda", "iterations": 30_000}
+    notes = "\n".join(table_of(tmp_path, fake_result("a"), fake_result("b"), other).notes)
+    assert "come from 2 versions of the scene" in notes
+    assert "different test images of yard" in notes
+    assert "trainings differ in length (iterations): a 100, b 100, c 30000" in notes
+    assert "different devices: a cpu, b cpu, c cuda" in notes
+    assert "different versions of ambiguous_wild: 0.1.0, 0.2.0" in notes
+    alike = table_of(tmp_path / "alike", fake_result("a"), fake_result("b")).notes
+    assert not [n for n in alike if "differ" in n or "comparable" in n]
+
+
+def test_incomplete_runs_are_below_the_table(tmp_path: Path) -> None:
+    (tmp_path / "yard" / "z" / "seed0").mkdir(parents=True)
+    table = table_of(tmp_path, fake_result("a"))
+    for render in (to_text, to_markdown, to_latex):
+        assert "still running" in render(table)
+    with pytest.raises(AwError, match="no finished run"):
+        comparison(read_runs(tmp_path / "yard" / "z"))
+
+
+def test_columns_and_scenes_can_be_chosen(tmp_path: Path) -> None:
+    results = [fake_result("a", s, masks={"iou": 0.5, "images": 2}) for s in ("one", "two", "three")]
+    table = table_of(tmp_path, *results, metrics=["mask_iou", "psnr", "psnr"], scenes=["two"])
+    assert [c.key for c in table.columns] == ["mask_iou", "psnr"] and table.scenes == ("two",)
+    assert cell(table, "a", "mask_iou").value == 0.5
+    runs = read_runs(tmp_path)
+    with pytest.raises(AwError, match="did you mean 'psnr'"):
+        comparison(runs, metrics=["pnsr"])
+    with pytest.raises(AwError, match="did you mean 'three'"):
+        comparison(runs, scenes=["thre"])
+
+
+def test_a_metric_of_another_takes_its_family(tmp_path: Path) -> None:
+    assert measure("psnr_distractor").better == "higher" and measure("lpips_squeeze").better == "lower"
+    assert measure("psnrish").better is None and measure("psnr") is MEASURES["psnr"]
+    images = [{"name": "0.png", "psnr": 20.0, "psnr_distractor": 12.0, "glare": 3.0}]
+    table = table_of(tmp_path, fake_result("a", per_image=images), fake_result("b", per_image=images))
+    assert {"psnr_distractor", "glare"} <= {c.key for c in table.columns}
+
+
+def test_csv_is_read_back_as_numbers(tmp_path: Path) -> None:
+    import pandas as pd
+
+    table = table_of(
+        tmp_path, *(fake_result(m, s) for m in ("a", "b") for s in ("one", "two")), failed("c", "one")
+    )
+    frame = pd.read_csv(io.StringIO(to_csv(table)))
+    assert len(frame) == 9 and frame["psnr"].dtype == float
+    mean = frame[frame["scene"].isna()].set_index("method")
+    assert mean.loc["a", "psnr"] == 21.0 and mean.loc["a", "gaussians"] == 1234
+    assert frame.set_index(["scene", "method"]).loc[("one", "c"), "status"] == "failed"
+    assert frame.set_index(["scene", "method"]).loc[("two", "c"), "status"] == "absent"
+
+
+@pytest.mark.parametrize("name", ["=1+1", "+x", "-x", "@x", " =x", "\t=x"])
+def test_csv_cells_are_no_formulas(name: str, tmp_path: Path) -> None:
+    table = table_of(tmp_path, fake_result(name), fake_result("b", psnr=(0.5,)))
+    rows = list(csv.DictReader(io.StringIO(to_csv(table))))
+    assert any(r["method"].startswith("'") and r["method"].endswith(plain(name)) for r in rows)
+
+
+def test_hostile_names_stay_text_in_every_format(tmp_path: Path) -> None:
+    table = table_of(tmp_path, fake_result(HOSTILE), fake_result("b"))
+    for name, render in RENDERERS.items():
+        text = render(table)
+        assert "\x1b" not in text and "\u202e" not in text, name
+    markdown = to_markdown(table)
+    row = next(line for line in markdown.splitlines() if "script" in line)
+    assert "<" not in row and not re.search(r"(?<!\\)\]\(", row) and "http:" not in row
+    assert len(re.findall(r"(?<!\\)\|", row)) == len(table.columns) + 2
+    latex = to_latex(table)
+    row = next(line for line in latex.splitlines() if "script" in line)
+    assert r"\textbackslash{}input\{x\}" in row and r"\$\&\%\#\_" in row
+    assert len(re.findall(r"(?<!\\)&", row)) == len(table.columns)
+    rows = list(csv.reader(io.StringIO(to_csv(table))))
+    assert {len(r) for r in rows} == {len(rows[0])}
+
+
+@given(st.text(max_size=30))
+def test_latex_and_markdown_of_any_name_have_no_open_special(name: str) -> None:
+    from ambiguous_wild.harness.render_tables import _latex, _markdown
+
+    assert "\n" not in _latex(name) + _markdown(name)
+    rest = re.sub(r"\\text\w+\{\}|\\[&%$#_{}]|\{[\[*]\}", "", _latex(name))
+    assert not re.search(r"[\\&%$#_{}~^\[*]", rest)
+    assert not re.search(r"[<>]", _markdown(name))
+
+
+def test_latex_is_balanced_and_names_begin_no_option(tmp_path: Path) -> None:
+    table = table_of(tmp_path, *(fake_result(m, s) for m in ("[2em] x", "*b") for s in ("one", "two")))
+    latex = to_latex(table)
+    body = [line for line in latex.splitlines() if line.endswith(r"\\")]
+    assert len({line.count("&") for line in body[1:]}) == 1
+    assert not any(line.startswith(("[", "*")) for line in latex.splitlines())
+    assert latex.count("{") == latex.count("}")
+    assert latex.index("mean over 2 scenes") > latex.index("{two}")
+
+
+def test_text_columns_are_aligned(tmp_path: Path) -> None:
+    table = table_of(tmp_path, fake_result("日本", psnr=(9.0,)), fake_result("long name", psnr=(20.0,)))
+    lines = to_text(table).splitlines()
+    ruler, second, first = lines[2], lines[3], lines[4]
+    end = len(ruler) - len(ruler.lstrip("─"))
+    assert end == len("long name")
+    # Two wide characters take four columns of a terminal: two fewer characters than columns.
+    assert first.index("9.00") + len("9.00") + 2 == second.index("20.00") + len("20.00")
+    colored = to_text(table, color=True)
+    assert re.sub(r"\x1b\[[0-9;]*m", "", colored) == to_text(table) and "\x1b[" in colored

@@ -1,0 +1,154 @@
+"""The splat PLY that every 3DGS viewer reads: binary little-endian, one vertex a Gaussian, raw parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.io.atomic import atomic_path
+
+_MAX_HEADER = 64 * 1024  # bytes; a splat header has under 2 kB
+_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2",
+    "ushort": "<u2", "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4",
+    "float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8",
+}  # fmt: skip
+_SHAPES = {"means": (3,), "quats": (4,), "log_scales": (3,), "opacity_logits": (), "sh0": (3,)}
+
+
+def _columns(rest: int) -> list[str]:
+    names = ["x", "y", "z", "nx", "ny", "nz"]
+    names += [f"f_dc_{i}" for i in range(3)] + [f"f_rest_{i}" for i in range(3 * rest)]
+    return [*names, "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+
+
+def write_splat_ply(path: Path | str, gaussians: Mapping[str, np.ndarray]) -> None:
+    """Write Gaussians atomically.
+
+    Args:
+        path: the file.
+        gaussians: raw parameters as `splat.Gaussians` holds them: means [N, 3], quats [N, 4] (w, x, y,
+            z), log_scales [N, 3], opacity_logits [N], sh0 [N, 3], sh_rest [N, K, 3] with K of 0, 3, 8, 15.
+
+    Raises:
+        AwError: an array is missing or has another shape.
+    """
+    missing = [name for name in (*_SHAPES, "sh_rest") if name not in gaussians]
+    if missing:
+        raise AwError(f"cannot write {path}: no {', '.join(missing)}")
+    n = len(gaussians["means"])
+    for name, shape in _SHAPES.items():
+        if gaussians[name].shape != (n, *shape):
+            raise AwError(f"cannot write {path}: {name} is {list(gaussians[name].shape)}, not {[n, *shape]}")
+    rest = gaussians["sh_rest"]
+    if rest.ndim != 3 or rest.shape[0] != n or rest.shape[1] not in (0, 3, 8, 15) or rest.shape[2] != 3:
+        raise AwError(f"cannot write {path}: sh_rest is {list(rest.shape)}, not [{n}, 0|3|8|15, 3]")
+    names = _columns(rest.shape[1])
+    table = np.concatenate(
+        [
+            gaussians["means"],
+            np.zeros((n, 3)),
+            gaussians["sh0"],
+            rest.transpose(0, 2, 1).reshape(n, 3 * rest.shape[1]),  # channel by channel
+            gaussians["opacity_logits"][:, None],
+            gaussians["log_scales"],
+            gaussians["quats"],
+        ],
+        axis=1,
+        dtype="<f4",
+        casting="same_kind",
+    )
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {n}"]
+    header += [f"property float {name}" for name in names] + ["end_header", ""]
+    with atomic_path(path) as temporary, open(temporary, "wb") as f:
+        f.write("\n".join(header).encode("ascii"))
+        f.write(table.tobytes())
+
+
+def read_splat_ply(path: Path | str) -> dict[str, np.ndarray]:
+    """Read a splat PLY, ours or another tool's; arrays as `write_splat_ply` takes them, float32.
+
+    Columns may come in any order and any scalar type, others are ignored, and a vertex element of
+    another number of harmonics than degree 0 to 3 holds is refused.
+
+    Raises:
+        AwError: not such a file, cut short, or columns are missing.
+    """
+    path = Path(path)
+    try:
+        size = path.stat().st_size
+        with open(path, "rb") as f:
+            count, dtype, start = _header(path, f.read(_MAX_HEADER))
+            if count * dtype.itemsize > size - start:
+                raise AwError(
+                    f"{path} is cut short: {count} Gaussians of {dtype.itemsize} bytes announced, "
+                    f"{size - start} bytes there; copy or export it again"
+                )
+            f.seek(start)
+            table = np.frombuffer(f.read(count * dtype.itemsize), dtype, count)
+    except OSError as error:
+        raise AwError(f"cannot read {path}: {error.strerror or error}") from None
+    present = set(dtype.names or ())
+    rest = sum(name.startswith("f_rest_") for name in present)
+    if rest not in (0, 9, 24, 45):
+        raise AwError(f"{path} has {rest} f_rest columns; degree 0 to 3 have 0, 9, 24 or 45")
+    missing = [c for c in _columns(rest // 3) if c not in present and c not in ("nx", "ny", "nz")]
+    if missing:
+        raise AwError(f"{path} is no splat PLY: it lacks {', '.join(missing[:6])}")
+
+    def columns(names: list[str]) -> np.ndarray:
+        return np.stack([table[name].astype(np.float32) for name in names], axis=1)
+
+    higher = np.zeros((count, 0, 3), np.float32)
+    if rest:
+        channels = columns([f"f_rest_{i}" for i in range(rest)]).reshape(count, 3, rest // 3)
+        higher = np.ascontiguousarray(channels.transpose(0, 2, 1))
+    return {
+        "means": columns(["x", "y", "z"]),
+        "quats": columns([f"rot_{i}" for i in range(4)]),
+        "log_scales": columns([f"scale_{i}" for i in range(3)]),
+        "opacity_logits": table["opacity"].astype(np.float32),
+        "sh0": columns([f"f_dc_{i}" for i in range(3)]),
+        "sh_rest": higher,
+    }
+
+
+def _header(path: Path, head: bytes) -> tuple[int, np.dtype, int]:
+    """Number of vertices, their record, and where the data starts."""
+    if not head.startswith(b"ply"):
+        raise AwError(f"{path} is no PLY file: it does not start with 'ply'")
+    end = head.find(b"end_header")
+    newline = head.find(b"\n", end)
+    if end < 0 or newline < 0:
+        raise AwError(f"{path}: no end of the PLY header within its first {_MAX_HEADER} bytes")
+    count, fields, element = -1, [], ""
+    binary = False
+    for line in head[:end].decode("latin-1").splitlines():
+        words = line.split()
+        if not words or words[0] in ("ply", "comment", "obj_info"):
+            continue
+        if words[0] == "format":
+            binary = words[1:2] == ["binary_little_endian"]
+        elif words[0] == "element" and len(words) == 3:
+            element = words[1] if count < 0 else "later"
+            if count < 0:
+                if element != "vertex" or not words[2].isdecimal() or len(words[2]) > 12:
+                    raise AwError(f"{path}: expected 'element vertex <count>' first, found {line[:60]!r}")
+                count = int(words[2])
+        elif words[0] == "property" and element == "vertex":
+            if len(words) != 3 or words[1] not in _TYPES:
+                raise AwError(f"{path}: cannot use vertex property {line[:60]!r}")
+            fields.append((words[2], _TYPES[words[1]]))
+        elif not (words[0] == "property" and element == "later"):
+            raise AwError(f"{path}: cannot use header line {line[:60]!r}")
+    if not binary:
+        raise AwError(f"{path} is not binary little-endian; export it in that format")
+    if count < 0 or not fields:
+        raise AwError(f"{path}: its header names no vertices")
+    names = [name for name, _ in fields]
+    if len(set(names)) != len(names):
+        raise AwError(f"{path}: its header names a vertex property twice")
+    return count, np.dtype(fields), newline + 1

@@ -1,0 +1,116 @@
+"""Splat PLY: the layout others read, round trips, and junk refused by name."""
+
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.io.ply import read_splat_ply, write_splat_ply
+
+
+def model(n=5, rest=15, seed=0):
+    rng = np.random.default_rng(seed)
+    shapes = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "opacity_logits": (n,), "sh0": (n, 3)}
+    out = {name: rng.normal(size=shape).astype(np.float32) for name, shape in shapes.items()}
+    return out | {"sh_rest": rng.normal(size=(n, rest, 3)).astype(np.float32)}
+
+
+@pytest.mark.parametrize("rest", [0, 3, 8, 15])
+@pytest.mark.parametrize("n", [0, 1, 7])
+def test_round_trip_is_exact(tmp_path, n, rest):
+    before = model(n, rest)
+    write_splat_ply(tmp_path / "a.ply", before)
+    after = read_splat_ply(tmp_path / "a.ply")
+    assert after.keys() == before.keys()
+    for name, array in before.items():
+        assert after[name].dtype == np.float32
+        np.testing.assert_array_equal(after[name], array)
+
+
+def test_the_layout_is_the_one_viewers_expect(tmp_path):
+    g = model(2, 3)
+    write_splat_ply(tmp_path / "a.ply", g)
+    data = (tmp_path / "a.ply").read_bytes()
+    header, _, body = data.partition(b"end_header\n")
+    lines = header.decode().splitlines()
+    assert lines[:3] == ["ply", "format binary_little_endian 1.0", "element vertex 2"]
+    names = [line.split()[2] for line in lines[3:]]
+    assert names[:9] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    assert names[9:18] == [f"f_rest_{i}" for i in range(9)]
+    assert names[18:] == ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    second = struct.unpack("<26f", body[26 * 4 :])
+    # f_rest runs over the three coefficients of red, then of green, then of blue
+    expected = [*g["means"][1], 0, 0, 0, *g["sh0"][1], *g["sh_rest"][1, :, 0], *g["sh_rest"][1, :, 1]]
+    expected += [*g["sh_rest"][1, :, 2], g["opacity_logits"][1], *g["log_scales"][1], *g["quats"][1]]
+    assert second == tuple(np.float32(v) for v in expected)
+
+
+def test_columns_in_another_order_and_type_are_understood(tmp_path):
+    before = model(3, 0)
+    columns = {"opacity": before["opacity_logits"]}
+    for prefix, name in (("rot_", "quats"), ("scale_", "log_scales"), ("f_dc_", "sh0")):
+        columns |= {f"{prefix}{i}": before[name][:, i] for i in range(before[name].shape[1])}
+    columns |= {axis: before["means"][:, i] for i, axis in enumerate("xyz")}
+    table = np.zeros(3, [("flag", "u1"), *((name, "<f8") for name in columns)])
+    for name, values in columns.items():
+        table[name] = values
+    header = "ply\r\nformat binary_little_endian 1.0\r\ncomment made elsewhere\r\nelement vertex 3\r\n"
+    header += "property uchar flag\r\n" + "".join(f"property double {name}\r\n" for name in columns)
+    path = tmp_path / "other.ply"
+    path.write_bytes(header.encode() + b"end_header\r\n" + table.tobytes())
+    after = read_splat_ply(path)
+    for name, array in before.items():
+        np.testing.assert_array_equal(after[name], array)
+
+
+def test_junk_is_refused_by_name(tmp_path):
+    path = tmp_path / "x.ply"
+    write_splat_ply(path, model())
+    whole = path.read_bytes()
+    cases = {
+        "does not start": b"PK\x03\x04" + whole,
+        "no end of the PLY header": whole[:200],
+        "cut short": whole[:-1],
+        "cut short:": whole.replace(b"vertex 5", b"vertex 999999999999"),
+        "element vertex": whole.replace(b"vertex 5", b"vertex -5"),
+        "not binary little-endian": whole.replace(b"binary_little_endian", b"ascii"),
+        "lacks": whole.replace(b"float opacity", b"float weight"),
+        "cannot use vertex property": whole.replace(b"property float x", b"property list uchar int x"),
+        "twice": whole.replace(b"property float y", b"property float x"),
+        "f_rest columns": whole.replace(b"f_rest_44", b"g_rest_44"),
+        "names no vertices": b"ply\nformat binary_little_endian 1.0\nend_header\n",
+    }
+    for message, data in cases.items():
+        path.write_bytes(data)
+        with pytest.raises(AwError, match=message.rstrip(":")):
+            read_splat_ply(path)
+    with pytest.raises(AwError, match="cannot read"):
+        read_splat_ply(tmp_path / "absent.ply")
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.binary(max_size=300), st.integers(0, 400))
+def test_damage_never_ends_in_anything_but_a_named_error(tmp_path_factory, noise, at):
+    path = tmp_path_factory.mktemp("ply") / "x.ply"
+    write_splat_ply(path, model(2, 0))
+    data = path.read_bytes()
+    path.write_bytes(data[:at] + noise + data[at + len(noise) :])
+    try:
+        assert set(read_splat_ply(path)) == set(model(1, 0))
+    except AwError as error:
+        assert str(path) in str(error)
+
+
+def test_wrong_shapes_are_refused_and_leave_no_file(tmp_path):
+    for name in model():
+        broken = model()
+        broken[name] = broken[name][:-1]
+        with pytest.raises(AwError, match="cannot write"):
+            write_splat_ply(tmp_path / "a.ply", broken)
+        del broken[name]
+        with pytest.raises(AwError, match=f"no {name}"):
+            write_splat_ply(tmp_path / "a.ply", broken)
+    assert not list(tmp_path.iterdir())

@@ -58,7 +58,7 @@ def downsample_photo(
     """Resample in linear light; the edges of both images coincide, so intrinsics scale exactly."""
     import OpenImageIO as oiio
 
-    source = oiio.ImageBuf(_TO_LINEAR[image])
+    source = oiio.ImageBuf(cv2.LUT(image, _TO_LINEAR))
     region = oiio.ROI(0, width, 0, height, 0, 1, 0, 3)
     # One thread a photo: several photos are under way at once.
     small = oiio.ImageBufAlgo.resize(source, filtername=FILTER, roi=region, nthreads=1)
@@ -103,6 +103,6 @@ def downsample(folder: Path, full: Path, factor: int, *, jobs: int, bar: Bar) ->
         return width, height
 
     with ThreadPoolExecutor(jobs) as pool:
-        sizes: Counter[tuple[int, int]] = Counter(pool.map(one, files))
+        sizes = Counter(pool.map(one, files))
     bar.finish()
-    return {"size": list(max(sizes, key=lambda s: (sizes[s], s)))}
+    return {"size": list(sizes.most_common(1)[0][0])}

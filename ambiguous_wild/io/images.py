@@ -100,7 +100,7 @@ def write_png(
         pixels = image
     else:
         raise AwError(f"{path}: a PNG of ours is [H, W] or [H, W, 3], got {list(image.shape)}")
-    done, data = cv2.imencode(".png", np.ascontiguousarray(pixels), [cv2.IMWRITE_PNG_COMPRESSION, 3])
+    done, data = cv2.imencode(".png", np.ascontiguousarray(pixels), [cv2.IMWRITE_PNG_COMPRESSION, 1])
     if not done:
         raise AwError(f"{path}: OpenCV could not encode {list(image.shape)} {image.dtype} as PNG")
     with atomic_path(path) as temporary:

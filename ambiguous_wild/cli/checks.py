@@ -1,0 +1,318 @@
+"""What `aw doctor` looks at: each check says what it found and, where something lacks, what brings it.
+
+Nothing heavy is imported here. What may crash or hang (torch, torchvision, pycolmap) is tried in a process
+of its own, all of them at the same time.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.util
+import json
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+PACKAGE = Path(__file__).resolve().parent.parent
+DISTRIBUTION = "ambiguous-wild"
+PROBE_TIMEOUT_S = 60
+SMALL_MEMORY_GB = 2.0  # below it COLMAP and a training of 100 000 Gaussians do not fit
+SMALL_DISK_GB = 1.0  # photos, features and one run
+
+# What is tried in a process of its own; each prints one line of JSON.
+PROBES = {
+    "torch": """
+import torch
+cuda = torch.cuda.is_available()
+names = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())] if cuda else []
+print(json.dumps({"version": torch.__version__, "built": torch.version.cuda, "cuda": cuda, "names": names}))
+""",
+    "torchvision": "import torchvision; print(json.dumps({'version': torchvision.__version__}))",
+    "numba": """
+import numba
+threads = numba.get_num_threads()  # starts the threading layer
+print(json.dumps({"threads": threads, "layer": numba.threading_layer()}))
+""",
+    "OpenImageIO": "import OpenImageIO; print(json.dumps({'version': OpenImageIO.VERSION_STRING}))",
+    "pycolmap": """
+import tempfile, pathlib
+from ambiguous_wild.io.safe_pycolmap import pycolmap
+import numpy as np
+from ambiguous_wild.io.images import read_png_rgb, write_png
+image = np.arange(48 * 64 * 3, dtype=np.uint8).reshape(48, 64, 3)
+with tempfile.TemporaryDirectory() as folder:
+    path = pathlib.Path(folder) / "probe.png"
+    write_png(path, image)
+    assert (read_png_rgb(path) == image).all(), "the PNG read back differs from the one written"
+print(json.dumps({"version": pycolmap.__version__}))
+""",
+}
+
+
+@dataclass(frozen=True)
+class Check:
+    """One line of the report."""
+
+    group: Literal["core", "optional"]
+    name: str
+    ok: bool
+    detail: str  # what was found
+    fix: str = ""  # the command that brings it; empty where nothing lacks
+
+
+@dataclass(frozen=True)
+class Probe:
+    """What a process said: its facts, or why there are none."""
+
+    facts: dict[str, Any] | None
+    error: str = ""
+
+
+def all_checks() -> list[Check]:
+    """Every check, core first."""
+    names = [n for n in PROBES if n != "torchvision" or importlib.util.find_spec(n) is not None]
+    with ThreadPoolExecutor(len(names)) as pool:
+        found = dict(zip(names, pool.map(probe, names)))
+    return [
+        *_machine(),
+        *_packages(),
+        _library("torch", found["torch"], "training and LPIPS"),
+        _library("OpenImageIO", found["OpenImageIO"], "reading photos"),
+        _library("pycolmap", found["pycolmap"], "structure from motion; a PNG written after it is intact"),
+        *_numba(found["numba"]),
+        *_gpu(found["torch"]),
+        *_extras(),
+        _torchvision(found.get("torchvision")),
+        *_weights(),
+        _git(),
+    ]
+
+
+def probe(name: str) -> Probe:
+    """Run one of `PROBES` in a process of its own."""
+    code = "import json\n" + PROBES[name]
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, timeout=PROBE_TIMEOUT_S, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return Probe(None, f"no answer within {PROBE_TIMEOUT_S} s")
+    if done.returncode < 0:
+        return Probe(None, f"the process crashed (signal {-done.returncode})")
+    lines = done.stderr.strip().splitlines()
+    if done.returncode:
+        return Probe(None, lines[-1] if lines else f"exit code {done.returncode}")
+    try:
+        return Probe(json.loads(done.stdout.strip().splitlines()[-1]))
+    except (IndexError, ValueError):
+        return Probe(None, f"unexpected output {done.stdout[-200:]!r}")
+
+
+def _machine() -> list[Check]:
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    python = sys.version_info >= (3, 11)
+    checks = [
+        Check(
+            "core",
+            "python",
+            python,
+            platform.python_version(),
+            "" if python else "install Python 3.11 or newer",
+        ),
+        Check("core", "cpu", True, f"{cores} cores usable of {os.cpu_count()}, {platform.machine()}"),
+    ]
+    memory = _memory_gb()
+    if memory is not None:
+        fine = memory >= SMALL_MEMORY_GB
+        fix = (
+            "" if fine else f"free some, or train with --max-gaussians: {SMALL_MEMORY_GB:.0f} GB are advised"
+        )
+        checks.append(Check("core", "memory", fine, f"{memory:.1f} GB", fix))
+    free = shutil.disk_usage(Path.cwd()).free / 1e9
+    fine = free >= SMALL_DISK_GB
+    fix = "" if fine else f"free {SMALL_DISK_GB:.0f} GB, or work elsewhere"
+    checks.append(Check("core", "disk", fine, f"{free:.0f} GB free in {Path.cwd()}", fix))
+    return checks
+
+
+def _memory_gb() -> float | None:
+    """Physical memory; None where the system does not say."""
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
+    except (AttributeError, ValueError, OSError):
+        return None
+
+
+def _packages() -> list[Check]:
+    """The required packages against their ranges, and against the versions the project is tested with."""
+    try:
+        required = importlib.metadata.requires(DISTRIBUTION) or []
+    except importlib.metadata.PackageNotFoundError:
+        return [Check("core", "packages", False, f"{DISTRIBUTION} is not installed", "pip install -e .")]
+    wrong = unmet(r for r in required if "extra ==" not in r)
+    if wrong:
+        fix = "pip install " + " ".join(f"'{w}'" for w in wrong)
+        return [Check("core", "packages", False, "absent or too old: " + ", ".join(wrong), fix)]
+    other = other_versions(PACKAGE.parent / "constraints.txt")
+    detail = f"all {sum('extra ==' not in r for r in required)} required ones"
+    if other is None:
+        return [Check("core", "packages", True, detail)]
+    detail += ", the tested versions" if not other else "; not the tested version: " + ", ".join(other)
+    return [Check("core", "packages", True, detail)]
+
+
+def unmet(requirements: Iterable[str]) -> list[str]:
+    """The requirements ("name>=1.0") that what is installed does not meet."""
+    from packaging.requirements import Requirement
+
+    wrong = []
+    for text in requirements:
+        requirement = Requirement(text)
+        version = installed(requirement.name)
+        if version is None or not requirement.specifier.contains(version, prereleases=True):
+            wrong.append(f"{requirement.name}{requirement.specifier}")
+    return wrong
+
+
+def other_versions(constraints: Path) -> list[str] | None:
+    """Installed packages whose version is not the pinned one; None where there is no such file."""
+    if not constraints.is_file():
+        return None
+    lines = []
+    for line in constraints.read_text(encoding="utf-8").splitlines():
+        name, _, pinned = line.partition("#")[0].strip().partition("==")
+        version = installed(name) if pinned else None
+        # A local build such as 2.13.0+cpu is the same version.
+        if version is not None and version.partition("+")[0] != pinned:
+            lines.append(f"{name} {version} (tested: {pinned})")
+    return lines
+
+
+def installed(name: str) -> str | None:
+    """The version of an installed distribution."""
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _library(name: str, found: Probe, use: str) -> Check:
+    if found.facts is not None:
+        return Check("core", name, True, f"{found.facts['version']} ({use})")
+    fix = "pip install -c constraints.txt --force-reinstall --no-deps " + name
+    return Check("core", name, False, f"{found.error} ({use})", fix)
+
+
+def _numba(found: Probe) -> list[Check]:
+    if found.facts is None:
+        fix = "pip install -c constraints.txt --force-reinstall numba llvmlite"
+        return [Check("core", "numba", False, found.error, fix)]
+    layer = f"{found.facts['threads']} threads, layer {found.facts['layer']}"
+    checks = [Check("core", "numba", True, layer)]
+    explicit = os.environ.get("NUMBA_CACHE_DIR")
+    folder = Path(explicit) if explicit else PACKAGE / "splat" / "cpu" / "__pycache__"
+    existing = next(p for p in (folder, *folder.parents) if p.exists())
+    compiled = len(list(folder.rglob("*.nbi"))) if folder.is_dir() else 0
+    state = (
+        f"{compiled} kernels compiled" if compiled else "not compiled yet: the first run takes a minute more"
+    )
+    writable = os.access(existing, os.W_OK)
+    where = f"in {folder}" if writable else f"{folder} is not writable"
+    fix = "" if writable else "export NUMBA_CACHE_DIR=$HOME/.cache/numba"
+    checks.append(Check("core", "kernel cache", writable, f"{state}, {where}", fix))
+    return checks
+
+
+def _gpu(torch: Probe) -> list[Check]:
+    driver = _command("nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader")
+    cuda = bool(torch.facts and torch.facts["cuda"])
+    checks = [
+        Check("optional", "nvidia driver", driver is not None, driver or "no nvidia-smi; the CPU is used",
+              "" if driver else "install the NVIDIA driver, if there is a GPU"),
+        Check("optional", "torch cuda", cuda, *_cuda_words(torch, driver is not None)),
+    ]  # fmt: skip
+    version = installed("gsplat")
+    fix = "" if version else "pip install 'ambiguous-wild[cuda]'"
+    checks.append(
+        Check("optional", "gsplat", version is not None, version or "absent: no GPU rendering", fix)
+    )
+    return checks
+
+
+def _cuda_words(torch: Probe, driver: bool) -> tuple[str, str]:
+    facts = torch.facts
+    if facts is None:
+        return torch.error, "mend torch first"
+    if facts["cuda"]:
+        return ", ".join(facts["names"]), ""
+    if facts["built"] is None:
+        fix = "pip install torch with CUDA (see pytorch.org)" if driver else "nothing to do without a GPU"
+        return f"torch {facts['version']} is a CPU build", fix
+    return f"torch is built for CUDA {facts['built']}, but sees no GPU", "check the driver with nvidia-smi"
+
+
+def _extras() -> list[Check]:
+    uses = {
+        "masks": ("transformers", "DINOv2 features, SAM masks"),
+        "ray": ("ray", "grids on several machines"),
+        "view": ("viser", "interactive viewer"),
+    }
+    checks = []
+    for extra, (package, use) in uses.items():
+        version = installed(package)
+        fix = "" if version else f"pip install 'ambiguous-wild[{extra}]'"
+        detail = f"{version or 'absent'} ({use})"
+        checks.append(Check("optional", package, version is not None, detail, fix))
+    return checks
+
+
+def _torchvision(found: Probe | None) -> Check:
+    """Absent is fine. Present but broken takes transformers down with it."""
+    if found is None:
+        return Check("optional", "torchvision", True, "absent, and not needed")
+    if found.facts is not None:
+        return Check("optional", "torchvision", True, f"{found.facts['version']}, not needed")
+    return Check("optional", "torchvision", False, f"broken, and breaks transformers: {found.error}",
+                 "pip uninstall torchvision")  # fmt: skip
+
+
+def _weights() -> list[Check]:
+    from ambiguous_wild.metrics import lpips
+    from ambiguous_wild.vision import weights
+
+    # The files of LPIPS are reported by metric: a backbone alone measures nothing.
+    checks = [
+        Check("optional", s.name, s.present, s.where, s.bring)
+        for s in weights.status()
+        if not any("LPIPS" in w.used_for for w in weights.KNOWN if w.name == s.name)
+    ]
+    for metric, reason in lpips.available().items():
+        detail, _, fix = (reason or "weights found").partition(": ")
+        checks.append(Check("optional", metric, reason is None, detail, fix))
+    return checks
+
+
+def _git() -> Check:
+    version = _command("git", "--version")
+    return Check(
+        "optional", "git", version is not None, version or "absent", "" if version else "install git"
+    )
+
+
+def _command(*words: str) -> str | None:
+    """First line of what a program prints; None where it is absent or fails."""
+    if shutil.which(words[0]) is None:
+        return None
+    try:
+        done = subprocess.run(words, capture_output=True, text=True, timeout=10, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    lines = done.stdout.strip().splitlines()
+    return lines[0] if done.returncode == 0 and lines else None

@@ -1,0 +1,112 @@
+"""`aw doctor`: what it says is so, and what lacks comes with a way to get it."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from ambiguous_wild.cli import checks
+from ambiguous_wild.cli.checks import Check, Probe, all_checks, other_versions, probe, unmet
+from ambiguous_wild.cli.doctor import command
+from ambiguous_wild.core import AwError
+
+
+@pytest.fixture(scope="module")
+def report() -> list[Check]:
+    return all_checks()
+
+
+def test_the_core_works_where_the_tests_run(report: list[Check]) -> None:
+    core = {c.name: c for c in report if c.group == "core"}
+    assert [c.name for c in core.values() if not c.ok] == []
+    assert core["python"].detail == ".".join(map(str, sys.version_info[:3]))
+    assert core["torch"].detail.startswith(__import__("torch").__version__)
+    assert {"cpu", "packages", "OpenImageIO", "pycolmap", "numba", "kernel cache", "disk"} <= core.keys()
+
+
+def test_whatever_lacks_comes_with_a_way_to_get_it(report: list[Check]) -> None:
+    for c in report:
+        assert c.detail
+        assert bool(c.fix) is not c.ok, c
+
+
+def test_the_report_prints_every_check(monkeypatch: pytest.MonkeyPatch, report: list[Check]) -> None:
+    monkeypatch.setattr(checks, "all_checks", lambda: report)
+    out = CliRunner().invoke(command, [], catch_exceptions=False).output
+    for c in report:
+        assert f"{'✓' if c.ok else '✗'} {c.name}" in out and c.detail in out and c.fix in out
+    facts = json.loads(CliRunner().invoke(command, ["--json"], catch_exceptions=False).output)
+    assert facts["ok"] is True
+    assert [Check(**c) for c in facts["checks"]] == report
+
+
+@pytest.mark.parametrize("words", [[], ["--json"]])
+def test_a_broken_core_is_an_error_with_what_to_run(
+    words: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = [
+        Check("core", "numba", False, "no threads", "pip install numba"),
+        Check("optional", "git", True, "2"),
+    ]
+    monkeypatch.setattr(checks, "all_checks", lambda: found)
+    done = CliRunner().invoke(command, words)
+    assert isinstance(done.exception, AwError) and done.exception.exit_code == 2
+    assert "numba" in str(done.exception) and "pip install numba" in str(done.exception)
+    assert "no threads" in done.output
+
+
+def test_requirements_that_are_not_met_are_found() -> None:
+    version = np.__version__
+    assert unmet([f"numpy>={version}", "click"]) == []
+    assert unmet([f"numpy>{version}", "no-such-package-of-ours>=1"]) == [
+        f"numpy>{version}",
+        "no-such-package-of-ours>=1",
+    ]
+
+
+def test_versions_other_than_the_tested_are_named(tmp_path: Path) -> None:
+    import click
+
+    file = tmp_path / "constraints.txt"
+    version = __import__("importlib.metadata", fromlist=["version"]).version("click")
+    file.write_text(f"# tested\nclick=={version}  # here\nnumpy==0.0.1\nno-such-package==3\n")
+    assert click and other_versions(file) == [f"numpy {np.__version__} (tested: 0.0.1)"]
+    assert other_versions(tmp_path / "absent.txt") is None
+
+
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [
+        ("raise OSError('nms does not exist')", "nms does not exist"),
+        ("import os; os.kill(os.getpid(), 9)", "crashed (signal 9)"),
+        ("print('hello')", "unexpected output"),
+    ],
+)
+def test_a_probe_that_fails_says_how(code: str, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(checks.PROBES, "broken", code)
+    found = probe("broken")
+    assert found.facts is None and words in found.error
+
+
+def test_a_broken_torchvision_is_named_and_an_absent_one_is_fine() -> None:
+    assert checks._torchvision(None).ok
+    broken = checks._torchvision(Probe(None, "operator torchvision::nms does not exist"))
+    assert not broken.ok and broken.group == "optional" and broken.fix == "pip uninstall torchvision"
+
+
+def test_a_cache_that_cannot_be_written_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    probe_ok = Probe({"threads": 2, "layer": "omp"})
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "new" / "cache"))
+    fresh = checks._numba(probe_ok)[1]
+    assert fresh.ok and "not compiled yet" in fresh.detail
+    (tmp_path / "new" / "cache" / "sub").mkdir(parents=True)
+    (tmp_path / "new" / "cache" / "sub" / "a.nbi").touch()
+    assert "1 kernels compiled" in checks._numba(probe_ok)[1].detail
+    monkeypatch.setattr(checks.os, "access", lambda path, mode: False)
+    refused = checks._numba(probe_ok)[1]
+    assert not refused.ok and "NUMBA_CACHE_DIR" in refused.fix

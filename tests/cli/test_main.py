@@ -1,0 +1,62 @@
+"""The front door: help, exit codes, one red line for what a user can mend."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from ambiguous_wild import __version__
+from ambiguous_wild.cli.main import COMMANDS
+
+
+def aw(*words: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "ambiguous_wild.cli.main", *words],
+        capture_output=True,
+        text=True,
+        cwd=cwd,
+        check=False,
+    )
+
+
+def test_help_lists_every_command_and_version_prints() -> None:
+    done = aw("--help")
+    assert done.returncode == 0
+    for name, (_, text) in COMMANDS.items():
+        assert name in done.stdout and text.split()[0] in done.stdout
+    assert __version__ in aw("--version").stdout
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_help(name: str) -> None:
+    done = aw(name, "--help")
+    assert done.returncode == 0, done.stderr
+    assert f"{name} [OPTIONS]" in done.stdout
+    assert "--help" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["tabel"], "did you mean 'table'?"),
+        (["table"], "Missing argument 'RUNS'"),
+        (["table", "nowhere"], "no folder of runs nowhere"),
+        (["table", ".", "--format", "html"], "html"),
+        (["methods", "--plugin", "mine.py"], "no plugin file mine.py"),
+    ],
+)
+def test_a_users_mistake_is_one_line_and_exit_code_2(words: list[str], expected: str, tmp_path: Path) -> None:
+    done = aw(*words, cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert expected in done.stderr and done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1
+
+
+def test_a_reader_that_leaves_is_no_error() -> None:
+    code = f"{sys.executable} -m ambiguous_wild.cli.main methods --json | head -n 1; echo ${{PIPESTATUS[0]}}"
+    done = subprocess.run(["bash", "-c", code], capture_output=True, text=True, check=False)
+    assert done.stdout.splitlines() == ["[", "0"] and done.stderr == ""

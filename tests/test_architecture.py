@@ -1,0 +1,137 @@
+"""The arrows of the package table: who may import whom, and what the light commands must not import."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from ambiguous_wild.cli.main import COMMANDS
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGE = ROOT / "ambiguous_wild"
+BELOW_HARNESS = {"core", "io", "builder", "simulate", "vision", "metrics", "splat", "methods"}
+ALLOWED: dict[str, set[str]] = {
+    "core": set(),
+    "io": {"core"},
+    "builder": {"core", "io"},
+    "simulate": {"core", "io"},
+    "vision": {"core", "io"},
+    "metrics": {"core"},
+    "splat": {"core", "io"},
+    "methods": {"core", "io", "splat", "vision"},
+    "harness": BELOW_HARNESS,
+    "cli": BELOW_HARNESS | {"harness"},
+}
+HEAVY = ("torch", "numba", "pycolmap", "cv2", "matplotlib", "transformers", "scipy", "pandas", "skimage")
+FILES = sorted(PACKAGE.rglob("*.py"))
+
+
+def imports(path: Path) -> Iterator[tuple[str, int, bool]]:
+    """(absolute module, line, at run time) of every import, those inside functions included."""
+    tree = ast.parse(path.read_text(encoding="utf-8"), str(path))
+    typing_only = {
+        id(inner)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+        for inner in ast.walk(node)
+    }
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            parts = path.relative_to(ROOT).with_suffix("").parts
+            base = ".".join(parts[: len(parts) - node.level]) if node.level else ""
+            module = ".".join(filter(None, (base, node.module)))
+            # "from package import sub" imports package.sub where that is a module.
+            names = [f"{module}.{alias.name}" for alias in node.names]
+        else:
+            continue
+        for name in names:
+            yield name, node.lineno, id(node) not in typing_only
+
+
+def of_ours(module: str) -> str | None:
+    """The package of ours that a module is in; "" for what the root itself offers."""
+    parts = module.split(".")
+    if parts[0] != "ambiguous_wild":
+        return None
+    return parts[1] if len(parts) > 1 and (PACKAGE / parts[1]).is_dir() else ""
+
+
+def test_every_package_is_in_the_table() -> None:
+    folders = {p.name for p in PACKAGE.iterdir() if p.is_dir() and p.name != "__pycache__"}
+    assert folders == set(ALLOWED)
+
+
+@pytest.mark.parametrize("package", ALLOWED)
+def test_imports_follow_the_arrows(package: str) -> None:
+    wrong = []
+    for path in FILES:
+        if path.relative_to(PACKAGE).parts[0] != package:
+            continue
+        for module, line, _ in imports(path):
+            target = of_ours(module)
+            if target and target != package and target not in ALLOWED[package]:
+                wrong.append(f"{path.relative_to(ROOT)}:{line} imports {module}")
+    assert wrong == []
+
+
+def test_the_reader_of_imports_sees_every_form(tmp_path: Path) -> None:
+    # The checks above would pass on everything if this returned nothing.
+    found = list(imports(PACKAGE / "metrics" / "lpips.py"))
+    modules = {name for name, _, _ in found}
+    assert {"torch", "numpy", "ambiguous_wild.core.AwError", "torch.nn"} <= modules
+    assert ("torch.Tensor", False) in {(name, at_run_time) for name, _, at_run_time in found}
+    assert of_ours("ambiguous_wild.core.AwError") == "core" and of_ours("ambiguous_wild.__version__") == ""
+    assert of_ours("numpy.core") is None
+
+
+def test_no_two_packages_import_each_other() -> None:
+    edges = {(a, b) for a, targets in ALLOWED.items() for b in targets}
+    assert not [(a, b) for a, b in edges if (b, a) in edges]
+
+
+def test_pycolmap_is_imported_by_the_guard_alone() -> None:
+    found = [
+        p.relative_to(PACKAGE).as_posix()
+        for p in FILES
+        for m, _, _ in imports(p)
+        if m.split(".")[0] == "pycolmap"
+    ]
+    assert found == ["io/safe_pycolmap.py"]
+
+
+def test_core_needs_numpy_alone() -> None:
+    allowed = set(sys.stdlib_module_names) | {"numpy", "ambiguous_wild"}
+    for path in PACKAGE.glob("core/*.py"):
+        assert {m.split(".")[0] for m, _, _ in imports(path)} <= allowed, path
+
+
+@pytest.mark.parametrize(
+    "words", [[], *([name] for name in COMMANDS)], ids=lambda words: " ".join(["aw", *words])
+)
+def test_help_imports_nothing_heavy(words: list[str]) -> None:
+    assert heavy_after([*words, "--help"]) == ""
+
+
+def test_listing_methods_imports_nothing_heavy() -> None:
+    assert heavy_after(["methods", "--json"]) == ""
+
+
+def heavy_after(words: list[str]) -> str:
+    """Heavy packages in memory after `aw WORDS`, joined by commas."""
+    code = (
+        "import sys\n"
+        "from ambiguous_wild.cli.main import cli\n"
+        f"try:\n    cli.main({words!r}, prog_name='aw', standalone_mode=False)\n"
+        "except SystemExit:\n    pass\n"
+        f"sys.stderr.write(','.join(m for m in {HEAVY!r} if m in sys.modules))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout
+    return done.stderr

@@ -1,0 +1,56 @@
+"""A tiny exact COLMAP model: points in front of cameras on a line, tracks by projection."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ambiguous_wild.io import colmap_binary
+from ambiguous_wild.io.colmap_model import Model, ModelCamera, ModelImage, ModelPoints
+from ambiguous_wild.io.images import write_png
+
+WIDTH, HEIGHT, FX, FY = 64, 48, 60.0, 62.0
+
+
+def make_model(names: list[str], points: int = 20, seed: int = 0, camera: str = "PINHOLE") -> Model:
+    rng = np.random.default_rng(seed)
+    xyz = np.column_stack(
+        [rng.uniform(-1, 1, points), rng.uniform(-0.5, 0.5, points), rng.uniform(4, 6, points)]
+    )
+    params = {"PINHOLE": (FX, FY, 33.0, 23.0), "SIMPLE_RADIAL": (FX, 32.0, 24.0, -0.05)}[camera]
+    cameras = {7: ModelCamera(7, camera, WIDTH, HEIGHT, params)}
+    images, tracks = {}, [[] for _ in range(points)]
+    for k, name in enumerate(names):
+        shift = np.array([-0.1 * k, 0.02 * k, 0.0])
+        seen = np.flatnonzero(rng.random(points) < 0.8)
+        cam = xyz[seen] + shift
+        xys = cam[:, :2] / cam[:, 2:] * [FX, FY] + [33.0, 23.0]
+        for j, i in enumerate(seen):
+            tracks[i].append((10 + k, j))
+        images[10 + k] = ModelImage(10 + k, np.array([1.0, 0, 0, 0]), shift, 7, name, xys, seen + 100)
+    offsets = np.concatenate([[0], np.cumsum([len(t) for t in tracks])]).astype(np.int64)
+    flat = np.array([pair for t in tracks for pair in t], dtype=np.int64).reshape(-1, 2)
+    rgb = rng.integers(0, 256, (points, 3), dtype=np.uint8)
+    ids = np.arange(points, dtype=np.int64) + 100
+    return Model(
+        cameras, images, ModelPoints(ids, xyz, rgb, rng.random(points), offsets, flat[:, 0], flat[:, 1])
+    )
+
+
+def write_binary(folder: Path, model: Model) -> None:
+    colmap_binary.write_cameras(folder / "cameras.bin", model.cameras.values())
+    colmap_binary.write_images(folder / "images.bin", model.images.values())
+    colmap_binary.write_points(folder / "points3D.bin", model.points)
+
+
+def write_scene(root: Path, names: list[str], factor: int = 2, **kwargs) -> Model:
+    """A plain COLMAP scene: images/, images_<factor>/, sparse/0; no lists, no scene.json."""
+    model = make_model(names, **kwargs)
+    write_binary(root / "sparse" / "0", model)
+    rng = np.random.default_rng(1)
+    for name in names:
+        write_png(root / "images" / name, rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8))
+        small = rng.integers(0, 256, (HEIGHT // factor, WIDTH // factor, 3), dtype=np.uint8)
+        write_png(root / f"images_{factor}" / name, small)
+    return model

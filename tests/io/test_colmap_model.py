@@ -1,0 +1,118 @@
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.io.colmap_model import read_model, rotation_from_quaternion
+from ambiguous_wild.io.safe_pycolmap import pycolmap
+from tests.io.model_maker import make_model, write_binary
+
+NAMES = ["a.png", "b é.png", "sub/c.png"]
+
+
+def test_binary_round_trip(tmp_path):
+    model = make_model(NAMES)
+    write_binary(tmp_path, model)
+    again = read_model(tmp_path)
+    assert again.cameras == model.cameras
+    assert list(again.images) == list(model.images)
+    for number, image in model.images.items():
+        other = again.images[number]
+        assert (other.name, other.camera_id) == (image.name, image.camera_id)
+        for field in ("qvec", "tvec", "xys", "point_ids"):
+            assert np.array_equal(getattr(other, field), getattr(image, field))
+    for field in dataclasses.fields(model.points):
+        assert np.array_equal(getattr(again.points, field.name), getattr(model.points, field.name)), (
+            field.name
+        )
+
+
+def test_colmap_reads_what_we_write_and_we_read_what_it_writes(tmp_path):
+    """pycolmap is the oracle for both directions, binary and text."""
+    model = make_model(["a.png", "b.png", "c.png"])
+    write_binary(tmp_path / "ours", model)
+    theirs = pycolmap.Reconstruction(str(tmp_path / "ours"))
+    assert theirs.num_reg_images() == 3
+    for image in model.images.values():
+        pose = theirs.images[image.image_id].cam_from_world().matrix()
+        assert np.allclose(pose, image.cam_from_world()[:3])
+    for kind in ("binary", "text"):
+        folder = tmp_path / kind
+        folder.mkdir()
+        getattr(theirs, f"write_{kind}")(str(folder))
+        again = read_model(folder)
+        assert again.cameras[7].params == pytest.approx(model.cameras[7].params)
+        for number, image in model.images.items():
+            assert again.images[number].name == image.name
+            assert np.allclose(again.images[number].xys, image.xys)
+        order = np.argsort(again.points.ids)
+        assert np.allclose(again.points.xyz[order], model.points.xyz)
+        assert np.array_equal(again.points.rgb[order], model.points.rgb)
+        assert len(again.points.track_image_ids) == len(model.points.track_image_ids)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.floats(-5, 5), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 1e-3))
+def test_rotation_agrees_with_scipy(q):
+    from scipy.spatial.transform import Rotation
+
+    ours = rotation_from_quaternion(np.array(q))
+    assert np.allclose(ours, Rotation.from_quat([q[1], q[2], q[3], q[0]]).as_matrix(), atol=1e-12)
+    assert np.allclose(ours @ ours.T, np.eye(3), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.99])
+def test_cut_file_is_named(tmp_path, name, share):
+    write_binary(tmp_path, make_model(["a.png", "b.png"]))
+    data = (tmp_path / name).read_bytes()
+    (tmp_path / name).write_bytes(data[: int(share * len(data))])
+    with pytest.raises(AwError, match=name.replace(".", r"\.")):
+        read_model(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
+def test_an_absurd_count_is_refused_before_allocating(tmp_path, name):
+    write_binary(tmp_path, make_model(["a.png", "b.png"]))
+    data = (tmp_path / name).read_bytes()
+    (tmp_path / name).write_bytes((2**60).to_bytes(8, "little") + data[8:])
+    with pytest.raises(AwError, match="announces"):
+        read_model(tmp_path)
+
+
+def test_lens_distortion_is_refused_for_training_with_the_command(tmp_path):
+    camera = make_model(["a.png"], camera="SIMPLE_RADIAL").cameras[7]
+    with pytest.raises(AwError, match="SIMPLE_RADIAL.*aw build-scene"):
+        camera.pinhole()
+    assert make_model(["a.png"]).cameras[7].pinhole() == (60.0, 62.0, 33.0, 23.0)
+
+
+def test_damaged_text_names_the_line(tmp_path):
+    (tmp_path / "cameras.txt").write_text("# head\n1 PINHOLE 64 48 60 62 33 nan-ish\n")
+    (tmp_path / "images.txt").write_text("")
+    (tmp_path / "points3D.txt").write_text("")
+    with pytest.raises(AwError, match=r"cameras\.txt, line 2"):
+        read_model(tmp_path)
+    (tmp_path / "cameras.txt").write_text("1 PINHOL 64 48 60 62 33 24\n")
+    with pytest.raises(AwError, match="PINHOLE"):
+        read_model(tmp_path)
+
+
+def test_text_image_without_observations(tmp_path):
+    (tmp_path / "cameras.txt").write_text("1 SIMPLE_PINHOLE 64 48 60 32 24\n")
+    (tmp_path / "images.txt").write_text(
+        "# a\n3 1 0 0 0 0 0 0 1 with space.png\n\n4 1 0 0 0 1 0 0 1 b.png\n1 2 -1\n"
+    )
+    (tmp_path / "points3D.txt").write_text("")
+    model = read_model(tmp_path)
+    assert [i.name for i in model.images.values()] == ["with space.png", "b.png"]
+    assert [len(i.xys) for i in model.images.values()] == [0, 1]
+    assert len(model.points.ids) == 0
+
+
+def test_no_model_at_all(tmp_path):
+    with pytest.raises(AwError, match="holds no COLMAP model"):
+        read_model(tmp_path)

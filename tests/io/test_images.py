@@ -1,0 +1,89 @@
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.io.images import (
+    image_size,
+    load_image_float,
+    read_gray,
+    read_keep_map,
+    read_png_rgb,
+    write_png,
+)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(1, 9), st.integers(1, 9), st.integers(0, 2**32 - 1))
+def test_png_gives_back_every_pixel(tmp_path_factory, width, height, seed):
+    path = tmp_path_factory.mktemp("png") / "a.png"
+    image = np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
+    write_png(path, image)
+    assert np.array_equal(read_png_rgb(path), image)
+    assert image_size(path) == (width, height)
+    assert np.array_equal(load_image_float(path), image.astype(np.float32) / np.float32(255))
+
+
+def test_colours_are_rgb_and_not_bgr(tmp_path):
+    write_png(tmp_path / "red.png", np.full((2, 2, 3), (250, 10, 20), np.uint8))
+    assert read_png_rgb(tmp_path / "red.png")[0, 0].tolist() == [250, 10, 20]
+    assert load_image_float(tmp_path / "red.png")[0, 0, 0] == np.float32(250 / 255)
+
+
+def test_sixteen_bits_keep_their_precision(tmp_path):
+    image = np.array([[[1, 256, 65535]]], np.uint16)
+    write_png(tmp_path / "deep.png", image)
+    assert np.allclose(load_image_float(tmp_path / "deep.png"), image / 65535, atol=1e-7)
+
+
+def test_same_pixels_same_bytes(tmp_path):
+    image = np.random.default_rng(3).integers(0, 256, (20, 30, 3), dtype=np.uint8)
+    write_png(tmp_path / "a.png", image)
+    write_png(tmp_path / "b.png", image)
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+def test_grey_file_reads_as_rgb_and_as_mask(tmp_path):
+    gray = np.array([[0, 127, 128, 255]], np.uint8)
+    write_png(tmp_path / "m.png", gray)
+    assert np.array_equal(read_png_rgb(tmp_path / "m.png"), np.repeat(gray[..., None], 3, 2))
+    assert np.array_equal(read_gray(tmp_path / "m.png"), gray)
+    assert read_keep_map(tmp_path / "m.png").tolist() == [[0.0, 0.0, 1.0, 1.0]]
+
+
+def test_non_ascii_name(tmp_path):
+    image = np.full((3, 4, 3), 9, np.uint8)
+    write_png(tmp_path / "фото é.png", image)
+    assert np.array_equal(read_png_rgb(tmp_path / "фото é.png"), image)
+
+
+def test_orientation_tag_is_ignored_for_scene_files(tmp_path):
+    # A scene's files are upright already; the model was made for the pixels as stored.
+    image = np.zeros((4, 6, 3), np.uint8)
+    _, data = cv2.imencode(".jpg", image)
+    exif = bytes.fromhex("ffe1002245786966000049492a00080000000100120103000100000006000000000000000000")[:36]
+    (tmp_path / "o.jpg").write_bytes(data.tobytes()[:2] + exif + data.tobytes()[2:])
+    assert read_png_rgb(tmp_path / "o.jpg").shape == (4, 6, 3)
+
+
+@pytest.mark.parametrize("content", [b"", b"hello", b"\x89PNG\r\n\x1a\n" + b"\0" * 40])
+def test_unreadable_file_names_itself(tmp_path, content):
+    (tmp_path / "bad.png").write_bytes(content)
+    with pytest.raises(AwError, match=r"bad\.png"):
+        read_png_rgb(tmp_path / "bad.png")
+
+
+def test_missing_file_names_itself(tmp_path):
+    with pytest.raises(AwError, match=r"none\.png: No such file"):
+        load_image_float(tmp_path / "none.png")
+
+
+@pytest.mark.parametrize(
+    "bad", [np.zeros((2, 2, 3)), np.zeros((2, 2, 2), np.uint8), np.zeros((0, 2), np.uint8)]
+)
+def test_what_is_no_image_is_refused(tmp_path, bad):
+    with pytest.raises(AwError, match="PNG"):
+        write_png(tmp_path / "x.png", bad)
+    assert not (tmp_path / "x.png").exists()

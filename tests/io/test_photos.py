@@ -1,0 +1,191 @@
+import struct
+import zlib
+
+import cv2
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from ambiguous_wild.io.photos import MAX_PIXELS, UnreadablePhoto, read_photo
+
+
+def picture(width=80, height=60, seed=0):
+    small = np.random.default_rng(seed).integers(0, 256, (6, 8, 3), dtype=np.uint8)
+    return cv2.resize(small, (width, height), interpolation=cv2.INTER_CUBIC)
+
+
+def save(path, pixels, fmt="uint8", **attributes):
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], fmt)
+    for name, value in attributes.items():
+        spec.attribute(name.replace("__", ":"), value)
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), spec), output.geterror()
+    assert output.write_image(np.ascontiguousarray(pixels)), output.geterror()
+    output.close()
+    return path
+
+
+def test_plain_jpeg_equals_opencv(tmp_path):
+    path = save(tmp_path / "a.jpg", picture())
+    photo, pixels = read_photo(path)
+    assert photo.plain
+    assert photo.notes == ()
+    assert (photo.width, photo.height, photo.format) == (80, 60, "jpeg")
+    reference = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB)
+    assert np.abs(pixels.astype(int) - reference).max() <= 1
+
+
+@pytest.mark.parametrize("orientation", range(2, 9))
+def test_exif_orientation_is_applied_as_opencv_does(tmp_path, orientation):
+    path = save(tmp_path / "a.jpg", picture(), Orientation=orientation)
+    photo, pixels = read_photo(path)
+    reference = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB)  # OpenCV turns by the tag
+    assert pixels.shape == reference.shape == (photo.height, photo.width, 3)
+    assert np.abs(pixels.astype(int) - reference).max() <= 1
+    assert not photo.plain
+    assert "upright" in photo.notes[0]
+
+
+def test_sixteen_bits(tmp_path):
+    deep = picture().astype(np.uint16) * 257
+    photo, pixels = read_photo(save(tmp_path / "a.png", deep, "uint16"))
+    assert np.array_equal(pixels, picture())
+    assert photo.notes == ("16 bits reduced to 8",)
+
+
+def test_grey_is_repeated(tmp_path):
+    gray = picture()[..., :1]
+    photo, pixels = read_photo(save(tmp_path / "a.png", gray))
+    assert np.array_equal(pixels, np.repeat(gray, 3, axis=2))
+    assert "grey" in photo.notes[0]
+
+
+def test_transparency_is_composited_over_black(tmp_path):
+    pixels = np.dstack([np.full((20, 30, 3), 200, np.uint8), np.zeros((20, 30), np.uint8)])
+    pixels[:, 15:, 3] = 255
+    cv2.imwrite(str(tmp_path / "a.png"), pixels)
+    photo, rgb = read_photo(tmp_path / "a.png")
+    assert rgb[0, 0].tolist() == [0, 0, 0]
+    assert rgb[0, -1].tolist() == [200, 200, 200]
+    assert "transparency" in photo.notes[0]
+
+
+def test_opaque_alpha_is_dropped(tmp_path):
+    pixels = np.dstack([picture(), np.full((60, 80), 255, np.uint8)])
+    photo, rgb = read_photo(save(tmp_path / "a.png", pixels))
+    assert np.array_equal(rgb, picture())
+    assert "opaque" in photo.notes[0]
+
+
+def test_cmyk_jpeg_becomes_rgb(tmp_path):
+    image = pytest.importorskip("PIL.Image", reason="Pillow writes the CMYK file")
+    image.fromarray(picture()).convert("CMYK").save(tmp_path / "a.jpg", quality=95)
+    photo, rgb = read_photo(tmp_path / "a.jpg")
+    assert np.abs(rgb.astype(int) - picture()).mean() < 3
+    assert "CMYK" in photo.notes[0]
+
+
+def test_another_format_under_jpg_is_read_and_said(tmp_path):
+    save(tmp_path / "a.tif", picture())
+    (tmp_path / "a.tif").rename(tmp_path / "a.jpg")
+    photo, rgb = read_photo(tmp_path / "a.jpg")
+    assert np.array_equal(rgb, picture())
+    assert photo.notes == ("tiff data under the name .jpg",)
+
+
+def test_non_ascii_and_long_names(tmp_path):
+    for name in ("снимок é 1.png", "x" * 240 + ".png"):
+        assert np.array_equal(read_photo(save(tmp_path / name, picture()))[1], picture())
+
+
+def test_exif_is_read(tmp_path):
+    path = save(
+        tmp_path / "a.jpg", picture(), Make="Maker", Model="M1", ExposureTime=0.01, FNumber=4.0,
+        Exif__FocalLength=5.0, Exif__FocalLengthIn35mmFilm=28, Exif__PhotographicSensitivity=200,
+    )  # fmt: skip
+    exif = read_photo(path)[0].exif
+    assert exif.camera == "Maker M1"
+    assert (exif.focal_mm, exif.focal_35mm, exif.iso) == (5.0, 28.0, 200.0)
+    assert exif.exposure_s == pytest.approx(0.01, rel=1e-3)
+    assert exif.orientation == 1
+    # 28 mm on a 43.27 mm diagonal, on a 100 px diagonal
+    assert exif.focal_px(80, 60) == pytest.approx(28 * 100 / 43.2666, rel=1e-4)
+
+
+def test_without_exif_nothing_is_invented(tmp_path):
+    exif = read_photo(save(tmp_path / "a.png", picture()))[0].exif
+    assert exif.camera is None
+    assert exif.focal_mm is None
+    assert exif.focal_px(80, 60) is None
+
+
+def cut(data, share):
+    return data[: int(len(data) * share)]
+
+
+@pytest.mark.parametrize("share", [0.3, 0.7, 0.95])
+def test_cut_jpeg_is_refused_not_filled_with_grey(tmp_path, share):
+    whole = save(tmp_path / "a.jpg", picture(400, 300)).read_bytes()
+    (tmp_path / "a.jpg").write_bytes(cut(whole, share))
+    with pytest.raises(UnreadablePhoto, match="cut JPEG"):
+        read_photo(tmp_path / "a.jpg")
+
+
+def test_cut_jpeg_with_a_whole_thumbnail_is_still_cut(tmp_path):
+    thumbnail = save(tmp_path / "t.jpg", picture(32, 24)).read_bytes()
+    whole = save(tmp_path / "a.jpg", picture(400, 300)).read_bytes()
+    segment = b"\xff\xed" + struct.pack(">H", len(thumbnail) + 2) + thumbnail
+    (tmp_path / "a.jpg").write_bytes(whole[:2] + segment + whole[2:-400])
+    with pytest.raises(UnreadablePhoto, match="cut JPEG"):
+        read_photo(tmp_path / "a.jpg")
+    (tmp_path / "a.jpg").write_bytes(whole[:2] + segment + whole[2:])
+    assert read_photo(tmp_path / "a.jpg")[1].shape == (300, 400, 3)
+
+
+def test_cut_and_damaged_png(tmp_path):
+    noise = np.random.default_rng(0).integers(0, 256, (60, 80, 3), dtype=np.uint8)
+    whole = save(tmp_path / "a.png", noise).read_bytes()
+    (tmp_path / "a.png").write_bytes(cut(whole, 0.5))
+    with pytest.raises(UnreadablePhoto, match="cut PNG"):
+        read_photo(tmp_path / "a.png")
+    (tmp_path / "a.png").write_bytes(cut(whole, 0.5) + whole[-12:])
+    with pytest.raises(UnreadablePhoto, match="damaged or cut png"):
+        read_photo(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [(b"", "0 bytes"), (b"just some text, no picture", "no image"), (b"\xff\xd8\xff\xe0", "cut JPEG")],
+)
+def test_what_is_no_photo_says_what_it_is(tmp_path, content, reason):
+    (tmp_path / "a.jpg").write_bytes(content)
+    with pytest.raises(UnreadablePhoto, match=reason) as caught:
+        read_photo(tmp_path / "a.jpg")
+    assert "a.jpg" not in caught.value.reason
+
+
+def test_one_pixel(tmp_path):
+    with pytest.raises(UnreadablePhoto, match="1x1 px is too small"):
+        read_photo(save(tmp_path / "a.png", picture(1, 1)))
+
+
+def test_float_pixels_are_refused(tmp_path):
+    with pytest.raises(UnreadablePhoto, match="float"):
+        read_photo(save(tmp_path / "a.tif", picture().astype(np.float32), "float"))
+
+
+def test_a_huge_header_costs_nothing(tmp_path):
+    """200 megapixels announced by a small file: refused before memory is taken."""
+    data = bytearray(save(tmp_path / "a.jpg", picture()).read_bytes())
+    at = data.find(b"\xff\xc0")
+    data[at + 5 : at + 9] = struct.pack(">HH", 10000, 20000)
+    (tmp_path / "a.jpg").write_bytes(data)
+    assert MAX_PIXELS < 20000 * 10000
+    with pytest.raises(UnreadablePhoto, match="200 megapixels"):
+        read_photo(tmp_path / "a.jpg")
+    data = bytearray(save(tmp_path / "a.png", picture()).read_bytes())
+    data[16:24] = struct.pack(">II", 20000, 10000)
+    data[29:33] = struct.pack(">I", zlib.crc32(bytes(data[12:29])))
+    (tmp_path / "a.png").write_bytes(data)
+    with pytest.raises(UnreadablePhoto, match=r"200 megapixels|1144 MB"):
+        read_photo(tmp_path / "a.png")

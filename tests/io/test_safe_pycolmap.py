@@ -1,0 +1,44 @@
+"""The trap itself: a process that loads pycolmap and then writes PNGs must live."""
+
+import subprocess
+import sys
+
+_SCRIPT = """
+from ambiguous_wild.io.safe_pycolmap import pycolmap
+import sys
+assert list(sys.modules).index("zlib") < list(sys.modules).index("pycolmap")
+pycolmap.Camera(model="PINHOLE", width=4, height=4, params=[1, 1, 2, 2])
+import cv2, numpy as np, OpenImageIO as oiio
+image = np.random.default_rng(0).integers(0, 256, (200, 300, 3), dtype=np.uint8)
+assert cv2.imwrite(sys.argv[1] + "/cv.png", image)
+spec = oiio.ImageSpec(300, 200, 3, "uint8")
+out = oiio.ImageOutput.create(sys.argv[1] + "/oiio.png")
+assert out.open(sys.argv[1] + "/oiio.png", spec) and out.write_image(image)
+out.close()
+for name in ("cv.png", "oiio.png"):
+    assert (np.sort(cv2.imread(sys.argv[1] + "/" + name), 2) == np.sort(image, 2)).all()
+print("alive")
+"""
+
+
+def test_png_writers_survive_pycolmap(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", _SCRIPT, str(tmp_path)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == "alive"
+
+
+def test_nobody_else_imports_pycolmap():
+    from pathlib import Path
+
+    import ambiguous_wild
+
+    root = Path(ambiguous_wild.__file__).parent
+    offenders = [
+        str(path.relative_to(root))
+        for path in root.rglob("*.py")
+        for line in path.read_text(encoding="utf-8").splitlines()
+        if line.strip().startswith(("import pycolmap", "from pycolmap")) and path.name != "safe_pycolmap.py"
+    ]
+    assert offenders == []

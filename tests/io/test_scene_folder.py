@@ -1,0 +1,188 @@
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.io.images import write_png
+from ambiguous_wild.io.scene_folder import load_scene, verify_files, without_keep
+from tests.io.model_maker import HEIGHT, WIDTH, make_model, write_binary, write_scene
+
+NAMES = [f"p{i}.png" for i in range(10)]
+
+
+def mark_as_ours(root, factor=2):
+    """A scene.json with the true hashes of what lies there."""
+    from ambiguous_wild.builder.package import list_files
+
+    info = {"schema_version": 1, "factor": factor, "name": "tiny", "files": list_files(root, 1)}
+    (root / "scene.json").write_text(json.dumps(info))
+
+
+def test_plain_colmap_scene_splits_every_eighth_as_gsplat(tmp_path):
+    write_scene(tmp_path, NAMES)
+    scene = load_scene(tmp_path)
+    assert [v.name for v in scene.test] == ["p0.png", "p8.png"]
+    assert [v.name for v in scene.views] == sorted(NAMES)
+    assert scene.train[0].camera.width == WIDTH
+
+
+@pytest.mark.parametrize("factor", [1, 2])
+def test_points_project_onto_their_tracks_at_the_loaded_size(tmp_path, factor):
+    write_scene(tmp_path, NAMES, factor=2)
+    scene = load_scene(tmp_path, factor=factor)
+    points = scene.points
+    owner = np.repeat(np.arange(len(points)), np.diff(points.track_offsets))
+    for k, i in enumerate(owner):
+        camera = scene.views[points.track_views[k]].camera
+        assert camera.width == WIDTH // factor
+        seen = camera.intrinsics @ (camera.cam_from_world[:3] @ np.append(points.xyz[i], 1.0))
+        assert np.allclose(seen[:2] / seen[2], points.track_xy[k], atol=1e-4)
+
+
+def test_intrinsics_follow_the_actual_size_per_axis(tmp_path):
+    write_scene(tmp_path, NAMES)
+    for name in NAMES:  # rounding differs between tools
+        write_png(tmp_path / "images_2" / name, np.zeros((25, 32, 3), np.uint8))
+    camera = load_scene(tmp_path, factor=2).views[0].camera
+    assert (camera.fx, camera.fy) == pytest.approx((60.0 * 32 / WIDTH, 62.0 * 25 / HEIGHT))
+    assert (camera.cx, camera.cy) == pytest.approx((33.0 * 32 / WIDTH, 23.0 * 25 / HEIGHT))
+
+
+def test_lists_decide_the_split_and_name_what_is_missing(tmp_path):
+    write_scene(tmp_path, NAMES)
+    (tmp_path / "train_list.txt").write_text("p3.png\np4\nlost.png\n")  # one without extension
+    (tmp_path / "test_list.txt").write_text("p1.png\n\n")
+    scene = load_scene(tmp_path)
+    assert [v.name for v in scene.train] == ["p3.png", "p4.png"]
+    assert [v.name for v in scene.test] == ["p1.png"]
+    assert "lost.png" in scene.info["warnings"][0]
+    # Observations in photos outside the split point nowhere.
+    assert set(np.unique(scene.points.track_views)) == {-1, 0, 1, 2}
+
+
+@pytest.mark.parametrize(
+    ("train", "test", "message"),
+    [
+        ("p1.png", None, "the other list"),
+        ("p1.png", "p1.png", "keep it in one"),
+        ("x.png", "p1.png", "no training"),
+    ],
+)
+def test_lists_that_cannot_be(tmp_path, train, test, message):
+    write_scene(tmp_path, NAMES)
+    (tmp_path / "train_list.txt").write_text(train)
+    if test is not None:
+        (tmp_path / "test_list.txt").write_text(test)
+    with pytest.raises(AwError, match=message):
+        load_scene(tmp_path)
+
+
+def test_keep_masks_reach_training_views_only(tmp_path):
+    write_scene(tmp_path, NAMES)
+    for name in ("p0.png", "p1.png"):  # p0 is a test view
+        write_png(tmp_path / "masks" / "train" / name, np.zeros((HEIGHT, WIDTH), np.uint8))
+    scene = load_scene(tmp_path)
+    assert {v.name for v in scene.views if v.keep_path} == {"p1.png"}
+    assert not any(v.keep_path for v in without_keep(scene).views)
+
+
+def test_default_factor_comes_from_scene_json(tmp_path):
+    write_scene(tmp_path, NAMES)
+    mark_as_ours(tmp_path)
+    scene = load_scene(tmp_path)
+    assert scene.name == "tiny"
+    assert scene.views[0].camera.width == WIDTH // 2
+    assert scene.views[0].image_path == tmp_path / "images_2" / "p0.png"
+
+
+def test_a_changed_file_is_named(tmp_path):
+    write_scene(tmp_path, NAMES)
+    mark_as_ours(tmp_path)
+    path = tmp_path / "images_2" / "p3.png"
+    data = bytearray(path.read_bytes())
+    data[-20] ^= 1  # same size, another content
+    path.write_bytes(data)
+    with pytest.raises(AwError, match=r"1 of \d+ files .*images_2/p3\.png \(changed\).*aw build-scene"):
+        load_scene(tmp_path)
+    load_scene(tmp_path, verify="quick")  # sizes agree
+    (tmp_path / "images_2" / "p4.png").unlink()
+    with pytest.raises(AwError, match=r"p4\.png \(missing\)"):
+        load_scene(tmp_path, verify="quick")
+
+
+def test_extra_files_of_other_tools_do_not_matter(tmp_path):
+    write_scene(tmp_path, NAMES)
+    mark_as_ours(tmp_path)
+    (tmp_path / "images_2_png").mkdir()
+    (tmp_path / "notes.txt").write_text("mine")
+    load_scene(tmp_path)
+
+
+def test_a_path_that_leaves_the_scene_is_refused(tmp_path):
+    write_scene(tmp_path, NAMES)
+    with pytest.raises(AwError, match="outside itself"):
+        verify_files(tmp_path, {"files": {"../secret": {"sha256": "", "bytes": 0}}})
+    write_binary(tmp_path / "sparse" / "0", make_model(["../../evil.png"]))
+    with pytest.raises(AwError, match="outside itself"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"schema_version": 99}'])
+def test_scene_json_that_cannot_be_read(tmp_path, text):
+    write_scene(tmp_path, NAMES)
+    (tmp_path / "scene.json").write_text(text)
+    with pytest.raises(AwError, match=r"scene\.json"):
+        load_scene(tmp_path)
+
+
+def test_distorted_model_says_how_to_undistort(tmp_path):
+    write_scene(tmp_path, NAMES, camera="SIMPLE_RADIAL")
+    with pytest.raises(AwError, match="aw build-scene"):
+        load_scene(tmp_path)
+
+
+def test_a_cropped_photo_is_refused(tmp_path):
+    write_scene(tmp_path, NAMES)
+    write_png(tmp_path / "images" / "p2.png", np.zeros((HEIGHT, HEIGHT, 3), np.uint8))
+    with pytest.raises(AwError, match=r"p2\.png is 48x48"):
+        load_scene(tmp_path)
+
+
+def test_missing_folder_factor_and_photo(tmp_path):
+    with pytest.raises(AwError, match="no scene folder"):
+        load_scene(tmp_path / "none")
+    with pytest.raises(AwError, match="is no scene"):
+        (tmp_path / "images").mkdir()
+        load_scene(tmp_path)
+    write_scene(tmp_path, NAMES)
+    with pytest.raises(AwError, match=r"factor 8; it has factor 1 \(images\), 2"):
+        load_scene(tmp_path, factor=8)
+    (tmp_path / "images" / "p2.png").unlink()
+    with pytest.raises(AwError, match=r"lacks p2\.png"):
+        load_scene(tmp_path)
+
+
+def test_copies_under_another_extension_are_found(tmp_path):
+    write_scene(tmp_path, [f"p{i}.jpg.png" for i in range(3)])
+    names = [f"p{i}.JPG" for i in range(3)]
+    write_binary(tmp_path / "sparse" / "0", make_model(names))
+    for i in range(3):
+        (tmp_path / "images" / f"p{i}.jpg.png").rename(tmp_path / "images" / f"p{i}.png")
+    assert [v.image_path.name for v in load_scene(tmp_path).views] == ["p0.png", "p1.png", "p2.png"]
+
+
+def test_training_side_needs_neither_pycolmap_nor_openimageio(tmp_path):
+    write_scene(tmp_path, NAMES)
+    code = (
+        "import sys; sys.modules['pycolmap'] = sys.modules['OpenImageIO'] = None\n"
+        "from ambiguous_wild.io.scene_folder import load_scene\n"
+        "from ambiguous_wild.io.images import load_image_float\n"
+        "s = load_scene(sys.argv[1]); print(len(s.views), load_image_float(s.views[0].image_path).shape)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, check=False
+    )
+    assert done.stdout.split() == ["10", "(48,", "64,", "3)"], done.stderr

@@ -1,0 +1,238 @@
+"""How hard distractors are to tell from the static scene: by colour, by look, by the share they cover.
+
+The paper (supplement, "Evaluation of ambiguity") calls a scene colour-ambiguous when more than 30 % of the
+distractor pixels differ from the background by less than 0.3, and semantically ambiguous when the cosine
+similarity of distractors and static objects exceeds 0.7. It leaves open which norm, which background and
+which pixels; here: the L2 norm over RGB in [0, 1], the background that is truly behind the distractor,
+and distractor pixels pooled over the training photos. What is not known is counted and left out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.metrics.stats import Interval
+
+COLOUR_THRESHOLD = 0.3  # of the L2 distance in RGB; its range is [0, sqrt(3)]
+COLOUR_AMBIGUOUS_ABOVE = 0.3  # share of the distractor pixels
+SEMANTIC_AMBIGUOUS_ABOVE = 0.7  # cosine; stated by the paper for DINOv2 features
+COLOUR_METRIC = "colour_share_rgb_l2_below_0.3"
+SEMANTIC_METRIC = "semantic_cosine_labhog"
+
+
+@dataclass(frozen=True)
+class ColourCounts:
+    """Pixel counts of one photo, or of several added up."""
+
+    pixels: int  # of the photo
+    distractor: int  # pixels of distractors
+    known: int  # of these, with a known background
+    close: int  # of these, closer to the background than the threshold
+    residual_sum: float  # sum of the differences over the known ones
+
+    def __add__(self, other: ColourCounts) -> ColourCounts:
+        return ColourCounts(
+            self.pixels + other.pixels,
+            self.distractor + other.distractor,
+            self.known + other.known,
+            self.close + other.close,
+            self.residual_sum + other.residual_sum,
+        )
+
+    @property
+    def unknown(self) -> int:
+        """Distractor pixels whose background nobody knows."""
+        return self.distractor - self.known
+
+    @property
+    def occlusion(self) -> float:
+        """Share of the photo that distractors cover, in [0, 1]; NaN without pixels."""
+        return self.distractor / self.pixels if self.pixels else math.nan
+
+    @property
+    def close_share(self) -> float:
+        """Share of the known distractor pixels that look like their background; NaN where there is none."""
+        return self.close / self.known if self.known else math.nan
+
+    @property
+    def mean_residual(self) -> float:
+        """Mean colour difference over the known distractor pixels; NaN where there is none."""
+        return self.residual_sum / self.known if self.known else math.nan
+
+
+@dataclass(frozen=True)
+class RegionMatch:
+    """One distractor region and the static region that looks most like it."""
+
+    pixels: int
+    cosine: float  # in [-1, 1]
+    static_label: int
+
+
+def colour_residual(
+    photo: np.ndarray,  # [H, W, 3] float in [0, 1], sRGB
+    background: np.ndarray,  # [H, W, 3] the same
+) -> np.ndarray:  # [H, W] float64 in [0, sqrt(3)]
+    """L2 distance in RGB between the photo and what is behind it.
+
+    Raises:
+        AwError: sizes differ, or values are not colours in [0, 1].
+    """
+    if photo.shape != background.shape or photo.ndim != 3 or photo.shape[2] != 3:
+        raise AwError(
+            f"photo and background must both be [H, W, 3], got {list(photo.shape)} and "
+            f"{list(background.shape)}"
+        )
+    for which, image in (("photo", photo), ("background", background)):
+        if not np.issubdtype(image.dtype, np.floating) or not bool(((image >= 0) & (image <= 1)).all()):
+            raise AwError(f"the {which} must be floating point in [0, 1]")
+    return np.linalg.norm(photo.astype(np.float64) - background.astype(np.float64), axis=2)
+
+
+def colour_counts(
+    photo: np.ndarray,  # [H, W, 3] float in [0, 1], sRGB
+    background: np.ndarray | None,  # [H, W, 3] float in [0, 1], sRGB; None where there is none
+    distractor: np.ndarray,  # [H, W] bool, True = distractor
+    *,
+    known: np.ndarray | None = None,  # [H, W] bool: where the background is known, default all
+    threshold: float = COLOUR_THRESHOLD,
+) -> ColourCounts:
+    """Count the distractor pixels of one photo that are closer than `threshold` to their background.
+
+    Raises:
+        AwError: sizes differ, or a mask is not boolean.
+    """
+    masks = [("distractor", distractor)] + ([("known", known)] if known is not None else [])
+    for which, mask in masks:
+        if mask.dtype != bool or mask.shape != photo.shape[:2]:
+            raise AwError(
+                f"the {which} mask must be bool {list(photo.shape[:2])}, got {mask.dtype} {list(mask.shape)}"
+            )
+    if background is None:
+        return ColourCounts(distractor.size, int(distractor.sum()), 0, 0, 0.0)
+    measured = distractor if known is None else distractor & known
+    residual = colour_residual(photo, background)[measured]
+    return ColourCounts(
+        pixels=distractor.size,
+        distractor=int(distractor.sum()),
+        known=residual.size,
+        close=int((residual < threshold).sum()),
+        residual_sum=float(residual.sum()),
+    )
+
+
+def pooled(counts: Sequence[ColourCounts]) -> ColourCounts:
+    """The counts of several photos added up: a photo weighs by its distractor pixels."""
+    return sum(counts, ColourCounts(0, 0, 0, 0, 0.0))
+
+
+def ratio_interval(
+    part: Sequence[float] | np.ndarray,  # [n], one per photo
+    whole: Sequence[float] | np.ndarray,  # [n]
+    *,
+    level: float = 0.95,
+    resamples: int = 2000,
+    seed: int = 0,
+) -> Interval:
+    """Percentile bootstrap over photos of sum(part) / sum(whole).
+
+    Photos are drawn, not pixels: pixels of one photo are anything but independent. A resample without
+    anything in `whole` has no ratio and is left out. One photo has a ratio and no interval.
+
+    Raises:
+        AwError: different lengths.
+    """
+    a, b = np.asarray(part, np.float64), np.asarray(whole, np.float64)
+    if a.shape != b.shape or a.ndim != 1:
+        raise AwError(f"part and whole must be one per photo, got {list(a.shape)} and {list(b.shape)}")
+    count = int((b > 0).sum())
+    if not count:
+        return Interval(math.nan, math.nan, math.nan, 0)
+    centre = float(a.sum() / b.sum())
+    if len(a) < 2:
+        return Interval(centre, math.nan, math.nan, count)
+    rows = np.random.default_rng(seed).integers(0, len(a), size=(resamples, len(a)))
+    wholes = b[rows].sum(axis=1)
+    ratios = a[rows].sum(axis=1)[wholes > 0] / wholes[wholes > 0]
+    tail = (1.0 - level) / 2.0
+    low, high = np.quantile(ratios, [tail, 1.0 - tail])
+    return Interval(centre, float(low), float(high), count)
+
+
+def channel_statistics(
+    features: Sequence[np.ndarray],  # [h, w, C] each
+) -> tuple[np.ndarray, np.ndarray]:  # ([C], [C]) float64
+    """Mean and spread of each channel over all photos; a channel without spread gets 1.
+
+    Features whose mean is far from zero have cosines near 1 whatever they show. Subtracting the scene's
+    mean first makes 0 the similarity of two unrelated regions.
+    """
+    stacked = np.concatenate([f.reshape(-1, f.shape[2]) for f in features]).astype(np.float64)
+    spread = stacked.std(axis=0)
+    return stacked.mean(axis=0), np.where(spread > 1e-9, spread, 1.0)
+
+
+def region_means(
+    features: np.ndarray,  # [h, w, C], a coarser grid over the same picture
+    labels: np.ndarray,  # [H, W] int, 0 = no region
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # labels [R], means [R, C], pixels [R]
+    """Mean feature of each labelled region; a cell counts by how many of its pixels the region holds."""
+    h, w, channels = features.shape
+    rows = np.minimum(np.arange(labels.shape[0]) * h // labels.shape[0], h - 1)
+    cols = np.minimum(np.arange(labels.shape[1]) * w // labels.shape[1], w - 1)
+    cell = (rows[:, None] * w + cols[None, :])[labels > 0]
+    names, index = np.unique(labels[labels > 0], return_inverse=True)
+    weight = np.zeros((len(names), h * w))
+    np.add.at(weight, (index, cell), 1.0)
+    pixels = weight.sum(axis=1)
+    means = weight @ features.reshape(h * w, channels).astype(np.float64) / np.maximum(pixels, 1)[:, None]
+    return names, means, pixels
+
+
+def semantic_matches(
+    features: np.ndarray,  # [h, w, C] of the photo, standardised over the scene
+    distractors: np.ndarray,  # [H, W] int: distractor regions from 1, 0 = static
+    segments: np.ndarray,  # [H, W] int: segments of the photo from 1, 0 = none
+    *,
+    min_share: float = 0.002,  # of the photo's pixels; smaller regions say nothing
+) -> list[RegionMatch]:
+    """For each distractor region the static segment of the same photo that is most like it.
+
+    Pixels of distractors are taken out of the segments first. A region whose mean feature is zero has no
+    direction and is left out.
+
+    Raises:
+        AwError: label maps of different size.
+    """
+    if distractors.shape != segments.shape:
+        raise AwError(f"label maps differ in size: {list(distractors.shape)} and {list(segments.shape)}")
+    least = min_share * distractors.size
+    _, moving_mean, moving_px = region_means(features, distractors)
+    static, static_mean, static_px = region_means(features, np.where(distractors > 0, 0, segments))
+    moving_norm, static_norm = np.linalg.norm(moving_mean, axis=1), np.linalg.norm(static_mean, axis=1)
+    fixed = np.flatnonzero((static_px >= least) & (static_norm > 0))
+    matches: list[RegionMatch] = []
+    for k in np.flatnonzero((moving_px >= least) & (moving_norm > 0)):
+        if not len(fixed):
+            break
+        cosines = static_mean[fixed] @ moving_mean[k] / (static_norm[fixed] * moving_norm[k])
+        best = int(np.argmax(cosines))
+        cosine = float(np.clip(cosines[best], -1.0, 1.0))
+        matches.append(RegionMatch(int(moving_px[k]), cosine, int(static[fixed[best]])))
+    return matches
+
+
+def semantic_cosine(matches: Sequence[RegionMatch]) -> float:
+    """Mean cosine over distractor regions, by their pixels; NaN without regions."""
+    pixels = sum(m.pixels for m in matches)
+    return sum(m.pixels * m.cosine for m in matches) / pixels if pixels else math.nan
+
+
+def verdict(value: float, above: float) -> bool | None:
+    """Whether the score exceeds the limit; None where there is no score."""
+    return None if math.isnan(value) else value > above

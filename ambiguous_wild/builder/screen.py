@@ -164,8 +164,9 @@ def _lay_out(source: Source, photo: Photo, pixels: np.ndarray, folder: Path) -> 
     original = oiio.ImageBuf(str(photo.path)).spec()
     spec = oiio.ImageSpec(photo.width, photo.height, 3, "uint8")
     for attribute in original.extra_attribs:
-        if attribute.name.startswith(("Exif:", "GPS:")) or attribute.name in ("Make", "Model", "DateTime"):
-            spec.attribute(attribute.name, attribute.type, attribute.value)
+        known = attribute.name.startswith("Exif:") or attribute.name in ("Make", "Model")
+        if known and isinstance(attribute.value, (str, int, float)):
+            spec.attribute(attribute.name, attribute.value)  # with its uint16 type it would be dropped
     output = oiio.ImageOutput.create(str(folder / name))
     if output is None or not output.open(str(folder / name), spec) or not output.write_image(pixels):
         reason = oiio.geterror() if output is None else output.geterror()

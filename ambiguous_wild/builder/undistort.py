@@ -23,6 +23,7 @@ from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 TRUTH_PARTS = ("distractor", "clean")
+NEGLIGIBLE_PX = 0.1  # distortion below this everywhere leaves the pixels as they are
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,10 +32,12 @@ class Lens:
 
     camera: Any  # pycolmap.Camera
     pinhole: ModelCamera
-    map_xy: tuple[np.ndarray, np.ndarray]  # [H, W] float32 each: source pixel index of every pixel
+    map_xy: tuple[np.ndarray, np.ndarray] | None  # [H, W] float32: source index of every pixel; None: same
 
     def remap(self, image: np.ndarray, *, nearest: bool) -> np.ndarray:
         """[H, W] or [H, W, 3] of the distorted camera, as the pinhole camera sees it."""
+        if self.map_xy is None:
+            return image
         how = cv2.INTER_NEAREST if nearest else cv2.INTER_CUBIC
         # Reflection only fills the half pixel the map may reach over the border.
         return cv2.remap(image, *self.map_xy, how, borderMode=cv2.BORDER_REFLECT_101)
@@ -49,19 +52,35 @@ class Lens:
 
 
 def make_lens(camera: ModelCamera) -> Lens:
-    """Choose the pinhole camera and compute the map; source: COLMAP's undistort_camera."""
+    """Choose the pinhole camera and compute the map; source: COLMAP's undistort_camera.
+
+    COLMAP shrinks an undistorted camera by a pixel and shifts it by half, which blurs for nothing;
+    where the distortion is negligible the photo stays as it is.
+    """
     lens = pycolmap.Camera(
         model=camera.model, width=camera.width, height=camera.height, params=list(camera.params)
     )
+    fx, fy = lens.focal_length_x, lens.focal_length_y
+    same = (fx, fy, lens.principal_point_x, lens.principal_point_y)
+    plain = ModelCamera(camera.camera_id, "PINHOLE", camera.width, camera.height, same)
+    grid, source = _source_pixels(lens, plain)
+    if np.abs(source - grid).max() < NEGLIGIBLE_PX:
+        return Lens(lens, plain, None)
     flat = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), lens)
-    pinhole = ModelCamera(
-        camera.camera_id, "PINHOLE", flat.width, flat.height, tuple(float(v) for v in flat.params)
-    )
+    params = tuple(float(v) for v in flat.params)
+    pinhole = ModelCamera(camera.camera_id, "PINHOLE", flat.width, flat.height, params)
+    _, source = _source_pixels(lens, pinhole)
+    index = (source - 0.5).astype(np.float32)  # OpenCV counts from pixel centres
+    return Lens(lens, pinhole, (np.ascontiguousarray(index[..., 0]), np.ascontiguousarray(index[..., 1])))
+
+
+def _source_pixels(lens: Any, pinhole: ModelCamera) -> tuple[np.ndarray, np.ndarray]:
+    """Pixel centres of the pinhole camera, and where the lens sees them: [H, W, 2] px each."""
     fx, fy, cx, cy = pinhole.pinhole()
-    u, v = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
-    rays = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones_like(u)], axis=-1).reshape(-1, 3)
-    source = np.asarray(lens.img_from_cam(rays)).reshape(pinhole.height, pinhole.width, 2) - 0.5
-    return Lens(lens, pinhole, (source[..., 0].astype(np.float32), source[..., 1].astype(np.float32)))
+    grid = np.stack(np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5), axis=-1)
+    rays = np.concatenate([(grid - [cx, cy]) / [fx, fy], np.ones((*grid.shape[:2], 1))], axis=-1)
+    source = np.asarray(lens.img_from_cam(rays.reshape(-1, 3)))
+    return grid, source.reshape(grid.shape)
 
 
 def undistort(

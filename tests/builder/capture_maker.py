@@ -1,0 +1,72 @@
+"""Photos of two textured walls that meet at an angle: enough depth to register, rendered in milliseconds.
+
+Each wall is a plane, so its picture in any pinhole camera is a homography of its texture.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
+_TEXELS = 512  # a side of a wall's texture
+
+
+@cache
+def texture(seed: int) -> np.ndarray:
+    """Blobs of many sizes: corners at every scale SIFT looks at."""
+    rng = np.random.default_rng(seed)
+    image = np.zeros((_TEXELS, _TEXELS, 3), np.float32)
+    for cells, weight in ((8, 0.3), (32, 0.4), (96, 0.5)):
+        noise = rng.random((cells, cells, 3), dtype=np.float32)
+        image += weight * cv2.resize(noise, (_TEXELS, _TEXELS), interpolation=cv2.INTER_NEAREST)
+    return np.clip(255 * image / image.max(), 0, 255).astype(np.uint8)
+
+
+def walls() -> list[tuple[np.ndarray, np.ndarray, np.ndarray, int]]:
+    """(corner, edge u, edge v, texture seed) of each wall, world units."""
+    up = np.array([0.0, 4.0, 0.0])
+    return [
+        (np.array([-3.0, -2.0, 4.5]), np.array([3.0, 0.0, 1.5]), up, 1),
+        (np.array([0.0, -2.0, 6.0]), np.array([3.0, 0.0, -1.5]), up, 2),
+    ]
+
+
+def render(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """[H, W, 3] uint8 as a camera at `eye` looking at `target` sees the walls."""
+    z = (target - eye) / np.linalg.norm(target - eye)
+    x = np.cross([0.0, 1.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    rotation = np.stack([x, np.cross(z, x), z])
+    k = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+    photo = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
+    for corner, u, v, seed in walls():
+        plane = np.column_stack([u / _TEXELS, v / _TEXELS, corner - eye])  # texel -> world, from the eye
+        homography = k @ rotation @ plane
+        warped = cv2.warpPerspective(texture(seed), homography, (WIDTH, HEIGHT), flags=cv2.INTER_AREA)
+        cover = cv2.warpPerspective(np.full((_TEXELS, _TEXELS), 255, np.uint8), homography, (WIDTH, HEIGHT))
+        photo[cover > 127] = warped[cover > 127]
+    return photo
+
+
+def eyes(count: int) -> list[np.ndarray]:
+    """Camera centres on an arc in front of the walls."""
+    angles = np.linspace(-0.5, 0.5, count)
+    return [np.array([3.0 * np.sin(a), 0.2 * np.cos(5 * a), 5.0 - 4.5 * np.cos(a)]) for a in angles]
+
+
+def write_capture(folder: Path, count: int = 6, prefix: str = "p") -> list[Path]:
+    """Photos `p00.jpg`, `p01.jpg`, ... in `folder`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for i, eye in enumerate(eyes(count)):
+        path = folder / f"{prefix}{i:02d}.jpg"
+        pixels = render(eye, np.array([0.0, 0.0, 5.2]))
+        path.write_bytes(
+            cv2.imencode(".jpg", pixels[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+        )
+        paths.append(path)
+    return paths

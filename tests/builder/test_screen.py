@@ -1,0 +1,124 @@
+import cv2
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from ambiguous_wild.builder.collect import collect
+from ambiguous_wild.builder.progress import Bar
+from ambiguous_wild.builder.screen import drift_warnings, exposure_stops, screen, sharpness, thumbnail
+from ambiguous_wild.core import AwError
+from ambiguous_wild.io.images import read_png_rgb
+from tests.builder.capture_maker import texture, write_capture
+
+
+def run(tmp_path, **kwargs):
+    folder = tmp_path / "stage"
+    folder.mkdir()
+    options = {"strict": False, "jobs": 2, **kwargs}
+    return screen(collect(tmp_path / "raw"), folder, bar=Bar(False), **options), folder / "photos"
+
+
+def test_plain_photos_are_linked_and_others_converted(tmp_path):
+    paths = write_capture(tmp_path / "raw", 3)
+    gray = cv2.imread(str(paths[1]), cv2.IMREAD_GRAYSCALE)
+    cv2.imwrite(str(paths[1]), gray)
+    facts, photos = run(tmp_path)
+    assert [p["work_name"] for p in facts["photos"]] == ["p00.jpg", "p01.png", "p02.jpg"]
+    assert (photos / "p00.jpg").is_symlink()
+    assert (
+        np.abs(read_png_rgb(photos / "p01.png")[..., 0].astype(int) - cv2.imread(str(paths[1]), 0)).max() <= 1
+    )
+    assert any("grey" in w for w in facts["warnings"])
+
+
+def test_turned_photo_is_upright_and_keeps_its_focal_length(tmp_path):
+    from ambiguous_wild.io.safe_pycolmap import pycolmap
+
+    write_capture(tmp_path / "raw", 3)
+    spec = oiio.ImageSpec(512, 400, 3, "uint8")
+    for name, value in (("Orientation", 6), ("Make", "M"), ("Model", "X")):
+        spec.attribute(name, value)
+    spec.attribute("Exif:FocalLengthIn35mmFilm", 28)
+    spec.attribute("Exif:FocalLength", 4.0)
+    target = str(tmp_path / "raw" / "z.jpg")
+    out = oiio.ImageOutput.create(target)
+    out.open(target, spec)
+    out.write_image(np.ascontiguousarray(texture(5)[:400]))
+    out.close()
+    facts, photos = run(tmp_path)
+    fact = facts["photos"][-1]
+    assert (fact["width"], fact["height"]) == (400, 512)
+    seen = pycolmap.Bitmap.read(str(photos / fact["work_name"]), True)
+    assert (seen.width, seen.height) == (400, 512)
+    # COLMAP takes 35 mm equivalents on the diagonal, as we do.
+    assert seen.exif_focal_length() == pytest.approx(28 / np.hypot(36, 24) * np.hypot(400, 512), rel=0.02)
+
+
+def test_bad_photos_are_counted_and_named(tmp_path):
+    paths = write_capture(tmp_path / "raw", 4)
+    (tmp_path / "raw" / "a.jpg").write_text("no picture")
+    paths[0].write_bytes(paths[0].read_bytes()[:3000])
+    facts, _ = run(tmp_path)
+    assert [s["source"] for s in facts["skipped"]] == ["a.jpg", "p00.jpg"]
+    assert "2 of 5 photos skipped: a.jpg (no image" in facts["warnings"][0]
+    assert len(facts["photos"]) == 3
+
+
+def test_strict_refuses_and_too_few_refuses(tmp_path):
+    write_capture(tmp_path / "raw", 3)
+    (tmp_path / "raw" / "a.jpg").write_bytes(b"")
+    with pytest.raises(AwError, match=r"1 of 4 photos cannot be read: a\.jpg \(empty file \(0 bytes\)\)"):
+        run(tmp_path, strict=True)
+    (tmp_path / "raw" / "p00.jpg").write_bytes(b"")
+    (tmp_path / "stage").rename(tmp_path / "old")
+    with pytest.raises(AwError, match="only 2 of 4 photos"):
+        run(tmp_path)
+
+
+def test_identical_and_near_duplicates_are_told_apart(tmp_path):
+    paths = write_capture(tmp_path / "raw", 4)
+    paths[1].write_bytes(paths[0].read_bytes())
+    lighter = cv2.convertScaleAbs(cv2.imread(str(paths[2])), alpha=0.97)
+    cv2.imwrite(str(paths[3]), lighter)
+    warnings = run(tmp_path)[0]["warnings"]
+    assert "identical files: p00.jpg, p01.jpg" in warnings
+    near = next(w for w in warnings if "near-duplicate" in w)
+    assert "p02.jpg = p03.jpg" in near
+    assert "p00.jpg = p01.jpg" not in near
+
+
+def test_sharpness_falls_with_blur_and_not_with_resolution():
+    image = cv2.resize(texture(1), (2048, 2048), interpolation=cv2.INTER_CUBIC)
+    soft = cv2.GaussianBlur(image, (0, 0), 8)
+    assert sharpness(soft) < 0.2 * sharpness(image)
+    half = cv2.resize(image, (1024, 1024), interpolation=cv2.INTER_AREA)
+    assert sharpness(image) == pytest.approx(sharpness(half), rel=0.05)
+
+
+def test_thumbnail_ignores_brightness_and_contrast():
+    image = texture(1)
+    other = (image * 0.5 + 40).astype(np.uint8)
+    assert thumbnail(image) @ thumbnail(other) > 0.999
+    assert thumbnail(image) @ thumbnail(texture(2)) < 0.5
+    assert np.isfinite(thumbnail(np.full((40, 40, 3), 7, np.uint8))).all()
+
+
+def fact(i, blur=100.0, **exif):
+    return {"source": f"{i}.jpg", "blur": blur, "width": 10, "height": 8, "camera": "C", "exif": exif}
+
+
+def test_drift_is_reported_with_its_number():
+    quiet = [fact(i, exposure_s=0.01, f_number=4.0, iso=100.0, focal_mm=5.0) for i in range(4)]
+    assert drift_warnings(quiet) == []
+    loud = [*quiet, fact(9, 5.0, exposure_s=0.04, f_number=4.0, iso=100.0, focal_mm=9.0, white_balance=1),
+            fact(10, white_balance=0)]  # fmt: skip
+    text = " | ".join(drift_warnings(loud))
+    for part in ("1 photos are blurred", "9.jpg", "2.0 stops", "white balance", "5.0 to 9.0 mm"):
+        assert part in text
+
+
+def test_exposure_is_in_stops():
+    base = {"exposure_s": 0.01, "f_number": 4.0, "iso": 100.0}
+    assert exposure_stops({**base, "iso": 200.0}) - exposure_stops(base) == pytest.approx(1.0)
+    assert exposure_stops({**base, "f_number": 8.0}) - exposure_stops(base) == pytest.approx(-2.0)
+    assert exposure_stops({"iso": 100.0}) is None

@@ -1,0 +1,126 @@
+import numpy as np
+import pytest
+
+from ambiguous_wild.builder.masks import find_masks, lay_out_masks
+from ambiguous_wild.builder.pairs import sequential_pairs
+from ambiguous_wild.builder.sfm import choose_camera, choose_matcher
+from ambiguous_wild.builder.split import read_test_list, split_photos
+from ambiguous_wild.core import AwError
+from ambiguous_wild.io.images import read_gray, write_png
+
+
+def facts(count=10, sides=None):
+    return [
+        {
+            "source": f"images/p{i}.jpg", "work_name": f"p{i}.jpg", "stem": f"p{i}", "width": 12, "height": 8,
+            "side": sides[i] if sides else None, "camera": "C", "exif": {"focal_mm": 5.0},
+        }
+        for i in range(count)
+    ]  # fmt: skip
+
+
+ALL = {f"p{i}" for i in range(10)}
+
+
+def test_every_eighth_warns_that_it_measures_distractors_too():
+    train, test, how, warnings = split_photos(facts(), ALL, None)
+    assert test == ["p0.png", "p8.png"]
+    assert len(train) == 8
+    assert how == "every-8"
+    assert "distractors" in warnings[0]
+
+
+def test_folders_split_and_a_lost_test_photo_is_said():
+    sides = ["test"] * 3 + ["train"] * 7
+    train, test, how, warnings = split_photos(facts(sides=sides), ALL - {"p1", "p9"}, None)
+    assert (how, test) == ("folders", ["p0.png", "p2.png"])
+    assert train == [f"p{i}.png" for i in range(3, 9)]
+    assert warnings == ["1 of 3 test photos are lost: scores cover 2"]
+
+
+def test_all_test_photos_lost_is_an_error():
+    sides = ["test"] * 3 + ["train"] * 7
+    with pytest.raises(AwError, match="none of the 3 test photos"):
+        split_photos(facts(sides=sides), ALL - {"p0", "p1", "p2"}, None)
+    with pytest.raises(AwError, match="only 0 training"):
+        split_photos(facts(sides=["test"] * 10), ALL, None)
+
+
+def test_list_names_photos_in_any_of_its_ways(tmp_path):
+    path = tmp_path / "t.txt"
+    path.write_text("images/p1.jpg\np2.jpg\np3\np4.png\n\n")
+    tests = read_test_list(path, facts())
+    assert tests == {"p1", "p2", "p3", "p4"}
+    assert split_photos(facts(), ALL, tests)[1] == ["p1.png", "p2.png", "p3.png", "p4.png"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"), [("p99.jpg", "did you mean 'images/p"), ("x\ny", "names 2 photos"), ("", "is empty")]
+)
+def test_list_that_cannot_be(tmp_path, text, message):
+    (tmp_path / "t.txt").write_text(text)
+    with pytest.raises(AwError, match=message):
+        read_test_list(tmp_path / "t.txt", facts())
+    with pytest.raises(AwError, match="cannot read the test list"):
+        read_test_list(tmp_path / "none.txt", facts())
+
+
+def test_masks_are_found_under_both_names(tmp_path):
+    white = np.full((8, 12), 200, np.uint8)
+    write_png(tmp_path / "m" / "p0.png", white)
+    write_png(tmp_path / "m" / "p1.jpg.png", white)
+    write_png(tmp_path / "m" / "images" / "p2.png", np.zeros((8, 12), np.uint8))
+    found = find_masks(tmp_path / "m", facts(3), "error")
+    assert sorted(found) == ["p0", "p1", "p2"]
+    (tmp_path / "out").mkdir()
+    shares = lay_out_masks(tmp_path / "out", found, facts(3))["kept_share"]
+    assert shares == {"p0": 1.0, "p1": 1.0, "p2": 0.0}
+    assert read_gray(tmp_path / "out" / "masks" / "p0.jpg.png").min() == 255  # 200 counts as white
+
+
+def test_missing_masks_are_named_or_the_photo_is_kept_whole(tmp_path):
+    write_png(tmp_path / "m" / "p0.png", np.zeros((8, 12), np.uint8))
+    with pytest.raises(AwError, match=r"2 of 3 photos have no mask: images/p1\.jpg, images/p2\.jpg"):
+        find_masks(tmp_path / "m", facts(3), "error")
+    found = find_masks(tmp_path / "m", facts(3), "keep")
+    (tmp_path / "out").mkdir()
+    lay_out_masks(tmp_path / "out", found, facts(3))
+    assert read_gray(tmp_path / "out" / "masks" / "p2.jpg.png").min() == 255
+
+
+def test_masks_of_the_wrong_size_are_named(tmp_path):
+    for i in range(3):
+        write_png(tmp_path / "m" / f"p{i}.png", np.zeros((8, 12 if i else 13), np.uint8))
+    with pytest.raises(AwError, match=r"1 of 3 masks .* p0\.png is 13x8 but its photo 12x8"):
+        find_masks(tmp_path / "m", facts(3), "error")
+    with pytest.raises(AwError, match="does not exist"):
+        find_masks(tmp_path / "none", facts(3), "error")
+
+
+def test_a_test_photo_meets_every_training_photo():
+    names = [f"w{i}" for i in range(60)] + ["t0", "t1"]
+    pairs = sequential_pairs(names, {"t0", "t1"})
+    assert len(pairs) == len({frozenset(p) for p in pairs})
+    joined = {frozenset(p) for p in pairs}
+    assert all(frozenset(("t0", f"w{i}")) in joined for i in range(60))
+    assert frozenset(("t0", "t1")) in joined
+    assert frozenset(("w0", "w10")) in joined
+    assert frozenset(("w0", "w32")) in joined
+    assert frozenset(("w0", "w11")) not in joined
+    assert len(pairs) < 60 * 59 / 2
+
+
+def test_one_camera_only_where_everything_agrees():
+    assert choose_camera(facts(3), "auto") == "single"
+    assert choose_camera(facts(3), "per-image") == "per-image"
+    for change in ({"width": 13}, {"camera": "D"}, {"exif": {"focal_mm": 6.0}}):
+        mixed = facts(3)
+        mixed[1].update(change)
+        assert choose_camera(mixed, "auto") == "per-image"
+        assert choose_camera(mixed, "single") == "single"
+
+
+def test_matcher_by_count():
+    assert choose_matcher(200, "auto") == "exhaustive"
+    assert choose_matcher(201, "auto") == "sequential"
+    assert choose_matcher(500, "exhaustive") == "exhaustive"

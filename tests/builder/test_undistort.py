@@ -1,0 +1,108 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+from ambiguous_wild.builder.progress import Bar
+from ambiguous_wild.builder.undistort import make_lens, undistort
+from ambiguous_wild.core import AwError
+from ambiguous_wild.io.colmap_model import ModelCamera, read_model
+from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
+from ambiguous_wild.io.safe_pycolmap import pycolmap
+from tests.builder.capture_maker import render
+from tests.io.model_maker import make_model
+
+CAMERA = ModelCamera(1, "SIMPLE_RADIAL", 320, 240, (300.0, 160.0, 120.0, -0.12))
+
+
+def photo():
+    return render(np.array([0.3, 0.0, 0.5]), np.array([0.0, 0.0, 5.0]))
+
+
+def test_agrees_with_colmap_pixel_by_pixel():
+    """pycolmap.undistort_image is the oracle; it is bilinear, so a smooth photo is compared."""
+    import cv2
+
+    smooth = cv2.GaussianBlur(photo(), (0, 0), 3)
+    theirs_in = pycolmap.Camera(model="SIMPLE_RADIAL", width=320, height=240, params=list(CAMERA.params))
+    theirs, flat = pycolmap.undistort_image(
+        pycolmap.UndistortCameraOptions(), pycolmap.Bitmap.from_array(smooth), theirs_in
+    )
+    lens = make_lens(CAMERA)
+    assert (lens.pinhole.width, lens.pinhole.height) == (flat.width, flat.height)
+    assert lens.pinhole.params == pytest.approx(flat.params)
+    ours = lens.remap(smooth, nearest=False)
+    difference = np.abs(ours.astype(int) - theirs.to_array())[2:-2, 2:-2]
+    assert difference.max() <= 3
+    assert np.abs(ours[2:238, 2:318].astype(int) - smooth[2:238, 2:318]).mean() > 5  # it did bend
+
+
+def test_points_and_pixels_go_the_same_way():
+    """A dot lands where its observation lands."""
+    lens = make_lens(CAMERA)
+    for x, y in ((40, 30), (280, 200), (160, 120), (300, 20)):
+        image = np.zeros((240, 320), np.uint8)
+        image[y - 1 : y + 2, x - 1 : x + 2] = 255
+        flat = lens.remap(image, nearest=False).astype(float)
+        rows, columns = np.indices(flat.shape)
+        seen = np.array([(flat * (columns + 0.5)).sum(), (flat * (rows + 0.5)).sum()]) / flat.sum()
+        assert np.allclose(seen, lens.undistort_points(np.array([[x + 0.5, y + 0.5]]))[0], atol=0.05)
+
+
+def test_without_distortion_nothing_moves():
+    lens = make_lens(dataclasses.replace(CAMERA, params=(300.0, 160.0, 120.0, 1e-6)))
+    assert lens.pinhole.params == (300.0, 300.0, 160.0, 120.0)
+    assert np.array_equal(lens.remap(photo(), nearest=False), photo())
+    xys = np.array([[3.0, 4.0], [200.0, 100.0]])
+    assert np.allclose(lens.undistort_points(xys), xys, atol=1e-3)
+
+
+def stage(tmp_path, truth=None, masks=None):
+    names = ["a.jpg", "b.jpg"]
+    model = make_model(names, camera="SIMPLE_RADIAL")
+    facts = [{"work_name": n, "stem": n[0], "source": f"train/{n}", "width": 64, "height": 48} for n in names]
+    pixels = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
+    found = undistort(
+        tmp_path / "out", model, facts, lambda fact: pixels, masks, truth, jobs=2, bar=Bar(False)
+    )
+    return model, found
+
+
+def test_the_model_becomes_pinhole_of_the_images_written(tmp_path):
+    model, _ = stage(tmp_path)
+    flat = read_model(tmp_path / "out" / "sparse" / "0")
+    assert [c.model for c in flat.cameras.values()] == ["PINHOLE"]
+    camera = flat.cameras[7]
+    for image in flat.images.values():
+        assert image.name.endswith(".png")
+        assert read_png_rgb(tmp_path / "out" / "images" / image.name).shape[:2] == (
+            camera.height,
+            camera.width,
+        )
+        assert np.array_equal(image.point_ids, model.images[image.image_id].point_ids)
+        # Both models see the same rays.
+        fx, fy, cx, cy = camera.pinhole()
+        lens = pycolmap.Camera(
+            model="SIMPLE_RADIAL", width=64, height=48, params=list(model.cameras[7].params)
+        )
+        rays = np.asarray(lens.cam_from_img(model.images[image.image_id].xys))
+        assert np.allclose((image.xys - [cx, cy]) / [fx, fy], rays)
+
+
+def test_masks_stay_black_and_white_and_truth_follows(tmp_path):
+    rng = np.random.default_rng(1)
+    for name in ("a", "b"):
+        write_png(tmp_path / "masks" / f"{name}.jpg.png", rng.integers(0, 2, (48, 64), dtype=np.uint8) * 255)
+    write_png(tmp_path / "truth" / "distractor" / "a.png", np.full((48, 64), 255, np.uint8))
+    write_png(tmp_path / "truth" / "clean" / "b.png", np.full((48, 64, 3), 77, np.uint8))
+    _, found = stage(tmp_path, tmp_path / "truth", tmp_path / "masks")
+    assert found == {"truth": {"distractor": 1, "clean": 1}}
+    assert set(np.unique(read_gray(tmp_path / "out" / "masks" / "a.png"))) == {0, 255}
+    assert read_gray(tmp_path / "out" / "truth" / "distractor" / "a.png").min() == 255
+    assert set(np.unique(read_png_rgb(tmp_path / "out" / "truth" / "clean" / "b.png"))) == {77}
+
+
+def test_truth_of_another_size_is_refused(tmp_path):
+    write_png(tmp_path / "truth" / "clean" / "a.png", np.zeros((10, 10, 3), np.uint8))
+    with pytest.raises(AwError, match="belongs to another capture"):
+        stage(tmp_path, tmp_path / "truth")

@@ -1,3 +1,10 @@
 """Distractor-free 3D Gaussian Splatting in ambiguous scenes: builder, trainer, harness."""
 
+import os
+
+# Two OpenMP pools share the cores, Numba's and torch's. By default their idle threads spin, each on the
+# core the other needs: 63 ms an iteration where sleeping threads take 4 (2 cores, 64x48 px). OpenMP reads
+# this when it is loaded, so it must stand before the first import of either.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
 __version__ = "0.1.0"

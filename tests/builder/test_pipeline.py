@@ -1,0 +1,209 @@
+"""The whole path on rendered photos of two walls, whose cameras are known exactly."""
+
+import hashlib
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from ambiguous_wild.builder import report
+from ambiguous_wild.builder.pipeline import build_scene
+from ambiguous_wild.builder.settings import BuildSettings
+from ambiguous_wild.core import AwError
+from ambiguous_wild.io.images import image_size, read_gray, read_png_rgb, write_png
+from ambiguous_wild.io.safe_pycolmap import pycolmap
+from ambiguous_wild.io.scene_folder import load_scene
+from tests.builder.capture_maker import HEIGHT, WIDTH, eyes, write_capture
+
+SETTINGS = BuildSettings(factor=2, max_features=800, name="walls", license="CC0-1.0")
+COUNT = 6
+
+
+def make_raw(root: Path) -> Path:
+    """train/ and test/ as the simulator lays them out, with truth and masks."""
+    paths = write_capture(root / "train", COUNT)
+    (root / "test").mkdir()
+    for path in (paths[1], paths[4]):
+        path.rename(root / "test" / path.name)
+    for i in range(COUNT):
+        distractor = np.zeros((HEIGHT, WIDTH), np.uint8)
+        distractor[: HEIGHT // 2, : 20 * i] = 255
+        write_png(root / "truth" / "distractor" / f"p{i:02d}.png", distractor)
+        write_png(root / "truth" / "clean" / f"p{i:02d}.png", np.full((HEIGHT, WIDTH, 3), 40 * i, np.uint8))
+    (root / "truth" / "capture.json").write_text('{"seed": 1}')
+    return root
+
+
+def hashes(scene: Path) -> dict[str, str]:
+    """Every file but scene.json, which holds timings; of that, all the rest."""
+    found = {
+        p.relative_to(scene).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest()
+        for p in sorted(scene.rglob("*"))
+        if p.is_file() and p.name != "scene.json"
+    }
+    info = json.loads((scene / "scene.json").read_text())
+    info.pop("seconds")
+    return {**found, "scene.json": json.dumps(info)}
+
+
+@pytest.fixture(scope="module")
+def raw(tmp_path_factory):
+    return make_raw(tmp_path_factory.mktemp("walls") / "raw")
+
+
+@pytest.fixture(scope="module")
+def scene(raw):
+    return build_scene(raw, raw.parent / "scene", SETTINGS, jobs=2).scene
+
+
+def test_every_photo_is_placed_where_it_was_taken(scene):
+    """Oracle: the eyes the photos were rendered from, up to the similarity SfM leaves open."""
+    loaded = load_scene(scene)
+    assert len(loaded.views) == COUNT
+    found = np.array([v.camera.center for v in loaded.views])
+    truth = np.array(eyes(COUNT))
+    a, b = found - found.mean(0), truth - truth.mean(0)
+    u, s, vt = np.linalg.svd(b.T @ a)
+    sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
+    scale = (s * np.diag(sign)).sum() / (a**2).sum()
+    residual = np.linalg.norm(scale * a @ (u @ sign @ vt).T - b, axis=1)
+    assert residual.max() < 0.02 * np.linalg.norm(b, axis=1).max()
+
+
+def test_folder_is_what_design_says(scene):
+    model = pycolmap.Reconstruction(str(scene / "sparse" / "0"))
+    assert model.num_reg_images() == COUNT
+    for image in model.images.values():
+        camera = model.cameras[image.camera_id]
+        assert str(camera.model_name) == "PINHOLE"
+        assert image_size(scene / "images" / image.name) == (camera.width, camera.height)
+        small = image_size(scene / "images_2" / image.name)
+        assert small == (round(camera.width / 2), round(camera.height / 2))
+    assert (scene / "test_list.txt").read_text().split() == ["p01.png", "p04.png"]
+    assert len((scene / "train_list.txt").read_text().split()) == 4
+    nb = json.loads((scene / "nb-info.json").read_text())
+    assert nb["loader_kwargs"] == {"images_path": "images_2"}
+
+
+def test_scene_json_tells_what_was_done(scene):
+    info = json.loads((scene / "scene.json").read_text())
+    assert info["counts"]["registered"] == info["counts"]["photos"] == COUNT
+    assert info["license"] == "CC0-1.0"
+    assert info["split"] == "folders"
+    assert info["chosen"]["camera"] == "single"
+    assert info["settings"]["max_features"] == 800
+    assert set(info["files"]) | {"scene.json"} == set(hashes(scene))
+    assert info["photos"]["p01.png"]["source"] == "test/p01.jpg"
+    assert set(info["seconds"]) >= {"screen", "features", "matches", "mapping", "undistort", "package"}
+    assert 0 < report.sfm_share(info) < 1
+    assert "6 of 6" in report.verdict(info, (160, 120), scene)
+
+
+def test_truth_comes_along_at_the_size_of_the_photos(scene):
+    size = image_size(scene / "images_2" / "p03.png")
+    mask = read_gray(scene / "truth" / "distractor" / "p03.png")
+    assert mask.shape == size[::-1]
+    assert set(np.unique(mask)) == {0, 255}
+    # 60 of 320 columns, half the height, give or take the undistortion's border
+    assert (mask > 0).mean() == pytest.approx(60 / 320 / 2, abs=0.02)
+    assert np.abs(read_png_rgb(scene / "truth" / "clean" / "p03.png").astype(int) - 120).max() <= 1
+    assert json.loads((scene / "truth" / "capture.json").read_text()) == {"seed": 1}
+
+
+def test_the_photos_survive_the_path(scene, raw):
+    """The full-size photo is the input again, up to the lens COLMAP found (there is none)."""
+    photo = cv2.imread(str(raw / "train" / "p02.jpg"), cv2.IMREAD_COLOR_RGB)
+    ours = read_png_rgb(scene / "images" / "p02.png")
+    assert abs(ours.shape[1] - WIDTH) <= 4
+    centre = np.s_[100:140, 140:180]
+    assert np.corrcoef(photo[centre].ravel(), ours[centre].ravel())[0, 1] > 0.9
+
+
+def test_nothing_is_left_beside_the_scene(scene, raw):
+    assert sorted(p.name for p in raw.parent.iterdir()) == ["raw", "scene"]
+
+
+def test_same_input_same_bits_for_any_number_of_threads(scene, raw, tmp_path):
+    again = build_scene(raw, tmp_path / "scene", SETTINGS, jobs=1)
+    assert hashes(again.scene) == hashes(scene)
+
+
+def test_second_call_has_nothing_to_do(scene, raw):
+    before = (scene / "scene.json").stat().st_mtime_ns
+    result = build_scene(raw, scene, SETTINGS)
+    assert result.up_to_date
+    assert (scene / "scene.json").stat().st_mtime_ns == before
+
+
+def test_other_settings_are_refused_by_name_until_overwrite(raw, tmp_path):
+    out = tmp_path / "scene"
+    first = build_scene(raw, out, SETTINGS, keep_work=True)
+    with pytest.raises(AwError, match=r"settings \(factor 2 -> 1\).*--overwrite"):
+        build_scene(raw, out, BuildSettings(**{**vars(SETTINGS), "factor": 1}))
+    other = BuildSettings(**{**vars(SETTINGS), "factor": 4})
+    result = build_scene(raw, out, other, overwrite=True, keep_work=True)
+    # Only what depends on the factor ran again.
+    assert set(result.reused) == {"screen", "features", "matches", "mapping", "undistort"}
+    assert (out / "images_4").is_dir()
+    assert not (out / "images_2").exists()
+    assert first.reused == ()
+
+
+def test_a_folder_of_something_else_is_never_replaced(raw, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "thesis.txt").write_text("mine")
+    with pytest.raises(AwError, match="is no scene"):
+        build_scene(raw, tmp_path / "out", SETTINGS, overwrite=True)
+    assert (tmp_path / "out" / "thesis.txt").read_text() == "mine"
+    with pytest.raises(AwError, match="holds the photos themselves"):
+        build_scene(raw, raw, SETTINGS, overwrite=True)
+
+
+def test_a_damaged_scene_is_noticed_and_mended(scene, raw, tmp_path):
+    copy = tmp_path / "scene"
+    shutil.copytree(scene, copy)
+    (copy / "images_2" / "p02.png").write_bytes(b"short")
+    with pytest.raises(AwError, match=r"images_2/p02\.png \(changed\)"):
+        build_scene(raw, copy, SETTINGS)
+
+
+def test_masks_are_used_and_carried_to_training_photos_only(raw, tmp_path):
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[:, :100] = 0
+    for i in range(COUNT):
+        write_png(tmp_path / "masks" / f"p{i:02d}.png", mask)
+    result = build_scene(raw, tmp_path / "scene", SETTINGS, masks=tmp_path / "masks", keep_work=True)
+    carried = sorted(p.name for p in (result.scene / "masks" / "train").iterdir())
+    assert carried == ["p00.png", "p02.png", "p03.png", "p05.png"]
+    loaded = load_scene(result.scene)
+    assert {v.name for v in loaded.views if v.keep_path} == set(carried)
+    keep = read_gray(loaded.train[0].keep_path)
+    assert keep.shape[::-1] == image_size(loaded.train[0].image_path)
+    assert keep[60, 5] == 0
+    assert keep[60, -5] == 255
+    # No feature was taken where the mask is black.
+    for image in pycolmap.Reconstruction(str(result.scene / "sparse" / "0")).images.values():
+        assert min(p.xy[0] for p in image.points2D) > 90
+
+
+def test_photos_of_different_places_fail_cleanly_with_the_figures(tmp_path):
+    from tests.builder.capture_maker import texture
+
+    (tmp_path / "raw").mkdir()
+    for i in range(4):
+        cv2.imwrite(str(tmp_path / "raw" / f"{i}.png"), texture(10 + i)[:240, :320])
+    with pytest.raises(AwError, match=r"placed \d of 4 photos.*median \d+ features.*overlap too little"):
+        build_scene(tmp_path / "raw", tmp_path / "scene", BuildSettings(max_features=500))
+    assert [p.name for p in tmp_path.iterdir()] == ["raw"]
+
+
+def test_identical_photos_fail_cleanly(tmp_path):
+    path = write_capture(tmp_path / "raw", 1)[0]
+    for name in ("q.jpg", "r.jpg"):
+        shutil.copy(path, path.with_name(name))
+    with pytest.raises(AwError, match=r"placed \d of 3 photos"):
+        build_scene(tmp_path / "raw", tmp_path / "scene", BuildSettings(max_features=500))
+    assert [p.name for p in tmp_path.iterdir()] == ["raw"]

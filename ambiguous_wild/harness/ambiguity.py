@@ -128,7 +128,7 @@ def load_clean(scene: Scene, view: View) -> np.ndarray | None:
     if image.shape[:2] != (view.camera.height, view.camera.width):
         raise AwError(
             f"{path} is {image.shape[1]}x{image.shape[0]}, its photo "
-            f"{view.camera.width}x{view.camera.height}; load the scene at the factor it was built for, or build it again"
+            f"{view.camera.width}x{view.camera.height}; load the factor it was built for, or build it again"
         )
     return image
 
@@ -202,7 +202,7 @@ def _figure(scene: Scene, masks: dict[str, Path], measured: list[Measured], path
     # Spread over the range of occlusion rather than the first four: what is easy and what is hard.
     order = sorted(range(len(measured)), key=lambda i: measured[i].counts.occlusion)
     chosen = [order[round(k)] for k in np.linspace(0, len(order) - 1, min(4, len(order)))]
-    figure = Figure(figsize=(3.4 * max(len(chosen), 2), 7.2), layout="constrained", dpi=110)
+    figure = Figure(figsize=(3.4 * max(len(chosen), 3), 6.2), layout="constrained", dpi=110)
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(3, 12)
     for column, index in enumerate(chosen):

@@ -72,6 +72,8 @@ def octaves(rng: np.random.Generator, height: int, width: int, cell_px: float, c
             break
         total += noise(rng, height, width, cell_px / 2**k) * 0.6**k
         weight += 0.6**k
+    if weight == 0.0:  # finer than the picture shows: what is left of it is its mean
+        return np.full((height, width), 0.5, np.float32)
     return np.asarray(total / weight, dtype=np.float32)
 
 

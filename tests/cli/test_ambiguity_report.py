@@ -1,0 +1,110 @@
+"""`aw ambiguity-report` on a scene whose answer is planted."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from ambiguous_wild.cli.ambiguity_report import command
+from ambiguous_wild.core import AwError
+from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.metrics.ambiguity import COLOUR_METRIC, SEMANTIC_METRIC
+from tests.tiny_scene import TRAIN, write_tiny_scene
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    """The tiny scene, its distractor-free twin as the clean views."""
+    root = write_tiny_scene(tmp_path / "scene")
+    clean = write_tiny_scene(tmp_path / "clean", distractors=False)
+    (root / "truth/clean").mkdir()
+    for name in TRAIN:
+        shutil.copy(clean / "images" / name, root / "truth/clean" / name)
+    return root
+
+
+def report(*words: object) -> dict:
+    done = CliRunner().invoke(command, [*(str(w) for w in words), "--json"], catch_exceptions=False)
+    assert done.exit_code == 0
+    return json.loads(done.stdout)
+
+
+def error(*words: object) -> str:
+    raised = CliRunner().invoke(command, [str(w) for w in words]).exception
+    assert isinstance(raised, AwError), raised
+    return str(raised)
+
+
+def pixels(scene: Path, part: str, name: str) -> np.ndarray:
+    return cv2.imread(str(scene / part / name)).astype(float) / 255
+
+
+def test_scores_are_those_of_the_files(scene: Path, tmp_path: Path) -> None:
+    facts = report(scene, "-o", tmp_path / "out")
+    masks = {n: pixels(scene, "truth/distractor", n)[..., 0] > 0.5 for n in TRAIN}
+    away = [
+        np.linalg.norm(pixels(scene, "images", n) - pixels(scene, "truth/clean", n), axis=2)[masks[n]]
+        for n in TRAIN
+    ]
+    assert facts["occlusion"]["value"] == pytest.approx(np.mean([m.mean() for m in masks.values()]), abs=1e-6)
+    assert facts[COLOUR_METRIC]["value"] == pytest.approx((np.concatenate(away) < 0.3).mean(), abs=1e-6)
+    assert facts[COLOUR_METRIC]["mean_residual"] == pytest.approx(np.concatenate(away).mean(), abs=1e-5)
+    assert facts[COLOUR_METRIC]["ambiguous"] is False and -1 <= facts[SEMANTIC_METRIC]["value"] <= 1
+    rows = list(csv.DictReader((tmp_path / "out/photos.csv").open()))
+    assert [r["photo"] for r in rows] == TRAIN
+    assert float(rows[0]["occlusion"]) == pytest.approx(masks[TRAIN[0]].mean(), abs=1e-6)
+    saved = json.loads((tmp_path / "out/ambiguity.json").read_text())
+    assert saved["occlusion"] == facts["occlusion"] and len(saved["per_photo"]) == len(TRAIN)
+    assert cv2.imread(str(tmp_path / "out/ambiguity.png")).std() > 5
+    assert "<table>" in (tmp_path / "out/index.html").read_text()
+
+
+def test_a_distractor_in_the_background_s_colours_is_ambiguous(scene: Path, tmp_path: Path) -> None:
+    for name in TRAIN:
+        shutil.copy(scene / "truth/clean" / name, scene / "images" / name)
+    facts = report(scene, "-o", tmp_path / "out")
+    assert facts[COLOUR_METRIC]["value"] == 1.0 and facts[COLOUR_METRIC]["ambiguous"] is True
+
+
+def test_without_clean_views_colour_is_missing_and_said(scene: Path, tmp_path: Path) -> None:
+    shutil.rmtree(scene / "truth/clean")
+    done = CliRunner().invoke(command, [str(scene), "-o", str(tmp_path / "out")], catch_exceptions=False)
+    assert "colour: missing" in done.stdout and "no verdict" in done.stdout
+    assert "100 % of the distractor pixels is unknown" in done.stdout
+
+
+def test_no_distractor_pixels_give_no_verdict(scene: Path, tmp_path: Path) -> None:
+    for name in TRAIN:
+        cv2.imwrite(str(scene / "truth/distractor" / name), np.zeros((48, 64), np.uint8))
+    facts = report(scene, "-o", tmp_path / "out")
+    assert facts["occlusion"]["value"] == 0
+    assert facts[COLOUR_METRIC]["value"] is None and facts[SEMANTIC_METRIC]["ambiguous"] is None
+
+
+def test_own_masks_and_what_is_said_where_there_are_none(scene: Path, tmp_path: Path) -> None:
+    own = tmp_path / "mine"
+    shutil.copytree(scene / "truth/distractor", own)
+    shutil.rmtree(scene / "truth")
+    assert "--masks DIR" in error(scene)
+    assert report(scene, "--masks", own, "-o", tmp_path / "out")["occlusion"]["value"] > 0
+    (own / TRAIN[2]).unlink()
+    assert TRAIN[2] in error(scene, "--masks", own)
+    cv2.imwrite(str(own / TRAIN[2]), np.zeros((48, 20), np.uint8))
+    assert "another shape" in error(scene, "--masks", own)
+
+
+def test_scores_are_noted_in_scene_json_unless_told_not_to(scene: Path, tmp_path: Path) -> None:
+    account = {"schema_version": 1, "name": "yard", "factor": 1, "files": {}}
+    (scene / "scene.json").write_text(json.dumps(account))
+    report(scene, "-o", tmp_path / "out", "--no-record")
+    assert json.loads((scene / "scene.json").read_text()) == account
+    facts = report(scene, "-o", tmp_path / "out")
+    noted = load_scene(scene).info["ambiguity"]
+    assert noted["occlusion"] == facts["occlusion"] and noted["masks"] == "truth"

@@ -1,0 +1,139 @@
+"""Ambiguity scores against plain loops, planted answers and the edges."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.metrics import ambiguity as am
+
+
+def pictures(seed: int = 0, size: tuple[int, int] = (7, 9)) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    photo, background = rng.random((*size, 3)), rng.random((*size, 3))
+    background = np.where(rng.random(size)[..., None] < 0.5, np.clip(photo + 0.1, 0, 1), background)
+    return photo.astype(np.float32), background.astype(np.float32), rng.random(size) < 0.4
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10**6), st.floats(0.05, 1.5))
+def test_counts_equal_a_loop_over_pixels(seed: int, threshold: float) -> None:
+    photo, background, mask = pictures(seed)
+    known = np.random.default_rng(seed + 1).random(mask.shape) < 0.8
+    close = measured = 0
+    total = 0.0
+    for i, j in zip(*np.nonzero(mask)):
+        if known[i, j]:
+            d = math.dist(photo[i, j].astype(float), background[i, j].astype(float))
+            measured, close, total = measured + 1, close + (d < threshold), total + d
+    got = am.colour_counts(photo, background, mask, known=known, threshold=threshold)
+    assert (got.distractor, got.known, got.close) == (mask.sum(), measured, close)
+    assert got.residual_sum == pytest.approx(total) and got.unknown == mask.sum() - measured
+
+
+def test_no_distractor_has_no_share_and_full_distractor_has_all() -> None:
+    photo, background, _ = pictures()
+    none = am.colour_counts(photo, background, np.zeros((7, 9), bool))
+    assert none.occlusion == 0 and math.isnan(none.close_share) and math.isnan(none.mean_residual)
+    everything = am.colour_counts(photo, photo, np.ones((7, 9), bool))
+    assert everything.occlusion == 1 and everything.close_share == 1 and everything.mean_residual == 0
+    assert am.verdict(none.close_share, 0.3) is None and am.verdict(0.31, 0.3) and not am.verdict(0.3, 0.3)
+
+
+def test_unknown_background_is_counted_and_left_out() -> None:
+    photo, background, mask = pictures()
+    lost = am.colour_counts(photo, None, mask)
+    assert lost.unknown == mask.sum() and math.isnan(lost.close_share)
+    seen = am.colour_counts(photo, background, mask)
+    both = am.pooled([lost, seen])
+    assert both.close_share == seen.close_share and both.unknown == mask.sum()
+    assert both.occlusion == pytest.approx(mask.mean())
+    assert math.isnan(am.pooled([]).occlusion)
+
+
+def test_black_against_white_is_the_farthest() -> None:
+    black, white = np.zeros((2, 2, 3), np.float32), np.ones((2, 2, 3), np.float32)
+    np.testing.assert_allclose(am.colour_residual(black, white), math.sqrt(3))
+
+
+def test_wrong_inputs_are_named() -> None:
+    photo, background, mask = pictures()
+    with pytest.raises(AwError, match="must both be"):
+        am.colour_counts(photo, background[:3], mask)
+    with pytest.raises(AwError, match="must be bool"):
+        am.colour_counts(photo, background, mask.astype(np.uint8))
+    with pytest.raises(AwError, match=r"in \[0, 1\]"):
+        am.colour_counts(photo * 255, background, mask)
+    with pytest.raises(AwError, match="one per photo"):
+        am.ratio_interval([1, 2], [1])
+
+
+def test_interval_of_the_pooled_ratio() -> None:
+    rng = np.random.default_rng(0)
+    whole = rng.integers(50, 500, 40)
+    part = rng.binomial(whole, rng.beta(4, 6, 40))
+    got = am.ratio_interval(part, whole, seed=3)
+    assert got.mean == pytest.approx(part.sum() / whole.sum()) and got.low < got.mean < got.high
+    assert got == am.ratio_interval(part, whole, seed=3)
+    # Linearised variance of a ratio estimator, an independent estimate of the same width.
+    error = math.sqrt(((part - got.mean * whole) ** 2).sum()) / whole.sum()
+    assert got.high - got.low == pytest.approx(2 * 1.96 * error, rel=0.15)
+
+
+def test_interval_edges() -> None:
+    constant = am.ratio_interval([2, 4, 6], [4, 8, 12])
+    assert (constant.low, constant.mean, constant.high) == (0.5, 0.5, 0.5)
+    one = am.ratio_interval([1], [4])
+    assert one.mean == 0.25 and math.isnan(one.low)
+    empty = am.ratio_interval([0, 0], [0, 0])
+    assert math.isnan(empty.mean) and empty.count == 0
+    # Photos without distractors may be all that a resample draws: it has no ratio and is left out.
+    sparse = am.ratio_interval([1, 0], [2, 0])
+    assert (sparse.low, sparse.mean, sparse.high) == (0.5, 0.5, 0.5)
+
+
+def test_region_means_equal_a_loop() -> None:
+    rng = np.random.default_rng(5)
+    features, labels = rng.normal(size=(3, 4, 5)), rng.integers(0, 4, (11, 17))
+    names, means, pixels = am.region_means(features, labels)
+    for name, mean, count in zip(names, means, pixels):
+        cells = [features[i * 3 // 11, j * 4 // 17] for i, j in zip(*np.nonzero(labels == name))]
+        np.testing.assert_allclose(mean, np.mean(cells, axis=0))
+        assert count == len(cells)
+
+
+def test_twin_is_found_and_stranger_is_not() -> None:
+    features = np.zeros((8, 8, 3))
+    features[:, :2], features[:, 2:4], features[:, 4:6], features[:, 6:] = np.eye(3)[[0, 1, 0, 2]]
+    segments = np.repeat(np.arange(1, 5), 2)[None].repeat(8, 0)
+    twin = am.semantic_matches(features, np.where(segments == 3, 1, 0), segments)
+    assert [(m.static_label, m.pixels) for m in twin] == [(1, 16)] and twin[0].cosine == pytest.approx(1)
+    stranger = am.semantic_matches(features, np.where(segments == 4, 1, 0), segments)
+    assert am.semantic_cosine(stranger) == pytest.approx(0)
+    both = [am.RegionMatch(30, 1.0, 1), am.RegionMatch(10, 0.2, 2)]
+    assert am.semantic_cosine(both) == pytest.approx(0.8)
+
+
+def test_semantic_edges() -> None:
+    features, segments = np.ones((4, 4, 2)), np.ones((4, 4), int)
+    assert am.semantic_matches(features, np.zeros((4, 4), int), segments) == []  # nobody there
+    assert am.semantic_matches(features, segments, segments) == []  # nothing static left to compare with
+    half = np.repeat([[0, 0, 1, 1]], 4, axis=0)
+    assert am.semantic_matches(0 * features, half, segments) == []  # no direction
+    assert math.isnan(am.semantic_cosine([]))
+    with pytest.raises(AwError, match="differ in size"):
+        am.semantic_matches(features, half, segments[:2])
+
+
+def test_standardised_channels_have_mean_zero_and_spread_one() -> None:
+    rng = np.random.default_rng(1)
+    grids = [rng.normal([5.0, -3.0, 2.0], [2.0, 0.1, 0.0], (6, 5, 3)) for _ in range(3)]
+    mean, spread = am.channel_statistics(grids)
+    flat = np.concatenate([(g - mean).reshape(-1, 3) / spread for g in grids])
+    np.testing.assert_allclose(flat.mean(0), 0, atol=1e-9)
+    np.testing.assert_allclose(flat.std(0), [1, 1, 0], atol=1e-9)

@@ -1,0 +1,129 @@
+"""The ray caster against dense sampling of solids, and its two pictures against each other."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ambiguous_wild.core import Camera
+from ambiguous_wild.simulate.atlas import build_atlas, linear_to_srgb, srgb_to_linear
+from ambiguous_wild.simulate.capture import look_at
+from ambiguous_wild.simulate.kernels import BOX, CAPSULE, CYLINDER, ELLIPSOID, FAR, PLANAR, QUAD, _intersect
+from ambiguous_wild.simulate.shapes import Shape, between, bounding_radius, placed, shape_table
+from ambiguous_wild.simulate.tracer import Light, trace
+
+HALF = (0.5, 0.5, 0.8)
+
+
+def inside(kind: int, p: np.ndarray) -> np.ndarray:
+    """Whether points [N, 3] lie in the solid, written from its definition."""
+    x, y, z = np.abs(p).T
+    if kind == BOX:
+        return (x <= HALF[0]) & (y <= HALF[1]) & (z <= HALF[2])
+    if kind == ELLIPSOID:
+        return ((p / HALF) ** 2).sum(1) <= 1
+    if kind == CAPSULE:
+        return np.linalg.norm(np.column_stack([x, y, np.maximum(z - HALF[2], 0)]), axis=1) <= HALF[0]
+    return (np.hypot(x, y) <= HALF[0]) & (z <= HALF[2])
+
+
+@pytest.mark.parametrize("kind", [BOX, ELLIPSOID, CAPSULE, CYLINDER])
+def test_first_hit_is_where_dense_samples_first_enter_the_solid(kind: int) -> None:
+    rng = np.random.default_rng(kind)
+    t = np.arange(0.0, 6.0, 2e-3)
+    hits = 0
+    for _ in range(150):
+        start = rng.normal(size=3)
+        start *= 2.5 / np.linalg.norm(start)
+        direction = rng.uniform(-0.8, 0.8, 3) - start
+        direction /= np.linalg.norm(direction)
+        found = _intersect(kind, tuple(start), tuple(direction), HALF, FAR)
+        within = inside(kind, start + t[:, None] * direction)
+        if within.any():
+            hits += 1
+            assert found == pytest.approx(t[np.argmax(within)], abs=2.1e-3)
+        elif found < FAR:  # only a graze may slip between the samples
+            assert inside(kind, (start + found * direction)[None] * 0.999).all()
+    assert hits > 50
+    rim = rng.normal(size=(500, 3)) * 2
+    assert bounding_radius(kind, HALF) >= np.linalg.norm(rim[inside(kind, rim)], axis=1).max()
+
+
+def _scene() -> tuple[list[Shape], list[Shape], Light, dict[str, np.ndarray]]:
+    rng = np.random.default_rng(3)
+    textures = {n: rng.uniform(0.1, 0.9, (64, 64, 3)).astype(np.float32) for n in ("floor", "thing")}
+    floor = Shape(QUAD, (0, 0, 0), (6, 6, 0), "floor", mapping=PLANAR, casts=False)
+    ball = Shape(ELLIPSOID, (0.4, 0.3, 0.6), (0.6, 0.5, 0.6), "thing")
+    post = between((-1, 0, 0), (-1.1, 0.3, 1.5), 0.2, "thing")
+    sun = np.tile(np.array([0.4, -0.5, 0.77]) / np.linalg.norm([0.4, -0.5, 0.77]), (4, 1))
+    light = Light(sun, np.ones(3), np.full(3, 0.5), np.full(3, 0.3))
+    return [floor, ball], [replace(post, owner=1)], light, textures
+
+
+def _camera(width: int = 80, height: int = 60) -> Camera:
+    pose = look_at(np.array([0.2, -4.0, 1.6]), np.array([0.0, 0.0, 0.5]), 3.0)
+    return Camera(width, height, 70.0, 70.0, width / 2, height / 2, pose)
+
+
+def test_both_pictures_agree_to_the_bit_where_no_distractor_was_hit() -> None:
+    static, moving, light, textures = _scene()
+    atlas = build_atlas(textures)
+    seen = trace(_camera(), shape_table(static, atlas), shape_table(moving, atlas), atlas, light)
+    alone = trace(_camera(), shape_table(static, atlas), shape_table([], atlas), atlas, light)
+    hit = seen.owner > 0
+    assert 0.02 < hit.mean() < 0.5
+    np.testing.assert_array_equal(seen.distracted[~hit], seen.clean[~hit])
+    np.testing.assert_array_equal(seen.clean, alone.clean)  # a mover changes nothing of the static scene
+    assert (np.abs(seen.distracted - seen.clean)[hit].sum(1) > 1e-4).mean() > 0.99
+    assert not alone.owner.any()
+
+
+def test_a_distractor_behind_a_static_thing_is_not_seen() -> None:
+    static, moving, light, textures = _scene()
+    atlas = build_atlas(textures)
+    wall = Shape(BOX, (0, -2.0, 1.0), (5, 0.05, 3.0), "thing")
+    seen = trace(_camera(), shape_table([*static, wall], atlas), shape_table(moving, atlas), atlas, light)
+    assert not seen.owner.any()
+
+
+def test_depth_of_the_ground_is_that_of_the_plane() -> None:
+    static, _, light, textures = _scene()
+    atlas = build_atlas(textures)
+    camera = _camera()
+    depth = trace(camera, shape_table(static[:1], atlas), shape_table([], atlas), atlas, light).depth_m
+    rows, cols = np.mgrid[40:60, 0:80] + 0.5
+    rays = np.stack([(cols - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones_like(rows)], -1)
+    up = rays @ camera.cam_from_world[:3, :3][:, 2]
+    # The pixel holds the mean over four samples of a convex function of the row: 1 % at this size.
+    np.testing.assert_allclose(depth[40:60], -camera.center[2] / up, rtol=0.01)
+
+
+def test_fine_texture_far_away_turns_grey_instead_of_shimmering() -> None:
+    checks = np.kron(np.indices((64, 64)).sum(0) % 2, np.ones((2, 2)))[..., None].repeat(3, 2)
+    atlas = build_atlas({"checks": checks.astype(np.float32)})
+    wall = Shape(
+        QUAD, (0, 0, 0), (40, 40, 0), "checks", ((1, 0, 0), (0, 0, 1), (0, -1, 0)), PLANAR, (1.0, 1.0)
+    )
+    light = Light(np.tile([0.0, 0.0, 1.0], (4, 1)), np.zeros(3), np.full(3, 1.0), np.full(3, 1.0))
+    camera = Camera(64, 48, 60.0, 60.0, 32, 24, look_at(np.array([0, -20.0, 0]), np.zeros(3), 0.0))
+    seen = trace(camera, shape_table([wall], atlas), shape_table([], atlas), atlas, light)
+    assert seen.clean.std() < 0.02  # unfiltered, its spread would be near 0.25
+    np.testing.assert_allclose(seen.clean.mean(), 0.5, atol=0.02)
+
+
+def test_colour_transfer_goes_there_and_back() -> None:
+    x = np.linspace(0, 1, 257, dtype=np.float32)
+    np.testing.assert_allclose(linear_to_srgb(srgb_to_linear(x)), x, atol=1e-5)
+    assert srgb_to_linear(np.array(0.5)) == pytest.approx(0.21404, abs=1e-4)
+
+
+def test_placing_keeps_distances() -> None:
+    parts = [between((0, 0, 0), (0, 0.5, 1), 0.1, "x"), Shape(BOX, (1, 0, 0), (0.1, 0.2, 0.3), "x")]
+    moved = placed(parts, (3, -2, 1), 57.0, 2.0)
+    gap = np.linalg.norm(np.subtract(parts[0].center, parts[1].center))
+    assert np.linalg.norm(np.subtract(moved[0].center, moved[1].center)) == pytest.approx(2 * gap)
+    for shape in moved:
+        axes = np.array(shape.axes)
+        np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)

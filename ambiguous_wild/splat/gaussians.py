@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
@@ -32,7 +32,7 @@ class Gaussians:
 
     # Set on an instance by an optimiser that postpones updates of rows nobody sees: the renderer calls it
     # with the rows about to be drawn before it reads their harmonics. Copies do not carry it.
-    before_colours: ClassVar[Callable[[np.ndarray], Any] | None] = None
+    before_colours: ClassVar[Any] = None
 
     def __post_init__(self) -> None:
         n = self.means.shape[0]

@@ -88,8 +88,12 @@ def _ssim_torch(a: Tensor, b: Tensor) -> Tensor:
     taps = (taps / taps.sum()).to(a)
 
     def blur(x: Tensor) -> Tensor:
-        x = torch.nn.functional.conv2d(x, taps.view(1, 1, 11, 1).expand(15, 1, 11, 1), padding=(5, 0), groups=15)
-        return torch.nn.functional.conv2d(x, taps.view(1, 1, 1, 11).expand(15, 1, 1, 11), padding=(0, 5), groups=15)
+        x = torch.nn.functional.conv2d(
+            x, taps.view(1, 1, 11, 1).expand(15, 1, 11, 1), padding=(5, 0), groups=15
+        )
+        return torch.nn.functional.conv2d(
+            x, taps.view(1, 1, 1, 11).expand(15, 1, 1, 11), padding=(0, 5), groups=15
+        )
 
     stack = torch.cat([a, b, a * a, b * b, a * b], 2).permute(2, 0, 1)[None]
     mean_a, mean_b, aa, bb, ab = blur(stack)[0].permute(1, 2, 0).split(3, 2)

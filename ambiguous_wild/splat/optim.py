@@ -157,7 +157,7 @@ class SplatAdam:
         if not self._lazy or self.steps == 0 or self.gaussians.sh_rest.shape[1] == 0:
             return
         from ambiguous_wild.splat.cpu import adam
-        from ambiguous_wild.splat.cpu.threads import threads
+        from ambiguous_wild.splat.cpu.compile import threads
 
         p = self.gaussians.sh_rest
         width = 3 * p.shape[1]
@@ -198,7 +198,7 @@ class SplatAdam:
         root: float,
     ) -> None:
         from ambiguous_wild.splat.cpu import adam
-        from ambiguous_wild.splat.cpu.threads import threads
+        from ambiguous_wild.splat.cpu.compile import threads
 
         if now >= self._history.shape[1]:
             self._history = np.concatenate([self._history, np.zeros_like(self._history)], axis=1)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+from ambiguous_wild.splat.cpu.compile import kernel, parallel_kernel
 from ambiguous_wild.splat.cpu.simd import (
     any_lane,
     fma,
@@ -26,20 +27,20 @@ _TINY_M = np.float32(1e-30)
 _TINY_V = np.float32(1.2e-38)
 
 
-@numba.njit(cache=True)
+@kernel
 def _moments(m, v, g, beta1, rest1, beta2, rest2):
     m = fma(g, rest1, m * beta1)
     v = fma(g * g, rest2, v * beta2)
     return select(magnitude(m) >= _TINY_M, m, np.float32(0.0)), select(v >= _TINY_V, v, np.float32(0.0))
 
 
-@numba.njit(cache=True)
+@kernel
 def _change(m, v, rate, root, eps):
     """rate m / (sqrt(v) root + eps), with rate = lr / bias1 and root = 1 / sqrt(bias2)."""
     return m * rate / fma(square_root(v), root, eps)
 
 
-@numba.njit(cache=True)
+@kernel
 def _dense_part(part, parts, p, m, v, g, rate, root, beta1, rest1, beta2, rest2, eps):
     """The part-th of `parts` slices of a flat array, one step."""
     blocks = (p.shape[0] + 15) // 16
@@ -60,14 +61,14 @@ def _dense_part(part, parts, p, m, v, g, rate, root, beta1, rest1, beta2, rest2,
         store_some(p, at, load_some(p, at, count) - _change(mean, square, rate, root, eps), count)
 
 
-@numba.njit(cache=True, parallel=True)
+@parallel_kernel
 def dense(p, m, v, g, rate, root, beta1, rest1, beta2, rest2, eps, parts):
     """One step of a flat array."""
     for part in numba.prange(parts):
         _dense_part(part, parts, p, m, v, g, rate, root, beta1, rest1, beta2, rest2, eps)
 
 
-@numba.njit(cache=True)
+@kernel
 def _advance(p, m, v, at, count, first, last, rates, roots, beta1, rest1, beta2, rest2, eps):
     """Steps first .. last - 1 with gradient zero for up to 16 values from flat index `at`."""
     value = load_some(p, at, count)
@@ -92,7 +93,7 @@ def _advance(p, m, v, at, count, first, last, rates, roots, beta1, rest1, beta2,
     store_some(v, at, square, count)
 
 
-@numba.njit(cache=True)
+@kernel
 def _row_catch_up(row, width, p, m, v, last, now, rates, roots, beta1, rest1, beta2, rest2, eps):
     if last[row] < now:
         for at in range(row * width, row * width + width, 16):
@@ -101,7 +102,7 @@ def _row_catch_up(row, width, p, m, v, last, now, rates, roots, beta1, rest1, be
         last[row] = now
 
 
-@numba.njit(cache=True, parallel=True)
+@parallel_kernel
 def catch_up(rows, width, p, m, v, last, now, rates, roots, beta1, rest1, beta2, rest2, eps, parts):
     """Bring rows up to step `now`: last[row] counts the steps a row has taken; flat arrays of `width` a row."""
     n = rows.shape[0]
@@ -110,7 +111,7 @@ def catch_up(rows, width, p, m, v, last, now, rates, roots, beta1, rest1, beta2,
             _row_catch_up(rows[k], width, p, m, v, last, now, rates, roots, beta1, rest1, beta2, rest2, eps)
 
 
-@numba.njit(cache=True, parallel=True)
+@parallel_kernel
 def catch_up_all(width, p, m, v, last, now, rates, roots, beta1, rest1, beta2, rest2, eps, parts):
     """`catch_up` of every row."""
     n = last.shape[0]
@@ -119,7 +120,7 @@ def catch_up_all(width, p, m, v, last, now, rates, roots, beta1, rest1, beta2, r
             _row_catch_up(row, width, p, m, v, last, now, rates, roots, beta1, rest1, beta2, rest2, eps)
 
 
-@numba.njit(cache=True, parallel=True)
+@parallel_kernel
 def sparse(visible, width, p, m, v, g, last, now, rates, roots, beta1, rest1, beta2, rest2, eps, parts):
     """Step `now` (counted from 0) of the visible rows with their gradient; the others are left for later."""
     n = visible.shape[0]

@@ -12,6 +12,7 @@ import math
 import numba
 import numpy as np
 
+from ambiguous_wild.splat.cpu.compile import kernel, parallel_kernel
 from ambiguous_wild.splat.cpu.project import (
     CHUNK,
     DEPTH,
@@ -30,7 +31,7 @@ PARTS = 16  # work items of the parallel loops over ranks
 _SLACK = 1e-3  # px; float32 rounding never loses a pixel, the alpha test decides
 
 
-@numba.njit(cache=True)
+@kernel
 def visible_slots(ids, counts):
     """Slots of the records in use, in the order of their Gaussians."""
     total = 0
@@ -46,7 +47,7 @@ def visible_slots(ids, counts):
     return slots[:k]
 
 
-@numba.njit(cache=True)
+@kernel
 def depth_order(slots, records):
     """The slots sorted by depth, ties in the order given: radix sort of the float bits, 11 bits a pass."""
     n = slots.shape[0]
@@ -82,7 +83,7 @@ def depth_order(slots, records):
     return source
 
 
-@numba.njit(cache=True)
+@kernel
 def tile_rows(record, height):
     """First and last row of tiles that hold a pixel centre within the contour's y extent."""
     low = math.ceil(max(record[MY] - record[EXTENT_Y] - 0.5 - _SLACK, 0.0))
@@ -90,7 +91,7 @@ def tile_rows(record, height):
     return int(low) // TILE, int(high) // TILE
 
 
-@numba.njit(cache=True)
+@kernel
 def tile_span(record, row, width):
     """First and last tile column the contour reaches in a row of tiles; last < first if none.
 
@@ -119,7 +120,7 @@ def tile_span(record, row, width):
     return int(low) // TILE, int(high) // TILE
 
 
-@numba.njit(cache=True, parallel=True)
+@parallel_kernel
 def count_tiles(order, records, width, height, columns, instances, histogram):
     """Per rank the number of tiles, per part and tile the number of ranks."""
     n = order.shape[0]
@@ -137,7 +138,7 @@ def count_tiles(order, records, width, height, columns, instances, histogram):
             instances[rank] = total
 
 
-@numba.njit(cache=True)
+@kernel
 def prefix(instances, offsets, histogram, starts):
     """Exclusive sums: offsets of a rank's instances, starts of the tiles, cursors of each part in each tile."""
     total = 0
@@ -155,7 +156,7 @@ def prefix(instances, offsets, histogram, starts):
     starts[histogram.shape[1]] = at
 
 
-@numba.njit(cache=True, parallel=True)
+@parallel_kernel
 def scatter(order, records, width, height, columns, offsets, histogram, tile_slots, tile_instances):
     """Write each tile's list: the record's slot, and the rank-major number of the instance."""
     n = order.shape[0]

@@ -14,6 +14,7 @@ import numba
 import numpy as np
 
 from ambiguous_wild.splat.cpu.bins import TILE
+from ambiguous_wild.splat.cpu.compile import kernel, parallel_kernel
 from ambiguous_wild.splat.cpu.project import (
     BLUE,
     CURVE_X,
@@ -54,7 +55,7 @@ EXTRA_U, EXTRA_Y, ABS_U, ABS_V = range(10, 14)
 ROW = 16
 
 
-@numba.njit(cache=True)
+@kernel
 def row_range(record, top, rows):
     """First row and one past the last row of a tile whose pixel centres lie within the y extent."""
     low = math.ceil(record[MY] - record[EXTENT_Y] - np.float32(0.501) - top)
@@ -62,7 +63,7 @@ def row_range(record, top, rows):
     return int(max(low, 0.0)), int(min(high, rows - 1.0)) + 1
 
 
-@numba.njit(cache=True)
+@kernel
 def _forward_tile(records, slots, begin, end, left, top, width, height, state):
     """Blend a tile's list into `state` = (T, red, green, blue, depth, last); returns how far it got.
 
@@ -118,7 +119,7 @@ def _forward_tile(records, slots, begin, end, left, top, width, height, state):
     return end
 
 
-@numba.njit(cache=True)
+@kernel
 def _forward_worker(
     worker, records, tile_slots, starts, tile_order, workers, width, height, background, image, alpha, depth, kept
 ):  # fmt: skip
@@ -150,7 +151,7 @@ def _forward_worker(
                 depth[top + y, left + x] = state[4][at]
 
 
-@numba.njit(cache=True, parallel=True)
+@parallel_kernel
 def forward(
     records, tile_slots, starts, tile_order, workers, width, height, background, image, alpha, depth, kept
 ):
@@ -172,7 +173,7 @@ def forward(
         )  # fmt: skip
 
 
-@numba.njit(cache=True)
+@kernel
 def _backward_tile(
     records, slots, instances, begin, end, top, left, rows, planes, extra, with_extra, with_depth, absolute, sums
 ):  # fmt: skip
@@ -280,7 +281,7 @@ def _backward_tile(
         store(sums, instances[k] * ROW, row)
 
 
-@numba.njit(cache=True)
+@kernel
 def _backward_worker(
     worker, records, tile_slots, tile_instances, starts, tile_order, workers, width, height, background, kept,
     d_image, d_alpha, d_depth, d_extra, absolute, sums,
@@ -341,7 +342,7 @@ def _backward_worker(
         )  # fmt: skip
 
 
-@numba.njit(cache=True, parallel=True)
+@parallel_kernel
 def backward(
     records, tile_slots, tile_instances, starts, tile_order, workers, width, height, background, kept,
     d_image, d_alpha, d_depth, d_extra, absolute, sums,

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ambiguous_wild.splat.cpu import ssim
 from ambiguous_wild.splat.cpu.buffers import Pool
-from ambiguous_wild.splat.cpu.threads import threads
+from ambiguous_wild.splat.cpu.compile import threads
 
 _pool = Pool()
 _taps = ssim.window()

@@ -12,7 +12,7 @@ from torch import Tensor
 from ambiguous_wild.core import AwError, Camera
 from ambiguous_wild.splat.cpu import bins, blend, harmonics, project, reverse
 from ambiguous_wild.splat.cpu.buffers import Pool
-from ambiguous_wild.splat.cpu.threads import threads
+from ambiguous_wild.splat.cpu.compile import threads
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.render import Gradients
 

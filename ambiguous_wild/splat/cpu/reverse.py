@@ -24,16 +24,17 @@ from ambiguous_wild.splat.cpu.blend import (
     SUM_Y,
     SUM_YY,
 )
+from ambiguous_wild.splat.cpu.compile import kernel, parallel_kernel
 from ambiguous_wild.splat.cpu.harmonics import C0, basis, direction_gradient
 from ambiguous_wild.splat.cpu.project import BLUE, BLUR, CHUNK, GREEN, RED, footprint, sigmoid
 
 
-@numba.njit(cache=True)
+@kernel
 def _cross(a, b):
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@numba.njit(cache=True)
+@kernel
 def _covariance_gradient(sums, f1, f2, antialias):
     """dL/d(u, v) and dL/d(rows f1, f2 of J W R diag(s)) from the sums over pixels."""
     sxx = f1[0] * f1[0] + f1[1] * f1[1] + f1[2] * f1[2] + BLUR
@@ -72,7 +73,7 @@ def _covariance_gradient(sums, f1, f2, antialias):
     return du, dv, d1, d2, a, q, k
 
 
-@numba.njit(cache=True)
+@kernel
 def _quaternion_gradient(quat, norm, g):
     """dL/d(raw quaternion) from dL/dR (nine values, row by row)."""
     w, x, y, z = quat
@@ -84,7 +85,7 @@ def _quaternion_gradient(quat, norm, g):
     return (dw - w * along) / norm, (dx - x * along) / norm, (dy - y * along) / norm, (dz - z * along) / norm
 
 
-@numba.njit(cache=True)
+@kernel
 def _reverse_chunk(
     first, stop, means, quats, log_scales, opacity_logits, sh_rest, degree, cam, centre, antialias,
     records, ids, ranks, offsets, sums, d_means, d_quats, d_log_scales, d_opacity_logits, d_sh0,
@@ -233,7 +234,7 @@ def _reverse_chunk(
             screen_abs[i, 1] = 1.3862943611198906 * total[ABS_V]  # 2 / log2(e)
 
 
-@numba.njit(cache=True, parallel=True)
+@parallel_kernel
 def reverse(
     means, quats, log_scales, opacity_logits, sh_rest, degree, cam, centre, antialias,
     records, ids, counts, ranks, offsets, sums,

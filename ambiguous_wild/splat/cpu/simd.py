@@ -13,8 +13,10 @@ from typing import Any
 from llvmlite import ir
 from numba.core import types
 from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
-from numba.extending import intrinsic, lower_builtin, models, register_model
+from numba.extending import lower_builtin, models, register_model
 from numba.np.arrayobj import make_array
+
+from ambiguous_wild.splat.cpu.compile import intrinsic
 
 LANES = 16
 _F32 = ir.FloatType()

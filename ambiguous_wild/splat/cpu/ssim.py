@@ -11,6 +11,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+from ambiguous_wild.splat.cpu.compile import kernel, parallel_kernel
 from ambiguous_wild.splat.cpu.simd import fma, load, select, splat, store, sum_lanes
 
 RADIUS = 5
@@ -30,7 +31,7 @@ def stride(width: int) -> int:
     return -(-3 * width // 16) * 16
 
 
-@numba.njit(cache=True, parallel=True)
+@parallel_kernel
 def pack(image, keep, out):
     """Copy [H, W, 3] into rows of whole vectors [H, stride], times keep [H, W] unless it is None."""
     height, width = image.shape[0], image.shape[1]
@@ -44,7 +45,7 @@ def pack(image, keep, out):
                 out[y, 3 * x + c] = value
 
 
-@numba.njit(cache=True)
+@kernel
 def _statistics_row(
     y, height, width, x_rows, y_rows, taps, keep, scale, buffers, maps, weights, ssim, totals
 ):
@@ -131,7 +132,7 @@ def _statistics_row(
     totals[y, 1] = row_sums[1]
 
 
-@numba.njit(cache=True)
+@kernel
 def _gradient_row(y, height, width, x_rows, y_rows, taps, keep, outer, l1_scale, buffers, maps, weights, out):
     """Row y of the gradient: window of the three maps, plus l1_scale times the sign; `outer` is chained on."""
     length = x_rows.shape[1]
@@ -184,7 +185,7 @@ def _gradient_row(y, height, width, x_rows, y_rows, taps, keep, outer, l1_scale,
             out[y, x, c] = buffers[base + 3 * x + c] * chain
 
 
-@numba.njit(cache=True, parallel=True)
+@parallel_kernel
 def photometric(x_rows, y_rows, width, taps, keep, outer, lam, parts, maps, ssim, totals, out):
     """Fill totals [H, 2] float64 (sums of w |x - y| and w (1 - S) a row) and out [H, W, 3], dL/dx.
 

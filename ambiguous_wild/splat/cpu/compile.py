@@ -1,0 +1,75 @@
+"""How kernels are compiled: one place for the cache, the threads and the threading layer.
+
+The layer is Numba's own work queue. The alternative, OpenMP, leaves its threads spinning after a loop and
+so takes the cores from torch's own pool (and torch's from ours): beside other work on two cores a step took
+147 ms instead of 24 (benchmarks/results/rasterizer.md). The work queue allows one caller at a time, so
+parallel kernels run under a lock.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numba
+from numba.extending import intrinsic as _intrinsic
+
+LAYER = "workqueue"
+_lock = threading.RLock()
+
+
+def _prepare() -> None:
+    package = Path(__file__).parent
+    if "NUMBA_CACHE_DIR" not in os.environ and not os.access(package, os.W_OK):
+        # Installed where this user may not write: keep the compiled code with the user's other caches.
+        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        numba.config.CACHE_DIR = str(base / "ambiguous_wild" / "kernels")
+    if "NUMBA_THREADING_LAYER" not in os.environ:
+        numba.config.THREADING_LAYER = LAYER
+
+
+_prepare()
+
+
+def intrinsic(function: Callable[..., Any]) -> Any:
+    """Numba's `intrinsic`, untyped: callers see the compiled signature, without the typing context."""
+    return _intrinsic(function)
+
+
+def kernel(function: Callable[..., Any]) -> Any:
+    """Compile for one thread; the result is kept on disk."""
+    return numba.njit(cache=True)(function)
+
+
+class _Serialized:
+    """A parallel kernel that one thread of the process runs at a time."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.compiled = numba.njit(cache=True, parallel=True)(function)
+        self.__doc__ = function.__doc__
+        self.__name__ = function.__name__
+
+    def __call__(self, *args: Any) -> Any:
+        with _lock:
+            return self.compiled(*args)
+
+
+def parallel_kernel(function: Callable[..., Any]) -> Any:
+    """Compile with `numba.prange` over threads; the result is kept on disk."""
+    return _Serialized(function)
+
+
+def set_threads(n: int) -> None:
+    """Use n threads for the kernels of this process, at most as many as Numba started with.
+
+    Results do not depend on n.
+    """
+    numba.set_num_threads(max(1, min(int(n), numba.config.NUMBA_NUM_THREADS)))
+
+
+def threads() -> int:
+    """Threads the kernels use."""
+    return int(numba.get_num_threads())

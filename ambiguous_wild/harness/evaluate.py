@@ -78,9 +78,10 @@ def write_masks(trainer: Trainer, folder: Path) -> dict[str, Any] | None:
     """Write every train view's keep map (white = keep) and score it where the truth is known.
 
     Returns:
-        Mean IoU, precision and recall of the distractor pixels over photos, or None without truth.
+        IoU, precision and recall of the distractor pixels, counted over all photos together (a photo
+        where nothing is masked has no precision of its own), or None without truth.
     """
-    scores = []
+    counts = []
     with atomic_dir(folder) as temporary:
         for index, view in enumerate(trainer.data.scene.train):
             step = trainer.make_step(max(trainer.iteration, 1), index, divisor=1)
@@ -93,11 +94,11 @@ def write_masks(trainer: Trainer, folder: Path) -> dict[str, Any] | None:
             write_png(path, binary.astype(np.uint8) * 255)
             truth = true_distractor(trainer.data.scene, view)
             if truth is not None:
-                scores.append(mask_metrics.mask_scores(~binary, truth))
-    if not scores:
+                counts.append(mask_metrics.confusion(binary, ~truth))
+    if not counts:
         return None
-    mean = {key: float(np.nanmean([s[key] for s in scores])) for key in ("iou", "precision", "recall")}
-    return mean | {"images": len(scores)}
+    total = mask_metrics.pooled(counts)
+    return {"iou": total.iou, "precision": total.precision, "recall": total.recall, "images": len(counts)}
 
 
 def true_distractor(scene: Scene, view: View) -> np.ndarray | None:

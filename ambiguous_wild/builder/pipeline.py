@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -37,6 +38,9 @@ from ambiguous_wild.io.colmap_model import Model, read_model
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.io.scene_folder import read_scene_json, verify_files
+
+# Full disk, quota, rights, read-only disk, broken disk: the user's to mend.
+_USERS_DISK = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EIO}
 
 
 @dataclass(frozen=True)
@@ -172,6 +176,14 @@ class _Build:
             info = self._stages(work, started)
         except SfmCrash:
             raise
+        except OSError as error:
+            if error.errno not in _USERS_DISK:
+                raise
+            where = f" ({error.filename})" if error.filename else ""
+            raise AwError(
+                f"cannot write the scene: {error.strerror}{where}; make room or mend the rights, then run the "
+                "same command again: it goes on from the last finished stage"
+            ) from error
         except AwError:
             # What the user must mend first leaves nothing behind; a kill or a crash keeps the work.
             if not self.keep_work:

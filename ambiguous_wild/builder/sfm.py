@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import sqlite3
 import subprocess
@@ -163,7 +164,7 @@ def map_scene(
 
 def _run(job: dict[str, Any], folder: Path, watch: Callable[[], None]) -> None:
     """Run one task of the worker; `watch` is called while it runs."""
-    write_json(folder / "job.json", job)
+    write_json(folder / "job.json", {**job, "parent": os.getpid()})
     log = folder / LOG
     with open(log, "ab") as sink:
         process = subprocess.Popen(

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import ctypes
 import json
+import os
 import signal
 import sys
 from pathlib import Path
@@ -144,6 +145,8 @@ def main() -> None:
     if sys.platform == "linux":  # no orphan keeps both cores busy after a kill of the parent
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     job = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
+    if os.getppid() != job["parent"]:  # it died before the request above
+        sys.exit(1)
     pycolmap.set_random_seed(job["seed"])
     {"features": run_features, "matches": run_matches, "mapping": run_mapping}[job["task"]](job)
 

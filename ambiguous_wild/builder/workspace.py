@@ -99,6 +99,9 @@ def build_lock(target: Path) -> Iterator[None]:
             handle.seek(0)
             holder = handle.read().strip() or "another process"
             raise AwError(f"{target} is being built by {holder}; wait for it or choose another -o") from None
+        if not (path.exists() and os.path.samestat(os.fstat(handle.fileno()), path.stat())):
+            # The holder finished, and took its file away, between our open and our lock.
+            raise AwError(f"{target} was being built until this moment; run the command again")
         handle.truncate(0)
         handle.write(f"process {os.getpid()} since {time.strftime('%H:%M:%S')}")
         handle.flush()

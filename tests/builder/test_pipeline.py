@@ -1,5 +1,6 @@
 """The whole path on rendered photos of two walls, whose cameras are known exactly."""
 
+import errno
 import hashlib
 import json
 import shutil
@@ -207,3 +208,19 @@ def test_identical_photos_fail_cleanly(tmp_path):
     with pytest.raises(AwError, match=r"placed \d of 3 photos"):
         build_scene(tmp_path / "raw", tmp_path / "scene", BuildSettings(max_features=500))
     assert [p.name for p in tmp_path.iterdir()] == ["raw"]
+
+
+def test_a_full_disk_keeps_what_is_done_and_goes_on(raw, scene, tmp_path, monkeypatch):
+    from ambiguous_wild.builder import downsample
+
+    def full(*args):
+        raise OSError(errno.ENOSPC, "No space left on device", "/disk/p02.png")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(downsample, "write_png", full)
+        with pytest.raises(AwError, match=r"No space left on device \(/disk/p02\.png\).*goes on"):
+            build_scene(raw, tmp_path / "scene", SETTINGS)
+    assert not (tmp_path / "scene").exists()
+    result = build_scene(raw, tmp_path / "scene", SETTINGS)
+    assert set(result.reused) == {"screen", "features", "matches", "mapping", "undistort"}
+    assert hashes(result.scene) == hashes(scene)

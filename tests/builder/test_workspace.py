@@ -1,0 +1,68 @@
+import fcntl
+import os
+
+import pytest
+
+from ambiguous_wild.builder.workspace import Workspace, build_lock, content_key
+from ambiguous_wild.core import AwError
+
+
+def test_a_stage_runs_once_for_the_same_inputs(tmp_path):
+    calls = []
+
+    def work(folder):
+        calls.append(folder)
+        (folder / "out.txt").write_text("x")
+        return {"n": len(calls)}
+
+    first = Workspace(tmp_path / "w").run("stage", {"a": 1}, work)
+    again = Workspace(tmp_path / "w").run("stage", {"a": 1}, work)
+    assert len(calls) == 1
+    assert (first.reused, again.reused) == (False, True)
+    assert again.facts == {"n": 1}
+    assert (again.folder / "out.txt").read_text() == "x"
+    other = Workspace(tmp_path / "w").run("stage", {"a": 2}, work)
+    assert other.facts == {"n": 2}
+    assert other.folder != first.folder
+
+
+def test_a_stage_that_fails_leaves_no_folder(tmp_path):
+    def work(folder):
+        (folder / "half.txt").write_text("x")
+        raise RuntimeError("disk full")
+
+    with pytest.raises(RuntimeError):
+        Workspace(tmp_path / "w").run("stage", 1, work)
+    assert list((tmp_path / "w").iterdir()) == []
+
+
+def test_leftovers_of_a_killed_stage_are_cleared(tmp_path):
+    (tmp_path / "w" / ".stage-abc.tmp-xyz").mkdir(parents=True)
+    Workspace(tmp_path / "w")
+    assert list((tmp_path / "w").iterdir()) == []
+
+
+def test_keys_see_every_part_and_not_the_order_of_dicts():
+    assert content_key("a", {"x": 1, "y": 2}) == content_key("a", {"y": 2, "x": 1})
+    assert len({content_key("a", 1), content_key("a", 2), content_key("b", 1), content_key("a", "1")}) == 4
+
+
+def test_one_builder_at_a_time(tmp_path):
+    target = tmp_path / "scene"
+    with build_lock(target):
+        with pytest.raises(AwError, match=f"being built by process {os.getpid()}"), build_lock(target):
+            pass
+        assert (tmp_path / ".scene.lock").exists()
+    assert list(tmp_path.iterdir()) == []
+    with build_lock(target):
+        pass
+
+
+def test_a_lock_file_left_by_a_kill_does_not_block(tmp_path):
+    (tmp_path / ".scene.lock").write_text("process 1 since 00:00:00")
+    with (
+        build_lock(tmp_path / "scene"),
+        open(tmp_path / ".scene.lock") as handle,
+        pytest.raises(BlockingIOError),
+    ):
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)

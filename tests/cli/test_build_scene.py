@@ -1,0 +1,144 @@
+"""What a user types and gets back: one line and exit code 2 for every mistake, nothing left behind."""
+
+import json
+import os
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from ambiguous_wild.cli.main import main
+from ambiguous_wild.io.scene_folder import load_scene
+from tests.builder.capture_maker import HEIGHT, WIDTH, write_capture
+
+DATA = Path(__file__).parents[3] / "shared" / "data"
+
+
+@pytest.fixture
+def aw(monkeypatch, capsys, tmp_path):
+    """Run `aw build-scene ...` in tmp_path; returns (exit code, stdout, stderr)."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*args):
+        monkeypatch.setattr(sys, "argv", ["aw", "build-scene", *map(str, args)])
+        code = 0
+        try:
+            main()
+        except SystemExit as stop:
+            code = stop.code
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    return run
+
+
+def fails(aw, *args):
+    """The one line of an exit-2 failure."""
+    code, out, err = aw(*args)
+    assert code == 2, err
+    assert out == ""
+    errors = [line for line in err.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1
+    assert "Traceback" not in err
+    return errors[0]
+
+
+def test_empty_folder(aw, tmp_path):
+    (tmp_path / "raw").mkdir()
+    assert "holds no photos" in fails(aw, "raw", "-o", "scene")
+    assert os.listdir(tmp_path) == ["raw"]
+
+
+def test_one_photo(aw, tmp_path):
+    write_capture(tmp_path / "raw", 1)
+    assert "one photo" in fails(aw, "raw", "-o", "scene")
+    assert os.listdir(tmp_path) == ["raw"]
+
+
+def test_text_named_jpg(aw, tmp_path):
+    (tmp_path / "raw").mkdir()
+    for name in "abc":
+        (tmp_path / "raw" / f"{name}.jpg").write_text("dear diary")
+    message = fails(aw, "raw", "-o", "scene")
+    assert "only 0 of 3 photos" in message
+    assert "a.jpg (no image" in message
+    assert os.listdir(tmp_path) == ["raw"]
+
+
+def test_cut_jpeg_among_good_ones_with_strict(aw, tmp_path):
+    paths = write_capture(tmp_path / "raw", 4)
+    paths[2].write_bytes(paths[2].read_bytes()[:5000])
+    message = fails(aw, "raw", "-o", "scene", "--strict")
+    assert "1 of 4 photos cannot be read: p02.jpg (cut JPEG" in message
+    assert os.listdir(tmp_path) == ["raw"]
+
+
+def test_cut_jpeg_among_good_ones_is_skipped_and_counted(aw, tmp_path):
+    paths = write_capture(tmp_path / "raw", 6)
+    paths[2].write_bytes(paths[2].read_bytes()[:5000])
+    code, out, _ = aw("raw", "-o", "scene", "--max-features", 500, "--json")
+    assert code == 0
+    facts = json.loads(out)
+    assert facts["counts"]["photos"] == 6
+    assert facts["counts"]["registered"] == 5
+    assert facts["skipped"] == [{"source": "p02.jpg", "skipped": "cut JPEG (its end is missing)"}]
+    assert "registered 5 of 6" in facts["verdict"]
+    code, out, _ = aw("raw", "-o", "scene", "--max-features", 500)
+    assert code == 0
+    assert out.startswith("scene is up to date")
+    assert "1 of 6 photos skipped: p02.jpg" in out
+    assert out.splitlines()[-1].endswith("next: aw bench --method refinesplat --scene scene -o runs")
+    # Other features now: refused with the setting's name.
+    assert "max_features 500 -> 900" in fails(aw, "raw", "-o", "scene", "--max-features", 900)
+
+
+def test_masks_missing_and_of_the_wrong_size(aw, tmp_path):
+    write_capture(tmp_path / "raw", 3)
+    (tmp_path / "masks").mkdir()
+    cv2.imwrite(str(tmp_path / "masks" / "p00.png"), np.zeros((HEIGHT, WIDTH), np.uint8))
+    message = fails(aw, "raw", "-o", "scene", "--masks", "masks")
+    assert "2 of 3 photos have no mask: p01.jpg, p02.jpg" in message
+    for i in (1, 2):
+        cv2.imwrite(str(tmp_path / "masks" / f"p0{i}.png"), np.zeros((HEIGHT, WIDTH - i), np.uint8))
+    assert "2 of 3 masks" in fails(aw, "raw", "-o", "scene", "--masks", "masks")
+    assert sorted(os.listdir(tmp_path)) == ["masks", "raw"]
+
+
+def test_options_that_cannot_be(aw, tmp_path):
+    write_capture(tmp_path / "raw", 3)
+    assert "does not exist" in fails(aw, "nowhere", "-o", "scene")
+    assert "--factor must be" in fails(aw, "raw", "-o", "scene", "--factor", 0)
+    assert "--max-features" in fails(aw, "raw", "-o", "scene", "--max-features", 3)
+    assert "--help" in fails(aw, "raw")
+    assert "'exhaustive'" in fails(aw, "raw", "-o", "scene", "--matcher", "all")
+    (tmp_path / "tests.txt").write_text("p07.jpg\n")
+    assert "did you mean" in fails(aw, "raw", "-o", "scene", "--test-list", "tests.txt")
+    assert sorted(os.listdir(tmp_path)) == ["raw", "tests.txt"]
+
+
+def test_output_that_cannot_be_written(aw, tmp_path):
+    write_capture(tmp_path / "raw", 3)
+    (tmp_path / "file").write_text("x")
+    assert "cannot write" in fails(aw, "raw", "-o", "file/scene")
+
+
+@pytest.mark.skipif(not (DATA / "tiny_aerial").is_dir(), reason="real photos: ../shared/data is not there")
+def test_real_photos_of_fields(aw, tmp_path):
+    code, out, _ = aw(DATA / "tiny_aerial", "-o", "scene", "--license", "CC0-1.0")
+    assert code == 0
+    assert "registered 12 of 12" in out
+    scene = load_scene("scene")
+    assert (len(scene.train), len(scene.test)) == (10, 2)
+    assert len(scene.points) > 600
+    # Reprojection of every observation, from what a trainer gets: the error SfM reports, and no outlier.
+    points = scene.points
+    owner = np.repeat(np.arange(len(points)), np.diff(points.track_offsets))
+    errors = []
+    for k, i in enumerate(owner):
+        camera = scene.views[points.track_views[k]].camera
+        seen = camera.intrinsics @ (camera.cam_from_world[:3] @ np.append(points.xyz[i], 1.0))
+        errors.append(np.linalg.norm(seen[:2] / seen[2] - points.track_xy[k]))
+    assert np.mean(errors) < 0.6
+    assert np.max(errors) < 6.0

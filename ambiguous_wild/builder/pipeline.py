@@ -181,8 +181,8 @@ class _Build:
                 raise
             where = f" ({error.filename})" if error.filename else ""
             raise AwError(
-                f"cannot write the scene: {error.strerror}{where}; make room or mend the rights, then run the "
-                "same command again: it goes on from the last finished stage"
+                f"cannot write the scene: {error.strerror}{where}; make room or mend the rights, then run "
+                "the same command again: it goes on from the last finished stage"
             ) from error
         except AwError:
             # What the user must mend first leaves nothing behind; a kill or a crash keeps the work.

@@ -180,7 +180,7 @@ class SplatAdam:
 
     def _constants(self) -> tuple[np.float32, ...]:
         # 1 - beta is rounded after the difference: float32(0.999) alone is off by 5e-5 of 0.001.
-        return tuple(np.float32(c) for beta in self.betas for c in (beta, 1 - beta)) + (np.float32(self.eps),)
+        return tuple(np.float32(c) for c in (*(c for b in self.betas for c in (b, 1 - b)), self.eps))
 
     def _flat(self, name: str, parameter: Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         m, v = self._moments[name]
@@ -215,7 +215,8 @@ class SplatAdam:
             gradient = grads.sh_rest.detach().to(torch.float32).contiguous().numpy()
             adam.sparse(
                 visible.numpy(), 3 * gaussians.sh_rest.shape[1], *self._flat(_LAZY, gaussians.sh_rest),
-                gradient.reshape(-1), self._taken, now, self._history[0], self._history[1], *self._constants(), parts,
+                gradient.reshape(-1), self._taken, now, self._history[0], self._history[1],
+                *self._constants(), parts,
             )  # fmt: skip
 
     @torch.no_grad()

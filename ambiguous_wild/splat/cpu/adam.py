@@ -104,7 +104,7 @@ def _row_catch_up(row, width, p, m, v, last, now, rates, roots, beta1, rest1, be
 
 @parallel_kernel
 def catch_up(rows, width, p, m, v, last, now, rates, roots, beta1, rest1, beta2, rest2, eps, parts):
-    """Bring rows up to step `now`: last[row] counts the steps a row has taken; flat arrays of `width` a row."""
+    """Bring rows up to step `now`; last[row] counts a row's steps, the flat arrays hold `width` a row."""
     n = rows.shape[0]
     for part in numba.prange(parts):
         for k in range(part * n // parts, (part + 1) * n // parts):

@@ -98,6 +98,12 @@ def tile_span(record, row, width):
     Over a band of y the right border of an ellipse is largest at its rightmost point if that lies in
     the band, else at the band's edge nearest to it; the left border is its mirror image.
     """
+    low = math.ceil(max(record[MX] - record[EXTENT_X] - 0.5 - _SLACK, 0.0))
+    high = math.floor(min(record[MX] + record[EXTENT_X] - 0.5 + _SLACK, width - 1.0))
+    if low > high:
+        return 1, 0
+    if int(low) // TILE == int(high) // TILE:  # nothing to be narrowed
+        return int(low) // TILE, int(high) // TILE
     ex = np.float64(record[EXTENT_X])
     ey = np.float64(record[EXTENT_Y])
     tilt = record[SLANT] * record[VARIANCE_Y] / record[VARIANCE_X] * ex  # y of the rightmost point
@@ -140,7 +146,7 @@ def count_tiles(order, records, width, height, columns, instances, histogram):
 
 @kernel
 def prefix(instances, offsets, histogram, starts):
-    """Exclusive sums: offsets of a rank's instances, starts of the tiles, cursors of each part in each tile."""
+    """Exclusive sums: offsets of a rank's instances, starts of the tiles, cursors of the parts in each."""
     total = 0
     for rank in range(instances.shape[0]):
         offsets[rank] = total

@@ -121,7 +121,8 @@ def _forward_tile(records, slots, begin, end, left, top, width, height, state):
 
 @kernel
 def _forward_worker(
-    worker, records, tile_slots, starts, tile_order, workers, width, height, background, image, alpha, depth, kept
+    worker, records, tile_slots, starts, tile_order, workers, width, height, background, image, alpha,
+    depth, kept,
 ):  # fmt: skip
     columns = (width + TILE - 1) // TILE
     state = (
@@ -175,11 +176,11 @@ def forward(
 
 @kernel
 def _backward_tile(
-    records, slots, instances, begin, end, top, left, rows, planes, extra, with_extra, with_depth, absolute, sums
+    records, slots, instances, begin, end, top, left, rows, planes, extra, with_extra, with_depth,
+    absolute, sums,
 ):  # fmt: skip
-    """Walk a tile's list back to front; planes = (T, last, behind, red, green, blue, alpha, depth cotangents).
-
-    `extra` = (behind, red, green, blue) of the second cotangent. What is None of `with_extra`,
+    """Walk a tile's list back to front; planes = (T, last, behind, cotangents of red, green, blue,
+    alpha, depth). `extra` = (behind, red, green, blue) of the second cotangent. What is None of `with_extra`,
     `with_depth` and `absolute` is compiled away.
     """
     transmittance, last, behind, d_red, d_green, d_blue, d_alpha, depths = planes
@@ -357,6 +358,6 @@ def backward(
     """
     for worker in numba.prange(workers):
         _backward_worker(
-            worker, records, tile_slots, tile_instances, starts, tile_order, workers, width, height, background,
-            kept, d_image, d_alpha, d_depth, d_extra, absolute, sums,
+            worker, records, tile_slots, tile_instances, starts, tile_order, workers, width, height,
+            background, kept, d_image, d_alpha, d_depth, d_extra, absolute, sums,
         )  # fmt: skip

@@ -19,6 +19,7 @@ class Pool:
     def __init__(self, keep: int = 3) -> None:
         self._keep = keep
         self._arrays: dict[tuple[Any, ...], list[np.ndarray]] = {}
+        self._pairs: dict[tuple[Any, ...], list[tuple[np.ndarray, np.ndarray]]] = {}
         self._lock = threading.Lock()
 
     def take(
@@ -40,7 +41,26 @@ class Pool:
                 arrays.append(flat)
             return flat[:size].reshape(shape)
 
+    def take_rows(self, name: str, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+        """A float32 array whose rows are zero but where the mask given with it, [rows] bool, is set.
+
+        Who writes rows keeps the mask up to date, so that the next one to get the array clears only them.
+        """
+        with self._lock:
+            pairs = self._pairs.setdefault((name, *shape), [])
+            for array, dirty in pairs:
+                # References: the pair's, the loop's and the argument of getrefcount.
+                if sys.getrefcount(array) <= 3:
+                    return array[:], dirty
+            array, dirty = np.zeros(shape, np.float32), np.zeros(shape[0], np.bool_)
+            for key in [key for key in self._pairs if key[0] == name and key != (name, *shape)]:
+                del self._pairs[key]
+            if len(pairs) < self._keep:
+                pairs.append((array, dirty))
+            return array[:], dirty
+
     def clear(self) -> None:
         """Forget every array."""
         with self._lock:
             self._arrays.clear()
+            self._pairs.clear()

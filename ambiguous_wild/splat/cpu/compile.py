@@ -18,6 +18,7 @@ import numba
 from numba.extending import intrinsic as _intrinsic
 
 LAYER = "workqueue"
+_config: Any = numba.config
 _lock = threading.RLock()
 
 
@@ -26,9 +27,9 @@ def _prepare() -> None:
     if "NUMBA_CACHE_DIR" not in os.environ and not os.access(package, os.W_OK):
         # Installed where this user may not write: keep the compiled code with the user's other caches.
         base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        numba.config.CACHE_DIR = str(base / "ambiguous_wild" / "kernels")
+        _config.CACHE_DIR = str(base / "ambiguous_wild" / "kernels")
     if "NUMBA_THREADING_LAYER" not in os.environ:
-        numba.config.THREADING_LAYER = LAYER
+        _config.THREADING_LAYER = LAYER
 
 
 _prepare()
@@ -40,15 +41,23 @@ def intrinsic(function: Callable[..., Any]) -> Any:
 
 
 def kernel(function: Callable[..., Any]) -> Any:
-    """Compile for one thread; the result is kept on disk."""
-    return numba.njit(cache=True)(function)
+    """Compile for one thread; the result is kept on disk. Every operation rounds by itself, as written."""
+    return numba.njit(cache=True, error_model="numpy")(function)
+
+
+def fused_kernel(function: Callable[..., Any]) -> Any:
+    """Like `kernel`, but a product may be fused into a sum and a division turned into a product.
+
+    NaN and infinity keep their meaning; what must round alike in two kernels does not belong here.
+    """
+    return numba.njit(cache=True, error_model="numpy", fastmath={"contract", "arcp"})(function)
 
 
 class _Serialized:
     """A parallel kernel that one thread of the process runs at a time."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
-        self.compiled = numba.njit(cache=True, parallel=True)(function)
+        self.compiled = numba.njit(cache=True, parallel=True, error_model="numpy")(function)
         self.__doc__ = function.__doc__
         self.__name__ = function.__name__
 
@@ -67,7 +76,7 @@ def set_threads(n: int) -> None:
 
     Results do not depend on n.
     """
-    numba.set_num_threads(max(1, min(int(n), numba.config.NUMBA_NUM_THREADS)))
+    numba.set_num_threads(max(1, min(int(n), _config.NUMBA_NUM_THREADS)))
 
 
 def threads() -> int:

@@ -7,7 +7,7 @@ import math
 import numba
 import numpy as np
 
-from ambiguous_wild.splat.cpu.compile import kernel, parallel_kernel
+from ambiguous_wild.splat.cpu.compile import fused_kernel, parallel_kernel
 from ambiguous_wild.splat.cpu.project import BLUE, CHUNK, GREEN, RED
 
 C0 = 0.28209479177387814
@@ -16,7 +16,7 @@ C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
 C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
 
 
-@kernel
+@fused_kernel
 def basis(x, y, z, degree, out):
     """Values of the harmonics 1 .. (degree + 1)^2 - 1 at a unit direction, in 3DGS's order and signs."""
     if degree >= 1:
@@ -39,7 +39,7 @@ def basis(x, y, z, degree, out):
         out[14] = -C3[0] * x * (x * x - 3.0 * y * y)
 
 
-@kernel
+@fused_kernel
 def direction_gradient(x, y, z, degree, d):
     """sum_j d[j] * d(basis j)/d(x, y, z), the harmonics taken as polynomials of three free variables."""
     gx = -C1 * d[2]
@@ -79,7 +79,7 @@ def direction_gradient(x, y, z, degree, d):
     return gx, gy, gz
 
 
-@kernel
+@fused_kernel
 def _colours_chunk(first, stop, means, sh0, sh_rest, degree, centre, records, ids, radii):
     terms = (degree + 1) * (degree + 1) - 1
     values = np.zeros(15, np.float32)

@@ -38,8 +38,8 @@ def photometric_cpu(
     totals = np.empty((height, 2), np.float64)
     out = np.empty((height, width, 3), np.float32)
     ssim.photometric(
-        x_rows, y_rows, width, _taps, outside, inside, float(lambda_dssim), min(height, threads()), maps, None,
-        totals, out,
+        x_rows, y_rows, width, _taps, outside, inside, float(lambda_dssim), min(height, threads()), maps,
+        None, totals, out,
     )  # fmt: skip
     # One serial sum over rows: the order, and so the bits, do not depend on the threads.
     l1, dssim = (totals.cumsum(axis=0)[-1] / (3 * height * width)).tolist()

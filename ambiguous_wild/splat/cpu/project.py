@@ -17,7 +17,7 @@ import math
 import numba
 import numpy as np
 
-from ambiguous_wild.splat.cpu.compile import kernel, parallel_kernel
+from ambiguous_wild.splat.cpu.compile import fused_kernel, parallel_kernel
 
 BLUR = 0.3  # px^2 added to both variances
 NEAR = 0.01  # smallest depth that is drawn
@@ -33,7 +33,7 @@ _LOG2E = 1.4426950408889634
 _HUGE = 1e30
 
 
-@kernel
+@fused_kernel
 def sigmoid(x: float) -> float:
     """1 / (1 + exp(-x)) without overflow."""
     if x >= 0.0:
@@ -42,7 +42,7 @@ def sigmoid(x: float) -> float:
     return e / (1.0 + e)
 
 
-@kernel
+@fused_kernel
 def footprint(mean, quat, scale, cam, x, y, z):
     """Rows f1, f2 of J W R diag(s), the clamped ray and the rotation: what S and its gradient are made of."""
     w_, qx, qy, qz = quat[0], quat[1], quat[2], quat[3]
@@ -75,7 +75,7 @@ def footprint(mean, quat, scale, cam, x, y, z):
     return (p0, p1, p2), (q0, q1, q2), (a0, a1, a2), (b0, b1, b2), rot, rx, ry
 
 
-@kernel
+@fused_kernel
 def _project_chunk(first, means, quats, log_scales, opacity_logits, cam, antialias, records, ids, radii):
     slot = first
     for i in range(first, min(first + CHUNK, means.shape[0])):

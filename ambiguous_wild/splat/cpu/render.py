@@ -20,7 +20,7 @@ _pool = Pool()
 
 
 def camera_vector(camera: Camera) -> np.ndarray:
-    """[22] float64: pose, intrinsics, size, and the limits of x/z and y/z in the Jacobian (card gsplat.md, 3)."""
+    """[22] float64: pose, intrinsics, size, limits of x/z and y/z in the Jacobian (card gsplat.md, 3)."""
     out = np.empty(22)
     out[:12] = camera.cam_from_world[:3].ravel()
     out[12:18] = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
@@ -107,16 +107,16 @@ class RenderedCpu:
         n = len(g)
         ranks = _pool.take("ranks", (max(n, 1),), np.int32)
         ranks[s.order] = np.arange(len(s.order), dtype=np.int32)
-        out = {name: np.empty(tuple(t.shape), np.float32) for name, t in g.items() if name != "sh_rest"}
-        rest = np.zeros(tuple(g.sh_rest.shape), np.float32)
-        screen = np.empty((n, 2), np.float32)
+        out = {name: _pool.take(f"d_{name}", tuple(t.shape)) for name, t in g.items() if name != "sh_rest"}
+        rest, dirty = _pool.take_rows("d_sh_rest", tuple(g.sh_rest.shape))
+        screen = _pool.take("screen", (n, 2))
         screen_extra = np.empty((n, 2), np.float32) if extra else None
         screen_abs = np.empty((n, 2), np.float32) if absolute else None
         reverse.reverse(
             *(_array(t) for t in (g.means, g.quats, g.log_scales, g.opacity_logits, g.sh_rest)),
             s.degree, s.cam, s.centre, s.antialias, s.records, s.ids, s.counts, ranks, s.offsets, sums,
             out["means"], out["quats"], out["log_scales"], out["opacity_logits"], out["sh0"], rest,
-            np.zeros(n, np.bool_), screen, screen_extra, screen_abs,
+            dirty, screen, screen_extra, screen_abs,
         )  # fmt: skip
         return Gradients(
             **{name: torch.from_numpy(a) for name, a in out.items()},
@@ -169,10 +169,10 @@ def render_cpu(
     centre = camera.center
     means, quats, log_scales, logits, sh0, sh_rest = (_array(t) for _, t in gaussians.items())
     chunks = -(-n // project.CHUNK)
-    records = np.empty((n, project.RECORD), np.float32)
-    ids = np.empty(n, np.int32)
+    records = _pool.take("records", (n, project.RECORD))
+    ids = _pool.take("ids", (n,), np.int32)
     counts = np.zeros(chunks, np.int32)
-    radii = np.empty(n, np.float32)
+    radii = _pool.take("radii", (n,))
     project.project(means, quats, log_scales, logits, cam, antialias, records, ids, counts, radii)
     slots = bins.visible_slots(ids, counts)
     if gaussians.before_colours is not None:
@@ -193,10 +193,10 @@ def render_cpu(
     bins.scatter(order, records, width, height, columns, offsets, histogram, tile_slots, tile_instances)
 
     tile_order = np.argsort(-np.diff(starts), kind="stable").astype(np.int32)
-    image = np.empty((height, width, 3), np.float32)
-    alpha = np.empty((height, width), np.float32)
-    depth = np.empty((height, width), np.float32)
-    kept = np.empty((columns * rows, 2, blend.PIXELS), np.float32)
+    image = _pool.take("image", (height, width, 3))
+    alpha = _pool.take("alpha", (height, width))
+    depth = _pool.take("depth", (height, width))
+    kept = _pool.take("kept", (columns * rows, 2, blend.PIXELS))
     behind = np.asarray(background, np.float32)
     blend.forward(
         records, tile_slots, starts, tile_order, threads(), width, height, behind, image, alpha, depth, kept

@@ -24,17 +24,18 @@ from ambiguous_wild.splat.cpu.blend import (
     SUM_Y,
     SUM_YY,
 )
-from ambiguous_wild.splat.cpu.compile import kernel, parallel_kernel
+from ambiguous_wild.splat.cpu.compile import fused_kernel, parallel_kernel
 from ambiguous_wild.splat.cpu.harmonics import C0, basis, direction_gradient
 from ambiguous_wild.splat.cpu.project import BLUE, BLUR, CHUNK, GREEN, RED, footprint, sigmoid
+from ambiguous_wild.splat.cpu.simd import load, splat, store
 
 
-@kernel
+@fused_kernel
 def _cross(a, b):
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@kernel
+@fused_kernel
 def _covariance_gradient(sums, f1, f2, antialias):
     """dL/d(u, v) and dL/d(rows f1, f2 of J W R diag(s)) from the sums over pixels."""
     sxx = f1[0] * f1[0] + f1[1] * f1[1] + f1[2] * f1[2] + BLUR
@@ -73,7 +74,7 @@ def _covariance_gradient(sums, f1, f2, antialias):
     return du, dv, d1, d2, a, q, k
 
 
-@kernel
+@fused_kernel
 def _quaternion_gradient(quat, norm, g):
     """dL/d(raw quaternion) from dL/dR (nine values, row by row)."""
     w, x, y, z = quat
@@ -85,7 +86,7 @@ def _quaternion_gradient(quat, norm, g):
     return (dw - w * along) / norm, (dx - x * along) / norm, (dy - y * along) / norm, (dz - z * along) / norm
 
 
-@kernel
+@fused_kernel
 def _reverse_chunk(
     first, stop, means, quats, log_scales, opacity_logits, sh_rest, degree, cam, centre, antialias,
     records, ids, ranks, offsets, sums, d_means, d_quats, d_log_scales, d_opacity_logits, d_sh0,
@@ -95,7 +96,7 @@ def _reverse_chunk(
     terms = (degree + 1) * (degree + 1) - 1
     values = np.zeros(15, np.float32)
     weights = np.zeros(15, np.float32)
-    total = np.zeros(ROW, np.float64)
+    total = np.zeros(ROW, np.float32)
     slot = first
     for i in range(first, min(first + CHUNK, n)):
         while slot < stop and ids[slot] < 0:
@@ -122,11 +123,10 @@ def _reverse_chunk(
         record = records[slot]
         rank = ranks[slot]
         slot += 1
-        for j in range(ROW):
-            total[j] = 0.0
+        row = splat(np.float32(0.0))
         for at in range(offsets[rank], offsets[rank + 1]):
-            for j in range(ROW):
-                total[j] += sums[at * ROW + j]
+            row = row + load(sums, at * ROW)
+        store(total, 0, row)
 
         m0 = np.float64(means[i, 0])
         m1 = np.float64(means[i, 1])
@@ -143,7 +143,7 @@ def _reverse_chunk(
         s0 = math.exp(np.float64(log_scales[i, 0]))
         s1 = math.exp(np.float64(log_scales[i, 1]))
         s2 = math.exp(np.float64(log_scales[i, 2]))
-        p, q, a, b, rot, rx, ry = footprint((m0, m1, m2), quat, (s0, s1, s2), cam, x, y, z)
+        p, q, a, b, rot, _, _ = footprint((m0, m1, m2), quat, (s0, s1, s2), cam, x, y, z)
         f1 = (p[0] * s0, p[1] * s1, p[2] * s2)
         f2 = (q[0] * s0, q[1] * s1, q[2] * s2)
         du, dv, g1, g2, inv_v, inv_y, slant = _covariance_gradient(total, f1, f2, antialias)
@@ -238,7 +238,8 @@ def _reverse_chunk(
 def reverse(
     means, quats, log_scales, opacity_logits, sh_rest, degree, cam, centre, antialias,
     records, ids, counts, ranks, offsets, sums,
-    d_means, d_quats, d_log_scales, d_opacity_logits, d_sh0, d_sh_rest, dirty, screen, screen_extra, screen_abs,
+    d_means, d_quats, d_log_scales, d_opacity_logits, d_sh0, d_sh_rest, dirty,
+    screen, screen_extra, screen_abs,
 ):  # fmt: skip
     """Add each Gaussian's rows and chain them to its raw parameters; Gaussians not seen get zeros.
 
@@ -252,6 +253,6 @@ def reverse(
     for chunk in numba.prange(counts.shape[0]):
         _reverse_chunk(
             chunk * CHUNK, chunk * CHUNK + counts[chunk], means, quats, log_scales, opacity_logits, sh_rest,
-            degree, cam, centre, antialias, records, ids, ranks, offsets, sums, d_means, d_quats, d_log_scales,
-            d_opacity_logits, d_sh0, d_sh_rest, dirty, screen, screen_extra, screen_abs,
+            degree, cam, centre, antialias, records, ids, ranks, offsets, sums, d_means, d_quats,
+            d_log_scales, d_opacity_logits, d_sh0, d_sh_rest, dirty, screen, screen_extra, screen_abs,
         )  # fmt: skip

@@ -10,7 +10,7 @@ from __future__ import annotations
 import operator
 from typing import Any
 
-from llvmlite import ir
+from llvmlite import ir  # type: ignore[import-untyped]
 from numba.core import types
 from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
 from numba.extending import lower_builtin, models, register_model
@@ -84,7 +84,7 @@ def _fmuladd(builder: Any, a: Any, b: Any, c: Any) -> Any:
 
 
 def _operator(op: Any, emit: Any, result: Any) -> None:
-    pairs = [(f32x16, f32x16)]
+    pairs: list[tuple[Any, Any]] = [(f32x16, f32x16)]
     for scalar in (types.float32, types.float64):
         pairs += [(f32x16, scalar), (scalar, f32x16)]
 

@@ -134,7 +134,7 @@ def _statistics_row(
 
 @kernel
 def _gradient_row(y, height, width, x_rows, y_rows, taps, keep, outer, l1_scale, buffers, maps, weights, out):
-    """Row y of the gradient: window of the three maps, plus l1_scale times the sign; `outer` is chained on."""
+    """Row y of the gradient: window of the three maps plus l1_scale times the sign, times `outer`."""
     length = x_rows.shape[1]
     flat_x = x_rows.reshape(-1)
     flat_y = y_rows.reshape(-1)

@@ -16,7 +16,7 @@ COLD_S = 25  # measured on two cores
 
 def _tiny_scene() -> tuple[Gaussians, Camera]:
     rng = np.random.default_rng(0)
-    xyz = rng.uniform(-1, 1, (8, 3)) + [0.0, 0.0, 4.0]
+    xyz = rng.uniform(-1, 1, (8, 3)) + np.array([0.0, 0.0, 4.0])
     gaussians = Gaussians.from_points(xyz, rng.integers(0, 255, (8, 3)).astype(np.uint8))
     return gaussians, Camera(20, 18, 20.0, 20.0, 10.0, 9.0, np.eye(4))
 

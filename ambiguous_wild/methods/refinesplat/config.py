@@ -18,17 +18,19 @@ class MaskConfig:
     """From maps on the feature grid to M_final."""
 
     variant: Variant = "softmax"  # of psi and its entropy; `sigmoid` is printed
-    statistic: Statistic = "contrast"  # per instance; `entropy` is printed
+    statistic: Statistic = "evidence"  # per instance; `entropy` is printed
+    scope: Literal["scene", "photo"] = "scene"  # whose instances T_ent cuts in two; `photo` is printed
     threshold: Form = "kapur"  # T_ent; `literal` is printed
-    gate: float = 3.0  # robust deviations an instance must stand above the photo's median; 0 = printed
-    disagree: float = 3.0  # the same for its feature distance between photo and render; 0 = printed
-    disagree_units: float = 6.0  # and at least this many units of what blur and noise make; 0 = printed
+    gate: float = 3.0  # robust deviations an instance must stand above the median; 0 = printed
+    least: float = 4.0  # and the statistic at least, in its own unit; 0 = printed
+    disagree: float = 3.0  # `gate` for the feature distance between photo and render; 0 = printed
+    disagree_units: float = 3.0  # and at least this many units of what blur and noise make; 0 = printed
     use_local: bool = True  # M_local; off is an ablation row
     use_global: bool = True  # M_global; off is an ablation row
     cosine: Literal["calibrated", "plain"] = "calibrated"  # in U; `plain` is printed
     normal_units: float = 20.0  # distance in units at which the calibrated cosine is 0
     box: int = 3  # cells, box filter over U / H
-    spread: Spread = "var"  # T_glb = mean + this; `var` is printed
+    spread: Spread = "std"  # T_glb = mean + this; `var` is printed
     global_gate: float = 6.0  # robust deviations above the median that M_global needs; 0 = printed
     dilation: int = 5  # px at the photo's resolution; 3, 5, 7 tried in the paper
     most: float = 0.6  # of a photo is masked at most: the surest pixels go first

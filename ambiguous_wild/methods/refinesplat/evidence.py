@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +23,17 @@ class Maps:
 
     entropy: np.ndarray  # H of the render, in [0, 1]
     statistic: np.ndarray  # what instances are judged by
-    distance: np.ndarray  # 1 - cos(phi(I), phi(render))
+    cosine: np.ndarray  # cos(phi(I), phi(render))
+    distance: np.ndarray  # 1 - cosine, in units of what blur and noise alone make
+
+
+@dataclass(frozen=True)
+class Judged:
+    """The instances of one photo as numbers; of other photos they are what is normal in the scene."""
+
+    values: np.ndarray  # [K] float64, mean statistic (Hbar)
+    distances: np.ndarray  # [K] float64, mean distance in units
+    areas: np.ndarray  # [K] float64, px
 
 
 @dataclass(frozen=True)
@@ -32,24 +43,23 @@ class Masks:
     local: np.ndarray
     global_: np.ndarray
     keep: np.ndarray  # [H, W] float32, 1 - M_final, bounded
-    values: np.ndarray  # [K] Hbar
-    distances: np.ndarray  # [K] mean distance, in units
-    areas: np.ndarray  # [K] px
+    judged: Judged
     cut: Cut
 
 
 @torch.no_grad()
-def compare(phi_photo: Tensor, phi_render: Tensor, psi: Psi | None, config: MaskConfig) -> Maps:
+def compare(phi_photo: Tensor, phi_render: Tensor, psi: Psi | None, unit: float, config: MaskConfig) -> Maps:
     """Entropy, statistic and distance maps of features [h, w, C] of photo and render.
 
-    Without psi (no instance has an identity) entropy and statistic are 0 and only distance speaks.
+    Without psi (no instance has an identity) entropy is 0 and the distance alone speaks.
     """
     norms = torch.linalg.vector_norm(phi_photo, dim=2) * torch.linalg.vector_norm(phi_render, dim=2)
-    distance = 1.0 - (phi_photo * phi_render).sum(2) / norms.clamp(min=1e-12)
-    distance = torch.where(norms > 0, distance, torch.zeros_like(distance))
+    # a feature of length 0 (black in both) says nothing, which counts as agreement
+    cosine = torch.where(norms > 0, (phi_photo * phi_render).sum(2) / norms.clamp(min=1e-12), 1.0)
+    distance = (1.0 - cosine).clamp(min=0.0) / unit
     if psi is None:
         zero = np.zeros(tuple(distance.shape))
-        return Maps(zero, zero, _array(distance))
+        return Maps(zero, _array(distance), _array(cosine), _array(distance))
     render = psi(phi_render)
     h = entropy(render, config.variant)
     if config.statistic == "entropy":
@@ -58,13 +68,15 @@ def compare(phi_photo: Tensor, phi_render: Tensor, psi: Psi | None, config: Mask
         statistic = surprise(render, psi(phi_photo), config.variant)
     elif config.statistic == "contrast":
         statistic = contrast(render, psi(phi_photo), config.variant)
+    elif config.statistic == "evidence":
+        statistic = torch.sqrt(contrast(render, psi(phi_photo), config.variant) * distance)
     else:
-        raise unknown("statistic", config.statistic, ("entropy", "surprise", "contrast"))
-    return Maps(_array(h), _array(statistic), _array(distance))
+        raise unknown("statistic", config.statistic, ("entropy", "surprise", "contrast", "evidence"))
+    return Maps(_array(h), _array(statistic), _array(cosine), _array(distance))
 
 
 def make_masks(
-    maps: Maps, labels: np.ndarray, count: int, unit: float, w2: float, config: MaskConfig
+    maps: Maps, labels: np.ndarray, count: int, others: Sequence[Judged], w2: float, config: MaskConfig
 ) -> Masks:
     """M_local, M_global and the keep map of one photo (Eqs. 4-8).
 
@@ -72,42 +84,52 @@ def make_masks(
         maps: from `compare`.
         labels: [H, W] int32 instances, 0 = none.
         count: K.
-        unit: of the features: the distance that blur and noise alone make.
+        others: instances of the scene's other photos when they were last judged (`scope` = scene).
         w2: weight of T_ent's lower subset.
         config: thresholds.
     """
     height, width = labels.shape
     values, areas = masking.instance_means(maps.statistic, labels, count)
-    distances, _ = masking.instance_means(maps.distance / unit, labels, count)
+    distances, _ = masking.instance_means(maps.distance, labels, count)
     known = areas > 0
+    judged = Judged(values[known], distances[known], areas[known])
+    pool = pooled([judged, *others] if config.scope == "scene" else [judged])
+    cut = t_ent(pool.values, w2, config.threshold, config.gate, config.least)
     flagged = np.zeros(count, dtype=bool)
-    cut = t_ent(values[known], w2, config.threshold, config.gate)
-    flagged[known] = cut.flagged & differs(distances[known], areas[known], config)
+    flagged[known] = (judged.values > cut.threshold) & differs(judged, pool, config)
     local = masking.local_mask(labels, flagged) if config.use_local else np.zeros(labels.shape, bool)
 
     coarse = np.zeros(maps.distance.shape, dtype=bool)
     if config.use_global:
-        cosine = 1.0 - maps.distance
+        cosine = maps.cosine
         if config.cosine == "calibrated":
-            cosine = masking.calibrated_cosine(maps.distance, unit, config.normal_units)
+            cosine = masking.calibrated_cosine(maps.distance, config.normal_units)
         r = masking.ratio(masking.uncertainty(cosine), maps.entropy)
         coarse = masking.global_mask(r, config.box, config.spread, config.global_gate)
     global_ = masking.enlarge(coarse, height, width)
     final = masking.dilate(local | global_, config.dilation)
-    surest = masking.enlarge(maps.distance, height, width)
-    keep = masking.keep_map(final, config.most, surest)
-    return Masks(local, global_, keep, values[known], distances[known], areas[known], cut)
+    keep = masking.keep_map(final, config.most, masking.enlarge(maps.distance, height, width))
+    return Masks(local, global_, keep, judged, cut)
 
 
-def differs(distances: np.ndarray, areas: np.ndarray, config: MaskConfig) -> np.ndarray:
-    """[K] bool: instances whose photo and render disagree more than is normal in this photo.
+def pooled(parts: Sequence[Judged]) -> Judged:
+    """The instances of several photos as one set."""
+    return Judged(
+        np.concatenate([p.values for p in parts]),
+        np.concatenate([p.distances for p in parts]),
+        np.concatenate([p.areas for p in parts]),
+    )
+
+
+def differs(judged: Judged, pool: Judged, config: MaskConfig) -> np.ndarray:
+    """[K] bool: instances in which photo and render disagree more than is normal.
 
     An identity that psi is unsure of is no distractor as long as the render shows what the photo shows.
     """
     if config.disagree <= 0:
-        return np.ones(len(distances), dtype=bool)
-    floor = robust_floor(distances, config.disagree)
-    return distances > max(floor, config.disagree_units)
+        return np.ones(len(judged.distances), dtype=bool)
+    floor = robust_floor(pool.distances, config.disagree)
+    return judged.distances > max(floor, config.disagree_units)
 
 
 def _array(t: Tensor) -> np.ndarray:

@@ -60,13 +60,13 @@ def uncertainty(cosine: np.ndarray) -> np.ndarray:
     return 2.0 / (np.clip(cosine, _COS_FLOOR, 1.0) + 1.0)
 
 
-def calibrated_cosine(distance: np.ndarray, unit: float, normal: float) -> np.ndarray:
+def calibrated_cosine(distance: np.ndarray, normal: float) -> np.ndarray:
     """A cosine that uses its whole range: 1 at distance 0, 0 at `normal` units, -1 at twice that and beyond.
 
     Hand-made features are all alike (their cosine stays above 0.99, where U is 1 everywhere); what counts is
     the distance in units of what blur and noise alone make.
     """
-    return 1.0 - np.clip(np.asarray(distance, dtype=np.float64) / (unit * normal), 0.0, 2.0)
+    return 1.0 - np.clip(np.asarray(distance, dtype=np.float64) / normal, 0.0, 2.0)
 
 
 def ratio(u: np.ndarray, h: np.ndarray, eps_share: float = 0.1) -> np.ndarray:

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
-from ambiguous_wild.methods.refinesplat.evidence import Masks, compare, make_masks
+from ambiguous_wild.methods.refinesplat.evidence import Judged, Masks, compare, make_masks, pooled
 from ambiguous_wild.methods.refinesplat.inputs import FrozenInputs, prepare
 from ambiguous_wild.methods.refinesplat.losses import consistency_loss, identity_loss, instance_matrix
 from ambiguous_wild.methods.refinesplat.threshold import LearntWeight, robust_floor
@@ -39,6 +39,7 @@ class RefineSplatMask(MaskPolicy):
         self.keeps: dict[int, Tensor] = {}  # view: [H, W] float32 at the photo's size
         self.visits: dict[int, int] = {}  # view: steps since masks began
         self.shares: dict[int, tuple[float, float, float, float]] = {}  # view: final, local, global, T_ent
+        self.judged: dict[int, Judged] = {}  # view: its instances when its mask was last made
         self.last_reset = 0  # iteration, 0 = never
 
     def setup(self, data: TrainData) -> None:
@@ -52,6 +53,7 @@ class RefineSplatMask(MaskPolicy):
         due = step.view not in self.keeps or visit % self.config.mask_every == 0
         if due and not self._paused(step):
             masks = self._masks(step)
+            self.judged[step.view] = masks.judged
             if self.config.mask.w2 is None:
                 self._learn(masks)
             self.keeps[step.view] = torch.from_numpy(masks.keep).to(self.data.device)
@@ -119,15 +121,20 @@ class RefineSplatMask(MaskPolicy):
         """Masks of the step's view at the photo's own size, from the step's render."""
         inputs, view = self.inputs, step.view
         image = _enlarge(step.rendered.image, self.data.photos[view])
-        maps = compare(inputs.phi[view], inputs.features(image), inputs.psi, self.config.mask)
-        unit = inputs.features.unit
-        return make_masks(maps, inputs.labels[view], inputs.counts[view], unit, self.w2, self.config.mask)
+        mask = self.config.mask
+        maps = compare(inputs.phi[view], inputs.features(image), inputs.psi, inputs.features.unit, mask)
+        others = [self.judged[v] for v in sorted(self.judged) if v != view]
+        return make_masks(maps, inputs.labels[view], inputs.counts[view], others, self.w2, mask)
 
     def _learn(self, masks: Masks) -> None:
-        """w2 from this photo's instances; the price of a masked pixel is a robustly high residual."""
-        price = robust_floor(masks.distances, max(self.config.mask.disagree, 1.0))
-        if len(masks.values) > 1 and np.isfinite(price):
-            self.weight.learn(masks.values, masks.distances / max(price, 1e-12), masks.areas, masks.cut.floor)
+        """w2 from all instances; the price of a masked pixel is a robustly high residual."""
+        everything = masks.judged
+        if self.config.mask.scope == "scene":
+            everything = pooled([self.judged[v] for v in sorted(self.judged)])
+        price = robust_floor(everything.distances, max(self.config.mask.disagree, 1.0))
+        if len(everything.values) > 1 and np.isfinite(price):
+            residuals = everything.distances / max(price, 1e-12)
+            self.weight.learn(everything.values, residuals, everything.areas, masks.cut.floor)
 
     def _entropy_terms(self, image: Tensor, step: Step, keep: Tensor | None) -> Tensor:
         inputs, config = self.inputs, self.config
@@ -155,6 +162,10 @@ class RefineSplatMask(MaskPolicy):
             "keeps": {str(view): (keep > 0.5).to(torch.uint8) for view, keep in self.keeps.items()},
             "visits": {str(view): count for view, count in self.visits.items()},
             "shares": {str(view): [repr(x) for x in row] for view, row in self.shares.items()},
+            "judged": {
+                str(view): torch.from_numpy(np.stack([j.values, j.distances, j.areas]))
+                for view, j in self.judged.items()
+            },
             "theta": self.weight.theta,
             "last_reset": self.last_reset,
             # psi's training stops at a wall-clock cap: another machine must go on with the same one
@@ -166,6 +177,7 @@ class RefineSplatMask(MaskPolicy):
         self.keeps = {int(v): keep.float().to(device) for v, keep in state["keeps"].items()}
         self.visits = {int(v): int(count) for v, count in state["visits"].items()}
         self.shares = {int(v): _four(row) for v, row in state["shares"].items()}
+        self.judged = {int(v): Judged(*rows.numpy()) for v, rows in state["judged"].items()}
         self.weight.theta = float(state["theta"])
         self.last_reset = int(state["last_reset"])
         if self.inputs.psi is not None and state["psi"] is not None:

@@ -26,7 +26,7 @@ class Cut:
 
     threshold: float  # above: transient; inf = nothing stands apart
     flagged: np.ndarray  # [K] bool
-    floor: float  # the gate's own bound: median + gate * robust spread
+    floor: float  # the gate's own bound: the larger of median + gate * robust spread and `least`
 
 
 def t_ent(
@@ -34,6 +34,7 @@ def t_ent(
     w2: float = 0.5,
     form: Form = "kapur",
     gate: float = 0.0,
+    least: float = 0.0,
 ) -> Cut:
     """The threshold T_ent and the instances above it.
 
@@ -42,12 +43,13 @@ def t_ent(
         w2: weight of the lower subset, in (0, 1).
         form: `literal` is the printed objective.
         gate: only values this many robust deviations above the median may be flagged; 0 = no gate.
+        least: and only values above this; 0 = no such bound.
 
     Returns:
         The cut; K <= 1 or equal values flag nothing.
     """
     values = np.asarray(values, dtype=np.float64)
-    floor = robust_floor(values, gate) if gate > 0 else -math.inf
+    floor = max(robust_floor(values, gate) if gate > 0 else -math.inf, least if least > 0 else -math.inf)
     nothing = Cut(math.inf, np.zeros(len(values), dtype=bool), floor)
     order = np.sort(values)
     if len(order) <= 1 or order[-1] - order[0] <= 1e-9 * max(abs(order[-1]), 1e-300):

@@ -50,10 +50,13 @@ def command(
         click.echo(text, nl=False)
         return
     write_text(output, text)
-    rows = len(table.blocks[0].rows)
-    click.echo(
-        f"wrote {output}: {rows} methods, {len(table.scenes)} scenes, {len(table.columns)} columns", err=True
-    )
+    counts = {
+        "method": len(table.blocks[0].rows),
+        "scene": len(table.scenes),
+        "column": len(table.columns),
+    }
+    told = ", ".join(f"{n} {what}{'' if n == 1 else 's'}" for what, n in counts.items())
+    click.echo(f"wrote {output}: {told}", err=True)
 
 
 def command_line(runs: Path, style: str, metrics: tuple[str, ...], scenes: tuple[str, ...]) -> str:

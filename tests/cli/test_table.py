@@ -36,7 +36,7 @@ def test_output_file_holds_what_would_be_printed(style: str, tmp_path: Path) -> 
     out, _ = aw_table(runs, "--format", style)
     target = tmp_path / "out" / "table.x"
     printed, err = aw_table(runs, "--format", style, "-o", target)
-    assert printed == "" and "2 methods, 1 scenes" in err
+    assert printed == "" and "2 methods, 1 scene, " in err
     assert target.read_text() == out
 
 

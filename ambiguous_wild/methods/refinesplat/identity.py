@@ -19,8 +19,8 @@ class PsiConfig:
     """psi's size and training. The paper states neither."""
 
     hidden: int = 64  # units of the one hidden layer
-    steps: int = 1500  # Adam steps
-    batch: int = 2048  # cells a step
+    steps: int = 1000  # Adam steps
+    batch: int = 1024  # cells a step
     rate: float = 3e-3  # Adam's, decayed to a tenth by a cosine
     seconds: float = 30.0  # no psi trains longer; the cap is a safeguard, never the plan
 

@@ -116,4 +116,4 @@ def _photometric_torch(
         else:
             dssim = (weight * (1 - _ssim_torch(x, y))).mean()
         (gradient,) = torch.autograd.grad((1 - lambda_dssim) * l1 + lambda_dssim * dssim, x)
-    return float(l1), float(dssim), gradient
+    return float(l1.detach()), float(dssim.detach()), gradient

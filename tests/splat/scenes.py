@@ -1,0 +1,46 @@
+"""Small random scenes for the tests of this folder."""
+
+import numpy as np
+import torch
+
+from ambiguous_wild.core import Camera
+from ambiguous_wild.splat.gaussians import Gaussians
+
+
+def camera(width=37, height=29, *, angle=0.3, fx=30.0, fy=33.0, cx=None, cy=None) -> Camera:
+    """Turned about y and shifted, with unequal focal lengths and an off-centre principal point."""
+    pose = np.eye(4)
+    pose[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    pose[:3, 3] = [0.1, -0.2, 0.3]
+    cx = width / 2 + 1 if cx is None else cx
+    cy = height / 2 - 2 if cy is None else cy
+    return Camera(width, height, fx, fy, cx, cy, pose)
+
+
+def gaussians(seed=0, n=60, *, rest=15, size=-1.5) -> Gaussians:
+    """Some behind the camera, some outside the frame, opaque and faint, colours on both sides of 0."""
+    rng = np.random.default_rng(seed)
+
+    def normal(*shape):
+        return torch.from_numpy(rng.normal(size=shape).astype(np.float32))
+
+    return Gaussians(
+        means=normal(n, 3) * torch.tensor([2.0, 1.5, 1.5]) + torch.tensor([0.0, 0.0, 3.0]),
+        quats=normal(n, 4),
+        log_scales=normal(n, 3) * 0.7 + size,
+        opacity_logits=normal(n) * 2 + 1,
+        sh0=normal(n, 3),
+        sh_rest=normal(n, rest, 3) * 0.2,
+    )
+
+
+def doubles(g: Gaussians, *, grad=True) -> dict[str, torch.Tensor]:
+    """The same parameters in float64, leaves of a graph."""
+    return {name: tensor.double().requires_grad_(grad) for name, tensor in g.items()}
+
+
+def cotangents(height, width, seed=0) -> dict[str, torch.Tensor]:
+    rng = np.random.default_rng(seed)
+    shapes = {"d_image": (height, width, 3), "d_image_extra": (height, width, 3)}
+    shapes |= {"d_alpha": (height, width), "d_depth": (height, width)}
+    return {k: torch.from_numpy(rng.normal(size=s).astype(np.float32)) for k, s in shapes.items()}

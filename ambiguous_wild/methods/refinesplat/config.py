@@ -28,10 +28,11 @@ class MaskConfig:
     use_local: bool = True  # M_local; off is an ablation row
     use_global: bool = True  # M_global; off is an ablation row
     cosine: Literal["calibrated", "plain"] = "calibrated"  # in U; `plain` is printed
-    normal_units: float = 20.0  # distance in units at which the calibrated cosine is 0
+    normal_units: float = 10.0  # distance in units at which the calibrated cosine is 0
     box: int = 3  # cells, box filter over U / H
     spread: Spread = "std"  # T_glb = mean + this; `var` is printed
     global_gate: float = 6.0  # robust deviations above the median that M_global needs; 0 = printed
+    global_units: float = 8.0  # and the distance of the cell itself at least; 0 = printed
     dilation: int = 5  # px at the photo's resolution; 3, 5, 7 tried in the paper
     most: float = 0.6  # of a photo is masked at most: the surest pixels go first
     w2: float | None = None  # fixed weight of T_ent's lower subset; None = learnt

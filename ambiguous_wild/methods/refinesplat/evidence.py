@@ -106,6 +106,7 @@ def make_masks(
             cosine = masking.calibrated_cosine(maps.distance, config.normal_units)
         r = masking.ratio(masking.uncertainty(cosine), maps.entropy)
         coarse = masking.global_mask(r, config.box, config.spread, config.global_gate)
+        coarse &= maps.distance > config.global_units
     global_ = masking.enlarge(coarse, height, width)
     final = masking.dilate(local | global_, config.dilation)
     keep = masking.keep_map(final, config.most, masking.enlarge(maps.distance, height, width))

@@ -63,7 +63,9 @@ def brute_force(values: np.ndarray, w2: float, form: str) -> float:
             x = x / x.sum() if len(x) else x
         return float(-(x * np.log(x)).sum())
 
-    best = max(sorted(set(values)), key=lambda t: (1 - w2) * ent(values[values >= t]) + w2 * ent(values[values < t]))
+    best = max(
+        sorted(set(values)), key=lambda t: (1 - w2) * ent(values[values >= t]) + w2 * ent(values[values < t])
+    )
     return float(best)
 
 

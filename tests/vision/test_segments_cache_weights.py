@@ -16,7 +16,9 @@ def patches() -> torch.Tensor:
     """Twelve plain rectangles: what a segmentation has to find is known."""
     rng = np.random.default_rng(3)
     colours = rng.permutation(12)[:, None] / 12.0 * np.array([[1.0, 0.2, 0.6]])
-    return torch.from_numpy(cv2.resize(colours.reshape(3, 4, 3).astype(np.float32), (160, 96), interpolation=0))
+    return torch.from_numpy(
+        cv2.resize(colours.reshape(3, 4, 3).astype(np.float32), (160, 96), interpolation=0)
+    )
 
 
 def test_segments_of_plain_rectangles():

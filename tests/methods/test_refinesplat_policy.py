@@ -1,0 +1,371 @@
+"""Identities, density control and the mask policy's state, on a scene made on the spot."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from ambiguous_wild.core import AwError, Camera, Points, Scene, View
+from ambiguous_wild.core.config import from_plain, to_plain
+from ambiguous_wild.methods.refinesplat.association import associate
+from ambiguous_wild.methods.refinesplat.config import MaskConfig, RefineSplatConfig
+from ambiguous_wild.methods.refinesplat.density import EntropyAwareDensity, EntropyDensityConfig
+from ambiguous_wild.methods.refinesplat.identity import PsiConfig, train_psi
+from ambiguous_wild.methods.refinesplat.policy import RefineSplatMask
+from ambiguous_wild.methods.refinesplat.recipe import build
+from ambiguous_wild.splat.checkpoint import load, save
+from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.parts import Step, TrainData
+
+HEIGHT, WIDTH, VIEWS = 72, 128, 4
+FAST = RefineSplatConfig(psi=PsiConfig(hidden=16, steps=150, batch=512), min_mask_start=1, mask_every=2)
+
+
+def background(shift: int) -> np.ndarray:
+    """Coloured patches with texture, moved sideways from view to view as by a turning camera."""
+    rng = np.random.default_rng(5)
+    patches = cv2.resize(
+        rng.random((5, 12, 3)).astype(np.float32), (240, HEIGHT), interpolation=cv2.INTER_NEAREST
+    )
+    texture = cv2.GaussianBlur(rng.random((HEIGHT, 240, 3)).astype(np.float32), (0, 0), 1.5)
+    image = cv2.GaussianBlur(patches, (0, 0), 0.7) * 0.8 + 0.4 * (texture - 0.5) + 0.1
+    return image[:, shift : shift + WIDTH].clip(0, 1)
+
+
+def distracted(image: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """The image with a plain box in a colour of its own, and where it is."""
+    rng = np.random.default_rng(seed)
+    y, x = rng.integers(8, HEIGHT - 34), rng.integers(8, WIDTH - 34)
+    truth = np.zeros(image.shape[:2], bool)
+    truth[y : y + 26, x : x + 26] = True
+    out = image.copy()
+    out[truth] = [0.9, 0.15, 0.75]
+    return out, truth
+
+
+def blurred(image: np.ndarray, seed: int) -> torch.Tensor:
+    noise = np.random.default_rng(seed).normal(0, 0.02, image.shape)
+    return torch.from_numpy((cv2.GaussianBlur(image, (0, 0), 1.2) + noise).clip(0, 1).astype(np.float32))
+
+
+def make_data(tmp_path: Path, photos: list[np.ndarray]) -> TrainData:
+    pose = np.eye(4)
+    camera = Camera(WIDTH, HEIGHT, 100.0, 100.0, WIDTH / 2, HEIGHT / 2, pose)
+    views = tuple(View(f"{i}.png", tmp_path / f"{i}.png", camera, "train") for i in range(VIEWS))
+    rows, xy, offsets = [], [], [0]
+    for x in range(60, 100, 3):  # points that every view sees, at their shifted places
+        for y in range(3, HEIGHT, 4):
+            for view in range(VIEWS):
+                rows.append(view)
+                xy.append((x - 12 * view + 0.5, y + 0.5))
+            offsets.append(len(rows))
+    n = len(offsets) - 1
+    points = Points(
+        xyz=np.random.default_rng(0).random((n, 3)),
+        rgb=np.zeros((n, 3), np.uint8),
+        error_px=np.zeros(n),
+        track_offsets=np.array(offsets),
+        track_views=np.array(rows, np.int32),
+        track_xy=np.array(xy, np.float32),
+    )
+    scene = Scene(tmp_path, "made", views, points)
+    tensors = [torch.from_numpy(p.astype(np.float32)) for p in photos]
+    return TrainData(
+        scene, tensors, [camera] * VIEWS, [None] * VIEWS, torch.device("cpu"), 3, tmp_path / "cache"
+    )
+
+
+def step_of(data: TrainData, view: int, image: torch.Tensor, iteration: int = 100, divisor: int = 1) -> Step:
+    return Step(
+        iteration=iteration,
+        nominal=20.0 * iteration,
+        view=view,
+        divisor=divisor,
+        ceiling=1000,
+        photo=data.photos[view],
+        camera=data.cameras[view],
+        rendered=SimpleNamespace(image=image),  # type: ignore[arg-type]
+        gaussians=None,  # type: ignore[arg-type]
+    )
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    clean = [background(12 * v) for v in range(VIEWS)]
+    photos, truths = zip(*[distracted(image, 40 + v) for v, image in enumerate(clean)])
+    data = make_data(tmp_path_factory.mktemp("scene"), list(photos))
+    policy = RefineSplatMask(FAST)
+    policy.setup(data)
+    return SimpleNamespace(clean=clean, truths=truths, data=data, policy=policy)
+
+
+def fresh(scene, config: RefineSplatConfig = FAST) -> RefineSplatMask:
+    policy = RefineSplatMask(config)
+    policy.setup(scene.data)
+    return policy
+
+
+def test_distractors_are_masked_and_the_rest_is_kept(scene):
+    policy = fresh(scene)
+    for rounds in range(2):
+        for view in range(VIEWS):
+            keep = policy.keep(step_of(scene.data, view, blurred(scene.clean[view], view), 100 + rounds))
+            assert keep.dtype == torch.float32
+            assert set(np.unique(keep)) <= {0.0, 1.0}
+            found = keep.numpy() < 0.5
+            truth = scene.truths[view]
+            assert (found & truth).sum() / truth.sum() > 0.8
+            assert (found & ~cv2.dilate(truth.astype(np.uint8), np.ones((13, 13))).astype(bool)).mean() < 0.02
+    facts = policy.facts()
+    assert 0.05 < facts["masked_share"] < 0.3
+    assert 0.0 < facts["w2"] < 1.0
+
+
+def test_photos_without_distractors_stay_whole(tmp_path):
+    clean = [background(12 * v) for v in range(VIEWS)]
+    data = make_data(tmp_path, clean)
+    policy = RefineSplatMask(FAST)
+    policy.setup(data)
+    for rounds in range(2):
+        for view in range(VIEWS):
+            keep = policy.keep(step_of(data, view, blurred(clean[view], 9 * rounds + view), 100))
+            assert float((keep == 0).float().mean()) < 0.02
+
+
+def test_nothing_before_the_warm_up_and_old_masks_during_a_pause(scene):
+    policy = fresh(scene, RefineSplatConfig(psi=FAST.psi, mask_every=1))
+    good, bad = blurred(scene.clean[0], 0), torch.zeros(HEIGHT, WIDTH, 3)
+    assert policy.keep(step_of(scene.data, 0, good, iteration=5)) is None
+    assert policy.predict(step_of(scene.data, 0, good, iteration=5)) is None
+    assert policy.cotangent(step_of(scene.data, 0, good, iteration=4), None) is None
+    before = policy.keep(step_of(scene.data, 0, good, iteration=400))
+    policy.on_opacity_reset(step_of(scene.data, 0, bad, iteration=401))
+    assert torch.equal(policy.keep(step_of(scene.data, 0, bad, iteration=402)), before)
+    after = policy.keep(step_of(scene.data, 0, bad, iteration=4000))
+    assert not torch.equal(after, before)
+
+
+def test_a_render_that_shows_nothing_masks_at_most_the_stated_share(scene):
+    policy = fresh(scene)
+    keep = policy.keep(step_of(scene.data, 1, torch.zeros(HEIGHT, WIDTH, 3)))
+    assert float((keep == 0).float().mean()) <= FAST.mask.most + 1e-6
+
+
+def test_smaller_steps_keep_a_pixel_only_if_all_it_covers_is_kept(scene):
+    policy = fresh(scene)
+    image = blurred(scene.clean[2], 2)
+    full = policy.keep(step_of(scene.data, 2, image)).numpy()
+    half = policy.keep(step_of(scene.data, 2, image, 101, divisor=2)).numpy()
+    assert half.shape == (HEIGHT // 2, WIDTH // 2)
+    assert np.array_equal(half, full.reshape(HEIGHT // 2, 2, WIDTH // 2, 2).min(axis=(1, 3)))
+    small = torch.nn.functional.interpolate(image.permute(2, 0, 1)[None], scale_factor=0.5, mode="area")[0]
+    predicted = policy.predict(step_of(scene.data, 2, small.permute(1, 2, 0), 102, divisor=2))
+    assert predicted.shape == (HEIGHT // 2, WIDTH // 2)
+
+
+def test_predict_changes_nothing(scene):
+    policy = fresh(scene)
+    image = blurred(scene.clean[0], 0)
+    policy.keep(step_of(scene.data, 0, image))
+    before = to_bytes(policy)
+    policy.predict(step_of(scene.data, 1, blurred(scene.clean[1], 1)))
+    assert to_bytes(policy) == before
+
+
+def to_bytes(policy: RefineSplatMask) -> str:
+    def plain(value):
+        if isinstance(value, torch.Tensor):
+            return (str(value.dtype), value.tolist())
+        if isinstance(value, dict):
+            return {k: plain(v) for k, v in sorted(value.items())}
+        return value
+
+    return repr(plain(policy.state_dict()))
+
+
+def test_a_resumed_policy_goes_on_with_the_same_bits(scene, tmp_path):
+    def walk(policy: RefineSplatMask, begin: int, end: int) -> list[torch.Tensor]:
+        out = []
+        for i in range(begin, end):
+            view = i % VIEWS
+            step = step_of(scene.data, view, blurred(scene.clean[view], i), 100 + 4 * i)
+            keep = policy.keep(step)
+            out += [keep, policy.cotangent(step, keep)]
+        return out
+
+    straight = walk(fresh(scene), 0, 16)
+    first = fresh(scene)
+    begun = walk(first, 0, 7)
+    save(tmp_path / "state.safetensors", first.state_dict())
+    second = fresh(scene)
+    second.load_state_dict(load(tmp_path / "state.safetensors"))
+    for a, b in zip(straight, begun + walk(second, 7, 16)):
+        assert torch.equal(a, b)
+
+
+def test_cotangent_equals_finite_differences_in_float64(scene):
+    policy = fresh(scene, RefineSplatConfig(psi=FAST.psi, min_mask_start=1, entropy_every=1))
+    image = blurred(scene.clean[0], 0).double() * 0.9 + 0.05
+    psi = policy.inputs.psi
+    psi.double()
+    keep = torch.ones(HEIGHT, WIDTH, dtype=torch.float64)
+    keep[:20] = 0.0
+    step = step_of(scene.data, 0, image)
+    gradient = policy.cotangent(step, keep)
+    assert gradient.shape == image.shape
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(4):
+        direction = torch.randn(image.shape, generator=generator).double()
+        h = 1e-7
+        with torch.no_grad():
+            up = policy._entropy_terms(image + h * direction, step, keep)
+            down = policy._entropy_terms(image - h * direction, step, keep)
+        assert float((gradient * direction).sum()) == pytest.approx(
+            float(up - down) / (2 * h), rel=5e-3, abs=1e-6
+        )
+    psi.float()
+
+
+def test_cotangent_comes_every_kth_iteration_and_weighs_k_times(scene):
+    every = {}
+    for k in (1, 3):
+        policy = fresh(scene, RefineSplatConfig(psi=FAST.psi, min_mask_start=1, entropy_every=k))
+        step = step_of(scene.data, 0, blurred(scene.clean[0], 0), iteration=102)
+        every[k] = policy.cotangent(step, None)
+        off = policy.cotangent(step_of(scene.data, 0, blurred(scene.clean[0], 0), iteration=103), None)
+        assert (off is None) == (k == 3)
+    assert torch.allclose(every[3], 3 * every[1])
+
+
+# -- identities ---------------------------------------------------------------------------------------
+
+
+def test_tracks_join_instances_and_one_photo_keeps_them_apart():
+    labels = np.repeat(np.repeat(np.array([[1, 2], [3, 4]], np.int32), 10, 0), 10, 1)
+    other = np.array([0, 4, 1, 2, 3], np.int32)[labels]  # the same quadrants under other names
+    rng = np.random.default_rng(0)
+    xy = rng.uniform(0, 20, (200, 2))
+    point = np.tile(np.arange(200), 2)
+    photo = np.repeat([0, 1], 200)
+    zeros = [np.zeros((4, 2))] * 2
+    found = associate([labels, other], zeros, (point, photo, np.concatenate([xy, xy])))
+    assert found.count == 4
+    assert np.array_equal(found.of_instance[0][labels], found.of_instance[1][other])
+    assert (found.photos_of == 2).all()
+    for ids in found.of_instance:
+        assert len(set(ids[1:])) == 4
+
+
+def test_features_join_what_no_track_does_and_the_number_is_bounded():
+    labels = [
+        np.array([[1, 2, 2]], np.int32),
+        np.array([[2, 1, 0]], np.int32),
+        np.array([[-1, 5, 0]], np.int32),
+    ]
+    a, b = np.array([1.0, 0.0]), np.array([0.0, 1.0])
+    means = [np.stack([a, b]), np.stack([b, a]), np.stack([a * 0, a * 0, a * 0, a * 0, a])]
+    nothing = (np.zeros(0, np.int64), np.zeros(0, np.int32), np.zeros((0, 2)))
+    found = associate(labels, means, nothing)
+    assert found.of_instance[0][1] == found.of_instance[1][2] == found.of_instance[2][5] == 1
+    assert found.of_instance[0][2] == found.of_instance[1][1] == 2
+    assert found.count == 2
+    assert associate(labels, means, nothing, most=1).count == 1
+    empty = associate([np.zeros((2, 2), np.int32)], [np.zeros((0, 2))], nothing)
+    assert empty.count == 0
+
+
+def test_psi_learns_and_repeats():
+    generator = torch.Generator().manual_seed(0)
+    ids = torch.randint(0, 4, (800,), generator=generator)
+    features = torch.nn.functional.one_hot(ids, 4) + 0.1 * torch.randn(800, 4, generator=generator)
+    for variant in ("sigmoid", "softmax"):
+        config = PsiConfig(hidden=16, steps=200, batch=256)
+        psi = train_psi(features, ids, 3, config, variant, 1)
+        again = train_psi(features, ids, 3, config, variant, 1)
+        assert torch.equal(psi(features), again(features))
+        some = ids > 0
+        assert float((psi(features)[some].argmax(1) + 1 == ids[some]).float().mean()) > 0.97
+        assert not any(p.requires_grad for p in psi.parameters())
+    with pytest.raises(AwError, match="identities"):
+        train_psi(features, torch.zeros(800, dtype=torch.long), 3, PsiConfig(), "sigmoid", 1)
+
+
+# -- density control and recipe -----------------------------------------------------------------------
+
+
+def test_the_deciding_gradient_is_selectable():
+    screen, extra = torch.tensor([[1.0, 2.0]]), torch.tensor([[10.0, -2.0]])
+    gradients = SimpleNamespace(screen=screen, screen_extra=extra)
+    plain = SimpleNamespace(screen=screen, screen_extra=None)
+
+    def control(decides):
+        return EntropyAwareDensity(EntropyDensityConfig(decides=decides), 1.0, 0)
+
+    assert torch.equal(control("total").statistic(gradients), screen + extra)
+    assert torch.equal(control("photometric").statistic(gradients), screen)
+    assert torch.equal(control("entropy").statistic(gradients), extra)
+    assert torch.equal(control("total").statistic(plain), screen)
+    assert not control("entropy").statistic(plain).any()
+    assert [control(d).wants_extra() for d in ("total", "photometric", "entropy")] == [True, False, True]
+    with pytest.raises(AwError, match="total"):
+        control("totl")
+
+
+def test_clones_go_downhill_and_stay_inside():
+    n = 6
+    g = torch.Generator().manual_seed(0)
+    gaussians = Gaussians(
+        torch.zeros(n, 3),
+        torch.randn(n, 4, generator=g),
+        torch.randn(n, 3, generator=g) - 3,
+        torch.zeros(n),
+        torch.zeros(n, 3),
+        torch.zeros(n, 0, 3),
+    )
+    control = EntropyAwareDensity(EntropyDensityConfig(clone_shift=0.5), 1.0, 0)
+    control.downhill = torch.randn(n, 3, generator=g)
+    control.downhill[5] = 0.0
+    rows = torch.arange(n)
+    offset = control.clone_offset(gaussians, rows)
+    assert ((offset * control.downhill).sum(1)[:5] > 0).all()
+    assert (offset.norm(dim=1) <= 0.5 * gaussians.log_scales.exp().amax(1) + 1e-7).all()
+    assert not offset[5].any()
+    still = EntropyAwareDensity(EntropyDensityConfig(clone_shift=0.0), 1.0, 0)
+    assert still.clone_offset(gaussians, rows) is None
+
+
+def test_merging_removes_quiet_twins_and_keeps_statistics_in_step():
+    base = Gaussians.from_points(np.random.default_rng(0).random((20, 3)) * 50, np.zeros((20, 3), np.uint8))
+    base.log_scales -= 4.0  # nobody reaches its neighbour
+    gaussians = base.cat(base)  # every Gaussian twice
+    calls = []
+    optimiser = SimpleNamespace(select=lambda rows: calls.append(int(rows.sum())), append=calls.append)
+    control = EntropyAwareDensity(EntropyDensityConfig(), 1.0, 0)
+    control._match(gaussians)
+    control.seen += 1
+    control.grad_sum[:] = 0.0
+    control.grad_sum[:5] = 1.0  # busy ones stay as they are
+    step = SimpleNamespace(nominal=12_000.0)
+    merged = control.after_growth(step, gaussians, optimiser)
+    assert len(merged) == 25
+    assert control.merged == 15
+    assert calls == [10, 15]
+    assert len(control.seen) == len(control.downhill) == 25
+    assert control.after_growth(step, merged, optimiser) is merged  # not due again
+    other = EntropyAwareDensity(EntropyDensityConfig(), 1.0, 0)
+    other.load_state_dict(control.state_dict())
+    assert other.merged == 15
+    assert other.last_merge == 12_000.0
+
+
+def test_recipe_and_config_round_trip():
+    parts = build(RefineSplatConfig())
+    assert isinstance(parts.mask, RefineSplatMask)
+    assert parts.density is EntropyAwareDensity
+    assert parts.density_config.start == 10_000.0
+    assert parts.density_config.resets == (15_000.0, 18_000.0)
+    config = RefineSplatConfig(mask=MaskConfig(statistic="entropy", w2=0.5))
+    assert from_plain(RefineSplatConfig, to_plain(config)) == config

@@ -128,7 +128,7 @@ def tile_span(record, row, width):
 
 @parallel_kernel
 def count_tiles(order, records, width, height, columns, instances, histogram):
-    """Per rank the number of tiles, per part and tile the number of ranks."""
+    """Per slot the number of tiles, per part and tile the number of ranks."""
     n = order.shape[0]
     for part in numba.prange(PARTS):
         histogram[part, :] = 0
@@ -141,17 +141,16 @@ def count_tiles(order, records, width, height, columns, instances, histogram):
                 total += max(high - low + 1, 0)
                 for column in range(low, high + 1):
                     histogram[part, row * columns + column] += 1
-            instances[rank] = total
+            instances[order[rank]] = total
 
 
 @kernel
-def prefix(instances, offsets, histogram, starts):
-    """Exclusive sums: offsets of a rank's instances, starts of the tiles, cursors of the parts in each."""
+def prefix(slots, instances, offsets, histogram, starts):
+    """Exclusive sums: offsets of a slot's instances, starts of the tiles, cursors of the parts in each."""
     total = 0
-    for rank in range(instances.shape[0]):
-        offsets[rank] = total
-        total += instances[rank]
-    offsets[instances.shape[0]] = total
+    for k in range(slots.shape[0]):
+        offsets[slots[k]] = total
+        total += instances[slots[k]]
     at = 0
     for tile in range(histogram.shape[1]):
         starts[tile] = at
@@ -164,13 +163,16 @@ def prefix(instances, offsets, histogram, starts):
 
 @parallel_kernel
 def scatter(order, records, width, height, columns, offsets, histogram, tile_slots, tile_instances):
-    """Write each tile's list: the record's slot, and the rank-major number of the instance."""
+    """Write each tile's list: the record's slot, and the number of the instance.
+
+    Instances are numbered in the order of the slots, so that `reverse` reads its rows one after the other.
+    """
     n = order.shape[0]
     for part in numba.prange(PARTS):
         for rank in range(part * n // PARTS, (part + 1) * n // PARTS):
             record = records[order[rank]]
             first, last = tile_rows(record, height)
-            instance = offsets[rank]
+            instance = offsets[order[rank]]
             for row in range(first, last + 1):
                 low, high = tile_span(record, row, width)
                 for column in range(low, high + 1):

@@ -9,6 +9,14 @@ from typing import Any
 import numpy as np
 
 
+_LINE = 64  # bytes of a cache line; what starts on one is read and written in whole lines
+
+
+def _carve(block: np.ndarray, size: int, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+    start = -block.ctypes.data % _LINE
+    return block[start : start + size * np.dtype(dtype).itemsize].view(dtype).reshape(shape)
+
+
 class Pool:
     """Hands out arrays, and the same one again as soon as nobody but the pool holds it.
 
@@ -18,28 +26,26 @@ class Pool:
 
     def __init__(self, keep: int = 3) -> None:
         self._keep = keep
-        self._arrays: dict[tuple[Any, ...], list[np.ndarray]] = {}
+        self._blocks: dict[str, list[np.ndarray]] = {}
         self._pairs: dict[tuple[Any, ...], list[tuple[np.ndarray, np.ndarray]]] = {}
         self._lock = threading.Lock()
 
     def take(
         self, name: str, shape: tuple[int, ...], dtype: Any = np.float32, slack: float = 0.0
     ) -> np.ndarray:
-        """An array of that shape with any content; `slack` lets a flat one be reused for smaller needs."""
+        """An array of that shape with any content; `slack` is room for a somewhat larger need next time."""
         size = int(np.prod(shape))
+        room = np.dtype(dtype).itemsize * size
         with self._lock:
-            arrays = self._arrays.setdefault((name, np.dtype(dtype).str), [])
-            for k in range(len(arrays)):
+            blocks = self._blocks.setdefault(name, [])
+            for k in range(len(blocks)):
                 # References: the list's, and the argument of getrefcount.
-                if sys.getrefcount(arrays[k]) <= 2 and size <= arrays[k].size <= (1 + 2 * slack) * size + 64:
-                    return arrays[k][:size].reshape(shape)
-            flat = np.empty(max(int(size * (1 + slack)), 1), dtype)
-            for k in range(len(arrays) - 1, -1, -1):
-                if len(arrays) >= self._keep and sys.getrefcount(arrays[k]) <= 2:
-                    del arrays[k]
-            if len(arrays) < self._keep:
-                arrays.append(flat)
-            return flat[:size].reshape(shape)
+                if sys.getrefcount(blocks[k]) <= 2 and room + _LINE <= len(blocks[k]) <= 2 * room + 1024:
+                    return _carve(blocks[k], size, shape, dtype)
+            block = np.empty(int(room * (1 + slack)) + _LINE, np.uint8)
+            blocks[:] = [b for b in blocks if sys.getrefcount(b) > 3][: self._keep - 1]
+            blocks.append(block)
+            return _carve(block, size, shape, dtype)
 
     def take_rows(self, name: str, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
         """A float32 array whose rows are zero but where the mask given with it, [rows] bool, is set.
@@ -62,5 +68,5 @@ class Pool:
     def clear(self) -> None:
         """Forget every array."""
         with self._lock:
-            self._arrays.clear()
+            self._blocks.clear()
             self._pairs.clear()

@@ -45,8 +45,8 @@ class _Lists:
     records: np.ndarray
     ids: np.ndarray
     counts: np.ndarray
-    order: np.ndarray
     offsets: np.ndarray
+    instances: np.ndarray
     starts: np.ndarray
     tile_order: np.ndarray
     tile_slots: np.ndarray
@@ -94,7 +94,7 @@ class RenderedCpu:
 
     def _sums(self, d_image: Any, d_alpha: Any, d_depth: Any, d_extra: Any, absolute: Any) -> np.ndarray:
         s = self._lists
-        sums = _pool.take("sums", (int(s.offsets[-1]) * blend.ROW,), slack=0.25)
+        sums = _pool.take("sums", (int(s.starts[-1]) * blend.ROW,), slack=0.25)
         blend.backward(
             s.records, s.tile_slots, s.tile_instances, s.starts, s.tile_order, threads(),
             self._camera.width, self._camera.height, s.background, s.kept,
@@ -105,8 +105,6 @@ class RenderedCpu:
     def _chain(self, sums: np.ndarray, extra: bool, absolute: bool) -> Gradients:
         s, g = self._lists, self._gaussians
         n = len(g)
-        ranks = _pool.take("ranks", (max(n, 1),), np.int32)
-        ranks[s.order] = np.arange(len(s.order), dtype=np.int32)
         out = {name: _pool.take(f"d_{name}", tuple(t.shape)) for name, t in g.items() if name != "sh_rest"}
         rest, dirty = _pool.take_rows("d_sh_rest", tuple(g.sh_rest.shape))
         screen = _pool.take("screen", (n, 2))
@@ -114,7 +112,7 @@ class RenderedCpu:
         screen_abs = np.empty((n, 2), np.float32) if absolute else None
         reverse.reverse(
             *(_array(t) for t in (g.means, g.quats, g.log_scales, g.opacity_logits, g.sh_rest)),
-            s.degree, s.cam, s.centre, s.antialias, s.records, s.ids, s.counts, ranks, s.offsets, sums,
+            s.degree, s.cam, s.centre, s.antialias, s.records, s.ids, s.counts, s.offsets, s.instances, sums,
             out["means"], out["quats"], out["log_scales"], out["opacity_logits"], out["sh0"], rest,
             dirty, screen, screen_extra, screen_abs,
         )  # fmt: skip
@@ -182,12 +180,12 @@ def render_cpu(
     order = bins.depth_order(slots, records)
 
     columns, rows = -(-width // bins.TILE), -(-height // bins.TILE)
-    instances = np.empty(len(order), np.int32)
+    instances = _pool.take("instances", (n,), np.int32)
     histogram = np.empty((bins.PARTS, columns * rows), np.int32)
     bins.count_tiles(order, records, width, height, columns, instances, histogram)
-    offsets = np.empty(len(order) + 1, np.int64)
+    offsets = _pool.take("offsets", (n,), np.int64)
     starts = np.empty(columns * rows + 1, np.int64)
-    bins.prefix(instances, offsets, histogram, starts)
+    bins.prefix(slots, instances, offsets, histogram, starts)
     tile_slots = _pool.take("tile_slots", (int(starts[-1]),), np.int32, slack=0.25)
     tile_instances = _pool.take("tile_instances", (int(starts[-1]),), np.int32, slack=0.25)
     bins.scatter(order, records, width, height, columns, offsets, histogram, tile_slots, tile_instances)
@@ -202,7 +200,7 @@ def render_cpu(
         records, tile_slots, starts, tile_order, threads(), width, height, behind, image, alpha, depth, kept
     )
     lists = _Lists(
-        cam, centre, sh_degree, antialias, behind, records, ids, counts, order, offsets, starts, tile_order,
+        cam, centre, sh_degree, antialias, behind, records, ids, counts, offsets, instances, starts, tile_order,
         tile_slots, tile_instances, kept,
     )  # fmt: skip
     return RenderedCpu(gaussians, camera, (image, alpha, depth, radii > 0, radii), lists)

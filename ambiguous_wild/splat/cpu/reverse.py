@@ -89,7 +89,7 @@ def _quaternion_gradient(quat, norm, g):
 @fused_kernel
 def _reverse_chunk(
     first, stop, means, quats, log_scales, opacity_logits, sh_rest, degree, cam, centre, antialias,
-    records, ids, ranks, offsets, sums, d_means, d_quats, d_log_scales, d_opacity_logits, d_sh0,
+    records, ids, offsets, instances, sums, d_means, d_quats, d_log_scales, d_opacity_logits, d_sh0,
     d_sh_rest, dirty, screen, screen_extra, screen_abs,
 ):  # fmt: skip
     n = means.shape[0]
@@ -121,12 +121,11 @@ def _reverse_chunk(
             d_sh0[i] = 0.0
             continue
         record = records[slot]
-        rank = ranks[slot]
-        slot += 1
         row = splat(np.float32(0.0))
-        for at in range(offsets[rank], offsets[rank + 1]):
+        for at in range(offsets[slot], offsets[slot] + instances[slot]):
             row = row + load(sums, at * ROW)
         store(total, 0, row)
+        slot += 1
 
         m0 = np.float64(means[i, 0])
         m1 = np.float64(means[i, 1])
@@ -237,14 +236,14 @@ def _reverse_chunk(
 @parallel_kernel
 def reverse(
     means, quats, log_scales, opacity_logits, sh_rest, degree, cam, centre, antialias,
-    records, ids, counts, ranks, offsets, sums,
+    records, ids, counts, offsets, instances, sums,
     d_means, d_quats, d_log_scales, d_opacity_logits, d_sh0, d_sh_rest, dirty,
     screen, screen_extra, screen_abs,
 ):  # fmt: skip
     """Add each Gaussian's rows and chain them to its raw parameters; Gaussians not seen get zeros.
 
     Args:
-        ranks: [N] int32, depth rank of each record; offsets: [V + 1] int64, its rows in `sums`.
+        offsets, instances: [N] int64 and int32, first row in `sums` and number of rows of each record.
         sums: [I * 16] float32.
         dirty: [N] bool, rows of `d_sh_rest` that are not zero before; updated.
         screen_extra, screen_abs: [N, 2] or None.
@@ -253,6 +252,6 @@ def reverse(
     for chunk in numba.prange(counts.shape[0]):
         _reverse_chunk(
             chunk * CHUNK, chunk * CHUNK + counts[chunk], means, quats, log_scales, opacity_logits, sh_rest,
-            degree, cam, centre, antialias, records, ids, ranks, offsets, sums, d_means, d_quats,
+            degree, cam, centre, antialias, records, ids, offsets, instances, sums, d_means, d_quats,
             d_log_scales, d_opacity_logits, d_sh0, d_sh_rest, dirty, screen, screen_extra, screen_abs,
         )  # fmt: skip

@@ -112,7 +112,7 @@ def command(
 
     \b
     aw bench --method 3dgs --method refinesplat --scene scene -o runs
-    aw bench --method refinesplat --scene scene --budget 10m --set refinesplat.alpha_1=0.1
+    aw bench --method refinesplat --scene scene --budget 10m --set refinesplat.lambda_cr=0.1
     """
     if iterations is not None and budget is not None:
         raise AwError("--iterations and --budget exclude each other: a run is as long as one of them says")

@@ -78,7 +78,7 @@ def _settings_by_method(settings: Iterable[str], methods: Sequence[str]) -> dict
         key, equals, value = setting.partition("=")
         method, dot, option = key.partition(".")
         if not equals or not dot:
-            raise AwError(f"--set {setting!r}: write METHOD.KEY=VALUE, e.g. refinesplat.alpha_1=0.1")
+            raise AwError(f"--set {setting!r}: write METHOD.KEY=VALUE, e.g. refinesplat.lambda_cr=0.1")
         if method not in methods:
             raise unknown("method in --set", method, methods)
         grouped.setdefault(method, {})[option] = value

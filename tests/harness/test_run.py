@@ -125,14 +125,14 @@ def test_a_failing_cell_does_not_take_the_others_with_it(scene, tmp_path):
 
 
 def test_options_reach_the_method_and_unknown_ones_are_named(scene):
-    (cell,) = plan_cells(["refinesplat"], [scene], [0], SHORT, settings=["refinesplat.alpha_1=0.1"])
-    assert cell.options.alpha_1 == 0.1
-    with pytest.raises(AwError, match="did you mean 'alpha_1'"):
-        plan_cells(["refinesplat"], [scene], [0], SHORT, settings=["refinesplat.alpha1=0.1"])
+    (cell,) = plan_cells(["refinesplat"], [scene], [0], SHORT, settings=["refinesplat.lambda_cr=0.1"])
+    assert cell.options.lambda_cr == 0.1
+    with pytest.raises(AwError, match="did you mean 'lambda_cr'"):
+        plan_cells(["refinesplat"], [scene], [0], SHORT, settings=["refinesplat.lambda_rc=0.1"])
     with pytest.raises(AwError, match=r"write METHOD\.KEY=VALUE"):
-        plan_cells(["refinesplat"], [scene], [0], SHORT, settings=["alpha_1=0.1"])
+        plan_cells(["refinesplat"], [scene], [0], SHORT, settings=["lambda_cr=0.1"])
     with pytest.raises(AwError, match="method in --set"):
-        plan_cells(["3dgs"], [scene], [0], SHORT, settings=["refinesplat.alpha_1=0.1"])
+        plan_cells(["3dgs"], [scene], [0], SHORT, settings=["refinesplat.lambda_cr=0.1"])
 
 
 def test_scenes_of_one_name_are_refused(scene, tmp_path):

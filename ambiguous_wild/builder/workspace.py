@@ -74,6 +74,11 @@ class Workspace:
         self.results.append(result)
         return result
 
+    def forget(self, result: StageResult) -> None:
+        """Delete one stage's folder, so that it runs again."""
+        self.results.remove(result)
+        shutil.rmtree(result.folder, ignore_errors=True)
+
     def remove(self) -> None:
         """Delete the work folder and everything in it."""
         shutil.rmtree(self.root, ignore_errors=True)

@@ -20,7 +20,7 @@ SETTINGS = BuildSettings(factor=2, max_features=500, name="walls")
 _DIE = "os.kill(os.getpid(), signal.SIGKILL)"
 KILLS = {
     "inside screening": f"S._lay_out = lambda *a: {_DIE}",
-    "between features and matches": f"P.match = lambda *a: {_DIE}",
+    "between features and matches": f"T.match = lambda *a: {_DIE}",
     "while COLMAP matches": (
         "real = F._run\n"
         "def run(job, folder, watch):\n"
@@ -34,15 +34,15 @@ KILLS = {
         "real = U.write_png\n"
         f"U.write_png = lambda path, image: {_DIE} if Path(path).stem == 'p02' else real(path, image)"
     ),
-    "before the rename": f"P._Build._publish = lambda *a: {_DIE}",
+    "before the rename": f"P._publish = lambda *a: {_DIE}",
     "after the rename": (
-        "real = P._Build._publish\n"
-        f"P._Build._publish = lambda *a: (real(*a), {_DIE})"
+        "real = P._publish\n"
+        f"P._publish = lambda *a: (real(*a), {_DIE})"
     ),
 }  # fmt: skip
 _SCRIPT = """
 import os, signal, sys
-from ambiguous_wild.builder import pipeline as P, screen as S, sfm as F
+from ambiguous_wild.builder import pipeline as P, screen as S, sfm as F, stages as T
 from ambiguous_wild.builder.settings import BuildSettings
 {kill}
 P.build_scene(sys.argv[1], sys.argv[2], BuildSettings(factor=2, max_features=500, name="walls"), jobs=1)

@@ -151,6 +151,12 @@ def test_other_settings_are_refused_by_name_until_overwrite(raw, tmp_path):
     assert (out / "images_4").is_dir()
     assert not (out / "images_2").exists()
     assert first.reused == ()
+    # The scene deleted, the work kept: packaging runs again, nothing else.
+    expected = hashes(out)
+    shutil.rmtree(out)
+    assert "package" not in build_scene(raw, out, other).reused
+    assert hashes(out) == expected
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["scene"]
 
 
 def test_a_folder_of_something_else_is_never_replaced(raw, tmp_path):

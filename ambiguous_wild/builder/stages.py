@@ -1,0 +1,246 @@
+"""The stages in order: what each reads, what its result is keyed by, what it hands on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ambiguous_wild.builder import report
+from ambiguous_wild.builder.collect import Capture
+from ambiguous_wild.builder.downsample import auto_factor, downsample
+from ambiguous_wild.builder.masks import find_masks, lay_out_masks, mask_hashes
+from ambiguous_wild.builder.package import Parts, package
+from ambiguous_wild.builder.progress import Bar
+from ambiguous_wild.builder.screen import screen
+from ambiguous_wild.builder.settings import BuildSettings
+from ambiguous_wild.builder.sfm import (
+    DATABASE,
+    choose_camera,
+    choose_matcher,
+    extract_features,
+    map_scene,
+    match,
+)
+from ambiguous_wild.builder.split import read_test_list, split_photos
+from ambiguous_wild.builder.versions import versions
+from ambiguous_wild.builder.workspace import StageResult, Workspace, content_key
+from ambiguous_wild.core.config import to_plain
+from ambiguous_wild.io.colmap_model import Model, read_model
+from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.io.images import read_png_rgb
+
+
+@dataclass
+class Stages:
+    """One build's inputs, and its stages as methods."""
+
+    capture: Capture
+    settings: BuildSettings
+    mask_folder: Path | None
+    test_list: Path | None
+    jobs: int
+    bar: Bar
+    link: bool  # the scene may share its files with the work folder
+
+    @cached_property
+    def inputs(self) -> dict[str, Any]:
+        """Everything the scene's files follow from, as plain data."""
+        return {
+            "photos": [[s.relative, s.stem, s.side, s.sha256] for s in self.capture.sources],
+            "masks": _tree(self.mask_folder),
+            "truth": _tree(self.capture.truth),
+            "test_list": sha256_file(self.test_list) if self.test_list and self.test_list.is_file() else None,
+            "settings": to_plain(self.settings),
+            "versions": versions(),
+        }
+
+    @cached_property
+    def build_key(self) -> str:
+        """Identity of the scene these inputs give."""
+        return content_key(self.inputs)
+
+    def run(self, work: Workspace, collect_s: float) -> Path:
+        """Run what has not been run yet.
+
+        Args:
+            work: where finished stages lie.
+            collect_s: seconds spent before, for the account.
+
+        Returns:
+            The whole scene, inside the work folder.
+        """
+        capture, settings, bar = self.capture, self.settings, self.bar
+        inputs = self.inputs
+        screened = work.run(
+            "screen",
+            [inputs["versions"], inputs["photos"], settings.strict],
+            lambda f: screen(capture, f, strict=settings.strict, jobs=self.jobs, bar=bar),
+        )
+        facts = screened.facts["photos"]
+        tests = read_test_list(self.test_list, facts) if self.test_list else None
+        mask_stage = self._masks(work, screened)
+        mapping, features, matches = self._sfm(work, screened, mask_stage)
+        best, model, others = _models(mapping)
+        stems = {f["work_name"]: f["stem"] for f in facts}
+        registered = {stems[i.name] for i in model.images.values()}
+        train, test, how, split_warnings = split_photos(facts, registered, tests)
+        flat = self._undistort(work, screened, mask_stage, mapping, model)
+        factor = settings.factor or auto_factor([(f["width"], f["height"]) for f in facts])
+        small = flat
+        if factor > 1:
+            small = work.run(
+                "downsample",
+                [inputs["versions"], flat.key, factor],
+                lambda f: downsample(f, flat.folder, factor, jobs=self.jobs, bar=bar),
+            )
+        account = report.account(
+            settings,
+            screened.facts,
+            features.facts,
+            matches.facts,
+            mapping.facts,
+            best,
+            model,
+            others,
+            matches.folder / DATABASE,
+            train=train,
+            test=test,
+            how=how,
+            factor=factor,
+            truth=flat.facts["truth"],
+            masks=mask_stage.facts if mask_stage else None,
+            warnings=split_warnings,
+        )
+        account |= {"build_key": self.build_key, "inputs": inputs}
+        account["seconds"] = {"collect": round(collect_s, 3), **{r.name: r.seconds for r in work.results}}
+        truth_files = [capture.truth / n for n in ("cameras.json", "capture.json")] if capture.truth else []
+        parts = Parts(
+            flat.folder,
+            small.folder if factor > 1 else None,
+            factor,
+            train,
+            test,
+            [p for p in truth_files if p.is_file()],
+        )
+        return self._package(work, small, parts, account)
+
+    def _package(self, work: Workspace, small: StageResult, parts: Parts, account: dict[str, Any]) -> Path:
+        def run() -> StageResult:
+            return work.run(
+                "package",
+                [self.inputs, small.key],
+                lambda f: package(f / "scene", parts, account, link=self.link, jobs=self.jobs),
+            )
+
+        done = run()
+        if not (done.folder / "scene").is_dir():  # an earlier call published it, and it was deleted since
+            work.forget(done)
+            done = run()
+        return done.folder / "scene"
+
+    def _masks(self, work: Workspace, screened: StageResult) -> StageResult | None:
+        if self.mask_folder is None:
+            return None
+        facts = screened.facts["photos"]
+        found = find_masks(self.mask_folder, facts, self.settings.masks_missing)
+        return work.run("masks", [screened.key, mask_hashes(found)], lambda f: lay_out_masks(f, found, facts))
+
+    def _sfm(
+        self, work: Workspace, screened: StageResult, masks: StageResult | None
+    ) -> tuple[StageResult, StageResult, StageResult]:
+        settings, facts = self.settings, screened.facts["photos"]
+        photos = screened.folder / "photos"
+        camera = choose_camera(facts, settings.camera)
+        matcher = choose_matcher(len(facts), settings.matcher)
+        features = work.run(
+            "features",
+            [
+                screened.key,
+                masks and masks.key,
+                camera,
+                settings.max_features,
+                settings.max_side,
+                settings.seed,
+            ],
+            lambda f: extract_features(
+                f,
+                photos,
+                facts,
+                settings,
+                self.jobs,
+                camera,
+                masks.folder / "masks" if masks else None,
+                self.bar,
+            ),
+        )
+        matches = work.run(
+            "matches",
+            [features.key, matcher, settings.seed],
+            lambda f: match(f, features.folder, facts, settings, self.jobs, matcher, self.bar),
+        )
+        mapping = work.run(
+            "mapping",
+            [matches.key, settings.mapper, settings.seed],
+            lambda f: map_scene(f, matches.folder, photos, len(facts), settings, self.bar),
+        )
+        from ambiguous_wild.builder.select_model import check_registered
+
+        check_registered(
+            mapping.facts["models"],
+            len(facts),
+            len(screened.facts["skipped"]),
+            matches.folder / DATABASE,
+            matches.facts,
+        )
+        return mapping, features, matches
+
+    def _undistort(
+        self,
+        work: Workspace,
+        screened: StageResult,
+        masks: StageResult | None,
+        mapping: StageResult,
+        model: Model,
+    ) -> StageResult:
+        from ambiguous_wild.builder.undistort import undistort
+
+        photos = screened.folder / "photos"
+
+        def read(fact: dict[str, Any]) -> np.ndarray:
+            return read_png_rgb(photos / fact["work_name"])
+
+        return work.run(
+            "undistort",
+            [mapping.key, _tree(self.capture.truth)],
+            lambda f: undistort(
+                f,
+                model,
+                screened.facts["photos"],
+                read,
+                masks.folder / "masks" if masks else None,
+                self.capture.truth,
+                jobs=self.jobs,
+                bar=self.bar,
+            ),
+        )
+
+
+def _models(mapping: StageResult) -> tuple[int, Model, dict[int, Model]]:
+    from ambiguous_wild.builder.select_model import choose_model
+
+    listing = mapping.facts["models"]
+    best, model = choose_model(mapping.folder, listing)
+    others = {m["model"]: read_model(mapping.folder / str(m["model"])) for m in listing if m["model"] != best}
+    return best, model, others
+
+
+def _tree(folder: Path | None) -> list[list[str]] | None:
+    """[path, sha256] of every file below a folder."""
+    if folder is None or not folder.is_dir():
+        return None
+    paths = sorted(p for p in folder.rglob("*") if p.is_file())
+    return [[p.relative_to(folder).as_posix(), sha256_file(p)] for p in paths]

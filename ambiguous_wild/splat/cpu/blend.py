@@ -99,6 +99,8 @@ def _forward_tile(records, slots, begin, end, left, top, width, height, state):
             u = lanes - (mx + slant * dy)
             exponent = fma(u * u, curve_x, level + curve_y * (dy * dy))
             drawn = exponent >= LOG2_MIN_ALPHA
+            if not any_lane(drawn):
+                continue
             e = exp2(exponent)
             alpha = select(drawn, select(e <= MAX_ALPHA, e, MAX_ALPHA), _ZERO)
             before = load(transmittance, at)
@@ -227,6 +229,8 @@ def _backward_tile(
             u = lanes - (mx + slant * dy)
             exponent = fma(u * u, curve_x, level + curve_y * (dy * dy))
             drawn = (exponent >= LOG2_MIN_ALPHA) & (load(last, at) >= index)
+            if not any_lane(drawn):
+                continue
             e = exp2(exponent)
             free = e <= MAX_ALPHA
             alpha = select(drawn, select(free, e, MAX_ALPHA), _ZERO)

@@ -14,6 +14,7 @@ from ambiguous_wild.methods.refinesplat.association import associate
 from ambiguous_wild.methods.refinesplat.config import MaskConfig, RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.density import EntropyAwareDensity, EntropyDensityConfig
 from ambiguous_wild.methods.refinesplat.identity import PsiConfig, train_psi
+from ambiguous_wild.methods.refinesplat.inputs import static_instances
 from ambiguous_wild.methods.refinesplat.policy import RefineSplatMask
 from ambiguous_wild.methods.refinesplat.recipe import build
 from ambiguous_wild.splat.checkpoint import load, save
@@ -21,7 +22,10 @@ from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.parts import Step, TrainData
 
 HEIGHT, WIDTH, VIEWS = 72, 128, 4
-FAST = RefineSplatConfig(psi=PsiConfig(hidden=16, steps=150, batch=512), min_mask_start=1, mask_every=2)
+PRINTED = {"lambda_id": 1.0, "lambda_cr": 0.2}  # the entropy terms are off by default
+FAST = RefineSplatConfig(
+    psi=PsiConfig(hidden=16, steps=150, batch=512), min_mask_start=1, mask_every=2, **PRINTED
+)
 
 
 def background(shift: int) -> np.ndarray:
@@ -51,7 +55,7 @@ def blurred(image: np.ndarray, seed: int) -> torch.Tensor:
     return torch.from_numpy((cv2.GaussianBlur(image, (0, 0), 1.2) + noise).clip(0, 1).astype(np.float32))
 
 
-def make_data(tmp_path: Path, photos: list[np.ndarray]) -> TrainData:
+def make_data(tmp_path: Path, photos: list[np.ndarray], truths: list[np.ndarray] | None = None) -> TrainData:
     pose = np.eye(4)
     camera = Camera(WIDTH, HEIGHT, 100.0, 100.0, WIDTH / 2, HEIGHT / 2, pose)
     views = tuple(View(f"{i}.png", tmp_path / f"{i}.png", camera, "train") for i in range(VIEWS))
@@ -59,6 +63,8 @@ def make_data(tmp_path: Path, photos: list[np.ndarray]) -> TrainData:
     for x in range(60, 100, 3):  # points that every view sees, at their shifted places
         for y in range(3, HEIGHT, 4):
             for view in range(VIEWS):
+                if truths is not None and truths[view][y, x - 12 * view]:
+                    continue  # a point behind the distractor is not seen
                 rows.append(view)
                 xy.append((x - 12 * view + 0.5, y + 0.5))
             offsets.append(len(rows))
@@ -78,7 +84,14 @@ def make_data(tmp_path: Path, photos: list[np.ndarray]) -> TrainData:
     )
 
 
-def step_of(data: TrainData, view: int, image: torch.Tensor, iteration: int = 100, divisor: int = 1) -> Step:
+def step_of(
+    data: TrainData,
+    view: int,
+    image: torch.Tensor,
+    iteration: int = 100,
+    divisor: int = 1,
+    alpha: float = 1.0,
+) -> Step:
     return Step(
         iteration=iteration,
         nominal=20.0 * iteration,
@@ -87,7 +100,7 @@ def step_of(data: TrainData, view: int, image: torch.Tensor, iteration: int = 10
         ceiling=1000,
         photo=data.photos[view],
         camera=data.cameras[view],
-        rendered=SimpleNamespace(image=image),  # type: ignore[arg-type]
+        rendered=SimpleNamespace(image=image, alpha=torch.full(image.shape[:2], alpha)),  # type: ignore[arg-type]
         gaussians=None,  # type: ignore[arg-type]
     )
 
@@ -96,7 +109,7 @@ def step_of(data: TrainData, view: int, image: torch.Tensor, iteration: int = 10
 def scene(tmp_path_factory):
     clean = [background(12 * v) for v in range(VIEWS)]
     photos, truths = zip(*[distracted(image, 40 + v) for v, image in enumerate(clean)])
-    data = make_data(tmp_path_factory.mktemp("scene"), list(photos))
+    data = make_data(tmp_path_factory.mktemp("scene"), list(photos), list(truths))
     policy = RefineSplatMask(FAST)
     policy.setup(data)
     return SimpleNamespace(clean=clean, truths=truths, data=data, policy=policy)
@@ -154,6 +167,12 @@ def test_a_render_that_shows_nothing_masks_at_most_the_stated_share(scene):
     assert float((keep == 0).float().mean()) <= FAST.mask.most + 1e-6
 
 
+def test_what_is_not_learnt_yet_is_not_masked(scene):
+    policy = fresh(scene)
+    keep = policy.keep(step_of(scene.data, 1, torch.zeros(HEIGHT, WIDTH, 3), alpha=0.1))
+    assert bool((keep == 1).all())
+
+
 def test_smaller_steps_keep_a_pixel_only_if_all_it_covers_is_kept(scene):
     policy = fresh(scene)
     image = blurred(scene.clean[2], 2)
@@ -207,7 +226,7 @@ def test_a_resumed_policy_goes_on_with_the_same_bits(scene, tmp_path):
 
 
 def test_cotangent_equals_finite_differences_in_float64(scene):
-    policy = fresh(scene, RefineSplatConfig(psi=FAST.psi, min_mask_start=1, entropy_every=1))
+    policy = fresh(scene, RefineSplatConfig(psi=FAST.psi, min_mask_start=1, entropy_every=1, **PRINTED))
     image = blurred(scene.clean[0], 0).double() * 0.9 + 0.05
     psi = policy.inputs.psi
     psi.double()
@@ -232,7 +251,7 @@ def test_cotangent_equals_finite_differences_in_float64(scene):
 def test_cotangent_comes_every_kth_iteration_and_weighs_k_times(scene):
     every = {}
     for k in (1, 3):
-        policy = fresh(scene, RefineSplatConfig(psi=FAST.psi, min_mask_start=1, entropy_every=k))
+        policy = fresh(scene, RefineSplatConfig(psi=FAST.psi, min_mask_start=1, entropy_every=k, **PRINTED))
         step = step_of(scene.data, 0, blurred(scene.clean[0], 0), iteration=102)
         every[k] = policy.cotangent(step, None)
         off = policy.cotangent(step_of(scene.data, 0, blurred(scene.clean[0], 0), iteration=103), None)
@@ -275,6 +294,23 @@ def test_features_join_what_no_track_does_and_the_number_is_bounded():
     assert associate(labels, means, nothing, most=1).count == 1
     empty = associate([np.zeros((2, 2), np.int32)], [np.zeros((0, 2))], nothing)
     assert empty.count == 0
+
+
+def test_sfm_vouches_for_what_it_saw_often():
+    labels = [np.repeat(np.array([[1, 2]], np.int32), 10, axis=1).repeat(10, axis=0)]
+    rng = np.random.default_rng(0)
+    left = np.stack([rng.uniform(0, 10, 190), rng.uniform(0, 10, 190)], 1)
+    right = left[:6] + np.array([10.0, 0.0])  # a few wrong matches
+    xy = np.concatenate([left, right])
+    point = np.arange(len(xy))
+    # each point is seen in three views, of which only photo 0 is asked about
+    tracks = (np.tile(point, 3), np.repeat([0, 1, 2], len(xy)), np.tile(xy, (3, 1)))
+    blank = [np.zeros((10, 20), np.int32)] * 2
+    found = static_instances(labels + blank, [2, 0, 0], tracks, share=0.35)
+    assert found[0].tolist() == [True, False]
+    assert not static_instances(labels, [2], tracks, share=0.0)[0].any()
+    pairs = (np.tile(point, 2), np.repeat([0, 1], len(xy)), np.tile(xy, (2, 1)))
+    assert not static_instances(labels, [2], pairs, share=0.35)[0].any()  # two views are no evidence
 
 
 def test_psi_learns_and_repeats():

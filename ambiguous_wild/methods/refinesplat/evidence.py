@@ -75,20 +75,39 @@ def compare(phi_photo: Tensor, phi_render: Tensor, psi: Psi | None, unit: float,
     return Maps(_array(h), _array(statistic), _array(cosine), _array(distance))
 
 
+def silence(maps: Maps, unseen: np.ndarray) -> Maps:
+    """The maps without evidence where the model has nothing to show yet (bool [h, w]).
+
+    A sky without points differs from every photo until it is learnt; masked, it would never be learnt.
+    """
+    return Maps(
+        maps.entropy,
+        np.where(unseen, 0.0, maps.statistic),
+        np.where(unseen, 1.0, maps.cosine),
+        np.where(unseen, 0.0, maps.distance),
+    )
+
+
 def make_masks(
-    maps: Maps, labels: np.ndarray, count: int, others: Sequence[Judged], w2: float, config: MaskConfig
+    maps: Maps,
+    labels: np.ndarray,
+    static: np.ndarray,
+    others: Sequence[Judged],
+    w2: float,
+    config: MaskConfig,
 ) -> Masks:
     """M_local, M_global and the keep map of one photo (Eqs. 4-8).
 
     Args:
         maps: from `compare`.
         labels: [H, W] int32 instances, 0 = none.
-        count: K.
+        static: [K] bool, instances that are not to be masked.
         others: instances of the scene's other photos when they were last judged (`scope` = scene).
         w2: weight of T_ent's lower subset.
         config: thresholds.
     """
     height, width = labels.shape
+    count = len(static)
     values, areas = masking.instance_means(maps.statistic, labels, count)
     distances, _ = masking.instance_means(maps.distance, labels, count)
     known = areas > 0
@@ -97,6 +116,7 @@ def make_masks(
     cut = t_ent(pool.values, w2, config.threshold, config.gate, config.least)
     flagged = np.zeros(count, dtype=bool)
     flagged[known] = (judged.values > cut.threshold) & differs(judged, pool, config)
+    flagged &= ~static
     local = masking.local_mask(labels, flagged) if config.use_local else np.zeros(labels.shape, bool)
 
     coarse = np.zeros(maps.distance.shape, dtype=bool)
@@ -107,7 +127,7 @@ def make_masks(
         r = masking.ratio(masking.uncertainty(cosine), maps.entropy)
         coarse = masking.global_mask(r, config.box, config.spread, config.global_gate)
         coarse &= maps.distance > config.global_units
-    global_ = masking.enlarge(coarse, height, width)
+    global_ = masking.enlarge(coarse, height, width) & ~masking.local_mask(labels, static)
     final = masking.dilate(local | global_, config.dilation)
     keep = masking.keep_map(final, config.most, masking.enlarge(maps.distance, height, width))
     return Masks(local, global_, keep, judged, cut)

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
-from ambiguous_wild.methods.refinesplat.evidence import Judged, Masks, compare, make_masks, pooled
+from ambiguous_wild.methods.refinesplat.evidence import Judged, Masks, compare, make_masks, pooled, silence
 from ambiguous_wild.methods.refinesplat.inputs import FrozenInputs, prepare
 from ambiguous_wild.methods.refinesplat.losses import consistency_loss, identity_loss, instance_matrix
 from ambiguous_wild.methods.refinesplat.threshold import LearntWeight, robust_floor
@@ -123,8 +123,11 @@ class RefineSplatMask(MaskPolicy):
         image = _enlarge(step.rendered.image, self.data.photos[view])
         mask = self.config.mask
         maps = compare(inputs.phi[view], inputs.features(image), inputs.psi, inputs.features.unit, mask)
+        h, w = maps.distance.shape
+        alpha = F.adaptive_avg_pool2d(step.rendered.alpha[None, None], (h, w))[0, 0]
+        maps = silence(maps, (alpha < mask.least_alpha).cpu().numpy())
         others = [self.judged[v] for v in sorted(self.judged) if v != view]
-        return make_masks(maps, inputs.labels[view], inputs.counts[view], others, self.w2, mask)
+        return make_masks(maps, inputs.labels[view], inputs.static[view], others, self.w2, mask)
 
     def _learn(self, masks: Masks) -> None:
         """w2 from all instances; the price of a masked pixel is a robustly high residual."""

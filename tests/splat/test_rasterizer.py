@@ -1,15 +1,18 @@
 """The CPU kernels against the float64 reference, bit for bit across threads, and at the edges."""
 
 import dataclasses
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from ambiguous_wild.core import AwError, Camera
-from ambiguous_wild.splat.cpu import set_threads
-from ambiguous_wild.splat.cpu.compile import threads
 from ambiguous_wild.splat.cpu.render import render_cpu
+from ambiguous_wild.splat.cpu.warmup import warm_up
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.reference import render_reference
 
@@ -229,21 +232,43 @@ def test_a_stack_of_ten_thousand_on_one_pixel():
             assert torch.isfinite(getattr(grads, name)).all()
 
 
-def test_same_bits_for_one_two_and_four_threads():
+_BITS = """
+import dataclasses, hashlib
+from ambiguous_wild.splat.cpu import set_threads
+from ambiguous_wild.splat.cpu.render import render_cpu
+from ambiguous_wild.splat.losses import photometric
+from ambiguous_wild.splat.optim import SplatAdam
+from tests.splat.scenes import camera, cotangents, gaussians
+
+for n in (1, 2, 4):
+    set_threads(n)
     g, cam = gaussians(11, n=3000, size=-2.5), camera(70, 45, fx=60.0, fy=60.0)
-    d = cotangents(cam.height, cam.width)
-    before, seen = threads(), set()
-    try:
-        for n in (1, 2, 4):
-            set_threads(n)
-            rendered = render_cpu(g, cam)
-            grads = rendered.backward(**d, absolute=True)
-            parts = [rendered.image, rendered.alpha, rendered.depth, rendered.radii]
-            parts += [getattr(grads, f.name) for f in dataclasses.fields(grads)]
-            seen.add(b"".join(p.numpy().tobytes() for p in parts))
-    finally:
-        set_threads(before)
-    assert len(seen) == 1
+    optimiser = SplatAdam(g, {name: 1e-3 for name, _ in g.items()})
+    digest = hashlib.sha256()
+    for _ in range(3):
+        rendered = render_cpu(g, cam)
+        d = cotangents(cam.height, cam.width)
+        loss = photometric(rendered.image, d.pop("d_image"), d["d_alpha"].abs())
+        grads = rendered.backward(loss.d_image, **d, absolute=True)
+        optimiser.step(grads, rendered.visible)
+        parts = [rendered.image, rendered.alpha, rendered.depth, rendered.radii, loss.d_image]
+        parts += [getattr(grads, f.name) for f in dataclasses.fields(grads)] + [t for _, t in g.items()]
+        for part in parts:
+            digest.update(part.numpy().tobytes())
+        digest.update(str((loss.value, loss.l1, loss.dssim)).encode())
+    print(digest.hexdigest())
+"""
+
+
+def test_same_bits_for_one_two_and_four_threads():
+    root = Path(__file__).parents[2]
+    environment = os.environ | {"NUMBA_NUM_THREADS": "4", "PYTHONPATH": str(root)}
+    done = subprocess.run(
+        [sys.executable, "-c", _BITS], env=environment, cwd=root, capture_output=True, text=True, check=True
+    )
+    digests = done.stdout.split()
+    assert len(digests) == 3
+    assert len(set(digests)) == 1
 
 
 def test_the_second_cotangent_adds_and_is_told_apart():
@@ -308,3 +333,17 @@ def test_wrong_shapes_and_degrees_are_named():
         rendered.backward(torch.zeros(3, 3, 3))
     with pytest.raises(AwError, match="d_depth must be"):
         rendered.backward(torch.zeros_like(rendered.image), d_depth=torch.zeros(2, 2))
+
+
+def test_warming_up_says_so_only_where_kernels_are_missing(tmp_path):
+    warm_up()
+    said = []
+    warm_up(said.append)
+    assert said == []
+    done = subprocess.run(
+        [sys.executable, "-c", "from ambiguous_wild.splat.cpu.warmup import _cached; print(_cached())"],
+        env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.stdout.strip() == "False", done.stderr

@@ -314,6 +314,12 @@ def _backward_worker(
         left = tile % columns * TILE
         rows = min(TILE, height - top)
         across = min(TILE, width - left)
+        if rows < TILE or across < TILE:
+            # Pixels outside the picture meet weight 0, which only makes 0 of what is finite.
+            for plane in planes:
+                plane[:] = _ZERO
+            for plane in extra:
+                plane[:] = _ZERO
         for at in range(PIXELS):
             planes[0][at] = abs(kept[tile, 0, at])
             planes[1][at] = kept[tile, 1, at]

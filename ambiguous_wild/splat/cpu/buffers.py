@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-
 _LINE = 64  # bytes of a cache line; what starts on one is read and written in whole lines
 
 

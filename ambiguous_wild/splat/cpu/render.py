@@ -200,7 +200,7 @@ def render_cpu(
         records, tile_slots, starts, tile_order, threads(), width, height, behind, image, alpha, depth, kept
     )
     lists = _Lists(
-        cam, centre, sh_degree, antialias, behind, records, ids, counts, offsets, instances, starts, tile_order,
-        tile_slots, tile_instances, kept,
+        cam, centre, sh_degree, antialias, behind, records, ids, counts, offsets, instances, starts,
+        tile_order, tile_slots, tile_instances, kept,
     )  # fmt: skip
     return RenderedCpu(gaussians, camera, (image, alpha, depth, radii > 0, radii), lists)

@@ -131,9 +131,9 @@ def measure(n: int, width: int, height: int, runs: int) -> dict[str, Any]:
 def peak_memory(n: int, width: int, height: int) -> float:
     """Largest resident size, MiB, of a process that does three iterations (libraries included)."""
     code = (
-        f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); import rasterizer as r\n"
+        f"import resource, sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); import rasterizer as r\n"
         f"r.measure({n}, {width}, {height}, 1)\n"
-        "print(r.resource.getrusage(r.resource.RUSAGE_SELF).ru_maxrss / 1024)"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     return float(done.stdout.split()[-1])

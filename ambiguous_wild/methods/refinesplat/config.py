@@ -15,7 +15,15 @@ from ambiguous_wild.vision.segments import SegmentConfig
 
 @dataclass(frozen=True)
 class MaskConfig:
-    """From maps on the feature grid to M_final."""
+    """From maps on the feature grid to M_final.
+
+    Where a default is not the printed form, it was measured with weight-free features on 30 simulated photos
+    against renders of 3DGS after 300, 600 and 1500 iterations. Telling distractor instances from static ones
+    (AUC): mean entropy of the render, as printed, 0.40, 0.44, 0.45, worse than chance; contrast 0.976, 0.982,
+    0.984; evidence, its geometric mean with the distance, 0.974, 0.981, 0.983. Best IoU of whole instances:
+    0.72 to 0.79 with a threshold of the scene, which lies at 3 to 5 at every iteration. mean + var of U / H
+    flags nothing at all, mean + std has precision 0.86 to 0.92.
+    """
 
     variant: Variant = "softmax"  # of psi and its entropy; `sigmoid` is printed
     statistic: Statistic = "evidence"  # per instance; `entropy` is printed

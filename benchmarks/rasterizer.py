@@ -161,9 +161,7 @@ def machine() -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="5 runs, no memory measurement")
-    parser.add_argument(
-        "--json", type=Path, default=RESULTS, help="where the figures go"
-    )
+    parser.add_argument("--json", type=Path, default=RESULTS, help="where the figures go")
     args = parser.parse_args()
     warm_up(lambda text: print(text, file=sys.stderr))
     runs = 5 if args.quick else 30

@@ -1,8 +1,9 @@
 """How kernels are compiled: one place for the cache, the threads and the threading layer.
 
 The layer is OpenMP where Numba finds it, which shares two cores with torch's own pool without loss: a step
-of 11 ms and torch work of 7 ms took 20 ms one after the other. Numba's work queue took 35 to 80 ms: torch's threads wait on the core its worker needs. The queue, used where there is no OpenMP, allows one
-caller at a time, so parallel kernels run under a lock. OpenMP does not survive a fork: start processes anew.
+of 11 ms and torch work of 7 ms took 20 ms one after the other. Numba's work queue took 35 to 80 ms: torch's
+threads wait on the core its worker needs. The queue, used where there is no OpenMP, allows one caller at a
+time, so parallel kernels run under a lock. OpenMP does not survive a fork: start processes anew.
 """
 
 from __future__ import annotations

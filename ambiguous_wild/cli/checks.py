@@ -216,8 +216,9 @@ def _numba(found: Probe) -> list[Check]:
         return [Check("core", "numba", False, found.error, fix)]
     layer = f"{found.facts['threads']} threads, layer {found.facts['layer']}"
     checks = [Check("core", "numba", True, layer)]
-    explicit = os.environ.get("NUMBA_CACHE_DIR")
-    folder = Path(explicit) if explicit else PACKAGE / "splat" / "cpu" / "__pycache__"
+    from ambiguous_wild.splat.cpu.cache import kernel_cache
+
+    folder = kernel_cache()
     existing = next(p for p in (folder, *folder.parents) if p.exists())
     compiled = len(list(folder.rglob("*.nbi"))) if folder.is_dir() else 0
     state = (

@@ -32,7 +32,7 @@ class _LazyGroup(click.Group):
             return None
         return importlib.import_module(f"ambiguous_wild.cli.{COMMANDS[name][0]}").command
 
-    def resolve_command(self, ctx: click.Context, args: list[str]):  # type: ignore[no-untyped-def]
+    def resolve_command(self, ctx: click.Context, args: list[str]):
         if args and args[0] not in COMMANDS:
             raise unknown("command", args[0], COMMANDS, "'aw --help' lists them")
         return super().resolve_command(ctx, args)

@@ -24,7 +24,7 @@ from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.parts import NOMINAL_ITERATIONS, Parts, Step, TrainData
 from ambiguous_wild.splat.render import Rendered, render
-from ambiguous_wild.splat.resolution import FULL, ceiling_at, coarse_to_fine, divisor_at
+from ambiguous_wild.splat.resolution import FULL, Level, ceiling_at, coarse_to_fine, divisor_at
 
 COARSE_UNTIL = 0.4  # share of the run; measured on simulated captures, see docs/training.md
 TIMELINE_ROWS = 100
@@ -133,8 +133,8 @@ class Trainer:
     def _short(self) -> bool:
         return self.config.budget_s is not None or self.config.iterations < self.parts.schedule.short_below
 
-    def _levels(self):  # type: ignore[no-untyped-def]
-        wanted = self.config.resolution
+    def _levels(self) -> tuple[Level, ...]:
+        wanted: str = self.config.resolution
         if wanted == "auto":
             wanted = "coarse-to-fine" if self.config.budget_s is not None else self.parts.schedule.resolution
         if wanted == "full":

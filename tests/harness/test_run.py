@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from ambiguous_wild.harness.store import read_result
-from ambiguous_wild.io.ply import read_splat_ply
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.grid import cell_folder, plan_cells, run_cells
+from ambiguous_wild.harness.store import read_result
 from ambiguous_wild.io.images import read_gray, read_png_rgb
+from ambiguous_wild.io.ply import read_splat_ply
 from ambiguous_wild.methods import MethodEntry, register, registry
 from ambiguous_wild.metrics.image import psnr
 from ambiguous_wild.splat.parts import MaskPolicy, Parts

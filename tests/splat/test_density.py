@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from ambiguous_wild.splat.optim import SplatAdam
 
 from ambiguous_wild.splat.density import DensityConfig, DensityControl, rotation_matrices
 from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.render import Gradients
 
 RATES = {

@@ -11,11 +11,12 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numba
 from numba.extending import intrinsic as _intrinsic
+
+from ambiguous_wild.splat.cpu.cache import kernel_cache
 
 LAYERS = ["omp", "tbb", "workqueue"]  # the first that is there
 _config: Any = numba.config
@@ -23,11 +24,7 @@ _lock = threading.RLock()
 
 
 def _prepare() -> None:
-    package = Path(__file__).parent
-    if "NUMBA_CACHE_DIR" not in os.environ and not os.access(package, os.W_OK):
-        # Installed where this user may not write: keep the compiled code with the user's other caches.
-        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        _config.CACHE_DIR = str(base / "ambiguous_wild" / "kernels")
+    _config.CACHE_DIR = str(kernel_cache())
     if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:
         _config.THREADING_LAYER_PRIORITY = LAYERS
 

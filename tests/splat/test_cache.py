@@ -1,0 +1,43 @@
+"""Compiled kernels belong to exactly one state of their source."""
+
+import os
+import stat
+
+import pytest
+
+from ambiguous_wild.splat.cpu import cache
+
+
+@pytest.fixture
+def home(tmp_path, monkeypatch):
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return tmp_path
+
+
+def test_a_change_in_any_kernel_file_gives_another_folder(home, monkeypatch):
+    source = home / "cpu"
+    source.mkdir()
+    (source / "cache.py").write_text("x = 1\n")
+    (source / "simd.py").write_text("y = 1\n")
+    monkeypatch.setattr(cache, "__file__", str(source / "cache.py"))
+    before = cache.kernel_cache()
+    assert cache.kernel_cache() == before
+    assert before.is_relative_to(home / "cache")
+    (source / "simd.py").write_text("y = 2\n")
+    assert cache.kernel_cache() != before
+
+
+def test_the_users_own_folder_comes_first(home, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "/elsewhere")
+    assert str(cache.kernel_cache()) == "/elsewhere"
+
+
+def test_without_a_writable_home_a_private_temporary_folder_is_used(home, monkeypatch):
+    (home / "cache").write_text("a file where the folder should be")
+    monkeypatch.setattr(cache.tempfile, "tempdir", str(home))
+    folder = cache.kernel_cache().parent
+    assert folder == home / f"ambiguous_wild-{os.getuid()}"
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    folder.chmod(0o777)  # somebody else could plant code there now
+    assert cache.kernel_cache().parent != folder

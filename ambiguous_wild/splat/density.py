@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from ambiguous_wild.splat.optim import SplatAdam
     from ambiguous_wild.splat.parts import Step
 
+NOMINAL_ITERATIONS = 30_000  # every schedule is written for this length and scales with the run
+
 
 @dataclass(frozen=True)
 class DensityConfig:
@@ -29,7 +31,8 @@ class DensityConfig:
     every: float = 100.0
     min_every: int = 50  # a short run densifies less often, so that each decision averages enough views
     resets: tuple[float, ...] = (3000.0, 6000.0, 9000.0, 12_000.0)
-    min_reset_spacing: int = 1000  # real iterations a reset needs to heal before the next one
+    min_reset_spacing: int = 3000  # real iterations between resets, and before the first
+    min_reset_rest: int = 6000  # real iterations that must remain: a reset costs decibels until it heals
     grow_grad: float = 2e-4  # mean norm of dL/d(u, v), scaled to half the image size
     grow_scale: float = 0.01  # of the scene extent: clone below, split above
     prune_opacity: float = 0.005
@@ -120,7 +123,8 @@ class DensityControl:
         config = self.config
         while self.resets_done < len(config.resets) and step.nominal >= config.resets[self.resets_done]:
             self.resets_done += 1
-            if step.iteration - self.last_reset >= config.min_reset_spacing:
+            rest = step.iteration * (NOMINAL_ITERATIONS / step.nominal - 1.0)
+            if step.iteration - self.last_reset >= config.min_reset_spacing and rest >= config.min_reset_rest:
                 return True
         return False
 

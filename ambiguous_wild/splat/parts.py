@@ -14,13 +14,13 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import Camera, Scene
-from ambiguous_wild.splat.density import DensityConfig, DensityControl
+from ambiguous_wild.splat.density import NOMINAL_ITERATIONS, DensityConfig, DensityControl
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.render import Rendered
 
-State = dict[str, Any]  # nested dicts of tensors and plain values, see checkpoint.py
+__all__ = ["NOMINAL_ITERATIONS", "MaskPolicy", "Parts", "Schedule", "State", "Step", "TrainData"]
 
-NOMINAL_ITERATIONS = 30_000  # every schedule is written for this length and scales with the run
+State = dict[str, Any]  # nested dicts of tensors and plain values, see checkpoint.py
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,8 @@ class Schedule:
     lr_scales: float = 5e-3
     lr_quats: float = 1e-3
     sh_every: float = 1000.0  # one SH degree more each
-    short_below: int = 15_000  # iterations; a run of fewer uses the short-run rates
+    short_below: int = 15_000  # iterations; a run of fewer uses the short-run values
+    per_pixel_short: float = 1.0  # Gaussians per pixel of a photo at most, in short runs
     resolution: Literal["full", "coarse-to-fine"] = "full"
 
 

@@ -133,6 +133,20 @@ class Trainer:
     def _short(self) -> bool:
         return self.config.budget_s is not None or self.config.iterations < self.parts.schedule.short_below
 
+    def _most_gaussians(self) -> int:
+        """Growth ends here: a short run can neither afford nor settle more than the photos can tell apart.
+
+        Simulated courtyard at 240x135, 3000 iterations: 14 000, 20 000, 32 000 and 64 000 Gaussians gave
+        RefineSplat 30.3, 31.1, 31.3 and 30.7 dB at 9.5, 11.3, 13.6 and 19.6 ms an iteration.
+        """
+        if self.config.max_gaussians is not None:
+            return self.config.max_gaussians
+        most = self.parts.density_config.max_gaussians
+        if not self._short():
+            return most
+        pixels = float(np.median([photo.shape[0] * photo.shape[1] for photo in self.data.photos]))
+        return min(most, max(self.start_count, int(self.parts.schedule.per_pixel_short * pixels)))
+
     def _levels(self) -> tuple[Level, ...]:
         wanted: str = self.config.resolution
         if wanted == "auto":
@@ -187,7 +201,6 @@ class Trainer:
         divisor = divisor_at(self.levels, progress) if divisor is None else divisor
         camera = shrink_camera(self.data.cameras[view], divisor)
         nominal = progress * NOMINAL_ITERATIONS
-        most = self.config.max_gaussians or self.parts.density_config.max_gaussians
         with self.clock.part("render"):
             self.optimiser.prepare(camera)
             rendered = self.render(camera, nominal)
@@ -196,7 +209,7 @@ class Trainer:
             nominal=nominal,
             view=view,
             divisor=divisor,
-            ceiling=ceiling_at(self.start_count, most, divisor, progress, COARSE_UNTIL),
+            ceiling=ceiling_at(self.start_count, self._most_gaussians(), divisor, progress, COARSE_UNTIL),
             photo=self._photo(view, divisor),
             camera=camera,
             rendered=rendered,

@@ -139,17 +139,29 @@ def test_non_finite_rows_are_removed():
     assert torch.isfinite(after.means).all()
 
 
-def test_opacity_resets_fire_once_each_and_never_too_close():
+def resets_of_a_run(iterations: int) -> tuple[list[int], Gaussians]:
     gaussians = model()
-    config = DensityConfig(start=1e9, stop=1e9, min_reset_spacing=1000)
-    density, optimiser = DensityControl(config, extent=1.0, seed=0), SplatAdam(gaussians, RATES)
-    fired = []
-    for iteration in range(1, 6000, 10):
-        # a run of 6000 iterations: nominal time runs five times faster
-        _, events = density.refine(step_at(gaussians, iteration, iteration * 5.0), gaussians, optimiser)
+    density = DensityControl(DensityConfig(start=1e9, stop=1e9), extent=1.0, seed=0)
+    optimiser, fired = SplatAdam(gaussians, RATES), []
+    for iteration in range(50, iterations + 1, 50):
+        step = step_at(gaussians, iteration, iteration * 30_000 / iterations)
+        _, events = density.refine(step, gaussians, optimiser)
         fired += [iteration] if "reset" in events else []
-    assert [round(i, -2) for i in fired] == [1200, 2400]
+    return fired, gaussians
+
+
+def test_opacity_resets_fire_as_published_in_a_run_of_full_length():
+    fired, gaussians = resets_of_a_run(30_000)
+    assert fired == [3000, 6000, 9000, 12_000]
     assert torch.sigmoid(gaussians.opacity_logits).max() <= 0.01 + 1e-6
+
+
+def test_opacity_resets_keep_apart_and_leave_time_to_heal():
+    assert resets_of_a_run(15_000)[0] == [3000, 6000]
+    assert resets_of_a_run(10_000)[0] == [3000]
+    fired, gaussians = resets_of_a_run(3000)
+    assert fired == []
+    assert torch.sigmoid(gaussians.opacity_logits).min() > 0.09
 
 
 def test_state_goes_on_with_the_same_random_numbers():

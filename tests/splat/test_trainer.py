@@ -271,6 +271,13 @@ def test_the_count_ceiling_rises_with_the_resolution():
     assert values[-1] == 50_000
 
 
+def test_a_short_run_grows_no_more_than_a_gaussian_a_pixel(scene, tmp_path):
+    pixels = 64 * 48
+    assert trainer_for(scene, tmp_path, iterations=100)._most_gaussians() == pixels
+    assert trainer_for(scene, tmp_path, iterations=30_000)._most_gaussians() == 1_000_000
+    assert trainer_for(scene, tmp_path, iterations=100, max_gaussians=500)._most_gaussians() == 500
+
+
 def test_shrinking_averages_photos_and_keeps_only_whole_blocks():
     photo = torch.arange(4 * 6 * 3, dtype=torch.float32).reshape(4, 6, 3)
     small = shrink(photo, 2)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.core.extras import install_command
 
 if TYPE_CHECKING:
     from ambiguous_wild.harness.run import Cell, CellReport
@@ -170,9 +171,7 @@ def choose_device(device: str) -> str:
         return "cuda"
     if device == "auto":
         return "cpu"
-    what = (
-        "torch sees no GPU" if not has_gpu else "gsplat is not installed: pip install 'ambiguous-wild[cuda]'"
-    )
+    what = "torch sees no GPU" if not has_gpu else f"gsplat is not installed: {install_command('cuda')}"
     raise AwError(f"--device cuda: {what}; 'aw doctor' tells more, --device cpu runs without")
 
 

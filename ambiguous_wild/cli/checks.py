@@ -1,6 +1,6 @@
 """What `aw doctor` looks at: each check says what it found and, where something lacks, what brings it.
 
-Nothing heavy is imported here. What may crash or hang (torch, torchvision, pycolmap) is tried in a process
+Nothing heavy is imported with this module. What may crash or hang (torch, torchvision, pycolmap) is tried in a process
 of its own, all of them at the same time.
 """
 
@@ -19,6 +19,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
+
+from ambiguous_wild.core.extras import install_command
 
 PACKAGE = Path(__file__).resolve().parent.parent
 DISTRIBUTION = "ambiguous-wild"
@@ -240,7 +242,7 @@ def _gpu(torch: Probe) -> list[Check]:
         Check("optional", "torch cuda", cuda, *_cuda_words(torch, driver is not None)),
     ]  # fmt: skip
     version = installed("gsplat")
-    fix = "" if version else "pip install 'ambiguous-wild[cuda]'"
+    fix = "" if version else install_command("cuda")
     checks.append(
         Check("optional", "gsplat", version is not None, version or "absent: no GPU rendering", fix)
     )
@@ -268,7 +270,7 @@ def _extras() -> list[Check]:
     checks = []
     for extra, (package, use) in uses.items():
         version = installed(package)
-        fix = "" if version else f"pip install 'ambiguous-wild[{extra}]'"
+        fix = "" if version else install_command(extra)
         detail = f"{version or 'absent'} ({use})"
         checks.append(Check("optional", package, version is not None, detail, fix))
     return checks

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError, Camera
+from ambiguous_wild.core.extras import install_command
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.render import Gradients
 
@@ -24,7 +25,7 @@ def _gsplat() -> Any:
         import gsplat
     except ImportError:
         raise AwError(
-            "the Gaussians are on a GPU and gsplat is not installed: pip install 'ambiguous-wild[cuda]', "
+            f"the Gaussians are on a GPU and gsplat is not installed: {install_command('cuda')}, "
             "or run with --device cpu"
         ) from None
     return gsplat

@@ -20,8 +20,18 @@ import click
     "--metric", "metrics", multiple=True, help="Only this column; repeatable.  [default: all measured]"
 )
 @click.option("--scene", "scenes", multiple=True, help="Only this scene; repeatable.  [default: all]")
+@click.option(
+    "--sheet",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Also write a PNG: test renders side by side, and what each method masks.",
+)
 def command(
-    runs: Path, style: str, output: Path | None, metrics: tuple[str, ...], scenes: tuple[str, ...]
+    runs: Path,
+    style: str,
+    output: Path | None,
+    metrics: tuple[str, ...],
+    scenes: tuple[str, ...],
+    sheet: Path | None,
 ) -> None:
     """Compare the runs below the folder RUNS: quality, cost and masks, method by method.
 
@@ -37,7 +47,13 @@ def command(
     from ambiguous_wild.harness.tables import comparison
     from ambiguous_wild.io.atomic import write_text
 
-    table = comparison(read_runs(runs), metrics=metrics, scenes=scenes)
+    found = read_runs(runs)
+    table = comparison(found, metrics=metrics, scenes=scenes)
+    if sheet is not None:
+        from ambiguous_wild.harness.sheet import write_sheet
+
+        shown = write_sheet(found, sheet, scene=scenes[0] if scenes else None)
+        click.echo(f"wrote {sheet}: {shown} methods side by side", err=True)
     made_by = "made by: " + command_line(runs, style, metrics, scenes)
     if style == "csv":
         for note in (*table.notes, made_by):

@@ -53,17 +53,23 @@ class Cell:
             "method": self.method.name,
             "options": to_plain(self.options),
             "train": train,
-            "scene": {"name": self.scene.name, "sha256": self.scene_id},
+            "scene": {
+                "name": self.scene.name,
+                "sha256": self.scene_id,
+                "factor": self.scene.info.get("loaded_factor"),
+                "path": str(self.scene.root.resolve()),
+            },
             "device": self.device,
             "version": __version__,
         }
 
     @property
     def identity(self) -> str:
-        """Hash of everything that decides the result; how often it is saved does not."""
+        """Hash of what decides the result: not how often it is saved, nor where the scene lies."""
         config = self.config
+        scene = {k: v for k, v in config["scene"].items() if k != "path"}
         train = {k: v for k, v in config["train"].items() if k not in ("checkpoint_every_s", "probes")}
-        return config_hash(config | {"train": train})
+        return config_hash(config | {"train": train, "scene": scene})
 
 
 @dataclass
@@ -131,7 +137,7 @@ def refuse_other_config(folder: Path, cell: Cell) -> None:
         raise AwError(f"{path} is damaged ({error}); start anew with --overwrite always") from None
     if old.get("config_hash") == cell.identity:
         return
-    ignored = {"train.checkpoint_every_s", "train.probes", "config_hash"}
+    ignored = {"train.checkpoint_every_s", "train.probes", "scene.path", "config_hash"}
     before, now = _flat(old), _flat(cell.config)
     names = [
         k for k in sorted(before.keys() | now.keys()) if before.get(k) != now.get(k) and k not in ignored

@@ -1,0 +1,118 @@
+"""One picture that compares runs: test renders beside the photo, and what each method masks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import yaml
+
+from ambiguous_wild.core import AwError, Scene, View
+from ambiguous_wild.harness.store import Runs
+from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
+from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.metrics.image import psnr
+
+GAP, BAR = 6, 22  # px between cells; height of a caption
+TINT = np.array([255, 30, 30], np.float32)  # of what is masked, sRGB
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A picture and what stands above it."""
+
+    caption: str
+    image: np.ndarray  # [H, W, 3] uint8
+
+
+def write_sheet(runs: Runs, path: Path, *, scene: str | None = None, views: int = 3) -> int:
+    """Write the sheet of one scene: a column a method (first seed), `views` test and train rows.
+
+    Args:
+        runs: what `read_runs` found.
+        path: PNG to write.
+        scene: its name; None where the runs are of one scene only.
+        views: rows of each kind.
+
+    Returns:
+        The number of methods shown.
+
+    Raises:
+        AwError: several scenes and none named, no finished run, or the scene folder has moved.
+    """
+    finished = runs.runs[runs.runs["status"] == "ok"]
+    names = sorted(finished["scene"].unique())
+    if scene is None and len(names) > 1:
+        raise AwError(f"runs of {len(names)} scenes: name one with --scene ({', '.join(names)})")
+    chosen = finished if scene is None else finished[finished["scene"] == scene]
+    if chosen.empty:
+        raise AwError("no finished run to show; 'aw table' lists what is there")
+    first = chosen.sort_values("seed").drop_duplicates("method").sort_values("method")
+    folders = {str(row.method): Path(str(row.folder)) for row in first.itertuples()}
+    source = _scene_of(next(iter(folders.values())))
+    rows = [_test_row(view, folders) for view in _spread(source.test, views)]
+    rows += [_train_row(view, folders) for view in _spread(source.train, views)]
+    write_png(path, _stack(rows))
+    return len(folders)
+
+
+def _scene_of(folder: Path) -> Scene:
+    config = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
+    where = config["scene"].get("path") if isinstance(config, dict) else None
+    if not where or not Path(where).is_dir():
+        raise AwError(f"{folder} was trained on {where}, which is not there any more: move the scene back")
+    width_of = load_scene(where, verify=False)
+    # The run may have used another factor than the scene's own; its renders tell which.
+    factor = config["scene"].get("factor")
+    return width_of if factor in (None, width_of.info["loaded_factor"]) else load_scene(where, factor=factor)
+
+
+def _spread(views: tuple[View, ...], count: int) -> list[View]:
+    if not views:
+        return []
+    index = np.unique(np.linspace(0, len(views) - 1, min(count, len(views))).round().astype(int))
+    return [views[i] for i in index]
+
+
+def _test_row(view: View, folders: dict[str, Path]) -> list[Cell]:
+    photo = read_png_rgb(view.image_path)
+    cells = [Cell(f"test photo {view.name}", photo)]
+    for method, folder in folders.items():
+        render = read_png_rgb(folder / "renders" / "test" / Path(view.name).with_suffix(".png"))
+        cells.append(Cell(f"{method}  {psnr(render, photo):.2f} dB", render))
+    return cells
+
+
+def _train_row(view: View, folders: dict[str, Path]) -> list[Cell]:
+    photo = read_png_rgb(view.image_path)
+    cells = [Cell(f"train photo {view.name}", photo)]
+    for method, folder in folders.items():
+        path = folder / "masks" / Path(view.name).with_suffix(".png")
+        if not path.is_file():
+            cells.append(Cell(f"{method}  masks nothing", photo))
+            continue
+        masked = read_gray(path) < 128
+        shown = photo.astype(np.float32)
+        shown[masked] = 0.45 * shown[masked] + 0.55 * TINT
+        cells.append(Cell(f"{method}  masks {100 * masked.mean():.0f} %", shown.astype(np.uint8)))
+    return cells
+
+
+def _stack(rows: list[list[Cell]]) -> np.ndarray:
+    width = max(cell.image.shape[1] for row in rows for cell in row)
+    lines = []
+    for row in rows:
+        height = max(cell.image.shape[0] for cell in row)
+        lines.append(np.hstack([_framed(cell, width, height) for cell in row]))
+    return np.vstack(lines)
+
+
+def _framed(cell: Cell, width: int, height: int) -> np.ndarray:
+    frame = np.full((height + BAR + GAP, width + GAP, 3), 255, np.uint8)
+    frame[BAR : BAR + cell.image.shape[0], : cell.image.shape[1]] = cell.image
+    # The field's names are ASCII; anything else would be drawn as question marks.
+    text = cell.caption.encode("ascii", "replace").decode()
+    cv2.putText(frame, text, (2, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (20, 20, 20), 1, cv2.LINE_AA)
+    return frame

@@ -1,0 +1,42 @@
+"""The picture that compares runs."""
+
+import numpy as np
+import pytest
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.grid import plan_cells, run_cells
+from ambiguous_wild.harness.sheet import BAR, GAP, write_sheet
+from ambiguous_wild.harness.store import read_runs
+from ambiguous_wild.io.images import read_png_rgb
+from ambiguous_wild.splat.trainer import TrainConfig
+from tests.tiny_scene import HEIGHT, WIDTH, write_tiny_scene
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("sheet")
+    scene = write_tiny_scene(folder / "scene")
+    run_cells(plan_cells(["3dgs"], [scene], [0], TrainConfig(iterations=20, probes=0)), folder / "runs")
+    return folder / "runs"
+
+
+def test_a_column_for_the_photo_and_each_method_a_row_for_each_view(runs, tmp_path):
+    assert write_sheet(read_runs(runs), tmp_path / "sheet.png", views=2) == 1
+    sheet = read_png_rgb(tmp_path / "sheet.png")
+    assert sheet.shape == (4 * (HEIGHT + BAR + GAP), 2 * (WIDTH + GAP), 3)
+    photo = read_png_rgb(runs.parent / "scene" / "images" / "test_0.png")
+    render = read_png_rgb(runs / "scene" / "3dgs" / "seed0" / "renders" / "test" / "test_0.png")
+    assert np.array_equal(sheet[BAR : BAR + HEIGHT, :WIDTH], photo)
+    assert np.array_equal(sheet[BAR : BAR + HEIGHT, WIDTH + GAP : 2 * WIDTH + GAP], render)
+
+
+def test_a_scene_that_is_not_there_is_named(runs, tmp_path):
+    with pytest.raises(AwError, match="no finished run"):
+        write_sheet(read_runs(runs), tmp_path / "sheet.png", scene="elsewhere")
+    moved = runs.parent / "moved"
+    (runs.parent / "scene").rename(moved)
+    try:
+        with pytest.raises(AwError, match="move the scene back"):
+            write_sheet(read_runs(runs), tmp_path / "sheet.png")
+    finally:
+        moved.rename(runs.parent / "scene")

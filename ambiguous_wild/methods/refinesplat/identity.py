@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +21,6 @@ class PsiConfig:
     steps: int = 1000  # Adam steps
     batch: int = 1024  # cells a step
     rate: float = 3e-3  # Adam's, decayed to a tenth by a cosine
-    seconds: float = 30.0  # no psi trains longer; the cap is a safeguard, never the plan
 
 
 class Psi(nn.Module):
@@ -80,16 +78,13 @@ def train_psi(
             psi.last.bias.fill_(-3.0)  # most identities are absent from most cells
     optimiser = torch.optim.Adam(psi.parameters(), lr=config.rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, config.steps, config.rate / 10)
-    started = time.monotonic()
-    for step in range(config.steps):
+    for _ in range(config.steps):
         rows = torch.randint(len(features), (config.batch,), generator=generator)
         loss = _loss(psi(features[rows]), identities[rows], variant)
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         optimiser.step()
         schedule.step()
-        if step % 50 == 49 and time.monotonic() - started > config.seconds:
-            break
     return psi.requires_grad_(False).eval()
 
 

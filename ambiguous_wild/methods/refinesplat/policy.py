@@ -171,7 +171,7 @@ class RefineSplatMask(MaskPolicy):
             },
             "theta": self.weight.theta,
             "last_reset": self.last_reset,
-            # psi's training stops at a wall-clock cap: another machine must go on with the same one
+            # the last bits of psi's training may differ on another machine: a run goes on with the same one
             "psi": None if psi is None else dict(psi.state_dict()),
         }
 

@@ -34,7 +34,7 @@ def command(
     loaded = load_scene(scene)
     found = ambiguity.find_masks(loaded, masks)
     measured = ambiguity.measure(
-        loaded, found, lambda v: tqdm(v, unit="photo", desc="measure", disable=as_json)
+        loaded, found, lambda v: tqdm(v, unit="photo", desc="measure", disable=as_json or None)
     )
     summary = ambiguity.summarise(loaded, measured, seed)
     folder = out or scene.resolve().parent / f"{scene.resolve().name}-ambiguity"

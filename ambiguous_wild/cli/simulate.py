@@ -54,7 +54,7 @@ def command(
     from ambiguous_wild.simulate.capture import simulate
 
     def bar(shots: list) -> tqdm:
-        return tqdm(shots, unit="photo", desc=f"simulate {name}", disable=as_json)
+        return tqdm(shots, unit="photo", desc=f"simulate {name}", disable=as_json or None)
 
     facts = simulate(spec, out, seed, depth, overwrite, bar)
     if as_json:

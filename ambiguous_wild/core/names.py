@@ -1,0 +1,43 @@
+"""What a name may be, where it is printed, written into tables and used as part of a path."""
+
+from __future__ import annotations
+
+import unicodedata
+
+from ambiguous_wild.core.errors import AwError
+
+LONGEST = 100  # bytes of UTF-8; file systems allow 255, and suffixes are added to names
+
+
+def check_name(kind: str, name: str) -> str:
+    """The name, stripped of surrounding blanks, where it is fit to print and to be part of a path.
+
+    Args:
+        kind: what is named, for the error, e.g. ``"scene name"``.
+        name: as it was given.
+
+    Raises:
+        AwError: empty, longer than 100 bytes, starting with a dot, or holding ``/``, ``\\`` or a character
+            that cannot be printed (control characters, text-direction marks, lone surrogates).
+    """
+    stripped = name.strip()
+    size = len(stripped.encode("utf-8", errors="replace"))
+    if not stripped:
+        raise AwError(f"the {kind} is empty; give it at least one letter")
+    bad = next((c for c in stripped if c in "/\\" or _unprintable(c)), None)
+    if bad is not None:
+        raise AwError(f"{kind} {_short(stripped)} holds {bad!a}; leave out '/', '\\' and control characters")
+    if stripped.startswith("."):
+        raise AwError(f"{kind} {_short(stripped)} starts with a dot, which hides files; leave out the dot")
+    if size > LONGEST:
+        raise AwError(f"{kind} {_short(stripped)} has {size} bytes; at most {LONGEST} are allowed")
+    return stripped
+
+
+def _unprintable(char: str) -> bool:
+    """Control, format and surrogate characters, and line and paragraph separators."""
+    return unicodedata.category(char) in ("Cc", "Cf", "Cs", "Zl", "Zp")
+
+
+def _short(name: str) -> str:
+    return ascii(name if len(name) <= 40 else name[:37] + "...")

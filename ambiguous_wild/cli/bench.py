@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 import re
+import shlex
 import sys
 from collections import Counter
 from pathlib import Path
@@ -29,7 +31,7 @@ def parse_budget(text: str) -> float:
     """
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*(s|m|min|h)\s*", text)
     if not match or float(match[1]) <= 0:
-        raise AwError(f"budget {text!r} is no duration: write 90s, 10m or 1.5h")
+        raise AwError(f"budget {text!r} is no duration above zero: write 90s, 10m or 1.5h")
     return float(match[1]) * _UNITS[match[2]]
 
 
@@ -43,7 +45,15 @@ def parse_budget(text: str) -> float:
     type=click.Path(path_type=Path),
     help="A scene folder; repeatable.",
 )
-@click.option("--seed", "seeds", multiple=True, type=int, default=(0,), show_default=True, help="Repeatable.")
+@click.option(
+    "--seed",
+    "seeds",
+    multiple=True,
+    type=click.IntRange(0),
+    default=(0,),
+    show_default=True,
+    help="Repeatable.",
+)
 @click.option("--iterations", type=click.IntRange(1), help="Length of the training.  [default: 30000]")
 @click.option("--budget", help="Training time instead: 90s, 10m, 1.5h. Schedules scale with it.")
 @click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True)
@@ -118,6 +128,8 @@ def command(
     if iterations is not None and budget is not None:
         raise AwError("--iterations and --budget exclude each other: a run is as long as one of them says")
     seconds = None if budget is None else parse_budget(budget)
+    if math.isnan(checkpoint_every):
+        raise AwError("--checkpoint-every nan: give a number of seconds")
 
     from ambiguous_wild.methods.registry import get_method, load_plugin
 
@@ -223,7 +235,8 @@ class _Progress:
         if self.bar is not None:
             self.bar.close()
             self.bar = None
-        click.echo(f"    {_outcome_line(report)}", err=True)
+        if report.outcome != "failed" or self.cells > 1:  # a single failure is the command's one error line
+            click.echo(f"    {_outcome_line(report)}", err=True)
 
 
 def _outcome_line(report: CellReport) -> str:
@@ -248,9 +261,10 @@ def _finish(reports: list[CellReport], output: Path, as_json: bool) -> None:
     if as_json:
         rows = [{"folder": str(r.folder), "outcome": r.outcome, "error": r.error or None} for r in reports]
         click.echo(json.dumps(rows, indent=2))
-    click.echo(f"{len(reports)} runs: {summary}; compare them with: aw table {output}", err=True)
     failed = [report for report in reports if report.outcome == "failed"]
     if len(failed) == len(reports) == 1:
         raise AwError(failed[0].error)
+    compare = f"compare them with: aw table {shlex.quote(str(output))}"
+    click.echo(f"{len(reports)} run{'s' if len(reports) > 1 else ''}: {summary}; {compare}", err=True)
     if failed:
         raise AwError(f"{len(failed)} of {len(reports)} runs failed: " + failed[0].error)

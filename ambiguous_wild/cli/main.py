@@ -72,6 +72,9 @@ def main() -> None:
         # The reader of our output left (`aw table | head`): not an error of ours.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)
+    except OSError as error:
+        # Disk full, no permission, a file where a folder is needed: the user's to mend, in one line.
+        _fail(f"{error.filename or 'input or output'}: {error.strerror or error}")
 
 
 def _click_message(error: click.ClickException) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 import types
 import typing
 from collections.abc import Mapping
@@ -120,6 +121,8 @@ def _coerce(hint: Any, value: Any, where: str) -> Any:
     if origin in (dict, Mapping) or hint in (dict, Any):
         return value
     if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+        if not math.isfinite(value):
+            raise AwError(f"{where}: expected a finite number, got {value}")
         return float(value)
     if hint is int and isinstance(value, float) and value.is_integer():
         return int(value)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import traceback
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,16 +11,15 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import with_options
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.harness.run import (
-    RESULT,
     Cell,
     CellReport,
     Overwrite,
-    failed_result,
+    error_line,
     refuse_other_config,
+    refuse_strange_folder,
     run_cell,
     scene_identity,
 )
-from ambiguous_wild.harness.store import write_result
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.registry import get_method
 from ambiguous_wild.splat.trainer import TrainConfig
@@ -53,7 +51,8 @@ def plan_cells(
     """
     by_method = _settings_by_method(settings, methods)
     entries = [(get_method(name), by_method.get(name, {})) for name in dict.fromkeys(methods)]
-    loaded = [load_scene(path, factor=factor) for path in scenes]
+    distinct = list({path.resolve(): path for path in scenes}.values())
+    loaded = [load_scene(path, factor=factor) for path in distinct]
     names = [scene.name for scene in loaded]
     twice = {name for name in names if names.count(name) > 1}
     if twice:
@@ -106,15 +105,19 @@ def run_cells(
         AwError: a run folder holds another configuration (found before anything is trained).
     """
     folders = [cell_folder(output, cell) for cell in cells]
-    if overwrite == "missing":
-        for cell, folder in zip(cells, folders):
-            if folder.exists():
+    cache_dir = cache_dir or output / ".cache"
+    for cell, folder in zip(cells, folders):
+        if folder.exists() and overwrite != "never":
+            refuse_strange_folder(folder)
+            if overwrite == "missing":
                 refuse_other_config(folder, cell)
+    for needed in (output, cache_dir):
+        needed.mkdir(parents=True, exist_ok=True)  # what cannot be written is found before it is needed
     reports = []
     for cell, folder in zip(cells, folders):
         if on_start is not None:
             on_start(cell, folder)
-        report = _isolated(cell, folder, cache_dir or output / ".cache", overwrite, tick)
+        report = _isolated(cell, folder, cache_dir, overwrite, tick)
         if on_end is not None:
             on_end(cell, report)
         reports.append(report)
@@ -126,13 +129,5 @@ def _isolated(
 ) -> CellReport:
     try:
         return run_cell(cell, folder, cache_dir=cache_dir, overwrite=overwrite, tick=tick)
-    except AwError as error:
-        message = str(error)
     except Exception as error:
-        # Ours, not the user's: the whole story goes beside the run, one line into the table.
-        message = f"{type(error).__name__}: {error}"
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "traceback.txt").write_text(traceback.format_exc(), encoding="utf-8")
-    if not (folder / RESULT).exists() and (folder / "config.yaml").exists():
-        write_result(folder / "failed.json", failed_result(cell, message))
-    return CellReport(folder, "failed", error=message)
+        return CellReport(folder, "failed", error=error_line(error))

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import resource
 import shutil
-import sys
 import time
+import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,7 +20,8 @@ from ambiguous_wild.core import AwError, Camera, Scene
 from ambiguous_wild.core.config import config_hash, to_plain
 from ambiguous_wild.harness import evaluate
 from ambiguous_wild.harness.environment import environment
-from ambiguous_wild.harness.store import write_result
+from ambiguous_wild.harness.memory import peak_rss_mb, reset_peak
+from ambiguous_wild.harness.store import read_result, write_result
 from ambiguous_wild.io.atomic import sweep, write_json, write_text
 from ambiguous_wild.io.lock import folder_lock
 from ambiguous_wild.io.ply import write_splat_ply
@@ -32,6 +32,10 @@ from ambiguous_wild.splat.trainer import TrainConfig, Trainer
 Overwrite = Literal["never", "missing", "always"]
 Outcome = Literal["trained", "kept", "skipped", "failed"]
 RESULT = "metrics.json"
+FAILED = "failed.json"
+TRACEBACK = "traceback.txt"
+# What a run leaves before anything worth keeping exists in its folder.
+_WORTHLESS = {"config.yaml", "env.json", FAILED, TRACEBACK}
 
 
 @dataclass(frozen=True)
@@ -51,6 +55,7 @@ class Cell:
         train = to_plain(self.train)
         return {
             "method": self.method.name,
+            "source": self.method.source_hash,
             "options": to_plain(self.options),
             "train": train,
             "scene": {
@@ -106,34 +111,78 @@ def run_cell(
     if folder.exists() and overwrite == "never":
         return CellReport(folder, "skipped")
     with folder_lock(folder, f"aw bench --method {cell.method.name}"):
-        if overwrite == "always" and folder.exists():
-            shutil.rmtree(folder)
-        elif folder.exists():
-            refuse_other_config(folder, cell)
-            if (folder / RESULT).exists():
-                return CellReport(folder, "kept")
+        if folder.exists():
+            refuse_strange_folder(folder)
+            if overwrite == "always":
+                shutil.rmtree(folder)
+            else:
+                refuse_other_config(folder, cell)
+                if _finished(folder):
+                    return CellReport(folder, "kept")
         folder.mkdir(parents=True, exist_ok=True)
         sweep(folder)
+        for name in (FAILED, TRACEBACK):
+            (folder / name).unlink(missing_ok=True)
         config = cell.config | {"config_hash": cell.identity}
         write_text(folder / "config.yaml", yaml.safe_dump(config, sort_keys=False, allow_unicode=True))
         write_json(folder / "env.json", environment(cell.device))
-        result = _train_and_measure(cell, folder, cache_dir, tick)
+        try:
+            result = _train_and_measure(cell, folder, cache_dir, tick)
+        except Exception as error:
+            _record_failure(cell, folder, error)
+            raise
         write_result(folder / RESULT, result)
     return CellReport(folder, "trained", result=result)
+
+
+def _finished(folder: Path) -> bool:
+    """Whether the folder has a result that can be read; a damaged one is made again."""
+    if not (folder / RESULT).is_file():
+        return False
+    try:
+        read_result(folder / RESULT)
+    except AwError:
+        return False
+    return True
+
+
+def _record_failure(cell: Cell, folder: Path, error: Exception) -> None:
+    """A run that failed says so in its folder: its error is its result."""
+    if not isinstance(error, (AwError, OSError)):
+        # Ours, not the user's: the whole story goes beside the run, one line into the table.
+        write_text(folder / TRACEBACK, "".join(traceback.format_exception(error)))
+    write_result(folder / FAILED, failed_result(cell, error_line(error)))
+
+
+def error_line(error: Exception) -> str:
+    """One line that says what went wrong."""
+    if isinstance(error, AwError):
+        return str(error)
+    if isinstance(error, OSError):
+        return f"{error.filename or 'input or output'}: {error.strerror or error}"
+    return f"{type(error).__name__}: {error}"
+
+
+def refuse_strange_folder(folder: Path) -> None:
+    """Raise AwError if the folder holds something and no run of ours: it is somebody's."""
+    if not folder.is_dir():
+        raise AwError(f"{folder} is a file, not a run folder; choose another -o")
+    names = {p.name for p in folder.iterdir() if not p.name.startswith(".")}
+    if names and not names & {"config.yaml", RESULT, FAILED, TRACEBACK}:
+        raise AwError(f"{folder} is not empty and no run of ours (no config.yaml); choose another -o")
 
 
 def refuse_other_config(folder: Path, cell: Cell) -> None:
     """Raise AwError if the folder was made by another configuration; names the keys that differ."""
     path = folder / "config.yaml"
-    if not path.exists():
-        if any(folder.iterdir()):
-            raise AwError(f"{folder} is not empty and no run of ours (no config.yaml); choose another -o")
-        return
+    present = {p.name for p in folder.iterdir() if not p.name.startswith(".")}
+    if not path.exists() or present <= _WORTHLESS:
+        return  # it stopped before the first checkpoint: there is nothing to lose
     try:
         old = yaml.safe_load(path.read_text(encoding="utf-8"))
         if not isinstance(old, dict):
             raise ValueError("not a mapping")
-    except (yaml.YAMLError, ValueError) as error:
+    except (yaml.YAMLError, ValueError, OSError) as error:
         raise AwError(f"{path} is damaged ({error}); start anew with --overwrite always") from None
     if old.get("config_hash") == cell.identity:
         return
@@ -162,6 +211,7 @@ def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 def _train_and_measure(
     cell: Cell, folder: Path, cache_dir: Path, tick: Callable[[Trainer], None] | None
 ) -> dict[str, Any]:
+    reset_peak()
     device = torch.device(cell.device)
     data = load_train_data(cell.scene, device=device, seed=cell.train.seed, cache_dir=cache_dir)
     parts = cell.method.build(cell.options)
@@ -173,9 +223,10 @@ def _train_and_measure(
     before = time.perf_counter()
     trainer = Trainer(data, parts, cell.train, folder=folder, probe=probe if truth else None)
     # Frozen inputs, instance masks and identities are part of what a method costs.
-    setup_s = time.perf_counter() - before
+    trainer.setup_s = time.perf_counter() - before
     trainer.resume()
     trainer.train(tick=tick)
+    cost = _cost(cell, trainer)  # now: what follows measures, and is no training
 
     write_splat_ply(folder / "point_cloud.ply", {k: v.cpu().numpy() for k, v in trainer.gaussians.items()})
     per_image, missing = evaluate.render_and_measure(trainer, truth, folder / "renders" / "test")
@@ -192,33 +243,30 @@ def _train_and_measure(
         "missing": missing,
         "masks": masks,
         "facts": trainer.parts.mask.facts() | {"skipped_views": trainer.skipped_views},
-        "cost": _cost(cell, trainer, folder, setup_s),
+        "cost": cost
+        | {
+            "fps": evaluate.frames_per_second(trainer),
+            "model_mb": (folder / "point_cloud.ply").stat().st_size / 1e6,
+        },
         "config_hash": cell.identity,
         "scene_hash": cell.scene_id,
         "version": __version__,
     }
 
 
-def _cost(cell: Cell, trainer: Trainer, folder: Path, setup_s: float) -> dict[str, Any]:
+def _cost(cell: Cell, trainer: Trainer) -> dict[str, Any]:
     n = max(trainer.iteration, 1)
     return {
         "train_s": trainer.clock.now(),
-        "setup_s": setup_s,
+        "setup_s": trainer.setup_s,
         "iterations": trainer.iteration,
         "ms_per_iteration": trainer.ms_per_iteration,
         "ms_parts": {name: 1e3 * seconds / n for name, seconds in trainer.clock.parts_s.items()},
-        "fps": evaluate.frames_per_second(trainer),
         "gaussians": len(trainer.gaussians),
-        "model_mb": (folder / "point_cloud.ply").stat().st_size / 1e6,
-        "peak_rss_mb": _peak_rss_mb(),
+        "peak_rss_mb": peak_rss_mb(),
         "device": cell.device,
         "threads": _threads(),
     }
-
-
-def _peak_rss_mb() -> float:
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / 1e6 if sys.platform == "darwin" else peak / 1e3  # bytes there, kB elsewhere
 
 
 def _threads() -> int:

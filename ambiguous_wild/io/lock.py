@@ -11,6 +11,10 @@ from pathlib import Path
 from ambiguous_wild.core.errors import AwError
 
 
+class Busy(AwError):
+    """Another process works on the folder: nothing in it may be touched."""
+
+
 @contextmanager
 def folder_lock(folder: Path | str, doing: str) -> Iterator[None]:
     """Hold `.<name>.lock` beside the folder; the kernel frees it even after kill -9.
@@ -20,24 +24,38 @@ def folder_lock(folder: Path | str, doing: str) -> Iterator[None]:
         doing: what for, shown to whoever is refused, e.g. ``"aw bench"``.
 
     Raises:
-        AwError: another process holds it.
+        Busy: another process holds it.
     """
     folder = Path(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     path = folder.parent / f".{folder.name}.lock"
-    handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    handle = _locked(path, folder)
     try:
+        os.truncate(handle, 0)
+        os.write(handle, f"{doing} (process {os.getpid()})".encode())
+        yield
+    finally:
+        # Unlinked while still held, so that no stale file stays behind.
+        path.unlink(missing_ok=True)
+        os.close(handle)
+
+
+def _locked(path: Path, folder: Path) -> int:
+    while True:
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             holder = os.read(handle, 200).decode(errors="replace").strip() or "another process"
-            raise AwError(
+            os.close(handle)
+            raise Busy(
                 f"{folder} is being worked on by {holder}; wait for it to end, or choose another folder"
             ) from None
-        os.truncate(handle, 0)
-        os.write(handle, f"{doing} (process {os.getpid()})".encode())
-        yield
-        # Unlinked while still held, so that no stale file stays behind.
-        path.unlink(missing_ok=True)
-    finally:
+        # The one before may have unlinked the file between our open and our lock: then what we hold is
+        # no longer the file others will find under this name.
+        try:
+            if os.path.samestat(os.fstat(handle), os.stat(path)):
+                return handle
+        except FileNotFoundError:
+            pass
         os.close(handle)

@@ -6,10 +6,13 @@ A method of one's own is found in three ways: `register(...)`, the entry-point g
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 import importlib
 import importlib.metadata
 import importlib.util
 import sys
+import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,6 +40,7 @@ class MethodEntry:
     config: str | type | None = None
     paper: str = ""
     needs: str = ""  # extras, weights or hardware; empty = nothing beyond the core
+    source_hash: str = ""  # of a plugin's file: a changed plugin is another configuration
 
     def options(self) -> Any:
         """The method's options at their defaults (a frozen dataclass instance)."""
@@ -116,11 +120,32 @@ def load_plugin(path: Path | str) -> list[str]:
         raise AwError(f"plugin {path} is no Python file: its name must end in .py")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
-    spec.loader.exec_module(module)
+    try:
+        spec.loader.exec_module(module)
+    except AwError:
+        raise
+    except SyntaxError as error:
+        raise AwError(f"plugin {path}, line {error.lineno}: {error.msg}") from None
+    except (Exception, SystemExit) as error:
+        line = _line_in(error, path)
+        raise AwError(
+            f"plugin {path}{line} fails when it is loaded: {type(error).__name__}: {error}"
+        ) from error
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
     added = [key for key, entry in _registered.items() if before.get(key) is not entry]
     if not added:
         raise AwError(f"plugin {path} registers no method: call register(MethodEntry(...)) in it")
+    for key in added:
+        _registered[key] = dataclasses.replace(_registered[key], source_hash=digest)
     return added
+
+
+def _line_in(error: BaseException, path: Path) -> str:
+    """ ", line 7" of the file, where the error passed through it."""
+    lines = [
+        frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)
+    ]
+    return f", line {lines[-1]}," if lines else ""
 
 
 def _resolve(target: Any) -> Any:

@@ -38,7 +38,7 @@ class DensityConfig:
     prune_opacity: float = 0.005
     prune_scale: float = 0.1  # of the scene extent, applied after the first reset
     reset_opacity: float = 0.01
-    max_gaussians: int = 1_000_000  # growth stops here: the largest gradients go first
+    max_gaussians: int = 1_000_000  # growth stops here unless the run says otherwise: largest gradients first
 
 
 class DensityControl:
@@ -132,7 +132,7 @@ class DensityControl:
         config = self.config
         score = self.grad_sum / self.seen.clamp(min=1)
         chosen = score > config.grow_grad
-        room = max(min(config.max_gaussians, step.ceiling) - len(gaussians), 0)
+        room = max(step.ceiling - len(gaussians), 0)
         if int(chosen.sum()) > room:
             # stable sort: ties are broken by row, so the same seed gives the same set
             order = torch.argsort(
@@ -189,12 +189,11 @@ class DensityControl:
         self.grad_sum, self.seen = self.grad_sum[stay], self.seen[stay]
 
     def _match(self, gaussians: Gaussians) -> None:
-        """Pad the statistics with zeros for new rows."""
-        missing = len(gaussians) - len(self.seen)
-        if missing > 0:
-            pad = torch.zeros(missing, device=gaussians.device)
-            self.grad_sum = torch.cat([self.grad_sum.to(gaussians.device), pad])
-            self.seen = torch.cat([self.seen.to(gaussians.device), pad])
+        """Pad the statistics with zeros for new rows; after a resume, bring them to the device."""
+        device = gaussians.device
+        pad = torch.zeros(max(len(gaussians) - len(self.seen), 0), device=device)
+        self.grad_sum = torch.cat([self.grad_sum.to(device), pad])
+        self.seen = torch.cat([self.seen.to(device), pad])
 
     def _clear(self, gaussians: Gaussians) -> None:
         self.grad_sum = torch.zeros(len(gaussians), device=gaussians.device)

@@ -102,6 +102,7 @@ class Trainer:
         self.probe = probe
         self.extent = data.scene.extent
         self.clock = Clock()
+        self.setup_s = 0.0  # seconds before the first step, of the process that began the run
         self.iteration = 0
         self.timeline: list[dict[str, Any]] = []
         self._loss_sum, self._loss_count = 0.0, 0
@@ -345,6 +346,7 @@ class Trainer:
         state = {
             "iteration": self.iteration,
             "elapsed_s": self.clock.now(),
+            "setup_s": self.setup_s,
             "parts_s": self.clock.parts_s,
             "gaussians": dict(self.gaussians.items()),
             "optimiser": self.optimiser.state_dict(),
@@ -369,6 +371,7 @@ class Trainer:
             self.density.load_state_dict(state["density"])
             self.parts.mask.load_state_dict(state["mask"])
             self.iteration = state["iteration"]
+            self.setup_s = state["setup_s"]
             self.clock = Clock(state["elapsed_s"], dict(state["parts_s"]))
             self.timeline = list(state["timeline"])
             self._loss_sum, self._loss_count = state["loss"]

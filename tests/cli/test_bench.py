@@ -48,6 +48,11 @@ def test_what_is_no_budget(text):
         (["--method", "3dgs", "--itterations", "5"], "--iterations"),
         (["--method", "refinesplat", "--set", "refinesplat.lamda_cr=1"], "did you mean 'lambda_cr'"),
         (["--method", "3dgs", "--plugin", "absent.py"], "no plugin file"),
+        (["--method", "3dgs", "--seed", "-1"], "--seed"),
+        (["--method", "3dgs", "--checkpoint-every", "nan"], "nan"),
+        (["--method", "3dgs", "--budget", "0s"], "above zero"),
+        (["--method", "refinesplat", "--set", "refinesplat.lambda_dssim=nan"], "finite"),
+        (["--method", "refinesplat", "--set", "refinesplat.mask_every=0"], "at least 1"),
     ],
 )
 def test_mistakes_get_one_line_and_exit_code_2(scene, tmp_path, arguments, message):
@@ -64,6 +69,16 @@ def test_no_scene_there(tmp_path):
     assert done.returncode == 2
     assert "there is no scene folder" in done.stderr
     assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize("output", ["file", "file/deeper"])
+def test_an_output_that_cannot_be_is_one_line(scene, tmp_path, output):
+    (tmp_path / "file").write_text("mine")
+    done = aw("bench", "--method", "3dgs", "--scene", scene, "--iterations", "5", "-o", tmp_path / output)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert "Traceback" not in done.stderr
+    assert (tmp_path / "file").read_text() == "mine"
 
 
 def test_killed_in_mid_training_the_same_command_ends_with_the_same_renders(scene, tmp_path):

@@ -12,6 +12,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.grid import cell_folder, plan_cells, run_cells
 from ambiguous_wild.harness.store import read_result
 from ambiguous_wild.io.images import read_gray, read_png_rgb
+from ambiguous_wild.io.lock import folder_lock
 from ambiguous_wild.io.ply import read_splat_ply
 from ambiguous_wild.methods import MethodEntry, register, registry
 from ambiguous_wild.metrics.image import psnr
@@ -110,8 +111,9 @@ def test_a_folder_that_is_not_ours_is_left_alone(scene, tmp_path):
     mine = tmp_path / "scene" / "3dgs" / "seed0" / "thesis.txt"
     mine.parent.mkdir(parents=True)
     mine.write_text("all I have")
-    with pytest.raises(AwError, match="no run of ours"):
-        bench(scene, tmp_path, "3dgs")
+    for overwrite in ("missing", "always"):
+        with pytest.raises(AwError, match="no run of ours"):
+            bench(scene, tmp_path, "3dgs", overwrite=overwrite)
     assert mine.read_text() == "all I have"
 
 
@@ -122,6 +124,52 @@ def test_a_failing_cell_does_not_take_the_others_with_it(scene, tmp_path):
     folder = cell_folder(tmp_path, cells[0])
     assert read_result(folder / "failed.json")["status"] == "failed"
     assert "boom" in (folder / "traceback.txt").read_text()
+
+
+def test_a_run_that_succeeds_after_a_failure_leaves_no_trace_of_it(scene, tmp_path, monkeypatch):
+    bench(scene, tmp_path, "broken")
+    register(MethodEntry("broken", "mended", lambda options: Parts()))
+    (cell,), (report,) = bench(scene, tmp_path, "broken")
+    assert report.outcome == "trained"
+    names = {p.name for p in cell_folder(tmp_path, cell).iterdir()}
+    assert not names & {"failed.json", "traceback.txt"}
+
+
+def test_a_failure_before_the_first_checkpoint_does_not_block_another_configuration(scene, tmp_path):
+    bench(scene, tmp_path, "broken")
+    register(MethodEntry("broken", "mended", lambda options: Parts()))
+    other = dataclasses.replace(SHORT, iterations=61)
+    assert bench(scene, tmp_path, "broken", train=other)[1][0].outcome == "trained"
+
+
+def test_a_damaged_result_is_made_again(scene, tmp_path):
+    (cell,), _ = bench(scene, tmp_path, "3dgs")
+    result = cell_folder(tmp_path, cell) / "metrics.json"
+    before = json.loads(result.read_text())["per_image"]
+    result.write_text("{half")
+    assert bench(scene, tmp_path, "3dgs")[1][0].outcome == "trained"
+    assert json.loads(result.read_text())["per_image"] == before
+
+
+def test_a_folder_in_use_is_left_as_it_is(scene, tmp_path):
+    (cell,) = plan_cells(["3dgs"], [scene], [0], SHORT)
+    folder = cell_folder(tmp_path, cell)
+    with folder_lock(folder, "aw bench"):
+        (report,) = run_cells([cell], tmp_path)
+        assert report.outcome == "failed"
+        assert "being worked on by aw bench" in report.error
+        assert not folder.exists()
+
+
+def test_parts_of_the_cost_are_those_of_training(scene, tmp_path):
+    _, (report,) = bench(scene, tmp_path, "3dgs")
+    cost = report.result["cost"]
+    assert 0 < sum(cost["ms_parts"].values()) <= cost["ms_per_iteration"]
+    assert 50 < cost["peak_rss_mb"] < 20_000
+
+
+def test_a_scene_named_twice_is_benched_once(scene):
+    assert len(plan_cells(["3dgs"], [scene, scene / "."], [0], SHORT)) == 1
 
 
 def test_options_reach_the_method_and_unknown_ones_are_named(scene):

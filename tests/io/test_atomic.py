@@ -1,5 +1,6 @@
 """Nothing half-written stays behind."""
 
+import fcntl
 import json
 import subprocess
 import sys
@@ -66,8 +67,26 @@ def test_a_locked_folder_names_its_holder_and_is_freed_afterwards(tmp_path):
 def test_a_lock_is_freed_after_an_error(tmp_path):
     with pytest.raises(AwError), folder_lock(tmp_path / "run", "first"):
         raise AwError("x")
+    assert list(tmp_path.iterdir()) == []
     with folder_lock(tmp_path / "run", "second"):
         assert (tmp_path / ".run.lock").exists()
+
+
+def test_a_lock_file_unlinked_under_ones_hands_is_not_held(tmp_path, monkeypatch):
+    """B opens the file, A unlinks it and leaves, B locks what is no longer there: B must look again."""
+    path, real = tmp_path / ".run.lock", fcntl.flock
+    taken = []
+
+    def flock(handle, operation):
+        if not taken:
+            path.unlink()
+        taken.append(handle)
+        real(handle, operation)
+
+    monkeypatch.setattr("ambiguous_wild.io.lock.fcntl.flock", flock)
+    with folder_lock(tmp_path / "run", "B"):
+        assert len(taken) == 2
+        assert path.exists()
 
 
 def test_what_a_killed_process_left_is_swept_and_nothing_else(tmp_path):

@@ -44,3 +44,30 @@ def test_a_plugin_that_registers_nothing_is_refused(tmp_path):
         load_plugin(tmp_path / "empty.py")
     with pytest.raises(AwError, match="no plugin file"):
         load_plugin(tmp_path / "absent.py")
+
+
+@pytest.mark.parametrize(
+    ("code", "message"),
+    [
+        ("x = 1\ndef broken(:\n", "line 2"),
+        ("import nothing_of_that_name\n", "line 1, fails when it is loaded: ModuleNotFoundError"),
+        ("import sys\nsys.exit(0)\n", "line 2, fails when it is loaded: SystemExit"),
+    ],
+)
+def test_a_plugin_that_does_not_load_is_one_line_that_names_the_place(tmp_path, code, message):
+    (tmp_path / "bad.py").write_text(code)
+    with pytest.raises(AwError, match=message):
+        load_plugin(tmp_path / "bad.py")
+
+
+def test_a_changed_plugin_is_another_configuration(tmp_path):
+    path, hashes = tmp_path / "mine.py", []
+    for summary in ("first", "second"):
+        path.write_text(
+            "from ambiguous_wild.methods import MethodEntry, register\n"
+            f"register(MethodEntry('mine', '{summary}', 'ambiguous_wild.methods.threedgs:build'))\n"
+        )
+        load_plugin(path)
+        hashes.append(get_method("mine").source_hash)
+    assert len(set(hashes)) == 2
+    assert get_method("3dgs").source_hash == ""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from ambiguous_wild.core import AwError
 from ambiguous_wild.methods.refinesplat.density import EntropyDensityConfig
 from ambiguous_wild.methods.refinesplat.entropy import Statistic, Variant
 from ambiguous_wild.methods.refinesplat.identity import PsiConfig
@@ -72,3 +73,17 @@ class RefineSplatConfig:
     identity_tracks: int = 3  # SfM tracks that two instances must share to be one identity
     identity_share: float = 0.25  # and their share of the tracks of the one with fewer
     identity_similarity: float = 0.8  # cosine of mean features where no tracks run
+
+    def __post_init__(self) -> None:
+        for name in ("mask_every", "entropy_every"):
+            if getattr(self, name) < 1:
+                raise AwError(
+                    f"refinesplat.{name} counts visits or iterations: at least 1, got {getattr(self, name)}"
+                )
+        for name in ("lambda_id", "lambda_cr", "mask_start", "reset_pause"):
+            if getattr(self, name) < 0:
+                raise AwError(f"refinesplat.{name} cannot be negative, got {getattr(self, name)}")
+        if not 0 <= self.lambda_dssim <= 1:
+            raise AwError(f"refinesplat.lambda_dssim is a share from 0 to 1, got {self.lambda_dssim}")
+        if not 1 <= self.identities <= 255:
+            raise AwError(f"refinesplat.identities is from 1 to 255, got {self.identities}")

@@ -110,10 +110,8 @@ class EntropyAwareDensity(DensityControl):
 
     def _match(self, gaussians: Gaussians) -> None:
         super()._match(gaussians)
-        missing = len(gaussians) - len(self.downhill)
-        if missing > 0:
-            pad = torch.zeros(missing, 3, device=gaussians.device)
-            self.downhill = torch.cat([self.downhill.to(gaussians.device), pad])
+        pad = torch.zeros(max(len(gaussians) - len(self.downhill), 0), 3, device=gaussians.device)
+        self.downhill = torch.cat([self.downhill.to(gaussians.device), pad])
 
     def _clear(self, gaussians: Gaussians) -> None:
         super()._clear(gaussians)

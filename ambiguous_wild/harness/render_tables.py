@@ -216,7 +216,8 @@ def _latex(text: str) -> str:
         "<": r"\textless{}",
         ">": r"\textgreater{}",
         "|": r"\textbar{}",
-        '"': r"\textquotedbl{}",
+        # \textquotedbl needs fontenc T1, which not every class loads.
+        '"': "{''}",
         # A row end takes these two for its own options when a name begins with them.
         "[": "{[}",
         "*": "{*}",

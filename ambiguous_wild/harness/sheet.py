@@ -7,10 +7,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import yaml
 
 from ambiguous_wild.core import AwError, Scene, View
-from ambiguous_wild.harness.store import Runs
+from ambiguous_wild.harness.store import Runs, read_config
 from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.metrics.image import psnr
@@ -40,7 +39,8 @@ def write_sheet(runs: Runs, path: Path, *, scene: str | None = None, views: int 
         The number of methods shown.
 
     Raises:
-        AwError: several scenes and none named, no finished run, or the scene folder has moved.
+        AwError: several scenes and none named, no finished run, the scene folder has moved, or a
+            run lacks its renders.
     """
     finished = runs.runs[runs.runs["status"] == "ok"]
     names = sorted(finished["scene"].unique())
@@ -59,14 +59,14 @@ def write_sheet(runs: Runs, path: Path, *, scene: str | None = None, views: int 
 
 
 def _scene_of(folder: Path) -> Scene:
-    config = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
-    where = config["scene"].get("path") if isinstance(config, dict) else None
-    if not where or not Path(where).is_dir():
+    settings = read_config(folder).get("scene")
+    where = settings.get("path") if isinstance(settings, dict) else None
+    if not isinstance(settings, dict) or not isinstance(where, str):
+        raise AwError(f"{folder} has no config.yaml that names its scene: restore it from where it was made")
+    if not Path(where).is_dir():
         raise AwError(f"{folder} was trained on {where}, which is not there any more: move the scene back")
-    width_of = load_scene(where, verify=False)
-    # The run may have used another factor than the scene's own; its renders tell which.
-    factor = config["scene"].get("factor")
-    return width_of if factor in (None, width_of.info["loaded_factor"]) else load_scene(where, factor=factor)
+    # The run may have used another factor than the scene's own.
+    return load_scene(where, factor=settings.get("factor"), verify=False)
 
 
 def _spread(views: tuple[View, ...], count: int) -> list[View]:
@@ -80,7 +80,13 @@ def _test_row(view: View, folders: dict[str, Path]) -> list[Cell]:
     photo = read_png_rgb(view.image_path)
     cells = [Cell(f"test photo {view.name}", photo)]
     for method, folder in folders.items():
-        render = read_png_rgb(folder / "renders" / "test" / Path(view.name).with_suffix(".png"))
+        path = folder / "renders" / "test" / Path(view.name).with_suffix(".png")
+        if not path.is_file():
+            raise AwError(
+                f"the run {folder} lacks its render {path.relative_to(folder)}: restore it, or make the run "
+                "again with 'aw bench --overwrite always'"
+            )
+        render = read_png_rgb(path)
         cells.append(Cell(f"{method}  {psnr(render, photo):.2f} dB", render))
     return cells
 

@@ -1,4 +1,4 @@
-"""Result files: one `metrics.json` a run, checked on the way out and on the way in.
+"""Result files: one `metrics.json` a run (`failed.json` where it failed), checked out and in.
 
 Per-image values are kept, never only their mean. JSON has no infinity: it is written as the string
 "inf" and read back as a number. A missing value is ``null`` in the file and NaN in the tables, and its
@@ -17,12 +17,15 @@ from typing import Any, NoReturn
 
 import numpy as np
 import pandas as pd
+import yaml
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.atomic import write_json
 
 SCHEMA = 1
 RESULT = "metrics.json"
+FAILED = "failed.json"  # same schema, status "failed"; counts where there is no metrics.json
+CONFIG = "config.yaml"
 # key -> type of a result file; a number may also be an int, "inf" or null
 FIELDS: dict[str, type | tuple[type, ...]] = {
     "method": str,
@@ -49,6 +52,8 @@ class Incomplete:
 
     folder: Path
     reason: str
+    method: str
+    scene: str
 
 
 @dataclass(frozen=True)
@@ -98,7 +103,7 @@ def read_result(path: Path | str) -> dict[str, Any]:
     except FileNotFoundError:
         raise AwError(f"no result file {path}") from None
     except (OSError, ValueError, RecursionError) as error:
-        raise AwError(f"{path} is damaged ({error}); delete it and run again") from None
+        raise AwError(f"{path} is damaged ({error}); run 'aw bench' again to replace it") from None
     _check(data, str(path))
     data["per_image"] = [
         {k: v if k == "name" else _decode(v) for k, v in row.items()} for row in data["per_image"]
@@ -112,8 +117,8 @@ def read_result(path: Path | str) -> dict[str, Any]:
 def read_runs(folder: Path | str) -> Runs:
     """Every result below a folder of runs, at any depth.
 
-    A run folder without a result (still running, or stopped) and a damaged result are listed under
-    `incomplete`, not dropped.
+    A run is a folder with config.yaml, metrics.json or failed.json in it. One without a result (still
+    running, or stopped) and a damaged result are listed under `incomplete`, not dropped.
 
     Raises:
         AwError: no such folder, no run in it, or two results for the same method, scene and seed.
@@ -124,14 +129,15 @@ def read_runs(folder: Path | str) -> Runs:
     results: list[tuple[Path, dict[str, Any]]] = []
     incomplete: list[Incomplete] = []
     for run in _run_folders(root):
-        if not (run / RESULT).exists():
-            reason = f"no {RESULT}: still running, or stopped; run the same command again to finish it"
-            incomplete.append(Incomplete(run, reason))
-            continue
+        paths = [run / name for name in (RESULT, FAILED) if (run / name).exists()]
         try:
-            results.append((run, read_result(run / RESULT)))
+            if not paths:
+                raise AwError(
+                    f"no {RESULT}: still running, or stopped; run the same command again to finish it"
+                )
+            results.append((run, read_result(paths[0])))
         except AwError as error:
-            incomplete.append(Incomplete(run, str(error)))
+            incomplete.append(Incomplete(run, str(error), *_method_and_scene(run)))
     if not results and not incomplete:
         raise AwError(f"no run in {root}: 'aw bench --method NAME --scene SCENE -o {root}' makes one")
     _refuse_duplicates(results)
@@ -147,18 +153,33 @@ def read_runs(folder: Path | str) -> Runs:
 
 
 def _run_folders(root: Path) -> Iterator[Path]:
-    """Folders that hold a result or the settings of a run, in the order of their paths."""
+    """Folders that hold a result or the settings of a run, in the order of their paths.
+
+    A name alone makes no run: a scene may be called seed1.
+    """
     for name, folders, files in os.walk(root):
         # Caches and half-written folders begin with a dot.
         folders[:] = sorted(f for f in folders if not f.startswith("."))
-        here = Path(name)
-        if RESULT in files or "config.yaml" in files or _names_a_seed(here.name):
+        if not {RESULT, FAILED, CONFIG}.isdisjoint(files):
             folders.clear()
-            yield here
+            yield Path(name)
 
 
-def _names_a_seed(name: str) -> bool:
-    return name.startswith("seed") and name[4:].isdecimal()
+def read_config(run: Path) -> dict[str, Any]:
+    """The run's config.yaml; empty where it is absent or damaged."""
+    try:
+        config = yaml.safe_load((run / CONFIG).read_text(encoding="utf-8"))
+    except (OSError, ValueError, yaml.YAMLError):
+        return {}
+    return config if isinstance(config, dict) else {}
+
+
+def _method_and_scene(run: Path) -> tuple[str, str]:
+    """Whose run it is, for one without a result: by its settings, else by its path."""
+    config, method_folder = read_config(run), run.absolute().parent
+    scene = config.get("scene")
+    name = scene.get("name") if isinstance(scene, dict) else None
+    return str(config.get("method") or method_folder.name), str(name or method_folder.parent.name)
 
 
 def _refuse_duplicates(results: list[tuple[Path, dict[str, Any]]]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 from ambiguous_wild.core.errors import shortlist
@@ -19,6 +20,7 @@ def notes(
         *_failed(runs),
         *_absent(runs, methods, scenes),
         *(f"incomplete: {i.folder}: {i.reason}" for i in runs.incomplete),
+        *_not_ranked(runs),
         *_missing(runs, columns),
         *_not_comparable(runs, columns),
     )
@@ -37,6 +39,16 @@ def _absent(runs: Runs, methods: Sequence[str], scenes: Sequence[str]) -> list[s
         if gone:
             lines.append(f"no result: {method} on {shortlist(gone)}; its mean over scenes is missing")
     return lines
+
+
+def _not_ranked(runs: Runs) -> list[str]:
+    done = set(zip(runs.runs["method"], runs.runs["scene"]))
+    open_runs = Counter((i.method, i.scene) for i in runs.incomplete)
+    return [
+        f"not ranked: {method} on {scene}: {count} run{'' if count == 1 else 's'} of it incomplete"
+        for (method, scene), count in open_runs.items()
+        if (method, scene) in done
+    ]
 
 
 def _missing(runs: Runs, columns: Sequence[Measure]) -> list[str]:

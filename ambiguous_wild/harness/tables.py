@@ -1,7 +1,8 @@
 """From runs to a comparison: rows are methods, columns are measures, one block a scene.
 
 The mean is taken over images, then over seeds, then over scenes, in that order. A mean over missing cells
-is missing; a failed run makes its cell "failed", so that no method gains by failing where it is hard.
+is missing; a failed run makes its cell "failed", so that no method gains by failing where it is hard, and
+a method with an unfinished run shows what it has but is not ranked.
 `render_tables.py` writes a `Table` as text, Markdown, CSV or LaTeX.
 """
 
@@ -42,6 +43,7 @@ class Row:
     method: str
     cells: tuple[Cell, ...]  # one a column
     runs: int  # finished runs behind it
+    ranked: bool = True  # False: a run behind it is unfinished
 
 
 @dataclass(frozen=True)
@@ -114,6 +116,7 @@ class _Index:
     def __init__(self, runs: Runs) -> None:
         self.runs = dict(iter(runs.runs.groupby(["method", "scene"])))
         self.images = dict(iter(runs.images.groupby(["method", "scene", "metric"])))
+        self.unfinished = {(i.method, i.scene) for i in runs.incomplete}
 
     def seeds(self, method: str, scene: str, column: Measure) -> pd.Series:
         """The run's value by seed, NaN where missing."""
@@ -171,7 +174,8 @@ def _scene_row(index: _Index, method: str, scene: str, columns: tuple[Measure, .
             interval = stats.bootstrap_interval(images.to_numpy().mean(axis=1))
             low, high = interval.low, interval.high
         cells.append(Cell(value, stats.spread(values), low, high))
-    return Row(method, tuple(cells), len(index.runs[method, scene]))
+    finished = (method, scene) not in index.unfinished
+    return Row(method, tuple(cells), len(index.runs[method, scene]), ranked=finished)
 
 
 def _mean_row(
@@ -190,14 +194,18 @@ def _mean_row(
             # Seed by seed, so that the spread is that of the number shown; needs the same seeds everywhere.
             by_seed = pd.concat([index.seeds(method, s, column) for s in scenes], axis=1).to_numpy()
             cells.append(Cell(value, stats.spread(by_seed.mean(axis=1))))
-    return Row(method, tuple(cells), sum(row.runs for row in rows))
+    return Row(method, tuple(cells), sum(row.runs for row in rows), ranked=all(row.ranked for row in rows))
 
 
 def _ranked(block: Block, columns: tuple[Measure, ...]) -> Block:
     """The block with the first, second and third of every column marked; equal in print = equal rank."""
     rows = [list(row.cells) for row in block.rows]
     for i, column in enumerate(columns):
-        values = {k: round(c[i].value, column.digits) for k, c in enumerate(rows) if c[i].state == "ok"}
+        values = {
+            k: round(row.cells[i].value, column.digits)
+            for k, row in enumerate(block.rows)
+            if row.ranked and row.cells[i].state == "ok"
+        }
         if column.better is None or len(set(values.values())) < 2:
             continue
         for k, value in values.items():

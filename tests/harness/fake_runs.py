@@ -51,8 +51,17 @@ def failed(method: str, scene: str = "yard", seed: int = 0) -> dict[str, Any]:
 
 
 def save(root: Path, *results: dict[str, Any]) -> Path:
-    """Write every result to its place below `root`."""
+    """Write every result to its place below `root`, as `aw bench` does."""
     for r in results:
         folder = "".join(c if c.isalnum() else "_" for c in r["method"])
-        write_result(root / r["scene"] / folder / f"seed{r['seed']}" / "metrics.json", r)
+        name = "failed.json" if r["status"] == "failed" else "metrics.json"
+        write_result(root / r["scene"] / folder / f"seed{r['seed']}" / name, r)
     return root
+
+
+def start(root: Path, method: str, scene: str = "yard", seed: int = 0) -> Path:
+    """A run that was begun and not finished; returns its folder."""
+    folder = root / scene / method / f"seed{seed}"
+    folder.mkdir(parents=True)
+    (folder / "config.yaml").write_text(f"method: {method}\nscene: {{name: {scene}}}\n", encoding="utf-8")
+    return folder

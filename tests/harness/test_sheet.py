@@ -1,5 +1,7 @@
 """The picture that compares runs."""
 
+import shutil
+
 import numpy as np
 import pytest
 
@@ -40,3 +42,11 @@ def test_a_scene_that_is_not_there_is_named(runs, tmp_path):
             write_sheet(read_runs(runs), tmp_path / "sheet.png")
     finally:
         moved.rename(runs.parent / "scene")
+
+
+@pytest.mark.parametrize("lost", ["renders", "config.yaml"])
+def test_a_run_that_lost_its_files_is_named(runs, tmp_path, lost):
+    copy = shutil.copytree(runs, tmp_path / "runs") / "scene" / "3dgs" / "seed0"
+    (copy / lost).rename(tmp_path / "lost")
+    with pytest.raises(AwError, match=rf"seed0 .*{lost}.*restore it"):
+        write_sheet(read_runs(tmp_path / "runs"), tmp_path / "sheet.png")

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.store import read_result, read_runs, write_result
-from tests.harness.fake_runs import failed, fake_result, save
+from tests.harness.fake_runs import failed, fake_result, save, start
 
 
 def test_a_result_comes_back_as_it_was(tmp_path: Path) -> None:
@@ -126,19 +126,36 @@ def test_a_metric_that_one_image_lacks_has_a_row(tmp_path: Path) -> None:
 
 def test_unfinished_and_damaged_runs_are_listed(tmp_path: Path) -> None:
     save(tmp_path, fake_result("3dgs"))
-    (tmp_path / "yard" / "b" / "seed0").mkdir(parents=True)
-    resumed = tmp_path / "yard" / "c" / "seed0"
-    resumed.mkdir(parents=True)
-    (resumed / "config.yaml").write_text("method: c\n")
+    start(tmp_path, "b")
+    # Settings that cannot be read: the path tells whose run it is.
+    (start(tmp_path, "c") / "config.yaml").write_text("{")
     damaged = tmp_path / "yard" / "d" / "seed0" / "metrics.json"
     damaged.parent.mkdir(parents=True)
     damaged.write_text("{")
-    hidden = tmp_path / ".cache" / "seed0"
-    hidden.mkdir(parents=True)
+    start(tmp_path / ".cache", "hidden")
     runs = read_runs(tmp_path)
-    assert [i.folder.parent.name for i in runs.incomplete] == ["b", "c", "d"]
+    assert [(i.method, i.scene) for i in runs.incomplete] == [("b", "yard"), ("c", "yard"), ("d", "yard")]
     assert "still running" in runs.incomplete[0].reason and "damaged" in runs.incomplete[2].reason
+    assert all("again" in i.reason and "delete" not in i.reason for i in runs.incomplete)
     assert len(runs.runs) == 1
+
+
+def test_a_failed_run_counts_unless_it_was_finished_since(tmp_path: Path) -> None:
+    save(tmp_path, failed("a"), failed("b"), fake_result("b"))
+    assert (tmp_path / "yard" / "a" / "seed0" / "failed.json").exists()
+    runs = read_runs(tmp_path)
+    assert dict(zip(runs.runs["method"], runs.runs["status"])) == {"a": "failed", "b": "ok"}
+    (tmp_path / "yard" / "a" / "seed0" / "failed.json").write_text("{")
+    assert [i.method for i in read_runs(tmp_path).incomplete] == ["a"]
+
+
+def test_names_of_folders_make_no_runs(tmp_path: Path) -> None:
+    output = tmp_path / "seed7"  # -o seed7, and a scene called seed1
+    save(output, fake_result("a", "seed1"), fake_result("b", "seed1"))
+    start(output, "c", "seed1")
+    (output / "seed1" / "d" / "seed0").mkdir(parents=True)
+    runs = read_runs(output)
+    assert list(runs.runs["method"]) == ["a", "b"] and [i.method for i in runs.incomplete] == ["c"]
 
 
 def test_a_single_run_folder_can_be_read(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ from ambiguous_wild.harness.render_tables import (
 )
 from ambiguous_wild.harness.store import read_runs
 from ambiguous_wild.harness.tables import Cell, Table, comparison
-from tests.harness.fake_runs import failed, fake_result, save
+from tests.harness.fake_runs import failed, fake_result, save, start
 
 HOSTILE = '<script>|\\input{x}$&%#_^~"*`[a](http://b)\x1b[31m\u202e'
 
@@ -145,6 +145,27 @@ def test_a_failed_seed_fails_its_cell(tmp_path: Path) -> None:
     assert "failed" in to_text(table).splitlines()[3]
 
 
+def test_where_every_run_failed_the_table_says_so(tmp_path: Path) -> None:
+    table = table_of(tmp_path, failed("a"), failed("b"))
+    assert {c.state for row in table.blocks[0].rows for c in row.cells} == {"failed"}
+    for render in RENDERERS.values():
+        assert "failed" in render(table)
+
+
+def test_a_method_with_an_unfinished_seed_shows_its_mean_but_no_rank(tmp_path: Path) -> None:
+    start(tmp_path, "a", "one", 1)
+    table = table_of(
+        tmp_path,
+        *(fake_result("a", s, psnr=(50.0,)) for s in ("one", "two")),
+        *(fake_result("b", s, psnr=(20.0,)) for s in ("one", "two")),
+        *(fake_result("c", s, psnr=(10.0,)) for s in ("one", "two")),
+    )
+    assert cell(table, "a", "psnr", 1).value == 50.0
+    ranks = [[cell(table, m, "psnr", block).rank for m in "abc"] for block in range(3)]
+    assert ranks == [[None, 1, 2], [None, 1, 2], [1, 2, 3]]  # mean, one, two
+    assert "not ranked: a on one: 1 run of it incomplete" in table.notes
+
+
 def test_missing_metrics_carry_their_reason_once(tmp_path: Path) -> None:
     table = table_of(tmp_path, fake_result("a"), fake_result("b"))
     assert cell(table, "a", "lpips_alex").state == "missing"
@@ -180,7 +201,7 @@ def test_what_cannot_be_compared_is_said(tmp_path: Path) -> None:
 
 
 def test_incomplete_runs_are_below_the_table(tmp_path: Path) -> None:
-    (tmp_path / "yard" / "z" / "seed0").mkdir(parents=True)
+    start(tmp_path, "z")
     table = table_of(tmp_path, fake_result("a"))
     for render in (to_text, to_markdown, to_latex):
         assert "still running" in render(table)
@@ -251,9 +272,14 @@ def test_latex_and_markdown_of_any_name_have_no_open_special(name: str) -> None:
     from ambiguous_wild.harness.render_tables import _latex, _markdown
 
     assert "\n" not in _latex(name) + _markdown(name)
-    rest = re.sub(r"\\text\w+\{\}|\\[&%$#_{}]|\{[\[*]\}", "", _latex(name))
+    rest = re.sub(r"\\text\w+\{\}|\\[&%$#_{}]|\{(?:[\[*]|'')\}", "", _latex(name))
     assert not re.search(r"[\\&%$#_{}~^\[*]", rest)
     assert not re.search(r"[<>]", _markdown(name))
+
+
+def test_latex_needs_no_font_encoding(tmp_path: Path) -> None:
+    latex = to_latex(table_of(tmp_path, fake_result('6" lens')))
+    assert "6{''} lens &" in latex and "quotedbl" not in latex
 
 
 def test_latex_is_balanced_and_names_begin_no_option(tmp_path: Path) -> None:

@@ -41,7 +41,7 @@ class Points:
     rgb: np.ndarray  # [M, 3] uint8
     error_px: np.ndarray  # [M] float64, mean reprojection error at full size
     track_offsets: np.ndarray  # [M + 1] int64
-    track_views: np.ndarray  # [L] int32, index into Scene.views; -1 = a view that is not in the split
+    track_views: np.ndarray  # [L] int32, index into Scene.views; -1 = a view out of the split, or no position
     track_xy: np.ndarray  # [L, 2] float32, px of the *loaded* image of that view
 
     def __len__(self) -> int:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal
+from typing import Any, Literal, TypeGuard
 
 import numpy as np
 
 from ambiguous_wild.core import AwError, Camera, Points, Scene, View
 from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.core.names import check_name
 from ambiguous_wild.core.scene import Split
 from ambiguous_wild.io.colmap_model import Model, ModelImage, read_model
 from ambiguous_wild.io.hashing import sha256_file
@@ -39,20 +40,27 @@ def load_scene(
     Returns:
         The scene: views ordered by name, intrinsics at the size of the loaded files, points with
         tracks in px of those files. ``info["warnings"]`` says what the lists name and the model lacks.
+        Observations in photos whose 2D points were stripped from the model point to view -1.
 
     Raises:
-        AwError: the folder is no scene, a file changed, lists and model do not fit.
+        AwError: the folder is no scene, its name is unfit, a file changed, lists and model do not fit.
     """
     root = Path(path)
+    if root.is_file():
+        raise AwError(f"{root} is a file, not a scene folder; give the folder: {root.parent}")
     if not root.is_dir():
         raise AwError(f"there is no scene folder {root}; 'aw build-scene PHOTOS -o {root}' makes one")
     info = read_scene_json(root)
     if info is not None and verify:
         verify_files(root, info, quick=verify == "quick")
+    # Photos alone lack a model first of all, whatever their folders are called.
+    model_folder = _model_folder(root)
     chosen = _default_factor(root, info) if factor is None else factor
     folder = _image_folder(root, chosen)
-    model = read_model(_model_folder(root))
     info = {} if info is None else dict(info)
+    # Runs are written to a folder of this name: a stranger's scene must not choose where that lies.
+    name = check_name(f"scene name in {root}", info.get("name", root.resolve().name))
+    model = read_model(model_folder)
     info["loaded_factor"] = chosen
     split, missing = _split(root, [image.name for image in model.images.values()])
     info["missing"] = missing
@@ -68,41 +76,77 @@ def load_scene(
     )
     if not any(v.split == "train" for v in views):
         raise AwError(f"{root} has no training photo: none of train_list.txt is in the model")
-    return Scene(root, str(info.get("name") or root.resolve().name), views, _points(model, views), info)
+    return Scene(root, name, views, _points(model, views), info)
 
 
 def read_scene_json(root: Path | str) -> dict[str, Any] | None:
     """scene.json as a dict, or None where there is none.
 
     Raises:
-        AwError: it does not parse, or is of a newer schema than this version knows.
+        AwError: it does not parse, is of a newer schema than this version knows, or a field that is read
+            here has the wrong type.
     """
     path = Path(root) / "scene.json"
     if not path.is_file():
         return None
     try:
         info = json.loads(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise AwError(f"{path} is damaged ({error}); build the scene again with 'aw build-scene'") from error
     version = info.get("schema_version") if isinstance(info, dict) else None
-    if not isinstance(version, int):
+    if not _is_count(version):
         raise AwError(f"{path} has no schema_version, so it is not a scene.json of 'aw build-scene'")
     if version > SCENE_SCHEMA:
         raise AwError(
             f"{path} has schema {version}, this version reads up to {SCENE_SCHEMA}: update ambiguous-wild"
         )
+    _check_fields(path, info)
     return info
+
+
+def _check_fields(path: Path, info: dict[str, Any]) -> None:
+    """Raise AwError where a field that this version reads has the wrong type."""
+    factor, name, files = info.get("factor"), info.get("name", ""), info.get("files")
+    wrong = []
+    if not _is_count(factor) or factor == 0:
+        wrong.append(f"factor must be a whole number from 1, not {_short(factor)}")
+    if not isinstance(name, str):
+        wrong.append(f"name must be a text, not {_short(name)}")
+    if not isinstance(files, dict):
+        wrong.append("it lists no files")
+    else:
+        odd = [_short(file) for file, entry in files.items() if not _is_file_entry(entry)]
+        wrong += [f"under files, sha256 or bytes is absent or no such thing: {shortlist(odd)}"] if odd else []
+    if wrong:
+        raise AwError(f"{path} is damaged ({'; '.join(wrong)}); restore it, or build the scene again")
+
+
+def _is_file_entry(entry: Any) -> bool:
+    known = entry if isinstance(entry, dict) else {}
+    return isinstance(known.get("sha256"), str) and _is_count(known.get("bytes"))
+
+
+def _is_count(value: Any) -> TypeGuard[int]:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+
+
+def _short(value: Any) -> str:
+    text = ascii(value)
+    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def verify_files(root: Path | str, info: dict[str, Any], *, quick: bool = False) -> None:
     """Compare the files scene.json lists with what lies there; quick compares sizes only.
 
+    Args:
+        root: the scene folder.
+        info: from `read_scene_json`.
+        quick: sizes only.
+
     Raises:
         AwError: names the files that are missing or changed.
     """
-    base, files = Path(root), info.get("files")
-    if not isinstance(files, dict):
-        raise AwError(f"{base}/scene.json lists no files; build the scene again with 'aw build-scene'")
+    base, files = Path(root), info["files"]
     wrong = []
     for name, known in files.items():
         path = base / _inside(name, base)
@@ -226,6 +270,8 @@ def _points(model: Model, views: tuple[View, ...]) -> Points:
     scaled = {v.image_id: (i, v) for i, v in enumerate(views)}
     for image_id, image in model.images.items():
         rows = order[np.searchsorted(ids, image_id) : np.searchsorted(ids, image_id, side="right")]
+        if not len(image.xys):
+            continue  # a stripped model: its tracks name 2D points that it no longer lists
         index = points.track_point2d[rows]
         if len(index) and (index.min() < 0 or index.max() >= len(image.xys)):
             raise AwError(f"the model's tracks and its image {image.name!r} contradict each other: damaged")

@@ -1,6 +1,8 @@
 import json
+import re
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -135,6 +137,81 @@ def test_scene_json_that_cannot_be_read(tmp_path, text):
     write_scene(tmp_path, NAMES)
     (tmp_path / "scene.json").write_text(text)
     with pytest.raises(AwError, match=r"scene\.json"):
+        load_scene(tmp_path)
+
+
+OURS = {"schema_version": 1, "name": "tiny", "factor": 1, "files": {}}
+ENTRY = {"sha256": "0" * 64, "bytes": 3}
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        *(({"factor": factor}, "factor must be") for factor in ("abc", None, 0, -1, 1.5, True)),
+        ({"name": 3}, "name must be"),
+        ({"name": None}, "name must be"),
+        ({"files": None}, "lists no files"),
+        ({"files": {"a.png": "abc", "b.png": ENTRY}}, r"sha256 or bytes.*: 'a.png'\)"),
+        ({"files": {"a.png": {"bytes": 3}}}, "sha256 or bytes"),
+        ({"files": {"a.png": {"sha256": "0" * 64}}}, "sha256 or bytes"),
+        ({"files": {"a.png": ENTRY | {"bytes": "3"}}}, "sha256 or bytes"),
+        ({"schema_version": True}, "schema_version"),
+    ],
+)
+@pytest.mark.parametrize("verify", [True, "quick", False])
+def test_a_scene_json_edited_by_hand_is_one_line_that_says_what_is_wrong(tmp_path, change, words, verify):
+    write_scene(tmp_path, NAMES[:2])
+    (tmp_path / "scene.json").write_text(json.dumps(OURS | change))
+    with pytest.raises(AwError, match=rf"scene\.json.*{words}") as caught:
+        load_scene(tmp_path, verify=verify)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "name", ["../../evil", "/evil", "..", ".cache", "", " ", "a\\b", "a\0b", "a\x1b[1m", "x" * 101]
+)
+def test_the_name_of_a_scene_cannot_choose_where_runs_lie(tmp_path, name):
+    write_scene(tmp_path, NAMES[:2])
+    (tmp_path / "scene.json").write_text(json.dumps(OURS | {"name": name}))
+    with pytest.raises(AwError, match="scene name"):
+        load_scene(tmp_path)
+
+
+def test_a_plain_folder_gives_its_own_name_which_is_checked_too(tmp_path):
+    write_scene(tmp_path / "yard", NAMES[:2])
+    assert load_scene(tmp_path / "yard").name == "yard"
+    (tmp_path / "yard").rename(tmp_path / "a\nb")
+    with pytest.raises(AwError, match="scene name"):
+        load_scene(tmp_path / "a\nb")
+
+
+def test_photos_alone_lack_a_model_first_of_all(tmp_path):
+    for factor in (None, 4):
+        with pytest.raises(AwError, match=r"COLMAP model.*aw build-scene"):
+            load_scene(tmp_path, factor=factor)
+
+
+def test_a_file_is_answered_with_its_folder(tmp_path):
+    (tmp_path / "scene.json").write_text(json.dumps(OURS))
+    with pytest.raises(AwError, match=f"is a file.*give the folder: {re.escape(str(tmp_path))}$"):
+        load_scene(tmp_path / "scene.json")
+
+
+def test_photos_stripped_of_their_2d_points_lose_their_observations_only(tmp_path):
+    model = write_scene(tmp_path, NAMES)
+    whole = load_scene(tmp_path).points
+    bare = {"xys": np.empty((0, 2)), "point_ids": np.empty(0, dtype=np.int64)}
+    images = {i: replace(m, **bare) if m.name == "p3.png" else m for i, m in model.images.items()}
+    write_binary(tmp_path / "sparse" / "0", replace(model, images=images))
+    points = load_scene(tmp_path).points
+    lost = whole.track_views == 3
+    assert lost.any() and (points.track_views[lost] == -1).all()
+    assert np.array_equal(points.track_views[~lost], whole.track_views[~lost])
+    assert np.array_equal(points.track_xy[~lost], whole.track_xy[~lost])
+    # One point too few is no stripped model but a damaged one.
+    short = {i: replace(m, xys=m.xys[:1], point_ids=m.point_ids[:1]) for i, m in model.images.items()}
+    write_binary(tmp_path / "sparse" / "0", replace(model, images=short))
+    with pytest.raises(AwError, match="contradict each other"):
         load_scene(tmp_path)
 
 

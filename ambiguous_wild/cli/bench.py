@@ -150,6 +150,9 @@ def command(
         checkpoint_every_s=checkpoint_every,
     )
     cells = plan_cells(methods, scenes, seeds, train, settings=settings, device=chosen, factor=factor)
+    for scene in {cell.scene.name: cell.scene for cell in cells}.values():
+        for warning in scene.info.get("warnings", ()):
+            click.echo(f"warning: {scene.name}: {warning}", err=True)
     if chosen == "cpu":
         prepare_cpu(threads)
     progress = _Progress(len(cells))

@@ -109,6 +109,15 @@ def test_killed_in_mid_training_the_same_command_ends_with_the_same_renders(scen
     assert list(killed.rglob(".*.tmp*")) == []
 
 
+def test_listed_photos_that_the_model_lacks_are_named(tmp_path):
+    scene = write_tiny_scene(tmp_path / "scene")
+    with open(scene / "test_list.txt", "a") as f:
+        f.write("lost.png\n")
+    done = aw("bench", "--method", "3dgs", "--scene", scene, "--iterations", "5", "-o", tmp_path / "runs")
+    assert done.returncode == 0, done.stderr
+    assert "warning: scene: 1 test photos of the list are not in the model: lost.png" in done.stderr
+
+
 def test_outcomes_as_json(scene, tmp_path):
     arguments = ["bench", "--method", "3dgs", "--scene", scene, "--iterations", "20", "-o", tmp_path / "runs"]
     first, second = aw(*arguments, "--json"), aw(*arguments, "--json")

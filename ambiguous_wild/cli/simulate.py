@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -51,12 +52,17 @@ def command(
 
     from tqdm import tqdm
 
+    from ambiguous_wild.io.atomic import check_output, sweep_siblings
+    from ambiguous_wild.io.lock import folder_lock
     from ambiguous_wild.simulate.capture import simulate
 
     def bar(shots: list) -> tqdm:
         return tqdm(shots, unit="photo", desc=f"simulate {name}", disable=as_json or None)
 
-    facts = simulate(spec, out, seed, depth, overwrite, bar)
+    check_output(out)
+    with folder_lock(out, f"aw simulate {name}"):
+        sweep_siblings(out)  # of a call that was killed
+        facts = simulate(spec, out, seed, depth, overwrite, bar)
     if as_json:
         click.echo(json.dumps({k: v for k, v in facts.items() if k not in ("files", "photos")}, indent=2))
         return
@@ -67,7 +73,8 @@ def command(
         f"{spec.width}x{spec.height}; {len(spec.distractors)} distractors cover "
         f"{100 * share['min']:.0f} to {100 * share['max']:.0f} % (mean {100 * share['mean']:.1f} %) of a train photo"
     )
-    click.echo(f"next: aw build-scene {out} -o {out.parent / (out.name + '-scene')}")
+    scene = out.parent / f"{out.name}-scene"
+    click.echo(f"next: aw build-scene {shlex.quote(str(out))} -o {shlex.quote(str(scene))}")
 
 
 def _print_list(specs: Iterable[CaptureSpec], as_json: bool) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import json
 import os
 import shutil
@@ -10,6 +11,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+from ambiguous_wild.core.errors import AwError
 
 
 @contextmanager
@@ -69,6 +72,34 @@ def sweep(folder: Path | str) -> None:
             shutil.rmtree(left, ignore_errors=True)
         else:
             left.unlink(missing_ok=True)
+
+
+def sweep_siblings(path: Path | str) -> None:
+    """Remove what killed calls of `atomic_dir(path)` left beside it; call it only while holding `path`."""
+    target = Path(path)
+    name = glob.escape(target.name)
+    for pattern in (f".{name}.tmp-*", f".{name}.old-*"):
+        for left in sorted(target.parent.glob(pattern)):
+            shutil.rmtree(left, ignore_errors=True)
+
+
+def check_output(path: Path | str) -> None:
+    """Make sure, before long work, that something can be made at `path`; its parents are made on the way.
+
+    Raises:
+        AwError: a parent is a file, or nothing can be written there.
+    """
+    folder = Path(os.path.abspath(path)).parent
+    for part in (folder, *folder.parents):
+        if part.exists() and not part.is_dir():
+            raise AwError(f"cannot write {path}: {part} is a file, not a folder; choose another -o")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        os.rmdir(tempfile.mkdtemp(prefix=".aw-probe-", dir=folder))
+    except OSError as error:
+        raise AwError(
+            f"cannot write in {folder}: {error.strerror or error}; choose another -o or mend the rights"
+        ) from error
 
 
 def write_text(path: Path | str, text: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from click.testing import CliRunner
 
 from ambiguous_wild.cli.simulate import command
 from ambiguous_wild.core import AwError
+from ambiguous_wild.io.lock import folder_lock
 from ambiguous_wild.simulate.presets import PRESETS
 
 
@@ -46,3 +48,35 @@ def test_counts_and_the_next_command(tmp_path: Path) -> None:
 def test_errors_say_what_to_do(words: list[str], expected: str) -> None:
     error = CliRunner().invoke(command, words).exception
     assert isinstance(error, AwError) and expected in str(error)
+
+
+def test_the_next_command_can_be_pasted_where_the_path_has_spaces(tmp_path: Path) -> None:
+    out = tmp_path / "my raw"
+    said = aw_simulate("tiny", "-o", out, "--views", 4, "--width", 64)
+    words = shlex.split(said.splitlines()[-1])
+    assert words[3] == str(out) and words[5] == f"{out}-scene"
+
+
+def test_what_a_killed_run_left_is_swept_but_nothing_else(tmp_path: Path) -> None:
+    for name in (".raw.tmp-a1", ".raw.old-b2", ".raw2.tmp-c3", ".raw.tmpl"):
+        (tmp_path / name / "train").mkdir(parents=True)
+    aw_simulate("tiny", "-o", tmp_path / "raw", "--views", 4, "--width", 64)
+    assert sorted(p.name for p in tmp_path.iterdir()) == [".raw.tmpl", ".raw2.tmp-c3", "raw"]
+
+
+def test_two_runs_do_not_write_one_folder(tmp_path: Path) -> None:
+    (tmp_path / ".raw.tmp-a1").mkdir()
+    with folder_lock(tmp_path / "raw", "aw simulate tiny"):
+        done = CliRunner().invoke(command, ["tiny", "-o", str(tmp_path / "raw")])
+        assert isinstance(done.exception, AwError) and "being worked on" in str(done.exception)
+    assert (tmp_path / ".raw.tmp-a1").is_dir()
+
+
+@pytest.mark.parametrize("out", ["/dev/null/x", "{}/file/x", "/proc/x"])
+def test_an_output_that_cannot_be_is_found_before_the_work(
+    out: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("x")
+    monkeypatch.setattr("ambiguous_wild.simulate.capture.simulate", lambda *_: pytest.fail("worked first"))
+    error = CliRunner().invoke(command, ["tiny", "-o", out.format(tmp_path)]).exception
+    assert isinstance(error, AwError) and "cannot write" in str(error)

@@ -16,7 +16,8 @@ import click
 @click.option(
     "--masks",
     type=click.Path(path_type=Path, file_okay=False),
-    help="Your own distractor masks: <stem>.png, 255 = distractor. Default: the scene's truth.",
+    help="Your own distractor masks: <stem>.png, white (255) = distractor, black = scene: the inverse of "
+    "build-scene's keep masks. Default: the scene's truth.",
 )
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the bootstrap.")
 @click.option("--record/--no-record", default=True, show_default=True, help="Note the scores in scene.json.")
@@ -27,17 +28,21 @@ def command(
     """Measure SCENE: colour ambiguity, semantic ambiguity, occlusion; write a page, a CSV and a picture."""
     from tqdm import tqdm
 
+    from ambiguous_wild.core.errors import AwError
     from ambiguous_wild.harness import ambiguity
-    from ambiguous_wild.io.atomic import write_json
+    from ambiguous_wild.io.atomic import check_output, write_json
     from ambiguous_wild.io.scene_folder import load_scene, read_scene_json
 
     loaded = load_scene(scene)
     found = ambiguity.find_masks(loaded, masks)
+    folder = out or scene.resolve().parent / f"{scene.resolve().name}-ambiguity"
+    if folder.resolve().is_relative_to(scene.resolve()):
+        raise AwError(f"{folder} lies inside {scene}, and would change the scene; choose another -o")
+    check_output(folder / "index.html" if folder.is_dir() else folder)
     measured = ambiguity.measure(
         loaded, found, lambda v: tqdm(v, unit="photo", desc="measure", disable=as_json or None)
     )
     summary = ambiguity.summarise(loaded, measured, seed)
-    folder = out or scene.resolve().parent / f"{scene.resolve().name}-ambiguity"
     ambiguity.write_report(loaded, found, measured, summary, folder)
     # scene.json lists the hashes of the other files, not its own: the scene's identity stays.
     info = read_scene_json(scene) if record else None

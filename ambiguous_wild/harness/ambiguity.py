@@ -43,7 +43,7 @@ def find_masks(scene: Scene, folder: Path | None) -> dict[str, Path]:
     if not where.is_dir():
         raise AwError(
             f"{scene.name} has no truth at {where}: give distractor masks with --masks DIR "
-            "(PNG, 255 = distractor, the photo's stem), or build the scene from an 'aw simulate' capture"
+            "(PNG of the photo's stem, white (255) = distractor), or build from an 'aw simulate' capture"
         )
     found = {v.name: where / f"{_stem(v)}.png" for v in scene.train}
     missing = [name for name, path in found.items() if not path.is_file()]
@@ -214,8 +214,9 @@ def _figure(scene: Scene, masks: dict[str, Path], measured: list[Measured], path
         top.imshow(tinted)
         top.set_title(f"{view.name}: {100 * mask.mean():.0f} % covered", fontsize=8)
         background = load_clean(scene, view)
-        if background is None:
-            below.text(0.5, 0.5, "background unknown", ha="center", transform=below.transAxes)
+        if background is None or not mask.any():
+            why = "no distractor" if background is not None else "background unknown"
+            below.text(0.5, 0.5, why, ha="center", transform=below.transAxes)
         else:
             shown = np.where(mask, am.colour_residual(photo, background), np.nan)
             picture = below.imshow(shown, vmin=0, vmax=1, cmap="viridis")
@@ -292,7 +293,7 @@ def describe(summary: dict[str, Any]) -> list[str]:
 
 def _percent(score: dict[str, Any]) -> str:
     if score["value"] is None:
-        return "missing %"
+        return "missing"
     text = f"{100 * score['value']:.1f} %"
     return text if score["low"] is None else f"{text} [{100 * score['low']:.1f}, {100 * score['high']:.1f}]"
 
@@ -300,8 +301,8 @@ def _percent(score: dict[str, Any]) -> str:
 def _value(score: dict[str, Any]) -> str:
     if score["value"] is None:
         return "missing"
-    text = f"{score['value']:.2f}"
-    return text if score["low"] is None else f"{text} [{score['low']:.2f}, {score['high']:.2f}]"
+    text = f"{score['value']:.3f}"
+    return text if score["low"] is None else f"{text} [{score['low']:.3f}, {score['high']:.3f}]"
 
 
 def _word(score: dict[str, Any]) -> str:

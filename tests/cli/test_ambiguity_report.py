@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+import warnings
 from pathlib import Path
 
 import cv2
@@ -14,6 +15,7 @@ from click.testing import CliRunner
 
 from ambiguous_wild.cli.ambiguity_report import command
 from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.ambiguity import describe
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.metrics.ambiguity import COLOUR_METRIC, SEMANTIC_METRIC
 from tests.tiny_scene import TRAIN, write_tiny_scene
@@ -83,7 +85,9 @@ def test_without_clean_views_colour_is_missing_and_said(scene: Path, tmp_path: P
 def test_no_distractor_pixels_give_no_verdict(scene: Path, tmp_path: Path) -> None:
     for name in TRAIN:
         cv2.imwrite(str(scene / "truth/distractor" / name), np.zeros((48, 64), np.uint8))
-    facts = report(scene, "-o", tmp_path / "out")
+    with warnings.catch_warnings():  # matplotlib's on layouts that do not fit
+        warnings.simplefilter("error")
+        facts = report(scene, "-o", tmp_path / "out")
     assert facts["occlusion"]["value"] == 0
     assert facts[COLOUR_METRIC]["value"] is None and facts[SEMANTIC_METRIC]["ambiguous"] is None
 
@@ -108,3 +112,26 @@ def test_scores_are_noted_in_scene_json_unless_told_not_to(scene: Path, tmp_path
     facts = report(scene, "-o", tmp_path / "out")
     noted = load_scene(scene).info["ambiguity"]
     assert noted["occlusion"] == facts["occlusion"] and noted["masks"] == "truth"
+
+
+def test_the_report_never_goes_into_the_scene(scene: Path, tmp_path: Path) -> None:
+    before = sorted(scene.rglob("*"))
+    (tmp_path / "link").symlink_to(scene)
+    for out in (scene, scene / "report", tmp_path / "link" / "x"):
+        assert "would change the scene" in error(scene, "-o", out)
+    assert sorted(scene.rglob("*")) == before
+
+
+@pytest.mark.parametrize("out", ["/dev/null/x", "{}/file/x", "/proc/x"])
+def test_an_output_that_cannot_be_is_found_before_the_work(
+    out: str, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("x")
+    monkeypatch.setattr("ambiguous_wild.harness.ambiguity.measure", lambda *_: pytest.fail("worked first"))
+    assert "cannot write" in error(scene, "-o", out.format(tmp_path))
+
+
+def test_a_cosine_near_its_limit_is_told_apart_from_it(scene: Path, tmp_path: Path) -> None:
+    summary = report(scene, "-o", tmp_path / "out")
+    summary[SEMANTIC_METRIC] |= {"value": 0.6964, "low": 0.6951, "high": 0.7049}
+    assert "cosine 0.696 [0.695, 0.705]" in "\n".join(describe(summary))

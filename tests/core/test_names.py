@@ -30,8 +30,9 @@ def test_blanks_around_a_name_are_dropped():
         "\ud800",
         ".x",
         "..",
-    ]
-    + ["x" * 101, "é" * 51],
+        "x" * 101,
+        "é" * 51,
+    ],
 )
 def test_an_unfit_name_is_refused_in_one_printable_line(name):
     with pytest.raises(AwError) as caught:

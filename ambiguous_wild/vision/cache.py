@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import hashlib
 import json
+import time
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -16,6 +19,7 @@ from ambiguous_wild.io.atomic import atomic_path
 from ambiguous_wild.io.hashing import sha256_array
 
 Arrays = dict[str, np.ndarray]
+STALE_S = 24 * 3600.0  # age at which a temporary file belongs to nobody any more
 
 
 def cache_key(kind: str, backend: str, settings: Any, *arrays: np.ndarray) -> str:
@@ -45,6 +49,7 @@ def cached(
         expected: name and dtype of every array. An entry that is corrupt or differs is computed anew.
         compute: makes the arrays.
     """
+    _tidy(folder)
     path = folder / f"{key}.npz"
     found = _load(path, expected)
     if found is not None:
@@ -53,6 +58,15 @@ def cached(
     with atomic_path(path) as temporary, open(temporary, "wb") as f:
         np.savez_compressed(f, **arrays)  # type: ignore[arg-type]
     return arrays
+
+
+@functools.cache  # once a process and folder: it lists every entry
+def _tidy(folder: Path) -> None:
+    """Remove what killed writes left; a younger one may still be somebody's."""
+    for left in folder.glob(".*.tmp*"):
+        with contextlib.suppress(OSError):
+            if time.time() - left.stat().st_mtime > STALE_S:
+                left.unlink()
 
 
 def _load(path: Path, expected: Mapping[str, type | str]) -> Arrays | None:

@@ -6,6 +6,7 @@ Nothing here imports torch or transformers and nothing downloads: a missing weig
 from __future__ import annotations
 
 import os
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -20,6 +21,7 @@ class Weight:
     files: tuple[str, ...]  # all of them are needed
     used_for: str
     hub_id: str = ""  # of kind hub
+    planned: bool = False  # looked for, but no code of this version reads it
 
 
 class WeightStatus(NamedTuple):
@@ -31,16 +33,21 @@ class WeightStatus(NamedTuple):
     bring: str  # what to do to have it; "" when present
 
 
+USUAL_FOLDER = "~/.cache/ambiguous_wild/weights"  # proposed where AW_WEIGHTS is not set
 _HUB_FILES = ("config.json", "model.safetensors")
+
+
+def _hub(name: str, used_for: str, hub_id: str) -> Weight:
+    return Weight(name, "hub", _HUB_FILES, used_for, hub_id, planned=True)
+
+
 KNOWN: tuple[Weight, ...] = (
-    Weight("dinov2-small", "hub", _HUB_FILES, "features", "facebook/dinov2-small"),
-    Weight(
-        "dinov2-with-registers-small", "hub", _HUB_FILES, "features", "facebook/dinov2-with-registers-small"
-    ),
-    Weight("dino-vits16", "hub", _HUB_FILES, "features", "facebook/dino-vits16"),
-    Weight("sam-vit-base", "hub", _HUB_FILES, "instance masks", "facebook/sam-vit-base"),
-    Weight("sam2.1-hiera-tiny", "hub", _HUB_FILES, "instance masks", "facebook/sam2.1-hiera-tiny"),
-    Weight("grounding-dino-tiny", "hub", _HUB_FILES, "instance masks", "IDEA-Research/grounding-dino-tiny"),
+    _hub("dinov2-small", "features", "facebook/dinov2-small"),
+    _hub("dinov2-with-registers-small", "features", "facebook/dinov2-with-registers-small"),
+    _hub("dino-vits16", "features", "facebook/dino-vits16"),
+    _hub("sam-vit-base", "instance masks", "facebook/sam-vit-base"),
+    _hub("sam2.1-hiera-tiny", "instance masks", "facebook/sam2.1-hiera-tiny"),
+    _hub("grounding-dino-tiny", "instance masks", "IDEA-Research/grounding-dino-tiny"),
     Weight("alexnet", "file", ("alexnet-owt-7be5be79.pth",), "LPIPS (alex)"),
     Weight("vgg16", "file", ("vgg16-397923af.pth",), "LPIPS (vgg)"),
     Weight("lpips-alex", "file", ("lpips_alex.pth",), "LPIPS (alex), the learnt heads"),
@@ -122,8 +129,10 @@ def _searched(weight: Weight) -> list[Path]:
 
 
 def _bring(weight: Weight) -> str:
-    folder = weights_folder() or Path("$AW_WEIGHTS")
+    """A command to paste; where AW_WEIGHTS is not set it sets it first."""
+    own = weights_folder()
+    start = "" if own else f"export AW_WEIGHTS={USUAL_FOLDER} && "
+    folder, files = shlex.quote(str(own)) if own else '"$AW_WEIGHTS"', " ".join(weight.files)
     if weight.kind == "hub":
-        target = folder / weight.name
-        return f"hf download {weight.hub_id} {' '.join(weight.files)} --local-dir {target}"
-    return f"copy {' and '.join(weight.files)} ({weight.used_for}) into {folder}, and set AW_WEIGHTS"
+        return f"{start}hf download {weight.hub_id} {files} --local-dir {folder}/{weight.name}"
+    return f"{start}mkdir -p {folder} && cp {files} {folder}/"

@@ -1,3 +1,4 @@
+import os
 import subprocess
 import sys
 
@@ -133,3 +134,28 @@ def test_weight_status_imports_neither_torch_nor_transformers():
         "sys.exit(any(m in sys.modules for m in ('torch', 'transformers', 'numpy')))"
     )
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+def test_old_leftovers_of_killed_writes_are_removed_from_the_cache(tmp_path):
+    old, young = tmp_path / ".a.x1.tmp.npz", tmp_path / ".b.x2.tmp.npz"
+    other = tmp_path / "segments.npz"
+    for path in (old, young, other):
+        path.write_bytes(b"half")
+    for path in (old, other):
+        os.utime(path, (1e9, 1e9))
+    cached(tmp_path, "k", {"x": np.int32}, lambda: {"x": np.zeros(1, np.int32)})
+    assert sorted(p.name for p in tmp_path.iterdir()) == [young.name, "k.npz", other.name]
+
+
+def test_what_brings_a_weight_can_be_pasted_with_and_without_a_folder(monkeypatch, tmp_path):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.delenv("AW_WEIGHTS", raising=False)
+    for line in weights.status():
+        assert line.bring.startswith("export AW_WEIGHTS=~/.cache/ambiguous_wild/weights && ")
+    file = next(w for w in weights.KNOWN if w.kind == "file")
+    (tmp_path / file.files[0]).write_bytes(b"x")
+    bring = next(s.bring for s in weights.status() if s.name == file.name)
+    assert subprocess.run(["bash", "-c", bring], cwd=tmp_path).returncode == 0
+    monkeypatch.setenv("AW_WEIGHTS", str(tmp_path / ".cache/ambiguous_wild/weights"))
+    assert weights.find(file)[0] is not None
+    assert not any("export" in s.bring for s in weights.status())

@@ -11,6 +11,7 @@ import importlib.util
 import json
 import os
 import platform
+import shlex
 import shutil
 import subprocess
 import sys
@@ -26,6 +27,7 @@ PACKAGE = Path(__file__).resolve().parent.parent
 DISTRIBUTION = "ambiguous-wild"
 PROBE_TIMEOUT_S = 60
 SMALL_MEMORY_GB = 2.0  # below it COLMAP and a training of 100 000 Gaussians do not fit
+UNUSED = "not used by this version yet"
 SMALL_DISK_GB = 1.0  # photos, features and one run
 
 # What is tried in a process of its own; each prints one line of JSON.
@@ -62,11 +64,11 @@ print(json.dumps({"version": pycolmap.__version__}))
 class Check:
     """One line of the report."""
 
-    group: Literal["core", "optional"]
+    group: Literal["core", "optional", "planned"]  # planned: no code of this version uses it
     name: str
     ok: bool
     detail: str  # what was found
-    fix: str = ""  # the command that brings it; empty where nothing lacks
+    fix: str = ""  # the command that brings it; empty where nothing lacks or nothing is gained
 
 
 @dataclass(frozen=True)
@@ -90,10 +92,10 @@ def all_checks() -> list[Check]:
         _library("pycolmap", found["pycolmap"], "structure from motion; a PNG written after it is intact"),
         *_numba(found["numba"]),
         *_gpu(found["torch"]),
-        *_extras(),
         _torchvision(found.get("torchvision")),
-        *_weights(),
+        *_metrics(),
         _git(),
+        *_planned(),
     ]
 
 
@@ -261,19 +263,22 @@ def _cuda_words(torch: Probe, driver: bool) -> tuple[str, str]:
     return f"torch is built for CUDA {facts['built']}, but sees no GPU", "check the driver with nvidia-smi"
 
 
-def _extras() -> list[Check]:
-    uses = {
-        "masks": ("transformers", "DINOv2 features, SAM masks"),
-        "ray": ("ray", "grids on several machines"),
-        "view": ("viser", "interactive viewer"),
+def _planned() -> list[Check]:
+    """What later versions will use: named without a command, so that nobody installs it for nothing."""
+    from ambiguous_wild.vision import weights
+
+    packages = {
+        "transformers": "DINOv2 features, SAM masks",
+        "ray": "grids on several machines",
+        "viser": "interactive viewer",
     }
-    checks = []
-    for extra, (package, use) in uses.items():
-        version = installed(package)
-        fix = "" if version else install_command(extra)
-        detail = f"{version or 'absent'} ({use})"
-        checks.append(Check("optional", package, version is not None, detail, fix))
-    return checks
+    found = [(name, bool(installed(name)), use) for name, use in packages.items()]
+    there = {s.name: s.present for s in weights.status()}
+    found += [(w.name, there[w.name], f"weights for {w.used_for}") for w in weights.KNOWN if w.planned]
+    return [
+        Check("planned", name, present, f"{'present' if present else 'absent'}, {UNUSED} ({use})")
+        for name, present, use in found
+    ]
 
 
 def _torchvision(found: Probe | None) -> Check:
@@ -286,18 +291,21 @@ def _torchvision(found: Probe | None) -> Check:
                  "pip uninstall torchvision")  # fmt: skip
 
 
-def _weights() -> list[Check]:
+def _metrics() -> list[Check]:
+    """LPIPS by metric, not by file: a backbone alone measures nothing."""
     from ambiguous_wild.metrics import lpips
     from ambiguous_wild.vision import weights
 
-    # The files of LPIPS are reported by metric: a backbone alone measures nothing.
-    checks = [
-        Check("optional", s.name, s.present, s.where, s.bring)
-        for s in weights.status()
-        if not any("LPIPS" in w.used_for for w in weights.KNOWN if w.name == s.name)
-    ]
+    own = weights.weights_folder()
+    if own:
+        folder = f"mkdir -p {shlex.quote(str(own))}"
+    else:
+        folder = f'export AW_WEIGHTS={weights.USUAL_FOLDER} && mkdir -p "$AW_WEIGHTS"'
+    checks = []
     for metric, reason in lpips.available().items():
-        detail, _, fix = (reason or "weights found").partition(": ")
+        detail, _, what = (reason or "weights found").partition(": ")
+        # A comment keeps the line fit to paste: no program brings these files.
+        fix = f"{folder}  # then {what.rpartition(' into ')[0]} into it" if what else ""
         checks.append(Check("optional", metric, reason is None, detail, fix))
     return checks
 

@@ -29,27 +29,32 @@ def command(as_json: bool) -> None:
         facts = {"ok": not broken, "checks": [dataclasses.asdict(c) for c in checks]}
         click.echo(json.dumps(facts, indent=2, ensure_ascii=False))
     else:
-        for group in ("core", "optional"):
+        for group in ("core", "optional", "planned"):
             _print_group(group, [c for c in checks if c.group == group])
     if broken:
         names = ", ".join(c.name for c in broken)
         raise AwError(f"the core does not work here: {names}; run {broken[0].fix!r} first")
     if not as_json:
-        missing = sum(not c.ok for c in checks)
+        missing = sum(c.group == "optional" and not c.ok for c in checks)
         click.echo(
             f"\nthe core works; {missing} optional parts are missing" if missing else "\neverything works"
         )
 
 
 def _print_group(group: str, checks: list[Check]) -> None:
+    if not checks:
+        return
     click.secho(("" if group == "core" else "\n") + group, bold=True)
     width = max(len(c.name) for c in checks)
     for c in checks:
-        mark = (
-            click.style("✓", fg="green")
-            if c.ok
-            else click.style("✗", fg="red" if group == "core" else "yellow")
-        )
-        click.echo(f"  {mark} {c.name.ljust(width)}  {c.detail}")
+        click.echo(f"  {_mark(c)} {c.name.ljust(width)}  {c.detail}")
         if not c.ok and c.fix:
             click.echo(f"    {' ' * width}  → {c.fix}")
+
+
+def _mark(check: Check) -> str:
+    if check.group == "planned":  # neither good nor bad
+        return "·"
+    if check.ok:
+        return click.style("✓", fg="green")
+    return click.style("✗", fg="red" if check.group == "core" else "yellow")

@@ -15,6 +15,8 @@ from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import read_gray, write_png
 
+LITTLE_KEPT = 0.3  # of a photo; people and cars rarely cover most of most photos
+
 
 def find_masks(folder: Path, facts: list[dict[str, Any]], missing: str) -> dict[str, Path]:
     """Mask file of each photo, by stem.
@@ -31,7 +33,8 @@ def find_masks(folder: Path, facts: list[dict[str, Any]], missing: str) -> dict[
         AwError: no such folder, photos without a mask, masks of another size.
     """
     if not folder.is_dir():
-        raise AwError(f"mask folder {folder} does not exist")
+        what = "is a file; give the folder that holds the masks" if folder.exists() else "does not exist"
+        raise AwError(f"mask folder {folder} {what}")
     found: dict[str, Path] = {}
     lacking, misfits = [], []
     for fact in facts:
@@ -69,6 +72,17 @@ def lay_out_masks(folder: Path, found: dict[str, Path], facts: list[dict[str, An
             shares[fact["stem"]] = round(float((mask > 0).mean()), 4)
         write_png(folder / "masks" / f"{fact['work_name']}.png", mask)
     return {"kept_share": shares}
+
+
+def mask_warnings(facts: dict[str, Any] | None) -> list[str]:
+    """What looks wrong about the masks, from the facts of `lay_out_masks`: they keep too little."""
+    shares = list(facts["kept_share"].values()) if facts else []
+    if not shares or np.median(shares) >= LITTLE_KEPT:
+        return []
+    return [
+        f"the masks keep only {100 * np.median(shares):.0f} % of a photo (median): white = keep, black = "
+        "ignore; are they inverted?"
+    ]
 
 
 def mask_hashes(found: dict[str, Path]) -> dict[str, str]:

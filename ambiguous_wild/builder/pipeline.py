@@ -13,12 +13,15 @@ from typing import Any
 
 from ambiguous_wild.builder import report
 from ambiguous_wild.builder.collect import collect
+from ambiguous_wild.builder.places import check_places
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.builder.sfm import SfmCrash
 from ambiguous_wild.builder.stages import Stages
 from ambiguous_wild.builder.workspace import Workspace, build_lock
 from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.core.names import check_name
+from ambiguous_wild.io.atomic import check_output
 from ambiguous_wild.io.scene_folder import read_scene_json, verify_files
 
 # Full disk, quota, rights, read-only disk, broken disk: the user's to mend.
@@ -70,11 +73,15 @@ def build_scene(
     started = time.perf_counter()
     target = Path(os.path.abspath(output))
     settings = settings or BuildSettings()
-    settings = replace(settings, name=settings.name or target.name)
+    if settings.name:
+        name = check_name("scene name", settings.name)
+    else:
+        name = check_name("scene name (the folder's; --name sets another)", target.name)
+    settings = replace(settings, name=name)
+    check_places(raw, target)
     count = jobs or os.cpu_count() or 1
     capture = collect(raw, count)
-    if target == capture.root or capture.root.is_relative_to(target):
-        raise AwError(f"{target} holds the photos themselves; choose another folder for -o")
+    check_output(target)
     with build_lock(target):
         stages = Stages(
             capture,

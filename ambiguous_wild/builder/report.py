@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -101,7 +102,7 @@ def verdict(info: dict[str, Any], size: tuple[int, int], scene: Path) -> str:
     return (
         f"registered {counts['registered']} of {counts['photos']}, {points} points, "
         f"{info['reprojection_error_px']:.2f} px, {size[0]}x{size[1]} at factor {info['factor']}: ready; "
-        f"next: aw bench --method refinesplat --scene {scene} -o runs"
+        f"next: aw bench --method refinesplat --scene {shlex.quote(str(scene))} -o runs"
     )
 
 

@@ -39,7 +39,8 @@ def screen(capture: Capture, folder: Path, *, strict: bool, jobs: int, bar: Bar)
     """
     photos = folder / "photos"
     photos.mkdir()
-    bar.start("reading photos", len(capture.sources))
+    sources, copies = without_copies(capture)
+    bar.start("reading photos", len(sources))
 
     def one(source: Source) -> tuple[dict[str, Any], np.ndarray | None]:
         try:
@@ -66,20 +67,40 @@ def screen(capture: Capture, folder: Path, *, strict: bool, jobs: int, bar: Bar)
         return facts, thumbnail(pixels)
 
     with ThreadPoolExecutor(jobs) as pool:
-        rows = list(pool.map(one, capture.sources))
+        rows = list(pool.map(one, sources))
     bar.finish()
     skipped = [r for r, _ in rows if "skipped" in r]
     good = [(r, t) for r, t in rows if t is not None]
-    _refuse_bad(capture, skipped, len(good), strict)
+    _refuse_bad(capture, skipped, copies, len(good), strict)
     facts = [r for r, _ in good]
+    for fact in facts:
+        fact["copies"] = [copy for copy, kept in copies.items() if kept == fact["source"]]
+    skipped = [*skipped, *_copy_rows(copies)]
     warnings = [
-        *_skipped_warning(skipped, len(rows)),
+        *_skipped_warning(skipped, len(capture.sources)),
         *(f"{r['source']}: {n}" for r in facts for n in r["notes"]),
-        *(f"identical files: {shortlist(group)}" for group in identical(capture)),
+        *(_identical_warning(group) for group in identical(capture) if capture.has_sides),
         *_near_duplicates(facts, np.stack([t for _, t in good])),
         *drift_warnings(facts),
     ]
     return {"photos": facts, "skipped": skipped, "warnings": warnings}
+
+
+def without_copies(capture: Capture) -> tuple[list[Source], dict[str, str]]:
+    """The photos to use, and the copies left out: relative name -> the first file with the same bytes.
+
+    Of two copies one could train and the other test, which would reward learning by heart. Where train/
+    and test/ are the user's own, nothing is left out: both are kept and named in a warning.
+    """
+    if capture.has_sides:
+        return list(capture.sources), {}
+    first: dict[str, Source] = {}
+    copies = {}
+    for source in capture.sources:
+        kept = first.setdefault(source.sha256, source)
+        if kept is not source:
+            copies[source.relative] = kept.relative
+    return list(first.values()), copies
 
 
 def sharpness(
@@ -175,7 +196,19 @@ def _lay_out(source: Source, photo: Photo, pixels: np.ndarray, folder: Path) -> 
     return name
 
 
-def _refuse_bad(capture: Capture, skipped: list[dict[str, Any]], good: int, strict: bool) -> None:
+def _identical_warning(group: list[str]) -> str:
+    sides = {name.partition("/")[0] for name in group}
+    leak = ": one trains and one tests, so its score rewards learning by heart" if len(sides) > 1 else ""
+    return f"identical files: {shortlist(group)}{leak}"
+
+
+def _copy_rows(copies: dict[str, str]) -> list[dict[str, Any]]:
+    return [{"source": copy, "skipped": f"the same file as {kept}"} for copy, kept in copies.items()]
+
+
+def _refuse_bad(
+    capture: Capture, skipped: list[dict[str, Any]], copies: dict[str, str], good: int, strict: bool
+) -> None:
     reasons = shortlist([f"{r['source']} ({r['skipped']})" for r in skipped], 4)
     total = len(capture.sources)
     if skipped and strict:
@@ -184,8 +217,9 @@ def _refuse_bad(capture: Capture, skipped: list[dict[str, Any]], good: int, stri
             "out --strict to go on without them"
         )
     if good < MIN_PHOTOS:
+        reasons = shortlist([f"{r['source']} ({r['skipped']})" for r in [*skipped, *_copy_rows(copies)]], 4)
         raise AwError(
-            f"only {good} of {total} photos in {capture.root} can be read, {MIN_PHOTOS} are needed: {reasons}"
+            f"only {good} of {total} photos in {capture.root} can be used, {MIN_PHOTOS} are needed: {reasons}"
         )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sqlite3
 from collections import Counter
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -72,9 +73,22 @@ def choose_model(folder: Path, listing: list[dict[str, Any]]) -> tuple[int, Mode
 
 
 def check_registered(
-    listing: list[dict[str, Any]], photos: int, skipped: int, database: Path, matches: dict[str, Any]
+    listing: list[dict[str, Any]],
+    photos: int,
+    skipped: int,
+    database: Path,
+    matches: dict[str, Any],
+    remarks: Sequence[str] = (),
 ) -> None:
     """Refuse a reconstruction that holds too few photos to be a scene.
+
+    Args:
+        listing: the models.
+        photos: how many were tried.
+        skipped: how many were left out before.
+        database: COLMAP's.
+        matches: facts of the matching stage.
+        remarks: what else may be the reason, added to the error.
 
     Raises:
         AwError: how many of how many, the figures, the likely reason, what to try.
@@ -86,10 +100,11 @@ def check_registered(
     facts = pair_facts(database, matches["pairs"])
     others = sum(m["images"] for m in listing) - registered
     split = f" ({others} more in {len(listing) - 1} other models)" if len(listing) > 1 else ""
-    unread = f", {skipped} could not be read" if skipped else ""
+    unread = f", {skipped} were left out" if skipped else ""
     raise AwError(
         f"structure from motion placed {registered} of {photos} photos{split}{unread}; a scene needs "
         f"{needed}: {facts.sentence()}; likely {facts.reason(photos)}"
+        + "".join(f"; {remark}" for remark in remarks)
     )
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import difflib
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from ambiguous_wild.core.errors import AwError, shortlist, unknown
+from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.io.scene_folder import TEST_EVERY, read_list
 
 
@@ -69,11 +70,25 @@ def read_test_list(path: Path, facts: list[dict[str, Any]]) -> set[str]:
         source = PurePosixPath(fact["source"])
         for key in (str(source), source.name, source.stem, fact["stem"], fact["stem"] + ".png"):
             known.setdefault(key, fact["stem"])
+        for copy in fact.get("copies", ()):
+            known.setdefault(copy, fact["stem"])
     strangers = [n for n in names if n not in known]
-    if len(strangers) == 1:
-        raise unknown(f"photo in {path}", strangers[0], (f["source"] for f in facts))
     if strangers:
-        raise AwError(f"{path} names {len(strangers)} photos that are not there: {shortlist(strangers)}")
+        what = "a photo" if len(strangers) == 1 else f"{len(strangers)} photos"
+        sources = {f["stem"]: f["source"] for f in facts}
+        raise AwError(
+            f"{path} names {what} not in the capture: "
+            + shortlist((_with_nearest(n, known, sources) for n in strangers), 3)
+        )
     if not names:
         raise AwError(f"{path} is empty; list test photos one a line, or leave out --test-list")
-    return {known[n] for n in names}
+    tests = {known[n] for n in names}
+    if len(tests) == len(facts):
+        raise AwError(f"{path} names all {len(facts)} photos: no training photo would be left; list fewer")
+    return tests
+
+
+def _with_nearest(name: str, known: dict[str, str], sources: dict[str, str]) -> str:
+    """The unknown name, and the photo whose name is nearest to it."""
+    near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    return f"{name!r} (did you mean {sources[known[near[0]]]!r}?)" if near else repr(name)

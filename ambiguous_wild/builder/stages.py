@@ -12,10 +12,10 @@ import numpy as np
 from ambiguous_wild.builder import report
 from ambiguous_wild.builder.collect import Capture
 from ambiguous_wild.builder.downsample import auto_factor, downsample
-from ambiguous_wild.builder.masks import find_masks, lay_out_masks, mask_hashes
+from ambiguous_wild.builder.masks import find_masks, lay_out_masks, mask_hashes, mask_warnings
 from ambiguous_wild.builder.package import Parts, package
 from ambiguous_wild.builder.progress import Bar
-from ambiguous_wild.builder.screen import screen
+from ambiguous_wild.builder.screen import screen, without_copies
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.builder.sfm import (
     DATABASE,
@@ -49,8 +49,12 @@ class Stages:
     @cached_property
     def inputs(self) -> dict[str, Any]:
         """Everything the scene's files follow from, as plain data."""
+        _, copies = without_copies(self.capture)
         return {
-            "photos": [[s.relative, s.stem, s.side, s.sha256] for s in self.capture.sources],
+            "photos": [
+                [s.relative, s.stem, s.side, s.sha256, *["copy"] * (s.relative in copies)]
+                for s in self.capture.sources
+            ],
             "masks": _tree(self.mask_folder),
             "truth": _tree(self.capture.truth),
             "test_list": sha256_file(self.test_list) if self.test_list and self.test_list.is_file() else None,
@@ -113,7 +117,7 @@ class Stages:
             factor=factor,
             truth=flat.facts["truth"],
             masks=mask_stage.facts if mask_stage else None,
-            warnings=split_warnings,
+            warnings=[*mask_warnings(mask_stage.facts if mask_stage else None), *split_warnings],
         )
         account |= {"build_key": self.build_key, "inputs": inputs}
         account["seconds"] = {"collect": round(collect_s, 3), **{r.name: r.seconds for r in work.results}}
@@ -195,6 +199,7 @@ class Stages:
             len(screened.facts["skipped"]),
             matches.folder / DATABASE,
             matches.facts,
+            mask_warnings(masks.facts if masks else None) or ["masks were used"] * (masks is not None),
         )
         return mapping, features, matches
 

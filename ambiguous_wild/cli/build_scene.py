@@ -23,7 +23,9 @@ import click
 )
 @click.option("--max-features", type=int, default=3000, show_default=True, help="SIFT features a photo.")
 @click.option(
-    "--masks", type=click.Path(path_type=Path), help="Keep masks, white = keep: a.png or a.jpg.png."
+    "--masks",
+    type=click.Path(path_type=Path),
+    help="Folder of keep masks, white = keep, black = ignore: a.png or a.jpg.png.",
 )
 @click.option(
     "--masks-missing",
@@ -36,7 +38,7 @@ import click
 @click.option("--strict", is_flag=True, help="Refuse the capture if one photo cannot be read.")
 @click.option("--jobs", type=click.IntRange(min=1), help="Threads; the result does not depend on it.")
 @click.option("--seed", type=int, default=0, show_default=True)
-@click.option("--name", default="", help="Name of the scene; default: the output folder's.")
+@click.option("--name", help="Name of the scene; default: the output folder's.")
 @click.option("--license", "license_", default="", help="Licence of the photos, recorded in scene.json.")
 @click.option("--overwrite", is_flag=True, help="Replace a scene built from something else.")
 @click.option("--keep-work", is_flag=True, help="Leave the work folder: every stage, COLMAP's log.")
@@ -55,7 +57,7 @@ def command(
     strict: bool,
     jobs: int | None,
     seed: int,
-    name: str,
+    name: str | None,
     license_: str,
     overwrite: bool,
     keep_work: bool,
@@ -70,6 +72,7 @@ def command(
     from ambiguous_wild.builder.pipeline import build_scene
     from ambiguous_wild.builder.settings import BuildSettings
     from ambiguous_wild.core.config import from_plain
+    from ambiguous_wild.core.names import check_name
     from ambiguous_wild.io.images import image_size
 
     settings = from_plain(
@@ -83,7 +86,7 @@ def command(
             "seed": seed,
             "masks_missing": masks_missing,
             "strict": strict,
-            "name": name,
+            "name": "" if name is None else check_name("scene name", name),
             "license": license_,
         },
     )

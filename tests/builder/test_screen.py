@@ -80,11 +80,26 @@ def test_identical_and_near_duplicates_are_told_apart(tmp_path):
     paths[1].write_bytes(paths[0].read_bytes())
     lighter = cv2.convertScaleAbs(cv2.imread(str(paths[2])), alpha=0.97)
     cv2.imwrite(str(paths[3]), lighter)
-    warnings = run(tmp_path)[0]["warnings"]
-    assert "identical files: p00.jpg, p01.jpg" in warnings
+    facts, photos = run(tmp_path)
+    warnings = facts["warnings"]
+    assert "1 of 4 photos skipped: p01.jpg (the same file as p00.jpg)" in warnings
+    assert facts["photos"][0]["copies"] == ["p01.jpg"]
+    assert sorted(p.name for p in photos.iterdir()) == ["p00.jpg", "p02.jpg", "p03.jpg"]
     near = next(w for w in warnings if "near-duplicate" in w)
     assert "p02.jpg = p03.jpg" in near
     assert "p00.jpg = p01.jpg" not in near
+
+
+def test_copies_in_train_and_test_are_kept_and_named(tmp_path):
+    paths = write_capture(tmp_path / "raw" / "train", 4)
+    (tmp_path / "raw" / "test").mkdir()
+    (tmp_path / "raw" / "test" / "t.jpg").write_bytes(paths[0].read_bytes())
+    (tmp_path / "raw" / "train" / "z.jpg").write_bytes(paths[1].read_bytes())
+    facts = run(tmp_path)[0]
+    assert len(facts["photos"]) == 6 and facts["skipped"] == []
+    leak = next(w for w in facts["warnings"] if "test/t.jpg" in w)
+    assert leak.startswith("identical files: train/p00.jpg, test/t.jpg: one trains and one tests")
+    assert "identical files: train/p01.jpg, train/z.jpg" in facts["warnings"]
 
 
 def test_sharpness_falls_with_blur_and_not_with_resolution():

@@ -84,5 +84,5 @@ def test_enough_photos_pass_and_the_share_counts(tmp_path):
         patch.setattr(module, "pair_facts", lambda *_: FACTS)
         with pytest.raises(AwError, match=r"placed 8 of 29 photos \(3 more in 1 other models\).*needs 9"):
             check_registered(listing(8, 3), 29, 0, tmp_path / "x.db", {"pairs": 45})
-        with pytest.raises(AwError, match=r"placed 0 of 4 photos, 2 could not be read.*needs 3"):
+        with pytest.raises(AwError, match=r"placed 0 of 4 photos, 2 were left out.*needs 3"):
             check_registered([], 4, 2, tmp_path / "x.db", {"pairs": 6})

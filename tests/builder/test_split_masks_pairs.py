@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from ambiguous_wild.builder.masks import find_masks, lay_out_masks
+from ambiguous_wild.builder.masks import find_masks, lay_out_masks, mask_warnings
 from ambiguous_wild.builder.pairs import sequential_pairs
 from ambiguous_wild.builder.sfm import choose_camera, choose_matcher
 from ambiguous_wild.builder.split import read_test_list, split_photos
@@ -55,7 +55,13 @@ def test_list_names_photos_in_any_of_its_ways(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "message"), [("p99.jpg", "did you mean 'images/p"), ("x\ny", "names 2 photos"), ("", "is empty")]
+    ("text", "message"),
+    [
+        ("p99.jpg", r"'p99.jpg' \(did you mean 'images/p9.jpg'"),
+        ("", "is empty"),
+        ("x\np77.jpg", r"names 2 photos not in the capture: 'x', 'p77.jpg' \(did you mean 'images/p7.jpg'"),
+        ("\n".join(f"p{i}" for i in range(10)), "no training photo would be left"),
+    ],
 )
 def test_list_that_cannot_be(tmp_path, text, message):
     (tmp_path / "t.txt").write_text(text)
@@ -124,3 +130,18 @@ def test_matcher_by_count():
     assert choose_matcher(200, "auto") == "exhaustive"
     assert choose_matcher(201, "auto") == "sequential"
     assert choose_matcher(500, "exhaustive") == "exhaustive"
+
+
+def test_a_copy_in_a_test_list_stands_for_the_photo_that_is_used(tmp_path):
+    (tmp_path / "t.txt").write_text("copy.jpg\n")
+    photos = facts()
+    photos[3]["copies"] = ["copy.jpg"]
+    assert read_test_list(tmp_path / "t.txt", photos) == {"p3"}
+
+
+def test_masks_that_keep_little_are_suspected_to_be_inverted():
+    assert mask_warnings(None) == []
+    assert mask_warnings({"kept_share": {}}) == []
+    assert mask_warnings({"kept_share": {"a": 0.9, "b": 0.1, "c": 0.31}}) == []
+    (warning,) = mask_warnings({"kept_share": {"a": 0.9, "b": 0.1, "c": 0.2}})
+    assert "20 % of a photo" in warning and "inverted" in warning

@@ -142,3 +142,81 @@ def test_real_photos_of_fields(aw, tmp_path):
         errors.append(np.linalg.norm(seen[:2] / seen[2] - points.track_xy[k]))
     assert np.mean(errors) < 0.6
     assert np.max(errors) < 6.0
+
+
+@pytest.mark.parametrize(
+    "output", ["raw/sub/scene", "raw/train/scene", "raw/images", "raw/../raw/x", "link/x"]
+)
+def test_a_scene_is_never_made_among_the_photos(aw, tmp_path, output):
+    write_capture(tmp_path / "raw", 3)
+    (tmp_path / "link").symlink_to("raw")
+    before = sorted(os.listdir(tmp_path / "raw"))
+    assert "lies inside raw" in fails(aw, "raw", "-o", output)
+    assert "holds the photos themselves" in fails(aw, "raw", "-o", "raw")
+    assert sorted(os.listdir(tmp_path / "raw")) == before
+    assert sorted(os.listdir(tmp_path)) == ["link", "raw"]
+
+
+@pytest.mark.parametrize("mark", ["scene.json", "sparse"])
+def test_a_scene_is_not_built_again(aw, tmp_path, mark):
+    write_capture(tmp_path / "raw" / "images", 3)
+    (tmp_path / "raw" / mark).mkdir()
+    message = fails(aw, "raw", "-o", "scene")
+    assert "is a scene already" in message and mark in message and "aw bench" in message
+    assert os.listdir(tmp_path) == ["raw"]
+
+
+@pytest.mark.parametrize("name", ["", " ", "a/b", "..", ".x", "a\nb", "\x1b[31m", "x" * 101])
+def test_a_name_that_cannot_be(aw, tmp_path, name):
+    write_capture(tmp_path / "raw", 3)
+    assert "scene name" in fails(aw, "raw", "-o", "scene", "--name", name)
+    assert os.listdir(tmp_path) == ["raw"]
+
+
+def test_the_folder_s_name_must_do_as_a_name_too(aw, tmp_path):
+    write_capture(tmp_path / "raw", 3)
+    assert "--name sets another" in fails(aw, "raw", "-o", ".scene")
+
+
+def test_a_mask_file_is_not_said_to_be_absent(aw, tmp_path):
+    write_capture(tmp_path / "raw", 3)
+    (tmp_path / "mask.png").write_bytes(b"x")
+    assert "mask.png is a file; give the folder" in fails(aw, "raw", "-o", "scene", "--masks", "mask.png")
+
+
+def test_masks_that_keep_nothing_are_named_where_registration_fails(aw, tmp_path):
+    write_capture(tmp_path / "raw", 3)
+    (tmp_path / "masks").mkdir()
+    for i in range(3):
+        cv2.imwrite(str(tmp_path / "masks" / f"p0{i}.png"), np.zeros((HEIGHT, WIDTH), np.uint8))
+    message = fails(aw, "raw", "-o", "scene", "--masks", "masks", "--max-features", 200)
+    assert "masks keep only 0 % of a photo" in message and "white = keep" in message
+
+
+def test_a_test_list_of_every_photo(aw, tmp_path):
+    paths = write_capture(tmp_path / "raw", 3)
+    (tmp_path / "t.txt").write_text("".join(f"{p.name}\n" for p in paths))
+    assert "no training photo would be left" in fails(aw, "raw", "-o", "scene", "--test-list", "t.txt")
+
+
+def test_copies_of_one_photo_are_used_once(aw, tmp_path):
+    paths = write_capture(tmp_path / "raw", 5)
+    (tmp_path / "raw" / "z.jpg").write_bytes(paths[0].read_bytes())
+    code, out, err = aw("raw", "-o", "a b", "--max-features", 500, "--json", "--strict")
+    assert code == 0, err
+    facts = json.loads(out)
+    assert facts["counts"]["registered"] == 5 and facts["counts"]["photos"] == 6
+    assert facts["skipped"] == [{"source": "z.jpg", "skipped": "the same file as p00.jpg"}]
+    assert any("z.jpg (the same file as p00.jpg)" in w for w in facts["warnings"])
+    assert facts["verdict"].endswith("--scene 'a b' -o runs")
+    for kept in paths[1:4]:
+        kept.unlink()
+    assert "only 2 of 3 photos" in fails(aw, "raw", "-o", "other")
+
+
+@pytest.mark.parametrize("output", ["/dev/null/x", "file", "file/x/y", "/proc/x"])
+def test_outputs_that_cannot_be_are_one_line(aw, tmp_path, output):
+    write_capture(tmp_path / "raw", 3)
+    (tmp_path / "file").write_text("x")
+    fails(aw, "raw", "-o", output)
+    assert sorted(os.listdir(tmp_path)) == ["file", "raw"]

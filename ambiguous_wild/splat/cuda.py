@@ -14,7 +14,7 @@ from torch import Tensor
 from ambiguous_wild.core import AwError, Camera
 from ambiguous_wild.core.extras import install_command
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.render import Gradients
+from ambiguous_wild.splat.rendered import Gradients
 
 NEAR = 0.01  # world units, as on the CPU
 BLUR = 0.3  # px^2, as on the CPU

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError, Camera, Scene
 from ambiguous_wild.io.images import load_image_float, read_keep_map
-from ambiguous_wild.splat.parts import TrainData
+from ambiguous_wild.splat.step import TrainData
 
 
 def load_train_data(scene: Scene, *, device: torch.device, seed: int, cache_dir: Path) -> TrainData:

@@ -13,13 +13,11 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.render import Gradients
+from ambiguous_wild.splat.rendered import Gradients
+from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step
 
 if TYPE_CHECKING:
     from ambiguous_wild.splat.optim import SplatAdam
-    from ambiguous_wild.splat.parts import Step
-
-NOMINAL_ITERATIONS = 30_000  # every schedule is written for this length and scales with the run
 
 
 @dataclass(frozen=True)

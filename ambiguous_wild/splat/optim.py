@@ -18,7 +18,7 @@ from torch import Tensor
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.render import Gradients
+from ambiguous_wild.splat.rendered import Gradients
 
 _LAZY = "sh_rest"
 

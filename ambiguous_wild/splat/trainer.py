@@ -22,9 +22,11 @@ from ambiguous_wild.splat.data import shrink, shrink_camera, shrink_keep
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.optim import SplatAdam
-from ambiguous_wild.splat.parts import NOMINAL_ITERATIONS, Parts, Step, TrainData
-from ambiguous_wild.splat.render import Rendered, render
+from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.render import render
+from ambiguous_wild.splat.rendered import Rendered
 from ambiguous_wild.splat.resolution import FULL, Level, ceiling_at, coarse_to_fine, divisor_at
+from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData
 
 COARSE_UNTIL = 0.4  # share of the run; measured on simulated captures, see docs/training.md
 TIMELINE_ROWS = 100

@@ -19,7 +19,7 @@ from ambiguous_wild.methods.refinesplat.policy import RefineSplatMask
 from ambiguous_wild.methods.refinesplat.recipe import build
 from ambiguous_wild.splat.checkpoint import load, save
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.parts import Step, TrainData
+from ambiguous_wild.splat.step import Step, TrainData
 
 HEIGHT, WIDTH, VIEWS = 72, 128, 4
 PRINTED = {"lambda_id": 1.0, "lambda_cr": 0.2}  # the entropy terms are off by default

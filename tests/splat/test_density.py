@@ -9,7 +9,7 @@ import torch
 from ambiguous_wild.splat.density import DensityConfig, DensityControl, rotation_matrices
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.optim import SplatAdam
-from ambiguous_wild.splat.render import Gradients
+from ambiguous_wild.splat.rendered import Gradients
 
 RATES = {
     "means": 1e-3,

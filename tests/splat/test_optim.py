@@ -9,7 +9,7 @@ from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.cpu.render import render_cpu
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.optim import SplatAdam
-from ambiguous_wild.splat.render import Gradients
+from ambiguous_wild.splat.rendered import Gradients
 
 from .scenes import camera, gaussians
 

@@ -13,11 +13,11 @@ from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.methods.refinesplat.merging import MergeConfig, clusters, merge_members, merge_pairs
 from ambiguous_wild.splat.density import DensityConfig, DensityControl, rotation_matrices
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.render import Gradients
+from ambiguous_wild.splat.rendered import Gradients
 
 if TYPE_CHECKING:
     from ambiguous_wild.splat.optim import SplatAdam
-    from ambiguous_wild.splat.parts import Step
+    from ambiguous_wild.splat.step import Step
 
 Decides = Literal["total", "photometric", "entropy"]
 

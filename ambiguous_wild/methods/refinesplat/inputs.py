@@ -13,7 +13,7 @@ from ambiguous_wild.methods.refinesplat.association import Identities, associate
 from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.identity import Psi, psi_arrays, psi_from_arrays, train_psi
 from ambiguous_wild.methods.refinesplat.masking import grid_labels, instance_means
-from ambiguous_wild.splat.parts import TrainData
+from ambiguous_wild.splat.step import TrainData
 from ambiguous_wild.vision.cache import cache_key, cached
 from ambiguous_wild.vision.protocols import Features, Instances
 

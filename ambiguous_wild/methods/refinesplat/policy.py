@@ -15,7 +15,8 @@ from ambiguous_wild.methods.refinesplat.inputs import FrozenInputs, prepare
 from ambiguous_wild.methods.refinesplat.losses import consistency_loss, identity_loss, instance_matrix
 from ambiguous_wild.methods.refinesplat.threshold import LearntWeight, robust_floor
 from ambiguous_wild.splat.data import shrink_keep
-from ambiguous_wild.splat.parts import MaskPolicy, State, Step, TrainData
+from ambiguous_wild.splat.parts import MaskPolicy, State
+from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.labhog import LabHog
 from ambiguous_wild.vision.protocols import Features, Instances
 from ambiguous_wild.vision.segments import GraphSegments

@@ -14,7 +14,7 @@ from ambiguous_wild.splat.cpu import bins, blend, harmonics, project, reverse
 from ambiguous_wild.splat.cpu.buffers import Pool
 from ambiguous_wild.splat.cpu.compile import threads
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.render import Gradients
+from ambiguous_wild.splat.rendered import Gradients
 
 _pool = Pool()
 

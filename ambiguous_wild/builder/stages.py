@@ -199,7 +199,8 @@ class Stages:
             len(screened.facts["skipped"]),
             matches.folder / DATABASE,
             matches.facts,
-            mask_warnings(masks.facts if masks else None) or ["masks were used"] * (masks is not None),
+            mask_warnings(masks.facts if masks else None)
+            or ["masks were used (white = keep): try without them"] * (masks is not None),
         )
         return mapping, features, matches
 

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ambiguous_wild.core.extras import install_command
+from ambiguous_wild.harness.environment import installed
 
 PACKAGE = Path(__file__).resolve().parent.parent
 DISTRIBUTION = "ambiguous-wild"
@@ -197,14 +198,6 @@ def other_versions(constraints: Path) -> list[str] | None:
         if version is not None and version.partition("+")[0] != pinned:
             lines.append(f"{name} {version} (tested: {pinned})")
     return lines
-
-
-def installed(name: str) -> str | None:
-    """The version of an installed distribution."""
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return None
 
 
 def _library(name: str, found: Probe, use: str) -> Check:

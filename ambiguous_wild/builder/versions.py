@@ -7,7 +7,7 @@ from importlib import metadata
 
 from ambiguous_wild import __version__
 
-BUILDER = 4  # raised when a stage computes something else from the same input
+BUILDER = 5  # raised when a stage computes something else from the same input
 _LIBRARIES = ("pycolmap", "OpenImageIO", "opencv-contrib-python-headless", "numpy")
 
 

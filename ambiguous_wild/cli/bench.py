@@ -139,6 +139,7 @@ def command(
         get_method(name)  # a misspelt name is answered before torch is imported
 
     from ambiguous_wild.harness.grid import plan_cells, run_cells
+    from ambiguous_wild.io.atomic import check_output
     from ambiguous_wild.splat.trainer import TrainConfig
 
     chosen = choose_device(device)
@@ -153,6 +154,7 @@ def command(
     for scene in {cell.scene.name: cell.scene for cell in cells}.values():
         for warning in scene.info.get("warnings", ()):
             click.echo(f"warning: {scene.name}: {warning}", err=True)
+    check_output(output / "run")  # before half a minute of compiling
     if chosen == "cpu":
         prepare_cpu(threads)
     progress = _Progress(len(cells))

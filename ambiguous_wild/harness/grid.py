@@ -20,6 +20,7 @@ from ambiguous_wild.harness.run import (
     run_cell,
     scene_identity,
 )
+from ambiguous_wild.io.atomic import check_output
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.registry import get_method
 from ambiguous_wild.splat.trainer import TrainConfig
@@ -112,7 +113,7 @@ def run_cells(
             if overwrite == "missing":
                 refuse_other_config(folder, cell)
     for needed in (output, cache_dir):
-        needed.mkdir(parents=True, exist_ok=True)  # what cannot be written is found before it is needed
+        check_output(needed / "run")  # what cannot be written is found before it is needed
     reports = []
     for cell, folder in zip(cells, folders):
         if on_start is not None:

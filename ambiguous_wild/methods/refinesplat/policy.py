@@ -10,7 +10,15 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
-from ambiguous_wild.methods.refinesplat.evidence import Judged, Masks, compare, make_masks, pooled, silence
+from ambiguous_wild.methods.refinesplat.evidence import (
+    Judged,
+    Maps,
+    Masks,
+    compare,
+    make_masks,
+    pooled,
+    silence,
+)
 from ambiguous_wild.methods.refinesplat.inputs import FrozenInputs, prepare
 from ambiguous_wild.methods.refinesplat.losses import consistency_loss, identity_loss, instance_matrix
 from ambiguous_wild.methods.refinesplat.threshold import LearntWeight, robust_floor
@@ -53,7 +61,7 @@ class RefineSplatMask(MaskPolicy):
         visit = self.visits.get(step.view, 0)
         due = step.view not in self.keeps or visit % self.config.mask_every == 0
         if due and not self._paused(step):
-            masks = self._masks(step)
+            _, masks = self.examine(step)
             self.judged[step.view] = masks.judged
             if self.config.mask.w2 is None:
                 self._learn(masks)
@@ -83,7 +91,7 @@ class RefineSplatMask(MaskPolicy):
     def predict(self, step: Step) -> Tensor | None:
         if not self._begun(step):
             return None
-        keep = torch.from_numpy(self._masks(step).keep).to(self.data.device)
+        keep = torch.from_numpy(self.examine(step)[1].keep).to(self.data.device)
         return shrink_keep(keep, step.divisor)
 
     def on_opacity_reset(self, step: Step) -> None:
@@ -118,8 +126,8 @@ class RefineSplatMask(MaskPolicy):
         return step.iteration - self.last_reset < pause
 
     @torch.no_grad()
-    def _masks(self, step: Step) -> Masks:
-        """Masks of the step's view at the photo's own size, from the step's render."""
+    def examine(self, step: Step) -> tuple[Maps, Masks]:
+        """The maps of the step's view and its masks at the photo's own size; learns and keeps nothing."""
         inputs, view = self.inputs, step.view
         image = _enlarge(step.rendered.image, self.data.photos[view])
         mask = self.config.mask
@@ -128,7 +136,7 @@ class RefineSplatMask(MaskPolicy):
         alpha = F.adaptive_avg_pool2d(step.rendered.alpha[None, None], (h, w))[0, 0]
         maps = silence(maps, (alpha < mask.least_alpha).cpu().numpy())
         others = [self.judged[v] for v in sorted(self.judged) if v != view]
-        return make_masks(maps, inputs.labels[view], inputs.static[view], others, self.w2, mask)
+        return maps, make_masks(maps, inputs.labels[view], inputs.static[view], others, self.w2, mask)
 
     def _learn(self, masks: Masks) -> None:
         """w2 from all instances; the price of a masked pixel is a robustly high residual."""

@@ -94,6 +94,7 @@ def all_checks() -> list[Check]:
         *_numba(found["numba"]),
         *_gpu(found["torch"]),
         _torchvision(found.get("torchvision")),
+        *_vision(),
         *_metrics(),
         _git(),
         *_planned(),
@@ -258,20 +259,31 @@ def _cuda_words(torch: Probe, driver: bool) -> tuple[str, str]:
 
 def _planned() -> list[Check]:
     """What later versions will use: named without a command, so that nobody installs it for nothing."""
+    packages = {"ray": "grids on several machines", "viser": "interactive viewer"}
+    return [
+        Check(
+            "planned", name, bool(version := installed(name)),
+            f"{'present' if version else 'absent'}, {UNUSED} ({use})",
+        )
+        for name, use in packages.items()
+    ]  # fmt: skip
+
+
+def _vision() -> list[Check]:
+    """Real foundation models: the package that runs them, and which weights are here."""
     from ambiguous_wild.vision import weights
 
-    packages = {
-        "transformers": "DINOv2 features, SAM masks",
-        "ray": "grids on several machines",
-        "viser": "interactive viewer",
-    }
-    found = [(name, bool(installed(name)), use) for name, use in packages.items()]
-    there = {s.name: s.present for s in weights.status()}
-    found += [(w.name, there[w.name], f"weights for {w.used_for}") for w in weights.KNOWN if w.planned]
-    return [
-        Check("planned", name, present, f"{'present' if present else 'absent'}, {UNUSED} ({use})")
-        for name, present, use in found
+    version = installed("transformers")
+    detail = f"{version or 'absent'} (DINO features, SAM masks)"
+    fix = "" if version else install_command("masks")
+    checks = [Check("optional", "transformers", version is not None, detail, fix)]
+    hub = {w.name: w.used_for for w in weights.KNOWN if w.kind == "hub"}
+    checks += [
+        Check("optional", line.name, line.present, f"{hub[line.name]}: {line.where}", line.bring)
+        for line in weights.status()
+        if line.name in hub
     ]
+    return checks
 
 
 def _torchvision(found: Probe | None) -> Check:

@@ -10,6 +10,7 @@ import numpy as np
 from torch import Tensor
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.core.config import config_hash
 
 _REFERENCE_PIXELS = 240 * 135  # k and min_size are stated for this size and grow with the pixel count
 
@@ -39,7 +40,8 @@ class GraphSegments:
                 f"segments: need 1 <= fewest <= most and tries >= 1, got {self.config.fewest}, "
                 f"{self.config.most}, {self.config.tries}"
             )
-        self.name = "graph-lab-1"
+        own = self.config != SegmentConfig()
+        self.name = "graph-lab-1" + (f"-{config_hash(self.config)[:8]}" if own else "")
 
     def labels(self, photo: Tensor) -> np.ndarray:
         """Segments [H, W] int32 from 1 of a photo [H, W, 3] in [0, 1]; the same photo, the same labels."""

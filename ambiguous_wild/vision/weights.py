@@ -21,7 +21,6 @@ class Weight:
     files: tuple[str, ...]  # all of them are needed
     used_for: str
     hub_id: str = ""  # of kind hub
-    planned: bool = False  # looked for, but no code of this version reads it
 
 
 class WeightStatus(NamedTuple):
@@ -35,24 +34,54 @@ class WeightStatus(NamedTuple):
 
 USUAL_FOLDER = "~/.cache/ambiguous_wild/weights"  # proposed where AW_WEIGHTS is not set
 _HUB_FILES = ("config.json", "model.safetensors")
+_TEXT_FILES = (*_HUB_FILES, "tokenizer.json", "tokenizer_config.json")
 
 
-def _hub(name: str, used_for: str, hub_id: str) -> Weight:
-    return Weight(name, "hub", _HUB_FILES, used_for, hub_id, planned=True)
+def _hub(name: str, used_for: str, owner: str = "facebook", files: tuple[str, ...] = _HUB_FILES) -> Weight:
+    return Weight(name, "hub", files, used_for, f"{owner}/{name}")
 
 
 KNOWN: tuple[Weight, ...] = (
-    _hub("dinov2-small", "features", "facebook/dinov2-small"),
-    _hub("dinov2-with-registers-small", "features", "facebook/dinov2-with-registers-small"),
-    _hub("dino-vits16", "features", "facebook/dino-vits16"),
-    _hub("sam-vit-base", "instance masks", "facebook/sam-vit-base"),
-    _hub("sam2.1-hiera-tiny", "instance masks", "facebook/sam2.1-hiera-tiny"),
-    _hub("grounding-dino-tiny", "instance masks", "IDEA-Research/grounding-dino-tiny"),
+    _hub("dinov2-small", "features"),
+    _hub("dinov2-with-registers-small", "features"),
+    _hub("dino-vits16", "features"),
+    _hub("sam-vit-base", "instance masks"),
+    _hub("sam2.1-hiera-tiny", "instance masks and identities"),
+    _hub("grounding-dino-tiny", "instance masks by prompt", "IDEA-Research", _TEXT_FILES),
     Weight("alexnet", "file", ("alexnet-owt-7be5be79.pth",), "LPIPS (alex)"),
     Weight("vgg16", "file", ("vgg16-397923af.pth",), "LPIPS (vgg)"),
     Weight("lpips-alex", "file", ("lpips_alex.pth",), "LPIPS (alex), the learnt heads"),
     Weight("lpips-vgg", "file", ("lpips_vgg.pth",), "LPIPS (vgg), the learnt heads"),
 )
+
+# Larger or finer ones of the same kinds: found and loaded by name, not listed by `aw doctor`.
+OTHER_SIZES: tuple[Weight, ...] = (
+    _hub("dinov2-base", "features"),
+    _hub("dinov2-with-registers-base", "features"),
+    _hub("dino-vits8", "features"),
+    _hub("dino-vitb16", "features"),
+    _hub("dino-vitb8", "features"),
+    _hub("sam-vit-large", "instance masks"),
+    _hub("sam-vit-huge", "instance masks"),
+    _hub("sam2.1-hiera-small", "instance masks and identities"),
+    _hub("sam2.1-hiera-base-plus", "instance masks and identities"),
+    _hub("sam2.1-hiera-large", "instance masks and identities"),
+    _hub("grounding-dino-base", "instance masks by prompt", "IDEA-Research", _TEXT_FILES),
+)
+
+
+def named(name: str) -> Weight:
+    """The weight of that name, of the listed ones or the other sizes.
+
+    Raises:
+        AwError: there is none; names the nearest.
+    """
+    from ambiguous_wild.core.errors import unknown  # brings numpy, which `status` does without
+
+    every = {weight.name: weight for weight in KNOWN + OTHER_SIZES}
+    if name not in every:
+        raise unknown("pretrained model", name, every)
+    return every[name]
 
 
 def weights_folder() -> Path | None:
@@ -99,7 +128,7 @@ def status() -> list[WeightStatus]:
         if place is not None:
             lines.append(WeightStatus(weight.name, True, str(place), ""))
         else:
-            lines.append(WeightStatus(weight.name, False, reason, _bring(weight)))
+            lines.append(WeightStatus(weight.name, False, reason, bring(weight)))
     return lines
 
 
@@ -128,7 +157,7 @@ def _searched(weight: Weight) -> list[Path]:
     ]
 
 
-def _bring(weight: Weight) -> str:
+def bring(weight: Weight) -> str:
     """A command to paste; where AW_WEIGHTS is not set it sets it first."""
     own = weights_folder()
     start = "" if own else f"export AW_WEIGHTS={USUAL_FOLDER} && "

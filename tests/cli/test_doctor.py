@@ -38,11 +38,17 @@ def test_whatever_lacks_comes_with_a_way_to_get_it(report: list[Check]) -> None:
 
 def test_what_no_code_uses_yet_is_said_so_and_not_asked_for(report: list[Check]) -> None:
     planned = {c.name: c for c in report if c.group == "planned"}
-    assert {"transformers", "ray", "viser", "dinov2-small", "sam-vit-base"} <= planned.keys()
+    assert {"ray", "viser"} <= planned.keys()
     assert all("not used by this version yet" in c.detail for c in planned.values())
     source = "".join(p.read_text() for p in checks.PACKAGE.rglob("*.py"))
-    for package in ("transformers", "ray", "viser"):  # the day one is imported, it is planned no more
+    for package in ("ray", "viser"):  # the day one is imported, it is planned no more
         assert f"import {package}" not in source and f"from {package}" not in source
+
+
+def test_weights_of_foundation_models_come_with_the_command_that_brings_them(report: list[Check]) -> None:
+    optional = {c.name: c for c in report if c.group == "optional"}
+    assert optional["transformers"].ok
+    assert optional["dinov2-small"].ok or "hf download facebook/dinov2-small" in optional["dinov2-small"].fix
 
 
 def test_the_way_to_lpips_can_be_pasted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -1,0 +1,186 @@
+"""Back ends by name: ``dinov2-small@252,blocks=6``, ``sam2-video``, ``grounded:person. car.``, ``graph``."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.core.config import with_options
+from ambiguous_wild.core.errors import unknown
+from ambiguous_wild.vision.protocols import Features, Instances
+
+# what one writes: the weight's name, see vision/weights.py
+DINO = {
+    "dinov2-small": "dinov2-small",
+    "dinov2-base": "dinov2-base",
+    "dinov2-small-registers": "dinov2-with-registers-small",
+    "dinov2-base-registers": "dinov2-with-registers-base",
+    "dino-vits16": "dino-vits16",
+    "dino-vits8": "dino-vits8",
+    "dino-vitb16": "dino-vitb16",
+    "dino-vitb8": "dino-vitb8",
+}
+SAM = {
+    "sam": "sam-vit-base",
+    "sam-large": "sam-vit-large",
+    "sam-huge": "sam-vit-huge",
+    "sam2": "sam2.1-hiera-tiny",
+    "sam2-small": "sam2.1-hiera-small",
+    "sam2-base-plus": "sam2.1-hiera-base-plus",
+    "sam2-large": "sam2.1-hiera-large",
+}
+SAM_VIDEO = {
+    "sam2-video": "sam2.1-hiera-tiny",
+    "sam2-small-video": "sam2.1-hiera-small",
+    "sam2-base-plus-video": "sam2.1-hiera-base-plus",
+    "sam2-large-video": "sam2.1-hiera-large",
+}
+FEATURES = ("labhog", *DINO)
+INSTANCES = ("graph", *SAM, *SAM_VIDEO, "grounded", "labels")
+_OPTION = re.compile(r",\s*([A-Za-z_][\w.]*)=([^,]*)$")
+
+
+@dataclasses.dataclass(frozen=True)
+class Spec:
+    """A back end as written: ``name[@size][:argument][,key=value...]``."""
+
+    name: str
+    size: int | None
+    argument: str  # after the colon: a prompt or a folder, "" = none
+    options: dict[str, str]
+
+
+def parse(text: str) -> Spec:
+    """Take a spec apart; options are read from its end, so that prompts may hold commas.
+
+    Raises:
+        AwError: the size is no number, or an option comes twice.
+    """
+    rest, options = text.strip(), dict[str, str]()
+    while match := _OPTION.search(rest):
+        if match[1] in options:
+            raise AwError(f"back end {text!r}: option {match[1]!r} comes twice")
+        options[match[1]] = match[2].strip()
+        rest = rest[: match.start()].rstrip()
+    head, _, argument = rest.partition(":")
+    name, at, size = head.partition("@")
+    if at and not size.isdecimal():
+        raise AwError(f"back end {text!r}: {size!r} is no size; write whole px, as in dinov2-small@252")
+    return Spec(name.strip(), int(size) if at else None, argument.strip(), dict(reversed(options.items())))
+
+
+def make_features(spec: str) -> Features:
+    """Features by name.
+
+    ``labhog``; or one of `DINO`, with ``@px`` (longer side), ``blocks=``, ``normalise=``, ``fit_photos=`` and
+    ``weights=FOLDER``.
+
+    Raises:
+        AwError: unknown name (names the nearest) or option; the weights are not here.
+    """
+    found = parse(spec)
+    if found.name not in FEATURES:
+        raise unknown("features", found.name, FEATURES)
+    if found.argument:
+        raise AwError(f"features {spec!r}: {found.name} takes nothing after a colon")
+    if found.name == "labhog":
+        from ambiguous_wild.vision.labhog import LabHog
+
+        _no_options(found, spec)
+        return LabHog()
+    from ambiguous_wild.vision.dino import DinoConfig, DinoFeatures
+
+    folder, options = _weights(found.options)
+    config = with_options(DinoConfig(), options, f"option of {found.name}")
+    if found.size is not None:
+        config = dataclasses.replace(config, size=found.size)
+    return DinoFeatures(DINO[found.name], config, folder)
+
+
+def make_instances(spec: str) -> Instances:
+    """Instances by name; what comes back may offer `NamedInstances` or `SceneInstances` as well.
+
+    ``graph``; one of `SAM` (``@n`` = points along a side) or `SAM_VIDEO`; ``grounded:PROMPT``;
+    ``labels:FOLDER`` (``scene_wide=true`` where its ids mean the same thing in every photo). Options are the
+    fields of the back end's config, and ``weights=FOLDER``.
+
+    Raises:
+        AwError: unknown name (names the nearest) or option; the weights or the folder are not here.
+    """
+    found = parse(spec)
+    if found.name not in INSTANCES:
+        raise unknown("instances", found.name, INSTANCES)
+    if found.argument and found.name not in ("grounded", "labels"):
+        raise AwError(f"instances {spec!r}: {found.name} takes nothing after a colon")
+    return _MAKERS.get(found.name, _sam)(found, spec)
+
+
+def _graph(found: Spec, spec: str) -> Instances:
+    from ambiguous_wild.vision.segments import GraphSegments, SegmentConfig
+
+    if found.size is not None:
+        raise AwError(f"instances {spec!r}: graph takes no size")
+    return GraphSegments(with_options(SegmentConfig(), found.options, "option of graph"))
+
+
+def _labels(found: Spec, spec: str) -> Instances:
+    from ambiguous_wild.vision.label_maps import LabelMaps, SceneLabelMaps
+
+    if found.size is not None or not found.argument:
+        raise AwError(f"instances {spec!r}: write labels:FOLDER")
+    flag = found.options.get("scene_wide", "false").lower()
+    if set(found.options) - {"scene_wide"}:
+        raise unknown("option of labels", next(iter(set(found.options) - {"scene_wide"})), ["scene_wide"])
+    if flag not in ("true", "false"):
+        raise AwError(f"instances {spec!r}: scene_wide is true or false, got {flag!r}")
+    return (SceneLabelMaps if flag == "true" else LabelMaps)(found.argument)
+
+
+def _grounded(found: Spec, spec: str) -> Instances:
+    from ambiguous_wild.vision.grounded import GroundedConfig, GroundedInstances
+
+    folder, options = _weights(found.options)
+    sam_folder, options = _weights(options, "sam_weights")
+    config = with_options(GroundedConfig(), options, "option of grounded")
+    if found.size is not None:
+        config = dataclasses.replace(config, shorter=found.size)
+    return GroundedInstances(found.argument, config, folder=folder, sam_folder=sam_folder)
+
+
+def _sam(found: Spec, spec: str) -> Instances:
+    folder, options = _weights(found.options)
+    where = f"option of {found.name}"
+    if found.name in SAM:
+        from ambiguous_wild.vision.sam import SamConfig, SamInstances
+
+        config = with_options(SamConfig(), options, where)
+        if found.size is not None:
+            config = dataclasses.replace(config, grid=found.size)
+        return SamInstances(SAM[found.name], config, folder)
+    from ambiguous_wild.vision.sam_video import SamVideoConfig, SamVideoInstances
+
+    video = with_options(SamVideoConfig(), options, where)
+    if found.size is not None:
+        video = dataclasses.replace(video, sam=dataclasses.replace(video.sam, grid=found.size))
+    return SamVideoInstances(SAM_VIDEO[found.name], video, folder)
+
+
+_MAKERS: dict[str, Callable[[Spec, str], Instances]] = {
+    "graph": _graph,
+    "labels": _labels,
+    "grounded": _grounded,
+}
+
+
+def _weights(options: dict[str, str], key: str = "weights") -> tuple[Path | None, dict[str, str]]:
+    """The folder an option names, and the other options."""
+    rest = {k: v for k, v in options.items() if k != key}
+    return (Path(options[key]).expanduser() if key in options else None), rest
+
+
+def _no_options(found: Spec, spec: str) -> None:
+    if found.options or found.size is not None:
+        raise AwError(f"features {spec!r}: {found.name} takes no options")

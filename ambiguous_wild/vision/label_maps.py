@@ -1,0 +1,152 @@
+"""Instance masks that the user made: a folder with one label map a photo, from any tool."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from torch import Tensor
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.vision.progress import Bar, no_bar
+
+SUFFIXES = (".png", ".npy")
+_ASPECT = 0.02  # relative difference of width / height from which on a map is another photo's
+
+
+class LabelMaps:
+    """Label maps found by the photo's name; ids of different photos have nothing to do with each other.
+
+    A file is a PNG of one channel (8 or 16 bits), a colour PNG (every colour is a label, black is none), or
+    a .npy of integers [H, W]; 0 and below = none. Another size than the photo's is resized, nearest.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        """Check that the folder is there.
+
+        Raises:
+            AwError: it is not, or holds no label map.
+        """
+        self.folder = Path(folder).expanduser()
+        if not self.folder.is_dir():
+            raise AwError(f"no folder {self.folder} with label maps; give one with a PNG or npy a photo")
+        if not any(p.suffix.lower() in SUFFIXES for p in self.folder.rglob("*")):
+            raise AwError(
+                f"{self.folder} holds no label map (.png, .npy); one a photo is needed, of its name"
+            )
+        self.name = f"labels-1-{self.folder.name}"
+
+    def labels(self, photo: Tensor) -> np.ndarray:
+        """Refused: a photo's pixels do not say which file is its own.
+
+        Raises:
+            AwError: always; `labels_of` takes the names as well.
+        """
+        raise AwError(f"label maps in {self.folder} are found by the photo's name: ask labels_of")
+
+    def labels_of(self, photos: Sequence[Tensor], names: Sequence[str]) -> list[np.ndarray]:
+        """Labels [H, W] int32 of every photo, 1..K without gaps; 0 = none.
+
+        Args:
+            photos: [H, W, 3]; only their sizes are used.
+            names: of the photos; the map of ``a/b.jpg`` is ``a/b.png`` or ``b.png`` (or .npy).
+
+        Raises:
+            AwError: photos without a map; a map that does not decode or is of another shape than its photo.
+        """
+        # the zero put in front makes 0 the first of the sorted ids, also where every pixel has a label
+        return [
+            np.searchsorted(np.unique(np.r_[0, m.ravel()]), m).astype(np.int32)
+            for m in self._raw(photos, names)
+        ]
+
+    def _raw(self, photos: Sequence[Tensor], names: Sequence[str]) -> list[np.ndarray]:
+        """[H, W] int64 of every photo at its size, ids as in the files."""
+        paths = [self._path(name) for name in names]
+        missing = [name for name, path in zip(names, paths) if path is None]
+        if missing:
+            raise AwError(
+                f"{len(missing)} of {len(names)} photos have no label map in {self.folder}: "
+                f"{shortlist(missing)}; add a PNG or npy of the same name for each"
+            )
+        sizes = [(int(p.shape[0]), int(p.shape[1])) for p in photos]
+        return [_resized(read_labels(path), *size, path) for path, size in zip(paths, sizes) if path]
+
+    def _path(self, name: str) -> Path | None:
+        stem = Path(name).with_suffix("")
+        if stem.is_absolute() or ".." in stem.parts:  # a name never leads out of the folder
+            return None
+        for base in (self.folder / stem, self.folder / stem.name):
+            for suffix in SUFFIXES:
+                path = base.with_name(base.name + suffix)
+                if path.is_file():
+                    return path
+        return None
+
+
+class SceneLabelMaps(LabelMaps):
+    """Label maps whose ids mean the same thing in every photo, as a video tracker writes them."""
+
+    def __init__(self, folder: str | Path) -> None:
+        super().__init__(folder)
+        self.name = f"labels-scene-1-{self.folder.name}"
+
+    def identities(
+        self, photos: Sequence[Tensor], names: Sequence[str], folder: Path | None = None, bar: Bar = no_bar
+    ) -> list[np.ndarray]:
+        """As `labels_of`, with the files' ids numbered 1..P without gaps over the whole scene."""
+        maps = self._raw(photos, names)
+        ids = np.unique(np.concatenate([np.zeros(1, np.int64), *(np.unique(m) for m in maps)]))
+        return [np.searchsorted(ids, m).astype(np.int32) for m in maps]
+
+
+def read_labels(path: Path) -> np.ndarray:
+    """Ids [H, W] int64 >= 0 of a label map as it lies in the file.
+
+    Raises:
+        AwError: the file does not decode, or holds something else than labels.
+    """
+    if path.suffix.lower() == ".npy":
+        return _checked(_load_npy(path), path)
+    try:
+        image = cv2.imdecode(np.fromfile(path, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    except (OSError, cv2.error):
+        image = None
+    if image is None:
+        raise AwError(f"cannot read label map {path}: it is empty, cut short or no image; restore it")
+    if image.ndim == 3:
+        if image.dtype != np.uint8:
+            raise AwError(f"label map {path} has {image.shape[2]} channels of 16 bits; save one channel")
+        blue, green, red = (image[:, :, c].astype(np.int64) for c in range(3))
+        return red + 256 * green + 65536 * blue
+    return _checked(image, path)
+
+
+def _load_npy(path: Path) -> np.ndarray:
+    try:
+        return np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise AwError(f"cannot read label map {path}: {error}; save integers [H, W] with np.save") from error
+
+
+def _checked(array: np.ndarray, path: Path) -> np.ndarray:
+    if array.ndim != 2 or array.size == 0 or array.dtype.kind not in "bui":
+        raise AwError(f"label map {path} is {array.dtype} {list(array.shape)}; integers [H, W] are needed")
+    return np.maximum(array.astype(np.int64), 0)
+
+
+def _resized(labels: np.ndarray, height: int, width: int, path: Path) -> np.ndarray:
+    h, w = labels.shape
+    if abs(w / h - width / height) > _ASPECT * width / height:
+        raise AwError(
+            f"label map {path} is {w}x{h}, its photo {width}x{height}: not the same shape; make it from the "
+            "scene's own undistorted photo"
+        )
+    if (h, w) == (height, width):
+        return labels
+    rows = ((np.arange(height) + 0.5) * h / height).astype(np.int64)
+    columns = ((np.arange(width) + 0.5) * w / width).astype(np.int64)
+    return labels[rows[:, None], columns[None, :]]

@@ -1,0 +1,230 @@
+"""Pretrained models from a folder: found or brought, checked, loaded whole - or refused in one line."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import importlib.util
+import json
+import logging
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.core.extras import install_command
+from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.vision import weights
+
+TENSORS = "model.safetensors"
+
+
+@dataclass(frozen=True)
+class Pretrained:
+    """A folder that holds one whole model of an expected kind."""
+
+    name: str
+    folder: Path
+    config: dict[str, Any]  # config.json
+    digest: str  # of the tensors and the config, 12 hex digits: part of cache keys
+
+    @property
+    def model_type(self) -> str:
+        return str(self.config["model_type"])
+
+
+def locate(name: str, model_types: Sequence[str], explicit: str | Path | None = None) -> Pretrained:
+    """The model's folder, checked without loading it.
+
+    Looks at the explicit folder, else AW_WEIGHTS/name, else the hub's cache, else downloads it.
+
+    Args:
+        name: of the weight, e.g. ``"dinov2-small"``.
+        model_types: what its config.json may say it is.
+        explicit: a folder of the user's that takes the place of the search.
+
+    Raises:
+        AwError: transformers is absent; there is no such weight; it is not here and cannot be brought; the
+            folder lacks a file, holds another kind of model, or no safetensors.
+    """
+    if importlib.util.find_spec("transformers") is None:
+        raise AwError(
+            f"{name} needs transformers, which is not installed; install it with: {install_command('masks')}"
+        )
+    if explicit is not None:
+        return _inspect(name, Path(explicit).expanduser(), model_types)
+    weight = weights.named(name)
+    folder, reason = weights.find(weight)
+    return _inspect(name, folder or _download(weight, reason), model_types)
+
+
+def offline() -> bool:
+    """Whether the user told the hub's library to stay off the network."""
+    on = ("1", "true", "yes", "on")
+    return any(os.environ.get(name, "").lower() in on for name in ("HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE"))
+
+
+def load(source: Pretrained, class_name: str, harmless: Sequence[str] = (), **options: Any) -> Any:
+    """The model in float32, frozen and in evaluation mode; every tensor of it comes from the file.
+
+    By default the library only logs a missing tensor and draws it at random; here that is an error.
+
+    Args:
+        source: from `locate`.
+        class_name: the library's concrete class.
+        harmless: prefixes of tensors in the file that the class has no use for.
+        options: for the class.
+
+    Raises:
+        AwError: a tensor lacks, is left over or has another shape; a file is damaged.
+    """
+    import torch
+
+    cls = model_class(class_name)
+    # building a net draws random numbers: the caller's generator must not notice
+    with _quiet(), torch.random.fork_rng(devices=[]):
+        try:
+            model, report = cls.from_pretrained(
+                str(source.folder),
+                use_safetensors=True,  # never a pickle
+                local_files_only=True,
+                output_loading_info=True,
+                dtype=torch.float32,
+                **options,
+            )
+        # what the library and safetensors raise for damaged files, other shapes and impossible configs
+        except Exception as error:
+            first = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+            raise AwError(
+                f"{source.folder} could not be loaded as {class_name}: {first}; bring it anew"
+            ) from error
+    left_over = [k for k in report["unexpected_keys"] if not k.startswith(tuple(harmless))]
+    wrong = {
+        "missing": list(report["missing_keys"]),
+        "left over": left_over,
+        "of another shape": [str(k[0] if isinstance(k, tuple) else k) for k in report["mismatched_keys"]],
+    }
+    if any(wrong.values()):
+        what = "; ".join(f"{len(k)} {kind}: {shortlist(sorted(k), 3)}" for kind, k in wrong.items() if k)
+        raise AwError(
+            f"{source.folder} is no whole {class_name} (tensors {what}); a net that is partly random is not"
+            " used: bring it anew"
+        )
+    return model.eval().requires_grad_(False)
+
+
+def model_class(name: str) -> Any:
+    """A class of transformers by name.
+
+    Raises:
+        AwError: importing it fails, most often because of a torchvision that does not fit torch.
+    """
+    try:
+        import transformers
+
+        return getattr(transformers, name)
+    except Exception as error:  # a broken torchvision raises RuntimeError, ImportError, AttributeError ...
+        cause = str(error).strip().splitlines()[-1] if str(error).strip() else type(error).__name__
+        if importlib.util.find_spec("torchvision") is not None and not _imports("torchvision"):
+            raise AwError(
+                "transformers cannot be used: the installed torchvision does not fit torch, and nothing here "
+                "needs it; remove it with: pip uninstall torchvision"
+            ) from error
+        raise AwError(
+            f"transformers has no usable {name}: {cause}; mend it with: {install_command('masks')}"
+        ) from error
+
+
+def _imports(name: str) -> bool:
+    try:
+        importlib.import_module(name)
+    except Exception:
+        return False
+    return True
+
+
+def _inspect(name: str, folder: Path, model_types: Sequence[str]) -> Pretrained:
+    if not folder.is_dir():
+        raise AwError(
+            f"no folder {folder} with the weights of {name}; give one with config.json and {TENSORS}"
+        )
+    path = folder / "config.json"
+    try:
+        config = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise AwError(
+            f"{folder} has no config.json: it is no folder of a pretrained model; {name} needs config.json"
+            f" and {TENSORS}"
+        ) from error
+    except (OSError, ValueError) as error:
+        raise AwError(f"cannot read {path}: {error}; bring {name} anew") from error
+    found = config.get("model_type") if isinstance(config, dict) else None
+    if found not in model_types:
+        raise AwError(f"{folder} holds a model of type {found!r}, {name} needs {' or '.join(model_types)}")
+    if not (folder / TENSORS).is_file():
+        pickle = (folder / "pytorch_model.bin").is_file()
+        why = "pytorch_model.bin only, a pickle that may run code" if pickle else f"no {TENSORS}"
+        raise AwError(f"{folder} has {why}; {name} needs {TENSORS}")
+    return Pretrained(name, folder, config, _digest(folder))
+
+
+def _digest(folder: Path) -> str:
+    parts = [_file_digest(str(folder / f), (folder / f).stat().st_mtime_ns) for f in ("config.json", TENSORS)]
+    return hashlib.sha256("".join(parts).encode()).hexdigest()[:12]
+
+
+@functools.lru_cache(maxsize=64)  # a hundred megabytes are hashed once a process, not once a back end
+def _file_digest(path: str, changed_ns: int) -> str:
+    return sha256_file(path)
+
+
+def _download(weight: weights.Weight, reason: str) -> Path:
+    """Bring the weight from the hub, into AW_WEIGHTS where that is set, else into the hub's cache."""
+    how = f"bring it with: {weights.bring(weight)}"
+    if offline():
+        raise AwError(f"the weights of {weight.name} are not here ({reason}); {how}")
+    from huggingface_hub import snapshot_download
+
+    own = weights.weights_folder()
+    try:
+        folder = Path(
+            snapshot_download(
+                weight.hub_id,
+                allow_patterns=list(weight.files),  # no pickle, no code
+                local_dir=None if own is None else own / weight.name,
+            )
+        )
+    except Exception as error:  # no network, no rights, no such repository, a full disk
+        cause = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        raise AwError(
+            f"the weights of {weight.name} are not here ({reason}) and could not be downloaded "
+            f"({cause}); {how}"
+        ) from error
+    missing = [name for name in weight.files if not (folder / name).is_file()]
+    if missing:
+        raise AwError(
+            f"the hub's {weight.hub_id} has no {shortlist(missing)}; put a copy that has it into AW_WEIGHTS/"
+            f"{weight.name} (save_pretrained writes {TENSORS})"
+        )
+    return folder
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """The library's report and bars are ours to give: what is wrong becomes one error."""
+    from transformers.utils import logging as library
+
+    root = logging.getLogger("transformers")
+    level, bars = root.level, library.is_progress_bar_enabled()
+    root.setLevel(logging.ERROR)
+    library.disable_progress_bar()
+    try:
+        yield
+    finally:
+        root.setLevel(level)
+        if bars:
+            library.enable_progress_bar()

@@ -1,0 +1,181 @@
+"""Segment Anything, version 1 and 2: every instance of a photo from a grid of points, or one a box.
+
+An own loop: the library's pipeline needs torchvision at its last step. The photo is encoded once, the points
+go through the mask decoder in batches (the decoder is the cost), and masks that are unsure, unstable or
+doubles are dropped before anything is enlarged to the photo's size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.core.config import config_hash
+from ambiguous_wild.vision.dino import normalised
+from ambiguous_wild.vision.masks import box_nms, mask_boxes, paint
+from ambiguous_wild.vision.pretrained import Pretrained, load, locate
+
+# A SAM 2 checkpoint is one of the video model; the image model takes its part of it.
+_CLASSES = {"sam": "SamModel", "sam2": "Sam2Model", "sam2_video": "Sam2Model"}
+
+
+@dataclass(frozen=True)
+class SamConfig:
+    """Full size SAM 2 tiny, 1024 px, two cores: 3.3 s to encode a photo, 15 s for 64 points."""
+
+    grid: int = 16  # points along each side; 32 is the authors', and four times the time
+    batch: int = 64  # points decoded at once
+    least_iou: float = 0.8  # the net's own guess of a mask's quality; SAM 1's authors use 0.88
+    least_stability: float = 0.95  # area above logit 1 over area above logit -1
+    nms: float = 0.7  # IoU of boxes from which on two masks are one
+    least_area: float = 2e-4  # of the photo; smaller masks are dropped
+
+
+@dataclass(frozen=True)
+class _Embedded:
+    """A photo as the net sees it."""
+
+    embeddings: Any  # of the net
+    height: int  # px of the photo
+    width: int
+    scale_x: float  # px of the net to a px of the photo
+    scale_y: float
+    seen: tuple[float, float]  # share of the net's square that the photo fills, rows and columns
+
+
+class SamInstances:
+    """Instances of a photo by SAM or SAM 2; implements the `Instances` protocol."""
+
+    def __init__(
+        self,
+        name: str = "sam2.1-hiera-tiny",
+        config: SamConfig | None = None,
+        folder: str | Path | None = None,
+    ) -> None:
+        """Find and check the weights; they are loaded when the first labels are asked for.
+
+        Raises:
+            AwError: no weights, see `pretrained.locate`; a setting that cannot be.
+        """
+        self.config = config or SamConfig()
+        if self.config.grid < 1 or self.config.batch < 1:
+            raise AwError(
+                f"{name}: grid and batch must be at least 1, got {self.config.grid}, {self.config.batch}"
+            )
+        self.source: Pretrained = locate(name, tuple(_CLASSES), folder)
+        self.name = f"sam-1-{name}-{self.source.digest}-{config_hash(self.config)[:8]}"
+        self._model: Any = None
+
+    @property
+    def model(self) -> Any:
+        """The net, loaded at first use."""
+        if self._model is None:
+            self._model = load(self.source, _CLASSES[self.source.model_type])
+        return self._model
+
+    @property
+    def side(self) -> int:
+        """Px of the square the net sees."""
+        return int(self.model.config.prompt_encoder_config.image_size)
+
+    @torch.no_grad()
+    def labels(self, photo: Tensor) -> np.ndarray:
+        """Labels [H, W] int32 of a photo [H, W, 3] in [0, 1], 1..K by falling area; 0 = none."""
+        embedded = self._embed(photo)
+        config, steps = self.config, (torch.arange(self.config.grid) + 0.5) / self.config.grid
+        y, x = torch.meshgrid(steps * embedded.height, steps * embedded.width, indexing="ij")
+        points = torch.stack([x.reshape(-1), y.reshape(-1)], dim=1).to(photo.device)
+        logits, scores = [], []
+        for low, quality in self._decode_points(embedded, points):
+            stable = (low > 1.0).sum((1, 2)) / (low > -1.0).sum((1, 2)).clamp(min=1)
+            area = (low > 0.0).float().mean((1, 2))
+            good = (quality > config.least_iou) & (stable >= config.least_stability)
+            good &= area >= config.least_area
+            logits.append(low[good])
+            scores.append(quality[good])
+        found, score = torch.cat(logits), torch.cat(scores).double().cpu().numpy()
+        keep = box_nms(mask_boxes((found > 0.0).cpu().numpy()), score, config.nms)
+        masks = [_enlarge(found[k], embedded) for k in keep]
+        return paint(masks, embedded.height, embedded.width)[0]
+
+    @torch.no_grad()
+    def in_boxes(self, photo: Tensor, boxes: np.ndarray) -> np.ndarray:
+        """Masks [n, H, W] bool, the instance in each box [n, 4] xyxy in px of the photo [H, W, 3]."""
+        embedded = self._embed(photo)
+        result = np.zeros((len(boxes), embedded.height, embedded.width), dtype=bool)
+        if not len(boxes):
+            return result
+        scale = [embedded.scale_x, embedded.scale_y] * 2
+        scaled = torch.as_tensor(np.asarray(boxes) * scale, dtype=torch.float32, device=photo.device)
+        for start in range(0, len(boxes), self.config.batch):
+            part = scaled[None, start : start + self.config.batch]
+            out = self.model(**self._prompt(embedded), input_boxes=part, multimask_output=False).pred_masks[
+                0, :, 0
+            ]
+            for offset, low in enumerate(_seen(out, embedded)):
+                result[start + offset] = _enlarge(low, embedded)
+        return result
+
+    def _decode_points(self, embedded: _Embedded, points: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+        """Logits [3 n, h, w] on the net's grid, cut to the photo, and quality [3 n], of each batch."""
+        scaled = points * points.new_tensor([embedded.scale_x, embedded.scale_y])
+        for start in range(0, len(scaled), self.config.batch):
+            part = scaled[start : start + self.config.batch][None, :, None]
+            ones = torch.ones(part.shape[:3], dtype=torch.int64, device=part.device)
+            out = self.model(**self._prompt(embedded), input_points=part, input_labels=ones)
+            low = _seen(out.pred_masks[0].flatten(0, 1), embedded)
+            yield low, out.iou_scores[0].flatten()
+
+    def _prompt(self, embedded: _Embedded) -> dict[str, Any]:
+        return {"image_embeddings": embedded.embeddings}
+
+    def _embed(self, photo: Tensor) -> _Embedded:
+        """SAM 1 sees the photo at one scale, padded right and below; SAM 2 sees it stretched to a square."""
+        height, width = int(photo.shape[0]), int(photo.shape[1])
+        self.model.to(photo.device)
+        side = self.side
+        if self.source.model_type == "sam":
+            scale = side / max(height, width)
+            inner = max(round(height * scale), 1), max(round(width * scale), 1)
+            pixels = fit_to(photo, *inner)
+            pixels = F.pad(pixels, (0, side - inner[1], 0, side - inner[0]))
+        else:
+            inner = side, side
+            pixels = fit_to(photo, side, side)
+        return _Embedded(
+            self.model.get_image_embeddings(pixels),
+            height,
+            width,
+            inner[1] / width,
+            inner[0] / height,
+            (inner[0] / side, inner[1] / side),
+        )
+
+
+def fit_to(photo: Tensor, height: int, width: int) -> Tensor:
+    """A photo [H, W, 3] in [0, 1] as the net's input [1, 3, height, width], resized and normalised."""
+    pixels = photo.detach().permute(2, 0, 1)[None].float()
+    pixels = F.interpolate(pixels, size=(height, width), mode="bilinear", align_corners=False, antialias=True)
+    return normalised(pixels)
+
+
+def _seen(low: Tensor, embedded: _Embedded) -> Tensor:
+    """Logits [n, h, w] without what is padding."""
+    rows = max(round(low.shape[1] * embedded.seen[0]), 1)
+    columns = max(round(low.shape[2] * embedded.seen[1]), 1)
+    return low[:, :rows, :columns]
+
+
+def _enlarge(low: Tensor, embedded: _Embedded) -> np.ndarray:
+    """A mask [H, W] bool at the photo's size of logits [h, w]."""
+    size = (embedded.height, embedded.width)
+    full = F.interpolate(low[None, None].float(), size=size, mode="bilinear", align_corners=False)
+    return (full[0, 0] > 0.0).cpu().numpy()

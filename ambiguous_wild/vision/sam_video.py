@@ -1,0 +1,176 @@
+"""Identities across an ordered sequence: SAM 2 follows what it found in one photo through the next ones.
+
+Every few photos all instances are looked for anew; those that no followed one covers get ids of their own.
+The sequence is cut there into chunks, each with a memory of its own, so that a chunk is a cache entry and a
+stopped stage goes on where it was. What leaves the sight for a whole chunk comes back under a new id.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.core.config import config_hash
+from ambiguous_wild.vision.cache import cache_key, cached
+from ambiguous_wild.vision.masks import add_new
+from ambiguous_wild.vision.pretrained import load, locate
+from ambiguous_wild.vision.progress import Bar, no_bar
+from ambiguous_wild.vision.sam import SamConfig, SamInstances, fit_to
+
+
+@dataclass(frozen=True)
+class SamVideoConfig:
+    """Cost grows with the objects: each has a memory of its own."""
+
+    every: int = 8  # photos from one look for new instances to the next
+    most: int = 32  # instances followed at a time, the largest
+    known: float = 0.5  # share of an instance under followed ones from which on it is nothing new
+    sam: SamConfig = field(default_factory=SamConfig)
+
+
+class SamVideoInstances:
+    """Instances with ids that mean the same thing in every photo of a sequence."""
+
+    def __init__(
+        self,
+        name: str = "sam2.1-hiera-tiny",
+        config: SamVideoConfig | None = None,
+        folder: str | Path | None = None,
+    ) -> None:
+        """Find and check the weights; they are loaded when the first identities are asked for.
+
+        Raises:
+            AwError: no weights, see `pretrained.locate`; a setting that cannot be.
+        """
+        self.config = config or SamVideoConfig()
+        if self.config.every < 1 or self.config.most < 1:
+            raise AwError(
+                f"{name}: every and most must be at least 1, got {self.config.every}, {self.config.most}"
+            )
+        self.source = locate(name, ("sam2_video",), folder)
+        self.single = SamInstances(name, self.config.sam, folder)
+        self.name = f"sam-video-1-{name}-{self.source.digest}-{config_hash(self.config)[:8]}"
+        self._model: Any = None
+
+    @property
+    def model(self) -> Any:
+        """The net, loaded at first use."""
+        if self._model is None:
+            self._model = load(self.source, "Sam2VideoModel")
+        return self._model
+
+    def labels(self, photo: Tensor) -> np.ndarray:
+        """Labels [H, W] int32 of one photo [H, W, 3] by itself: no identities."""
+        return self.single.labels(photo)
+
+    def identities(
+        self, photos: Sequence[Tensor], names: Sequence[str], folder: Path | None = None, bar: Bar = no_bar
+    ) -> list[np.ndarray]:
+        """Labels [H, W] int32 of every photo, one id for one thing in the whole sequence; 0 = none.
+
+        Args:
+            photos: [H, W, 3] in [0, 1].
+            names: of the photos; their natural order (a2 before a10) is the order of the sequence.
+            folder: of the cache; every photo's instances and every chunk are an entry of it.
+            bar: wraps the chunks, for a progress bar.
+        """
+        order = sorted(range(len(photos)), key=lambda i: (natural(names[i]), i))
+        result: list[np.ndarray] = [np.zeros(tuple(p.shape[:2]), dtype=np.int32) for p in photos]
+        carried: np.ndarray | None = None  # ids that reached the next chunk's first photo
+        next_id = 1
+        for start in bar(list(range(0, len(order), self.config.every))):
+            chunk = order[start : start + self.config.every + 1]
+            frames = [photos[i] for i in chunk]
+            found = self._found(frames[0], folder)
+            empty = np.zeros_like(found)
+            first, next_id = add_new(
+                empty if carried is None else carried, found, next_id, self.config.most, self.config.known
+            )
+            maps = self._followed(frames, first, folder)
+            for i, ids in zip(chunk[: self.config.every], maps):
+                result[i] = ids
+            carried = maps[-1]
+        return result
+
+    def _found(self, photo: Tensor, folder: Path | None) -> np.ndarray:
+        if folder is None:
+            return self.single.labels(photo)
+        key = cache_key("instances", self.single.name, None, photo.detach().cpu().numpy())
+        return cached(folder, key, {"labels": np.int32}, lambda: {"labels": self.single.labels(photo)})[
+            "labels"
+        ]
+
+    def _followed(self, frames: list[Tensor], first: np.ndarray, folder: Path | None) -> list[np.ndarray]:
+        names = [f"frame{k:04d}" for k in range(len(frames))]
+
+        def compute() -> dict[str, np.ndarray]:
+            return dict(zip(names, self.follow(frames, first)))
+
+        if folder is None:
+            found = compute()
+        else:
+            pixels = [frame.detach().cpu().numpy() for frame in frames]
+            key = cache_key("followed", self.name, None, first, *pixels)
+            found = cached(folder, key, dict.fromkeys(names, np.int32), compute)
+        return [found[name] for name in names]
+
+    @torch.no_grad()
+    def follow(self, frames: Sequence[Tensor], first: np.ndarray) -> list[np.ndarray]:
+        """The ids of `first` [H, W] int32 through all frames [H, W, 3]; the first map is `first` itself."""
+        ids = [int(k) for k in np.unique(first) if k > 0]
+        if not ids or len(frames) == 1:
+            return [first, *(np.zeros(tuple(f.shape[:2]), dtype=np.int32) for f in frames[1:])]
+        from transformers import Sam2VideoInferenceSession
+
+        device = frames[0].device
+        model = self.model.to(device)
+        side = int(model.config.prompt_encoder_config.image_size)
+        session = Sam2VideoInferenceSession(
+            video=torch.cat([fit_to(frame, side, side) for frame in frames]),
+            video_height=side,
+            video_width=side,
+            inference_device=device,
+            inference_state_device=device,
+            video_storage_device=device,
+            dtype=torch.float32,
+        )
+        for number in ids:
+            mask = torch.from_numpy((first == number).astype(np.float32))[None, None].to(device)
+            prompt = (F.interpolate(mask, size=(side, side), mode="area") >= 0.5).float()
+            session.add_mask_inputs(session.obj_id_to_idx(number), 0, prompt)
+        session.obj_with_new_inputs = list(ids)
+        model(inference_session=session, frame_idx=0)
+        outs = model.propagate_in_video_iterator(session)
+        followed = [_painted(out, tuple(frames[out.frame_idx].shape[:2])) for out in outs if out.frame_idx]
+        return [first, *followed]
+
+
+def _painted(out: Any, size: tuple[int, int]) -> np.ndarray:
+    """Ids [H, W] of one frame: at every pixel the object of the highest logit above 0."""
+    best = torch.zeros(size, device=out.pred_masks.device)
+    ids = torch.zeros(size, dtype=torch.int32, device=best.device)
+    present = out.object_score_logits
+    for index, number in enumerate(out.object_ids):
+        if present is not None and float(present.reshape(-1)[index]) <= 0.0:
+            continue
+        low = out.pred_masks[index].reshape(1, 1, *out.pred_masks.shape[-2:]).float()
+        full = F.interpolate(low, size=size, mode="bilinear", align_corners=False)[0, 0]
+        wins = full > best
+        best = torch.where(wins, full, best)
+        ids[wins] = int(number)
+    return ids.cpu().numpy()
+
+
+def natural(name: str) -> tuple[tuple[int, int, str], ...]:
+    """Key that sorts numbers inside names by value: frame2 before frame10."""
+    parts = re.split(r"(\d+)", name)
+    return tuple((0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts)

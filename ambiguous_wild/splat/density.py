@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ambiguous_wild.splat.density_log import DensityLog
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.rendered import Gradients
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step
@@ -54,6 +55,7 @@ class DensityControl:
         self.last_growth = 0  # iteration
         self.last_reset = 0  # iteration
         self.resets_done = 0
+        self.log = DensityLog()  # for pictures; decides nothing
 
     def statistic(self, gradients: Gradients) -> Tensor:
         """The screen-space gradient [N, 2] in 1/px that decides growth."""
@@ -91,9 +93,11 @@ class DensityControl:
             self._match(gaussians)
             # Lazily stepped rows are brought up to date first: growth copies parameters.
             optimiser.flush()
+            self.log.begin(step.iteration)
             gaussians = self._grow(step, gaussians, optimiser)
             gaussians = self._prune(gaussians, optimiser)
             gaussians = self.after_growth(step, gaussians, optimiser)
+            self.log.now.count = len(gaussians)
             self._clear(gaussians)
             self.last_growth = step.iteration
             events.append("grow")
@@ -153,6 +157,7 @@ class DensityControl:
         optimiser.select(stay)
         self._select(stay)
         new = copies.cat(halves[0]).cat(halves[1])
+        self.log.grew(len(clones), len(splits), new.means)
         gaussians = gaussians.select(stay).cat(new)
         optimiser.append(len(new))
         self._match(gaussians)
@@ -175,6 +180,7 @@ class DensityControl:
         if not bool(drop.any()) or bool(drop.all()):
             # An empty model cannot learn again: a round that would remove everything removes nothing.
             return gaussians
+        self.log.now.pruned += int(drop.sum())
         return self.keep_rows(gaussians, optimiser, ~drop)
 
     def keep_rows(self, gaussians: Gaussians, optimiser: SplatAdam, stay: Tensor) -> Gaussians:
@@ -205,6 +211,7 @@ class DensityControl:
             "last_reset": self.last_reset,
             "resets_done": self.resets_done,
             "rng": self.rng.bit_generator.state,
+            "log": self.log.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -212,6 +219,7 @@ class DensityControl:
         self.last_growth, self.last_reset = state["last_growth"], state["last_reset"]
         self.resets_done = state["resets_done"]
         self.rng.bit_generator.state = state["rng"]
+        self.log.load_state_dict(state["log"])
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:

@@ -7,8 +7,10 @@ that is not there is never called and allocates nothing.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 from torch import Tensor
 
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
@@ -45,6 +47,17 @@ class MaskPolicy:
     def facts(self) -> dict[str, Any]:
         """Plain values worth a line in the run's metrics, e.g. the share of pixels masked."""
         return {}
+
+    def panels(self, step: Step) -> dict[str, np.ndarray]:
+        """Pictures of what the policy sees in this step, [H, W, 3] uint8 at the photo's size, by caption.
+
+        Nothing is learnt or kept: a run is the same with and without them (a test compares the bits).
+        """
+        return {}
+
+    def draw(self, folder: Path) -> list[Path]:
+        """Write pictures of one's own after the last step; returns what was written."""
+        return []
 
     def state_dict(self) -> State:
         return {}

@@ -102,6 +102,7 @@ class EntropyAwareDensity(DensityControl):
         optimiser.append(len(new))  # their moments start at zero
         self._match(gaussians)
         self.merged += len(rows) - len(new)
+        self.log.merge(len(rows) - len(new), new.means)
         return gaussians
 
     def _select(self, stay: Tensor) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ambiguous_wild.methods.refinesplat import pictures
 from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.evidence import (
     Judged,
@@ -167,6 +169,12 @@ class RefineSplatMask(MaskPolicy):
             member = instance_matrix(inputs.grid[step.view].reshape(-1), inputs.counts[step.view], weights)
             loss = loss + config.lambda_cr * consistency_loss(flat, member, variant)
         return loss
+
+    def panels(self, step: Step) -> dict[str, np.ndarray]:
+        return pictures.panels(self, step, begun=self._begun(step))
+
+    def draw(self, folder: Path) -> list[Path]:
+        return pictures.draw_entropies(self, folder)
 
     def state_dict(self) -> State:
         psi = self.inputs.psi

@@ -1,0 +1,106 @@
+"""What RefineSplat sees, for people: maps and masks of one step, and where T_ent cuts the scene's instances."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ambiguous_wild.io.atomic import atomic_path
+from ambiguous_wild.io.palette import GLOBAL, LOCAL, MASKED, NEUTRAL, plot_colour, ramp, tint
+from ambiguous_wild.methods.refinesplat import masking
+from ambiguous_wild.splat.step import Step
+
+if TYPE_CHECKING:
+    from ambiguous_wild.methods.refinesplat.policy import RefineSplatMask
+
+
+def panels(policy: RefineSplatMask, step: Step, *, begun: bool = True) -> dict[str, np.ndarray]:
+    """Entropy, instances by their statistic, and the local, global and final mask; [H, W, 3] uint8 each.
+
+    Args:
+        policy: whose masks; it learns nothing here.
+        step: of one train view at the photo's own size.
+        begun: whether masks are in force at this step.
+    """
+    maps, masks = policy.examine(step)
+    labels = policy.inputs.labels[step.view]
+    photo = (policy.data.photos[step.view].cpu().numpy() * 255 + 0.5).astype(np.uint8)
+    height, width = labels.shape
+    means, _ = masking.instance_means(maps.statistic, labels, len(policy.inputs.static[step.view]))
+    threshold = masks.cut.threshold
+    top = 2 * threshold if math.isfinite(threshold) else 1.5 * float(np.nanmax(means, initial=1e-9))
+    cut = f"T {threshold:.2f}" if math.isfinite(threshold) else "nothing stands apart"
+    of_pixel = np.r_[np.nan, means][np.clip(labels, 0, len(means))]
+    final = masks.keep < 0.5
+    used = "" if begun else ", not used yet"
+    return {
+        f"entropy, mean {maps.entropy.mean():.2f}": masking.enlarge(
+            ramp(maps.entropy, 0.0, 1.0), height, width
+        ),
+        f"instances, {cut}": _outlined(ramp(of_pixel, 0.0, top), labels),
+        f"local {100 * masks.local.mean():.0f} %": tint(photo, masks.local, LOCAL),
+        f"global {100 * masks.global_.mean():.0f} %": tint(photo, masks.global_, GLOBAL),
+        f"final {100 * final.mean():.0f} %{used}": tint(photo, final, MASKED),
+    }
+
+
+def _outlined(image: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """The image with a dark line where one instance ends and another begins."""
+    edge = np.zeros(labels.shape, bool)
+    edge[:, 1:] |= labels[:, 1:] != labels[:, :-1]
+    edge[1:] |= labels[1:] != labels[:-1]
+    image = image.copy()
+    image[edge] = image[edge] // 2
+    return image
+
+
+def draw_entropies(policy: RefineSplatMask, folder: Path) -> list[Path]:
+    """entropies.png: instances of all photos when they were last judged, and their thresholds."""
+    views = [v for v in sorted(policy.judged) if v in policy.shares and len(policy.judged[v].values)]
+    if not views:
+        return []
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    values = np.concatenate([policy.judged[v].values for v in views])
+    distances = np.concatenate([policy.judged[v].distances for v in views])
+    areas = np.concatenate([policy.judged[v].areas for v in views])
+    cuts = np.array([policy.shares[v][3] for v in views])
+    above = np.concatenate([policy.judged[v].values > policy.shares[v][3] for v in views])
+    figure = Figure(figsize=(11, 4.2), layout="constrained", dpi=110)
+    FigureCanvasAgg(figure)
+    left, right = figure.subplots(1, 2)
+    # the few largest would squeeze all others into one bar
+    end = max(float(np.quantile(values, 0.995)), 1.1 * float(cuts[np.isfinite(cuts)].max(initial=0.0)), 1e-6)
+    bins = np.linspace(0.0, end, 60)
+    clipped = np.minimum(values, end)
+    kept, masked = plot_colour(NEUTRAL), plot_colour(MASKED)
+    left.hist([clipped[~above], clipped[above]], bins, stacked=True, color=[kept, masked],
+              label=[f"below T_ent: {int((~above).sum())}", f"above: {int(above.sum())}"])  # fmt: skip
+    left.set_yscale("symlog", linthresh=10)
+    left.set_ylabel("instances")
+    size = 4 + 60 * np.sqrt(areas / max(float(areas.max()), 1.0))
+    for chosen, colour in ((~above, kept), (above, masked)):
+        right.scatter(clipped[chosen], distances[chosen], size[chosen], color=colour, alpha=0.5, lw=0)
+    right.set_yscale("symlog", linthresh=1)
+    right.set_ylim(bottom=0)
+    right.set_ylabel("distance of photo and render (units of blur and noise)")
+    finite = cuts[np.isfinite(cuts)]
+    for axes in (left, right):
+        for cut in finite:
+            axes.axvline(cut, color="k", lw=0.5, alpha=0.25)
+        if len(finite):
+            label = f"T_ent, median {np.median(finite):.2f} ({len(finite)} of {len(views)} photos)"
+            axes.axvline(float(np.median(finite)), color="k", lw=1.5, label=label)
+        axes.set_xlabel(f"mean {policy.config.mask.statistic} of an instance")
+        axes.set_xlim(0, end)
+    left.legend(fontsize=8, loc="upper right")
+    left.set_title(f"{len(values)} instances of {len(views)} photos, w2 = {policy.w2:.2f}", fontsize=10)
+    right.set_title("each instance, its size by its area", fontsize=10)
+    path = folder / "entropies.png"
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, metadata={"Software": None})
+    return [path]

@@ -1,0 +1,80 @@
+"""What a second image cotangent costs: one backward, two in one traversal, two backwards one after the other.
+
+    python benchmarks/cotangents.py [--runs N] [--json PATH]
+
+The scene is that of benchmarks/rasterizer.py. The three ways take turns within every run, so that they meet
+the same machine; ratios are of the best of N. Prints a table and writes benchmarks/results/cotangents.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rasterizer import CASES, Stopwatch, machine, scene
+
+from ambiguous_wild.io.atomic import write_json
+from ambiguous_wild.splat.cpu.render import render_cpu
+from ambiguous_wild.splat.cpu.warmup import warm_up
+
+RESULTS = Path(__file__).parent / "results" / "cotangents.json"
+WARM = 3  # runs whose times are thrown away
+
+
+def measure(n: int, width: int, height: int, runs: int) -> dict[str, Any]:
+    """Milliseconds of the three ways, and what they cost against one backward."""
+    gaussians, camera = scene(n, width, height)
+    rng = np.random.default_rng(1)
+    # of a mean over pixels, as a loss's is
+    scale = 1.0 / (width * height)
+    first, second = (
+        torch.from_numpy((scale * rng.normal(size=(height, width, 3))).astype(np.float32)) for _ in range(2)
+    )
+    rendered = render_cpu(gaussians, camera)
+    ways: dict[str, Callable[[], Any]] = {
+        "one": lambda: rendered.backward(first),
+        "two in one traversal": lambda: rendered.backward(first, d_image_extra=second),
+        "two backwards": lambda: (rendered.backward(first), rendered.backward(second)),
+    }
+    watch = Stopwatch()
+    for run in range(runs + WARM):
+        used = watch if run >= WARM else Stopwatch()
+        for name, way in ways.items():
+            used(name, way)
+    parts = watch.summary()
+    best = {name: ms["best_ms"] for name, ms in parts.items()}
+    return {
+        "gaussians": n,
+        "width": width,
+        "height": height,
+        "runs": runs,
+        "parts": parts,
+        "over_one": {name: round(ms / best["one"], 3) for name, ms in best.items()},
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--runs", type=int, default=30, help="timed runs a case")
+    parser.add_argument("--json", type=Path, default=RESULTS, help="where the figures go")
+    args = parser.parse_args()
+    warm_up(lambda text: print(text, file=sys.stderr))
+    cases = [measure(*case, args.runs) for case in CASES]
+    for case in cases:
+        print(f"{case['gaussians']} Gaussians, {case['width']}x{case['height']}, {case['runs']} runs")
+        for name, ms in case["parts"].items():
+            ratio = case["over_one"][name]
+            print(
+                f"  {name:21s} best {ms['best_ms']:7.2f} ms, median {ms['median_ms']:7.2f} ms, x {ratio:.2f}"
+            )
+    write_json(args.json, {"machine": machine(), "cases": cases})
+    print(f"wrote {args.json}")
+
+
+if __name__ == "__main__":
+    main()

@@ -68,6 +68,12 @@ class GroundedInstances:
                 f"{name}: need 0 < shorter <= longer, got {self.config.shorter}, {self.config.longer}"
             )
         self.source = locate(name, ("grounding-dino",), folder)
+        # without them the library makes a tokenizer that knows no word, and says nothing
+        if not any((self.source.folder / file).is_file() for file in ("tokenizer.json", "vocab.txt")):
+            raise AwError(
+                f"{self.source.folder} has no tokenizer.json: {name} cannot read a prompt; bring that "
+                "file and tokenizer_config.json"
+            )
         self.sam = SamInstances(sam, self.config.sam, sam_folder)
         digests = f"{self.source.digest}-{self.sam.source.digest}"
         settings = config_hash({"prompt": self.prompt, "config": self.config})[:8]

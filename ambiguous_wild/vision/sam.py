@@ -46,9 +46,29 @@ class _Embedded:
     embeddings: Any  # of the net
     height: int  # px of the photo
     width: int
-    scale_x: float  # px of the net to a px of the photo
-    scale_y: float
-    seen: tuple[float, float]  # share of the net's square that the photo fills, rows and columns
+    side: int  # px of the square the net sees
+    inner: tuple[int, int]  # rows and columns of it that the photo fills; the rest is padding
+
+    @property
+    def scale(self) -> tuple[float, float]:
+        """Px of the net to a px of the photo, in x and y."""
+        return self.inner[1] / self.width, self.inner[0] / self.height
+
+    def seen(self, low: Tensor) -> Tensor:
+        """Logits [n, h, w] without what is padding."""
+        rows = max(round(low.shape[1] * self.inner[0] / self.side), 1)
+        columns = max(round(low.shape[2] * self.inner[1] / self.side), 1)
+        return low[:, :rows, :columns]
+
+    def enlarged(self, low: Tensor) -> np.ndarray:
+        """A mask [H, W] bool at the photo's size of logits [h, w]; padding is cut off where it is exact."""
+        full = low[None, None].float()
+        if self.inner != (self.side, self.side):
+            full = F.interpolate(full, size=(self.side, self.side), mode="bilinear", align_corners=False)
+            full = full[:, :, : self.inner[0], : self.inner[1]]
+        size = (self.height, self.width)
+        full = F.interpolate(full, size=size, mode="bilinear", align_corners=False)
+        return (full[0, 0] > 0.0).cpu().numpy()
 
 
 class SamInstances:
@@ -95,15 +115,16 @@ class SamInstances:
         points = torch.stack([x.reshape(-1), y.reshape(-1)], dim=1).to(photo.device)
         logits, scores = [], []
         for low, quality in self._decode_points(embedded, points):
-            stable = (low > 1.0).sum((1, 2)) / (low > -1.0).sum((1, 2)).clamp(min=1)
-            area = (low > 0.0).float().mean((1, 2))
+            seen = embedded.seen(low)
+            stable = (seen > 1.0).sum((1, 2)) / (seen > -1.0).sum((1, 2)).clamp(min=1)
+            area = (seen > 0.0).float().mean((1, 2))
             good = (quality > config.least_iou) & (stable >= config.least_stability)
             good &= area >= config.least_area
             logits.append(low[good])
             scores.append(quality[good])
         found, score = torch.cat(logits), torch.cat(scores).double().cpu().numpy()
-        keep = box_nms(mask_boxes((found > 0.0).cpu().numpy()), score, config.nms)
-        masks = [_enlarge(found[k], embedded) for k in keep]
+        keep = box_nms(mask_boxes((embedded.seen(found) > 0.0).cpu().numpy()), score, config.nms)
+        masks = [embedded.enlarged(found[k]) for k in keep]
         return paint(masks, embedded.height, embedded.width)[0]
 
     @torch.no_grad()
@@ -113,26 +134,26 @@ class SamInstances:
         result = np.zeros((len(boxes), embedded.height, embedded.width), dtype=bool)
         if not len(boxes):
             return result
-        scale = [embedded.scale_x, embedded.scale_y] * 2
-        scaled = torch.as_tensor(np.asarray(boxes) * scale, dtype=torch.float32, device=photo.device)
+        scaled = torch.as_tensor(
+            np.asarray(boxes) * (embedded.scale * 2), dtype=torch.float32, device=photo.device
+        )
         for start in range(0, len(boxes), self.config.batch):
             part = scaled[None, start : start + self.config.batch]
             out = self.model(**self._prompt(embedded), input_boxes=part, multimask_output=False).pred_masks[
                 0, :, 0
             ]
-            for offset, low in enumerate(_seen(out, embedded)):
-                result[start + offset] = _enlarge(low, embedded)
+            for offset, low in enumerate(out):
+                result[start + offset] = embedded.enlarged(low)
         return result
 
     def _decode_points(self, embedded: _Embedded, points: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-        """Logits [3 n, h, w] on the net's grid, cut to the photo, and quality [3 n], of each batch."""
-        scaled = points * points.new_tensor([embedded.scale_x, embedded.scale_y])
+        """Logits [3 n, h, w] on the net's grid and quality [3 n], of each batch."""
+        scaled = points * points.new_tensor(embedded.scale)
         for start in range(0, len(scaled), self.config.batch):
             part = scaled[start : start + self.config.batch][None, :, None]
             ones = torch.ones(part.shape[:3], dtype=torch.int64, device=part.device)
             out = self.model(**self._prompt(embedded), input_points=part, input_labels=ones)
-            low = _seen(out.pred_masks[0].flatten(0, 1), embedded)
-            yield low, out.iou_scores[0].flatten()
+            yield out.pred_masks[0].flatten(0, 1), out.iou_scores[0].flatten()
 
     def _prompt(self, embedded: _Embedded) -> dict[str, Any]:
         return {"image_embeddings": embedded.embeddings}
@@ -150,14 +171,7 @@ class SamInstances:
         else:
             inner = side, side
             pixels = fit_to(photo, side, side)
-        return _Embedded(
-            self.model.get_image_embeddings(pixels),
-            height,
-            width,
-            inner[1] / width,
-            inner[0] / height,
-            (inner[0] / side, inner[1] / side),
-        )
+        return _Embedded(self.model.get_image_embeddings(pixels), height, width, side, inner)
 
 
 def fit_to(photo: Tensor, height: int, width: int) -> Tensor:
@@ -165,17 +179,3 @@ def fit_to(photo: Tensor, height: int, width: int) -> Tensor:
     pixels = photo.detach().permute(2, 0, 1)[None].float()
     pixels = F.interpolate(pixels, size=(height, width), mode="bilinear", align_corners=False, antialias=True)
     return normalised(pixels)
-
-
-def _seen(low: Tensor, embedded: _Embedded) -> Tensor:
-    """Logits [n, h, w] without what is padding."""
-    rows = max(round(low.shape[1] * embedded.seen[0]), 1)
-    columns = max(round(low.shape[2] * embedded.seen[1]), 1)
-    return low[:, :rows, :columns]
-
-
-def _enlarge(low: Tensor, embedded: _Embedded) -> np.ndarray:
-    """A mask [H, W] bool at the photo's size of logits [h, w]."""
-    size = (embedded.height, embedded.width)
-    full = F.interpolate(low[None, None].float(), size=size, mode="bilinear", align_corners=False)
-    return (full[0, 0] > 0.0).cpu().numpy()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -116,6 +116,15 @@ MAKERS: dict[str, Callable[[], Any]] = {
     "dinov2": dinov2, "registers": dinov2_registers, "dinov1": dinov1, "sam": sam, "sam2": sam2,
     "sam2_video": sam2_video, "grounding": grounding_dino,
 }  # fmt: skip
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread() -> Iterator[None]:
+    """Nets this small spend their time on waking threads, most of all on a busy machine."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="session")

@@ -65,7 +65,7 @@ def test_tensors_of_another_shape_and_damaged_files_are_refused(copy):
 
 
 def test_another_kind_of_model_is_refused_before_it_is_loaded(checkpoint):
-    with pytest.raises(AwError, match="holds a model of type 'dinov2_with_registers', x needs dinov2$"):
+    with pytest.raises(AwError, match="holds a model of type 'dinov2_with_registers', x needs dinov2"):
         locate("x", ("dinov2",), checkpoint("registers"))
     with pytest.raises(AwError, match="type 'sam', x needs dinov2 or dinov2_with_registers or vit"):
         DinoFeatures("x", folder=checkpoint("sam"))
@@ -79,7 +79,7 @@ def test_a_pickle_is_never_opened(copy):
 
 
 def test_folders_that_hold_no_model(tmp_path: Path):
-    with pytest.raises(AwError, match="there is no folder"):
+    with pytest.raises(AwError, match=r"no folder .*absent"):
         locate("x", ("dinov2",), tmp_path / "absent")
     with pytest.raises(AwError, match=r"no config\.json"):
         locate("x", ("dinov2",), tmp_path)
@@ -179,8 +179,8 @@ def test_a_torchvision_that_does_not_fit_is_named(checkpoint, tmp_path: Path):
 
 def test_importing_the_back_ends_does_not_import_transformers():
     code = (
-        "import sys, ambiguous_wild.vision.backends, ambiguous_wild.vision.dino, ambiguous_wild.vision.grounded,"
-        " ambiguous_wild.vision.sam_video, ambiguous_wild.vision.stage\n"
+        "import sys, ambiguous_wild.vision.backends, ambiguous_wild.vision.dino,"
+        " ambiguous_wild.vision.grounded, ambiguous_wild.vision.sam_video, ambiguous_wild.vision.stage\n"
         "sys.exit('transformers' in sys.modules or 'huggingface_hub' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

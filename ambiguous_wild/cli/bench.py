@@ -99,6 +99,12 @@ def parse_budget(text: str) -> float:
     show_default=True,
     help="Seconds between checkpoints.",
 )
+@click.option(
+    "--pictures/--no-pictures",
+    default=True,
+    show_default=True,
+    help="Draw what the method saw into RUN/pictures; changes nothing else.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print the outcome of every run as JSON.")
 def command(
     methods: tuple[str, ...],
@@ -117,6 +123,7 @@ def command(
     overwrite: str,
     cache: Path | None,
     checkpoint_every: float,
+    pictures: bool,
     as_json: bool,
 ) -> None:
     """Train METHODs on SCENEs and measure them on the test views.
@@ -164,6 +171,7 @@ def command(
         overwrite=overwrite,  # type: ignore[arg-type]
         cache_dir=cache,
         tick=progress.tick,
+        pictures=pictures,
         on_start=progress.start,
         on_end=progress.end,
     )

@@ -97,6 +97,7 @@ def run_cells(
     overwrite: Overwrite = "missing",
     cache_dir: Path | None = None,
     tick: Callable[[Any], None] | None = None,
+    pictures: bool = True,
     on_start: Callable[[Cell, Path], None] | None = None,
     on_end: Callable[[Cell, CellReport], None] | None = None,
 ) -> list[CellReport]:
@@ -118,7 +119,7 @@ def run_cells(
     for cell, folder in zip(cells, folders):
         if on_start is not None:
             on_start(cell, folder)
-        report = _isolated(cell, folder, cache_dir, overwrite, tick)
+        report = _isolated(cell, folder, cache_dir, overwrite, tick, pictures)
         if on_end is not None:
             on_end(cell, report)
         reports.append(report)
@@ -126,9 +127,14 @@ def run_cells(
 
 
 def _isolated(
-    cell: Cell, folder: Path, cache_dir: Path, overwrite: Overwrite, tick: Callable[[Any], None] | None
+    cell: Cell,
+    folder: Path,
+    cache_dir: Path,
+    overwrite: Overwrite,
+    tick: Callable[[Any], None] | None,
+    pictures: bool,
 ) -> CellReport:
     try:
-        return run_cell(cell, folder, cache_dir=cache_dir, overwrite=overwrite, tick=tick)
+        return run_cell(cell, folder, cache_dir=cache_dir, overwrite=overwrite, tick=tick, pictures=pictures)
     except Exception as error:
         return CellReport(folder, "failed", error=error_line(error))

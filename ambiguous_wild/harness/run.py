@@ -19,6 +19,7 @@ from ambiguous_wild import __version__
 from ambiguous_wild.core import AwError, Camera, Scene
 from ambiguous_wild.core.config import config_hash, to_plain
 from ambiguous_wild.harness import evaluate
+from ambiguous_wild.harness import pictures as run_pictures
 from ambiguous_wild.harness.environment import environment
 from ambiguous_wild.harness.memory import peak_rss_mb, reset_peak
 from ambiguous_wild.harness.store import read_result, write_result
@@ -94,6 +95,7 @@ def run_cell(
     cache_dir: Path,
     overwrite: Overwrite = "missing",
     tick: Callable[[Trainer], None] | None = None,
+    pictures: bool = True,
 ) -> CellReport:
     """Train and measure, or find that it is done.
 
@@ -104,6 +106,7 @@ def run_cell(
         overwrite: "missing" keeps a finished run and resumes a stopped one, "always" starts anew,
             "never" leaves a folder that exists as it is.
         tick: called after every iteration.
+        pictures: draw what the method saw into pictures/; changes no other file.
 
     Raises:
         AwError: the folder holds a run of another configuration, or is in use.
@@ -127,7 +130,7 @@ def run_cell(
         write_text(folder / "config.yaml", yaml.safe_dump(config, sort_keys=False, allow_unicode=True))
         write_json(folder / "env.json", environment(cell.device))
         try:
-            result = _train_and_measure(cell, folder, cache_dir, tick)
+            result = _train_and_measure(cell, folder, cache_dir, tick, pictures)
         except Exception as error:
             _record_failure(cell, folder, error)
             raise
@@ -209,7 +212,7 @@ def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _train_and_measure(
-    cell: Cell, folder: Path, cache_dir: Path, tick: Callable[[Trainer], None] | None
+    cell: Cell, folder: Path, cache_dir: Path, tick: Callable[[Trainer], None] | None, pictures: bool
 ) -> dict[str, Any]:
     reset_peak()
     device = torch.device(cell.device)
@@ -225,12 +228,22 @@ def _train_and_measure(
     # Frozen inputs, instance masks and identities are part of what a method costs.
     trainer.setup_s = time.perf_counter() - before
     trainer.resume()
-    trainer.train(tick=tick)
+    recorder = run_pictures.Recorder(trainer, folder) if pictures else None
+
+    def after_iteration(trainer: Trainer) -> None:
+        if recorder is not None:
+            recorder(trainer)
+        if tick is not None:
+            tick(trainer)
+
+    trainer.train(tick=after_iteration)
     cost = _cost(cell, trainer)  # now: what follows measures, and is no training
 
     write_splat_ply(folder / "point_cloud.ply", {k: v.cpu().numpy() for k, v in trainer.gaussians.items()})
     per_image, missing = evaluate.render_and_measure(trainer, truth, folder / "renders" / "test")
     masks = evaluate.write_masks(trainer, folder / "masks")
+    if recorder is not None:
+        run_pictures.draw_all(trainer, recorder, folder)
     return {
         "schema": 1,
         "method": cell.method.name,

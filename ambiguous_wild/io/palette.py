@@ -36,6 +36,12 @@ def tint(photo: np.ndarray, mask: np.ndarray, colour: tuple[int, int, int]) -> n
     return shown.astype(np.uint8)
 
 
+def faded(photo: np.ndarray) -> np.ndarray:
+    """The photo [H, W, 3] uint8 in light grey, so that a tint on it is seen whatever the photo's colours."""
+    grey = photo.astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32)
+    return np.repeat((70 + 0.65 * grey)[..., None], 3, axis=2).astype(np.uint8)
+
+
 def plot_colour(colour: tuple[int, int, int]) -> tuple[float, float, float]:
     """The colour in [0, 1], as plots want it."""
     return (colour[0] / 255, colour[1] / 255, colour[2] / 255)

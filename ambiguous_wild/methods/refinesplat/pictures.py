@@ -1,4 +1,4 @@
-"""What RefineSplat sees, for people: maps and masks of one step, and where T_ent cuts the scene's instances."""
+"""What RefineSplat sees, for people: maps and masks of one step, and T_ent among the scene's instances."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ambiguous_wild.io.atomic import atomic_path
-from ambiguous_wild.io.palette import GLOBAL, LOCAL, MASKED, NEUTRAL, plot_colour, ramp, tint
+from ambiguous_wild.io.palette import GLOBAL, LOCAL, MASKED, NEUTRAL, faded, plot_colour, ramp, tint
 from ambiguous_wild.methods.refinesplat import masking
 from ambiguous_wild.splat.step import Step
 
@@ -28,6 +28,7 @@ def panels(policy: RefineSplatMask, step: Step, *, begun: bool = True) -> dict[s
     maps, masks = policy.examine(step)
     labels = policy.inputs.labels[step.view]
     photo = (policy.data.photos[step.view].cpu().numpy() * 255 + 0.5).astype(np.uint8)
+    grey = faded(photo)
     height, width = labels.shape
     means, _ = masking.instance_means(maps.statistic, labels, len(policy.inputs.static[step.view]))
     threshold = masks.cut.threshold
@@ -41,9 +42,9 @@ def panels(policy: RefineSplatMask, step: Step, *, begun: bool = True) -> dict[s
             ramp(maps.entropy, 0.0, 1.0), height, width
         ),
         f"instances, {cut}": _outlined(ramp(of_pixel, 0.0, top), labels),
-        f"local {100 * masks.local.mean():.0f} %": tint(photo, masks.local, LOCAL),
-        f"global {100 * masks.global_.mean():.0f} %": tint(photo, masks.global_, GLOBAL),
-        f"final {100 * final.mean():.0f} %{used}": tint(photo, final, MASKED),
+        f"local {100 * masks.local.mean():.0f} %": tint(grey, masks.local, LOCAL),
+        f"global {100 * masks.global_.mean():.0f} %": tint(grey, masks.global_, GLOBAL),
+        f"final {100 * final.mean():.0f} %{used}": tint(grey, final, MASKED),
     }
 
 
@@ -87,7 +88,7 @@ def draw_entropies(policy: RefineSplatMask, folder: Path) -> list[Path]:
         right.scatter(clipped[chosen], distances[chosen], size[chosen], color=colour, alpha=0.5, lw=0)
     right.set_yscale("symlog", linthresh=1)
     right.set_ylim(bottom=0)
-    right.set_ylabel("distance of photo and render (units of blur and noise)")
+    right.set_ylabel("distance (units of blur and noise)")
     finite = cuts[np.isfinite(cuts)]
     for axes in (left, right):
         for cut in finite:
@@ -95,11 +96,11 @@ def draw_entropies(policy: RefineSplatMask, folder: Path) -> list[Path]:
         if len(finite):
             label = f"T_ent, median {np.median(finite):.2f} ({len(finite)} of {len(views)} photos)"
             axes.axvline(float(np.median(finite)), color="k", lw=1.5, label=label)
-        axes.set_xlabel(f"mean {policy.config.mask.statistic} of an instance")
+        axes.set_xlabel(f"mean {policy.config.mask.statistic} of an instance (at the end: and above)")
         axes.set_xlim(0, end)
     left.legend(fontsize=8, loc="upper right")
     left.set_title(f"{len(values)} instances of {len(views)} photos, w2 = {policy.w2:.2f}", fontsize=10)
-    right.set_title("each instance, its size by its area", fontsize=10)
+    right.set_title("photo against render: each instance, its size by its area", fontsize=10)
     path = folder / "entropies.png"
     with atomic_path(path) as temporary:
         figure.savefig(temporary, metadata={"Software": None})

@@ -39,7 +39,7 @@ SAM_VIDEO = {
     "sam2-large-video": "sam2.1-hiera-large",
 }
 FEATURES = ("labhog", *DINO)
-INSTANCES = ("graph", *SAM, *SAM_VIDEO, "grounded", "labels")
+INSTANCES = ("graph", *SAM, *SAM_VIDEO, "grounded", "grounded-video", "labels")
 _OPTION = re.compile(r",\s*([A-Za-z_][\w.]*)=([^,]*)$")
 
 
@@ -103,9 +103,9 @@ def make_features(spec: str) -> Features:
 def make_instances(spec: str) -> Instances:
     """Instances by name; what comes back may offer `NamedInstances` or `SceneInstances` as well.
 
-    ``graph``; one of `SAM` (``@n`` = points along a side) or `SAM_VIDEO`; ``grounded:PROMPT``;
-    ``labels:FOLDER`` (``scene_wide=true`` where its ids mean the same thing in every photo). Options are the
-    fields of the back end's config, and ``weights=FOLDER``.
+    ``graph``; one of `SAM` (``@n`` = points along a side) or `SAM_VIDEO`; ``grounded:PROMPT`` and, followed
+    through a sequence, ``grounded-video:PROMPT``; ``labels:FOLDER`` (``scene_wide=true`` where its ids mean
+    the same thing in every photo). Options are the fields of the back end's config, and ``weights=FOLDER``.
 
     Raises:
         AwError: unknown name (names the nearest) or option; the weights or the folder are not here.
@@ -113,7 +113,7 @@ def make_instances(spec: str) -> Instances:
     found = parse(spec)
     if found.name not in INSTANCES:
         raise unknown("instances", found.name, INSTANCES)
-    if found.argument and found.name not in ("grounded", "labels"):
+    if found.argument and found.name not in ("grounded", "grounded-video", "labels"):
         raise AwError(f"instances {spec!r}: {found.name} takes nothing after a colon")
     return _MAKERS.get(found.name, _sam)(found, spec)
 
@@ -144,10 +144,20 @@ def _grounded(found: Spec, spec: str) -> Instances:
 
     folder, options = _weights(found.options)
     sam_folder, options = _weights(options, "sam_weights")
+    following = {}
+    if found.name == "grounded-video":
+        following = {k: v for k, v in options.items() if k in ("every", "most", "known")}
+        options = {k: v for k, v in options.items() if k not in following}
     config = with_options(GroundedConfig(), options, "option of grounded")
     if found.size is not None:
         config = dataclasses.replace(config, shorter=found.size)
-    return GroundedInstances(found.argument, config, folder=folder, sam_folder=sam_folder)
+    instances = GroundedInstances(found.argument, config, folder=folder, sam_folder=sam_folder)
+    if found.name == "grounded":
+        return instances
+    from ambiguous_wild.vision.sam_video import SamVideoConfig, SamVideoInstances
+
+    video = with_options(SamVideoConfig(sam=config.sam), following, "option of grounded-video")
+    return SamVideoInstances(SAM_VIDEO["sam2-video"], video, sam_folder, instances)
 
 
 def _sam(found: Spec, spec: str) -> Instances:
@@ -172,6 +182,7 @@ _MAKERS: dict[str, Callable[[Spec, str], Instances]] = {
     "graph": _graph,
     "labels": _labels,
     "grounded": _grounded,
+    "grounded-video": _grounded,
 }
 
 

@@ -16,6 +16,9 @@ from ambiguous_wild.vision.masks import box_nms, paint
 from ambiguous_wild.vision.pretrained import load, locate, model_class
 from ambiguous_wild.vision.sam import SamConfig, SamInstances, fit_to
 
+# A table of 0, 1, 2 ... that older checkpoints of BERT carry along.
+_HARMLESS = ("model.text_backbone.embeddings.position_ids",)
+
 
 @dataclass(frozen=True)
 class GroundedConfig:
@@ -132,7 +135,7 @@ class GroundedInstances:
                     f"{folder} has no usable tokenizer: {str(error).splitlines()[0]}; bring tokenizer.json "
                     "and tokenizer_config.json"
                 ) from error
-            self._loaded = load(self.source, "GroundingDinoForObjectDetection"), tokenizer
+            self._loaded = load(self.source, "GroundingDinoForObjectDetection", harmless=_HARMLESS), tokenizer
         return self._loaded
 
 

@@ -24,6 +24,7 @@ from ambiguous_wild.vision.cache import cache_key, cached
 from ambiguous_wild.vision.masks import add_new
 from ambiguous_wild.vision.pretrained import load, locate
 from ambiguous_wild.vision.progress import Bar, no_bar
+from ambiguous_wild.vision.protocols import Instances
 from ambiguous_wild.vision.sam import SamConfig, SamInstances, fit_to
 
 
@@ -45,8 +46,15 @@ class SamVideoInstances:
         name: str = "sam2.1-hiera-tiny",
         config: SamVideoConfig | None = None,
         folder: str | Path | None = None,
+        single: Instances | None = None,
     ) -> None:
         """Find and check the weights; they are loaded when the first identities are asked for.
+
+        Args:
+            name: of the weight, see `vision.weights`; any label where `folder` is given.
+            config: see `SamVideoConfig`.
+            folder: of the weights, in place of the search.
+            single: finds the instances that are followed; by default SAM 2 itself, everything there is.
 
         Raises:
             AwError: no weights, see `pretrained.locate`; a setting that cannot be.
@@ -57,8 +65,9 @@ class SamVideoInstances:
                 f"{name}: every and most must be at least 1, got {self.config.every}, {self.config.most}"
             )
         self.source = locate(name, ("sam2_video",), folder)
-        self.single = SamInstances(name, self.config.sam, folder)
-        self.name = f"sam-video-1-{name}-{self.source.digest}-{config_hash(self.config)[:8]}"
+        self.single: Instances = single or SamInstances(name, self.config.sam, folder)
+        settings = config_hash({"config": self.config, "single": self.single.name})[:8]
+        self.name = f"sam-video-1-{name}-{self.source.digest}-{settings}"
         self._model: Any = None
 
     @property

@@ -58,6 +58,11 @@ def test_instances_by_name(checkpoint, tmp_path):
     grounded = make_instances(f"grounded:person, car,least_score=0.2,{weights}")
     assert isinstance(grounded, GroundedInstances)
     assert (grounded.prompt, grounded.config.least_score) == ("person. car.", 0.2)
+    weights = f"weights={checkpoint('grounding')},sam_weights={checkpoint('sam2_video')}"
+    followed = make_instances(f"grounded-video:dog,least_score=0.2,every=5,{weights}")
+    assert isinstance(followed, SamVideoInstances) and isinstance(followed.single, GroundedInstances)
+    assert (followed.config.every, followed.single.config.least_score) == (5, 0.2)
+    assert followed.name != SamVideoInstances("sam2.1-hiera-tiny", None, checkpoint("sam2_video")).name
     np.save(tmp_path / "a.npy", np.ones((4, 4), np.int32))
     own = make_instances(f"labels:{tmp_path}")
     assert isinstance(own, LabelMaps) and isinstance(own, NamedInstances)

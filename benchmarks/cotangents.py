@@ -3,7 +3,8 @@
     python benchmarks/cotangents.py [--runs N] [--json PATH]
 
 The scene is that of benchmarks/rasterizer.py. The three ways take turns within every run, so that they meet
-the same machine; ratios are of the best of N. Prints a table and writes benchmarks/results/cotangents.json.
+the same machine, and each is repeated for a tenth of a second, so that a slice of the scheduler is no part of
+the result; ratios are of the best of N. Prints a table and writes benchmarks/results/cotangents.json.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from ambiguous_wild.splat.cpu.warmup import warm_up
 
 RESULTS = Path(__file__).parent / "results" / "cotangents.json"
 WARM = 3  # runs whose times are thrown away
+LEAST_MS = 100.0  # that a timed piece of work takes
 
 
 def measure(n: int, width: int, height: int, runs: int) -> dict[str, Any]:
@@ -41,18 +43,26 @@ def measure(n: int, width: int, height: int, runs: int) -> dict[str, Any]:
         "two in one traversal": lambda: rendered.backward(first, d_image_extra=second),
         "two backwards": lambda: (rendered.backward(first), rendered.backward(second)),
     }
+    probe = Stopwatch()
+    for _ in range(WARM):
+        probe("one", ways["one"])
+    repeats = max(int(np.ceil(LEAST_MS / probe.summary()["one"]["best_ms"])), 1)
     watch = Stopwatch()
     for run in range(runs + WARM):
         used = watch if run >= WARM else Stopwatch()
         for name, way in ways.items():
-            used(name, way)
-    parts = watch.summary()
+            used(name, lambda way=way: [way() for _ in range(repeats)])  # type: ignore[misc]
+    parts = {
+        name: {kind: round(ms / repeats, 3) for kind, ms in times.items()}
+        for name, times in watch.summary().items()
+    }
     best = {name: ms["best_ms"] for name, ms in parts.items()}
     return {
         "gaussians": n,
         "width": width,
         "height": height,
         "runs": runs,
+        "repeats": repeats,
         "parts": parts,
         "over_one": {name: round(ms / best["one"], 3) for name, ms in best.items()},
     }

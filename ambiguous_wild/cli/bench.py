@@ -164,7 +164,7 @@ def command(
     check_output(output / "run")  # before half a minute of compiling
     if chosen == "cpu":
         prepare_cpu(threads)
-    progress = _Progress(len(cells))
+    progress = Progress(len(cells))
     reports = run_cells(
         cells,
         output,
@@ -210,7 +210,7 @@ def prepare_cpu(threads: int | None) -> None:
     warm_up(lambda text: click.echo(text, err=True))
 
 
-class _Progress:
+class Progress:
     """A bar a cell; on stderr, so that stdout stays clean for results."""
 
     def __init__(self, cells: int) -> None:

@@ -18,6 +18,7 @@ COMMANDS = {
     "build-scene": ("build_scene", "From a folder of photos to a scene: check, COLMAP, downsample, split."),
     "ambiguity-report": ("ambiguity_report", "How hard are this scene's distractors to tell apart?"),
     "bench": ("bench", "Train methods on scenes and measure them."),
+    "ablate": ("ablate", "What each part of a method brings, and what it costs."),
     "table": ("table", "Compare runs: Markdown, CSV, LaTeX."),
     "methods": ("methods", "List the methods there are."),
 }

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ambiguous_wild.core.errors import AwError, unknown
+from ambiguous_wild.methods.ablation import Group
 
 if TYPE_CHECKING:
     from ambiguous_wild.splat.parts import Parts
@@ -40,12 +41,17 @@ class MethodEntry:
     config: str | type | None = None
     paper: str = ""
     needs: str = ""  # extras, weights or hardware; empty = nothing beyond the core
+    ablations: str | tuple[Group, ...] = ()  # "module:ABLATIONS" or the groups, see methods/ablation.py
     source_hash: str = ""  # of a plugin's file: a changed plugin is another configuration
 
     def options(self) -> Any:
         """The method's options at their defaults (a frozen dataclass instance)."""
         cls = _resolve(self.config) if self.config else NoOptions
         return cls()
+
+    def ablation_groups(self) -> tuple[Group, ...]:
+        """The ablations the method declares; empty where there are none."""
+        return tuple(_resolve(self.ablations))
 
     def build(self, options: Any) -> Parts:
         """The parts that fill the training loop."""
@@ -70,6 +76,7 @@ BUILTIN = (
         recipe="ambiguous_wild.methods.refinesplat.recipe:build",
         config="ambiguous_wild.methods.refinesplat.recipe:Config",
         paper="Rectifying Mask via Entropy for Distractor-Free 3DGS in Ambiguous Scenarios",
+        ablations="ambiguous_wild.methods.refinesplat.ablations:ABLATIONS",
     ),
 )
 

@@ -1,0 +1,162 @@
+"""`aw ablate`: what each part of a method brings, and what it costs."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from pathlib import Path
+
+import click
+
+from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.methods.ablation import Group
+
+
+@click.command(name="ablate")
+@click.option("--method", default="refinesplat", show_default=True, help="A method that declares ablations.")
+@click.option(
+    "--scene", "scenes", multiple=True, type=click.Path(path_type=Path), help="A scene folder; repeatable."
+)
+@click.option("--group", "groups", multiple=True, help="Only this group; repeatable.  [default: all]")
+@click.option(
+    "--seed",
+    "seeds",
+    multiple=True,
+    type=click.IntRange(0),
+    default=(0,),
+    show_default=True,
+    help="Repeatable.",
+)
+@click.option("--iterations", type=click.IntRange(1), help="Length of each training.  [default: 30000]")
+@click.option("--budget", help="Training time instead: 90s, 10m, 1.5h.")
+@click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True)
+@click.option("--threads", type=click.IntRange(1), help="CPU threads; the result does not depend on it.")
+@click.option("--factor", type=click.IntRange(1), help="Train on images_N.")
+@click.option("--max-gaussians", type=click.IntRange(4), help="Growth stops here.")
+@click.option(
+    "--set", "settings", multiple=True, metavar="KEY=VALUE", help="An option in every row; repeatable."
+)
+@click.option(
+    "--plugin",
+    "plugins",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    help="A file that registers methods.",
+)
+@click.option("-o", "--output", type=click.Path(path_type=Path), default=Path("ablation"), show_default=True)
+@click.option(
+    "--overwrite",
+    type=click.Choice(["never", "missing", "always"]),
+    default="missing",
+    show_default=True,
+    help="missing: keep what is finished, resume what stopped.",
+)
+@click.option(
+    "--cache", type=click.Path(path_type=Path), help="Features and masks.  [default: OUTPUT/.cache]"
+)
+@click.option("--pictures/--no-pictures", default=False, show_default=True, help="Draw every run's pictures.")
+@click.option("--list", "listing", is_flag=True, help="Show groups and variants, train nothing.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
+def command(
+    method: str,
+    scenes: tuple[Path, ...],
+    groups: tuple[str, ...],
+    seeds: tuple[int, ...],
+    iterations: int | None,
+    budget: str | None,
+    device: str,
+    threads: int | None,
+    factor: int | None,
+    max_gaussians: int | None,
+    settings: tuple[str, ...],
+    plugins: tuple[Path, ...],
+    output: Path,
+    overwrite: str,
+    cache: Path | None,
+    pictures: bool,
+    listing: bool,
+    as_json: bool,
+) -> None:
+    """Train the variants of METHOD's ablations on SCENEs and write ablation.csv, .json, .md and .png to OUTPUT.
+
+    What is finished is kept: after an interruption the same command goes on, and another group joins.
+
+    \b
+    aw ablate --list
+    aw ablate --method refinesplat --scene scene --group masks --iterations 3000 -o ablation
+    """
+    from ambiguous_wild.methods.ablation import choose_groups
+    from ambiguous_wild.methods.registry import get_method, load_plugin
+
+    for plugin in plugins:
+        load_plugin(plugin)
+    entry = get_method(method)
+    chosen = choose_groups(method, entry.ablation_groups(), groups)
+    if listing:
+        click.echo(json.dumps(_listed(chosen), indent=2) if as_json else _list_text(chosen))
+        return
+    if not scenes:
+        raise AwError("no scene: give one with --scene, or see the groups with --list")
+    if iterations is not None and budget is not None:
+        raise AwError("--iterations and --budget exclude each other: a run is as long as one of them says")
+
+    from ambiguous_wild.cli.bench import Progress, choose_device, parse_budget, prepare_cpu
+    from ambiguous_wild.harness.ablate import plan_study
+    from ambiguous_wild.harness.ablation_report import report, to_markdown, write_report
+    from ambiguous_wild.harness.grid import run_cells
+    from ambiguous_wild.io.atomic import check_output
+    from ambiguous_wild.splat.trainer import TrainConfig
+
+    on = choose_device(device)
+    train = TrainConfig(
+        iterations=iterations or TrainConfig.iterations,
+        budget_s=None if budget is None else parse_budget(budget),
+        max_gaussians=max_gaussians,
+    )
+    study = plan_study(
+        method, scenes, seeds, train, groups=groups, settings=settings, device=on, factor=factor
+    )
+    check_output(output / "run")
+    if on == "cpu":
+        prepare_cpu(threads)
+    cells = study.cells
+    absent = sum(1 for row in study.rows if row.missing)
+    click.echo(f"{len(study.rows)} rows: {len(cells)} runs to have, {absent} variants missing", err=True)
+    progress = Progress(len(cells))
+    reports = run_cells(
+        cells, output, overwrite=overwrite, cache_dir=cache, tick=progress.tick, pictures=pictures,  # type: ignore[arg-type]
+        on_start=progress.start, on_end=progress.end,
+    )  # fmt: skip
+    data = report(study, output, made_by=shlex.join(["aw", *sys.argv[1:]]))
+    written = write_report(data, output)
+    click.echo(json.dumps(data, indent=2) if as_json else to_markdown(data))
+    click.echo("wrote " + ", ".join(str(path) for path in written), err=True)
+    failed = [r for r in reports if r.outcome == "failed"]
+    if failed:
+        raise AwError(f"{len(failed)} of {len(reports)} runs failed: {failed[0].error}")
+
+
+def _listed(groups: tuple[Group, ...]) -> list[dict[str, object]]:
+    return [
+        {
+            "group": group.name,
+            "title": group.title,
+            "paper": group.source or None,
+            "variants": [
+                {"name": v.name, "settings": list(v.settings), "method": v.method or None, "text": v.text}
+                for v in group.variants
+            ],
+        }
+        for group in groups
+    ]
+
+
+def _list_text(groups: tuple[Group, ...]) -> str:
+    lines = []
+    for group in groups:
+        lines.append(f"{group.name}: {group.title}" + (f" ({group.source})" if group.source else ""))
+        for v in group.variants:
+            what = f"method {v.method}" if v.method else " ".join(v.settings)
+            lines.append(f"    {v.name:18} {what}" + (f"   {v.text}" if v.text else ""))
+    return "\n".join(lines)

@@ -1,0 +1,69 @@
+"""Ablations as data: a method says which settings to vary, `aw ablate` trains and tabulates them.
+
+Imports nothing heavy: `aw ablate --list` shows them without torch.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from ambiguous_wild.core.errors import AwError, unknown
+
+_NAME = re.compile(r"[a-z0-9][a-z0-9._-]*")  # names become folders
+DEFAULT = "default"
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A name and the settings it puts on top of the defaults."""
+
+    name: str
+    settings: tuple[str, ...] = ()  # "key=value", as `--set METHOD.KEY=VALUE` takes them
+    text: str = ""  # one line where the name does not say it all
+    features: str = ""  # a features back end it needs, see vision/backends.py; absent weights = missing
+    method: str = ""  # another method at its defaults instead, where the paper compares with one
+
+
+@dataclass(frozen=True)
+class Group:
+    """One table of an ablation study; its first row is always the default."""
+
+    name: str
+    title: str
+    variants: tuple[Variant, ...]
+    source: str = ""  # the paper's table
+
+
+def folder_name(method: str, group: Group, variant: Variant) -> str:
+    """What runs of a variant are called instead of their method's name: refinesplat@masks-local."""
+    return f"{method}@{group.name}-{variant.name}"
+
+
+def check_groups(method: str, groups: Sequence[Group]) -> None:
+    """Raise AwError where two things share a name, or a name cannot be a folder's."""
+    for kind, names in [("groups", [g.name for g in groups])] + [
+        (f"variants of {g.name}", [v.name for v in g.variants]) for g in groups
+    ]:
+        wrong = [n for n in names if not _NAME.fullmatch(n) or n == DEFAULT]
+        twice = sorted({n for n in names if names.count(n) > 1})
+        if wrong or twice:
+            what = f"cannot be called {wrong[0]!r}" if wrong else f"are called {twice[0]!r} twice"
+            raise AwError(f"ablations of {method}: {kind} {what}; use small letters, digits, '.', '_', '-'")
+
+
+def choose_groups(method: str, groups: Sequence[Group], names: Sequence[str]) -> tuple[Group, ...]:
+    """The groups of these names in their own order; all where none is named.
+
+    Raises:
+        AwError: the method has no ablations, or none of that name.
+    """
+    if not groups:
+        raise AwError(f"{method} declares no ablations: see 'ablations' in docs/add-a-method.md")
+    check_groups(method, groups)
+    known = [group.name for group in groups]
+    for name in names:
+        if name not in known:
+            raise unknown(f"group of {method}'s ablations", name, known, "'aw ablate --list' shows them")
+    return tuple(group for group in groups if not names or group.name in names)

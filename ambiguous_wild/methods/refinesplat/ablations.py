@@ -1,0 +1,144 @@
+"""The paper's ablations of RefineSplat, and ours, as data. Settings are on top of the defaults.
+
+Where the paper varies a loss that is off by default (config.py says why), the rows switch it on.
+"""
+
+from __future__ import annotations
+
+from ambiguous_wild.methods.ablation import Group, Variant
+
+_NO_MASKS = ("mask.use_local=false", "mask.use_global=false")
+_PLAIN_DENSITY = ("density.decides=photometric", "density.clone_shift=0", "density.merge_every=0")
+_CR = ("lambda_cr=0.2",)
+_PRINTED_LOSSES = ("lambda_id=1", "lambda_cr=0.2")
+_NO_GATE = ("mask.gate=0", "mask.least=0")
+_NO_AGREEMENT = ("mask.disagree=0", "mask.disagree_units=0")
+_NO_GLOBAL_GATE = ("mask.global_gate=0", "mask.global_units=0")
+_ALL_PRINTED = (
+    "mask.variant=sigmoid", "mask.statistic=entropy", "mask.scope=photo", "mask.threshold=literal", *_NO_GATE,
+    *_NO_AGREEMENT, "mask.static_tracks=0", "mask.least_alpha=0", "mask.cosine=plain", "mask.spread=var",
+    *_NO_GLOBAL_GATE, "density.merge.form=literal", "density.merge.most=0", *_PRINTED_LOSSES,
+)  # fmt: skip
+
+ABLATIONS = (
+    Group(
+        "modules",
+        "Entropy-aware masks (EAM), density control (EDC), consistency (CR)",
+        (
+            Variant("robustsplat", method="robustsplat", text="the paper's baseline row"),
+            Variant("none", (*_NO_MASKS, *_PLAIN_DENSITY, "lambda_cr=0"), "none of the three"),
+            Variant("eam", (*_PLAIN_DENSITY, "lambda_cr=0"), "(a) masks alone"),
+            Variant("eam-cr", (*_PLAIN_DENSITY, *_CR), "(b) masks and consistency"),
+            Variant("eam-edc", ("lambda_cr=0",), "(c) masks and density control"),
+            Variant("eam-edc-cr", _CR, "(d) all three"),
+            Variant("edc", (*_NO_MASKS, "lambda_cr=0"), "density control alone; not in the paper"),
+        ),
+        "Tab. impact of each module",
+    ),
+    Group(
+        "masks",
+        "Local and global mask",
+        (
+            Variant("neither", _NO_MASKS),
+            Variant("local", ("mask.use_global=false",), "(b) M_local alone"),
+            Variant("global", ("mask.use_local=false",), "(c) M_global alone"),
+            Variant("both", ("mask.use_local=true", "mask.use_global=true"), "(d)"),
+        ),
+        "Tab. ablation of the entropy-aware adaptive masking",
+    ),
+    Group(
+        "thresholds",
+        "What cuts the instances in two",
+        (
+            Variant("t-hard", ("mask.threshold=hard",), "T_hard: a fixed value"),
+            Variant("t-statistics", ("mask.threshold=statistics",), "T_statistics: mean and deviation"),
+            Variant("t-ent", ("mask.threshold=kapur",), "T_ent"),
+            Variant("t-ent-literal", ("mask.threshold=literal",), "T_ent as printed"),
+            Variant("t-ent-no-gate", ("mask.threshold=kapur", *_NO_GATE), "T_ent that always cuts"),
+        ),
+        "Tab. ablation of the threshold with existing methods",
+    ),
+    Group(
+        "density",
+        "Entropy and merging in density control",
+        (
+            Variant("neither", _PLAIN_DENSITY, "(a)"),
+            Variant("entropy", ("density.merge_every=0",), "(b) entropy, no merging"),
+            Variant("merging", ("density.decides=photometric", "density.clone_shift=0"), "(c) merging alone"),
+            Variant("both", ("density.decides=total",), "(d)"),
+            # without entropy terms their gradient is 0 and `decides` decides nothing: these rows have them
+            Variant(
+                "losses-total", (*_PRINTED_LOSSES, "density.decides=total"), "with L_id, L_cr: L decides"
+            ),
+            Variant("losses-photometric", (*_PRINTED_LOSSES, "density.decides=photometric"), "L_GS decides"),
+            Variant("losses-entropy", (*_PRINTED_LOSSES, "density.decides=entropy"), "they decide"),
+        ),
+        "Tab. analysis of the entropy-aware density control",
+    ),
+    Group(
+        "filters",
+        "Box filter over U / H (cells) and dilation (px)",
+        (
+            Variant("no-box", ("mask.box=1",)),
+            *(Variant(f"box-{size}", (f"mask.box={size}",)) for size in (3, 5, 7)),
+            Variant("no-dilation", ("mask.dilation=1",)),
+            *(Variant(f"dilation-{size}", (f"mask.dilation={size}",)) for size in (3, 5, 7)),
+        ),
+        "Tab. sensitivity of filters",
+    ),
+    Group(
+        "alpha1",
+        "alpha_1, the weight of consistency",
+        tuple(Variant(f"alpha1-{value}", (f"lambda_cr={value}",)) for value in ("0", "0.1", "0.2", "0.3")),
+        "Tab. sensitivity analysis for alpha_1",
+    ),
+    Group(
+        "merge-threshold",
+        "Largest colour distance of Gaussians that merge",
+        tuple(
+            Variant(f"colour-{value}", (f"density.merge.colour={value}",))
+            for value in ("0.10", "0.15", "0.20")
+        ),
+        "Tab. threshold of EDC",
+    ),
+    Group(
+        "features",
+        "What photo and render are compared by",
+        tuple(
+            Variant(name, (f"features={name}",), features=name, text=text)
+            for name, text in (
+                ("labhog", "weight-free: colours and edges"),
+                ("dinov2-small", "14 x 14 patches, the paper's"),
+                ("dino-vits16", "16 x 16 patches, DINOv1"),
+                ("dino-vits8", "8 x 8 patches, DINOv1"),
+            )
+        ),
+        "Tab. sensitivity of size, sensitivity of DINO",
+    ),
+    Group(
+        "w2",
+        "Weight of T_ent's lower subset",
+        (Variant("learnt", ("mask.w2=none",)), Variant("fixed-0.5", ("mask.w2=0.5",))),
+    ),
+    Group(
+        "printed",
+        "Each printed form in the place of ours",
+        (
+            Variant("sigmoid", ("mask.variant=sigmoid",), "psi one-against-rest"),
+            Variant("statistic-entropy", ("mask.statistic=entropy",), "mean entropy of the render"),
+            Variant("scope-photo", ("mask.scope=photo",), "each photo cut by itself"),
+            Variant("t-ent-literal", ("mask.threshold=literal",), "additive objective"),
+            Variant("no-gate", _NO_GATE, "always cuts in two"),
+            Variant("no-agreement", _NO_AGREEMENT, "an unsure identity is enough"),
+            Variant("no-tracks", ("mask.static_tracks=0",), "structure from motion vouches for nothing"),
+            Variant("no-alpha", ("mask.least_alpha=0",), "what is not learnt yet is judged"),
+            Variant("cosine-plain", ("mask.cosine=plain",)),
+            Variant("spread-var", ("mask.spread=var",), "mean + variance"),
+            Variant("no-global-gate", _NO_GLOBAL_GATE),
+            Variant("overlap-literal", ("density.merge.form=literal",), "a density, not a share"),
+            Variant("whole-components", ("density.merge.most=0",), "clusters of any size merge"),
+            Variant("losses", _PRINTED_LOSSES, "L_id + 0.2 L_cr"),
+            Variant("all", _ALL_PRINTED, "all of them together"),
+        ),
+    ),
+)

@@ -1,0 +1,214 @@
+"""Ablations: variants are ordinary cells, equal settings share runs, what is not there says so."""
+
+import csv
+import json
+import typing
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.core.config import with_options
+from ambiguous_wild.harness.ablate import plan_study, read_outcomes
+from ambiguous_wild.harness.ablation_report import report, to_markdown, write_report
+from ambiguous_wild.harness.grid import cell_folder, run_cells
+from ambiguous_wild.harness.store import read_runs, write_result
+from ambiguous_wild.methods import MethodEntry, get_method, register, registry
+from ambiguous_wild.methods.ablation import Group, Variant, check_groups, choose_groups
+from ambiguous_wild.methods.refinesplat import threshold
+from ambiguous_wild.splat.density import DensityConfig
+from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.trainer import TrainConfig
+from tests.harness.fake_runs import fake_result
+from tests.tiny_scene import write_tiny_scene
+
+SHORT = TrainConfig(iterations=30, probes=0)
+GROUPS = (
+    Group(
+        "size", "how large", (Variant("small", ("grow_grad=0.1",)), Variant("same", ("grow_grad=0.0002",)))
+    ),
+    Group(
+        "other",
+        "the rest",
+        (
+            Variant("small-too", ("grow_grad=0.1",)),
+            Variant("to-come", ("not_there=1",)),
+            Variant("peer", method="no-such-method"),
+            Variant("plain", method="3dgs"),
+        ),
+    ),
+)
+
+
+@pytest.fixture(autouse=True)
+def _methods(monkeypatch):
+    monkeypatch.setattr(registry, "_registered", {})
+    register(
+        MethodEntry(
+            "mine",
+            "3dgs whose density can be set",
+            lambda options: Parts(density_config=options),
+            config=DensityConfig,
+            ablations=GROUPS,
+        )
+    )
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
+
+
+def study(scene, **kw):
+    return plan_study("mine", [scene], kw.pop("seeds", [0]), SHORT, **kw)
+
+
+def names(plan):
+    return [cell.method.name for cell in plan.cells]
+
+
+def test_equal_settings_share_one_run_and_what_is_not_there_is_a_row(scene):
+    plan = study(scene)
+    assert names(plan) == ["mine", "mine@size-small", "3dgs"]
+    rows = {(row.group, row.variant.name): row for row in plan.rows}
+    assert rows["size", "same"].same_as == "default"
+    assert rows["other", "small-too"].same_as == "size-small"
+    assert "unknown option 'not_there'" in rows["other", "to-come"].missing
+    assert "unknown method 'no-such-method'" in rows["other", "peer"].missing
+    assert [row.variant.name for row in plan.rows if row.is_default] == ["default", "default"]
+
+
+def test_a_run_keeps_its_folder_whatever_groups_are_chosen(scene):
+    assert names(study(scene, groups=["other"])) == ["mine", "mine@size-small", "3dgs"]
+
+
+def test_settings_hold_in_every_row_and_become_the_default(scene):
+    plan = study(scene, settings=["grow_grad=0.1"])
+    assert {cell.options.grow_grad for cell in plan.default} == {0.1}
+    rows = {row.variant.name: row for row in plan.rows}
+    assert rows["small"].same_as == "default"
+    assert rows["same"].cells[0].options.grow_grad == 0.0002
+
+
+def test_every_scene_and_seed_has_its_own_folder(scene, tmp_path):
+    cells = study(scene, seeds=[0, 1]).cells
+    assert len({cell_folder(tmp_path, cell) for cell in cells}) == len(cells) == 6
+    assert len({cell.identity for cell in cells}) == 6
+
+
+def test_an_unknown_group_is_named(scene):
+    with pytest.raises(AwError, match="did you mean 'size'"):
+        study(scene, groups=["sise"])
+    with pytest.raises(AwError, match="3dgs declares no ablations"):
+        plan_study("3dgs", [scene], [0], SHORT)
+
+
+def test_runs_of_a_study_are_those_of_aw_table_and_are_kept(scene, tmp_path):
+    plan = study(scene)
+    assert {r.outcome for r in run_cells(plan.cells, tmp_path)} == {"trained"}
+    assert {r.outcome for r in run_cells(plan.cells, tmp_path)} == {"kept"}
+    assert set(read_runs(tmp_path).runs["method"]) == set(names(plan))
+    written = write_report(report(plan, tmp_path), tmp_path)
+    assert {p.name for p in written} == {f"ablation.{kind}" for kind in ("json", "csv", "md", "png")}
+
+
+def save(cells, output, **values):
+    """Made-up results: PSNR by (method, scene, seed)."""
+    for cell in cells:
+        result = fake_result(cell.method.name, cell.scene.name, cell.train.seed, (values["psnr"](cell),))
+        result["masks"] = {"iou": values["iou"](cell), "precision": 0.5, "recall": 0.25}
+        result["cost"] |= {"setup_s": 2.0, "ms_per_iteration": values["ms"](cell)}
+        write_result(cell_folder(output, cell) / "metrics.json", result)
+
+
+def test_means_spreads_and_paired_differences(scene, tmp_path):
+    plan = study(scene, seeds=[0, 1, 2])
+    gain = {"mine": (0, 0, 0), "mine@size-small": (1.0, 3.0, 2.0), "3dgs": (-1.0, -1.0, -1.0)}
+    base = (20.0, 30.0, 25.0)
+    save(
+        plan.cells,
+        tmp_path,
+        psnr=lambda c: base[c.train.seed] + gain[c.method.name][c.train.seed],
+        iou=lambda c: 0.5 + 0.1 * (c.method.name == "mine@size-small"),
+        ms=lambda c: 10.0 * (1 + (c.method.name == "3dgs")),
+    )
+    data = report(plan, tmp_path)
+    rows = {(r["group"], r["variant"]): r for r in data["rows"]}
+    small = rows["size", "small"]
+    assert small["values"]["psnr"]["mean"] == pytest.approx(27.0)
+    assert small["values"]["psnr"]["spread"] == pytest.approx(np.std([21, 33, 27], ddof=1))
+    # paired: the spread between seeds of the scene itself cancels
+    assert small["differences"]["psnr"] == {"mean": pytest.approx(2.0), "spread": pytest.approx(1.0)}
+    assert small["differences"]["iou"]["mean"] == pytest.approx(0.1)
+    assert small["values"]["total_s"]["mean"] == pytest.approx(10 + 1 + 2)  # train_s is 10 + seed
+    assert rows["other", "plain"]["differences"]["ms_per_iteration"]["mean"] == pytest.approx(10.0)
+    assert rows["size", "same"]["differences"]["psnr"]["mean"] == 0.0
+    assert rows["size", "default"]["values"]["recall"]["mean"] == 0.25
+
+
+def test_what_is_missing_or_failed_is_told_never_dropped(scene, tmp_path):
+    plan = study(scene, seeds=[0, 1])
+    done = [c for c in plan.cells if (c.method.name, c.train.seed) != ("mine@size-small", 1)]
+    save(done, tmp_path, psnr=lambda c: 20.0, iou=lambda c: 0.5, ms=lambda c: 1.0)
+    data = report(plan, tmp_path)
+    rows = {(r["group"], r["variant"]): r for r in data["rows"]}
+    assert len(data["rows"]) == sum(len(g.variants) + 1 for g in GROUPS)
+    assert rows["size", "small"]["status"] == "failed"
+    assert rows["size", "small"]["values"]["psnr"]["mean"] is None  # one of two seeds is no mean
+    assert rows["other", "to-come"]["status"] == "missing"
+    text = to_markdown(data)
+    assert "- small failed: scene, seed 1: not run" in text
+    assert "- peer missing: unknown method" in text
+    write_report(data, tmp_path)
+    table = list(csv.DictReader((tmp_path / "ablation.csv").open()))
+    assert [row["variant"] for row in table] == [r["variant"] for r in data["rows"]]
+    assert json.loads((tmp_path / "ablation.json").read_text())["rows"] == data["rows"]
+
+
+def test_a_failed_run_brings_its_error(scene, tmp_path):
+    plan = study(scene)
+    cell = plan.cells[1]
+    result = fake_result(cell.method.name, "scene", 0, (), status="failed", error="no weights here", cost={})
+    write_result(cell_folder(tmp_path, cell) / "failed.json", result)
+    (outcome,) = read_outcomes([cell], tmp_path)
+    assert outcome.error == "no weights here" and outcome.value("psnr") is None
+
+
+def test_names_that_cannot_be_folders_are_refused():
+    for bad in ("a/b", "..", "Big", "", "default"):
+        with pytest.raises(AwError, match="cannot be called"):
+            check_groups("m", [Group("g", "t", (Variant(bad),))])
+    with pytest.raises(AwError, match="twice"):
+        check_groups("m", [replace(GROUPS[0], name="g"), replace(GROUPS[1], name="g")])
+
+
+def test_refinesplats_ablations_name_options_it_has():
+    entry = get_method("refinesplat")
+    groups = choose_groups("refinesplat", entry.ablation_groups(), [])
+    assert [g.name for g in groups][:4] == ["modules", "masks", "thresholds", "density"]
+    for variant in (v for g in groups for v in g.variants):
+        pairs = dict(setting.split("=") for setting in variant.settings)
+        assert len(pairs) == len(variant.settings), f"{variant.name} sets an option twice"
+        if "features" in pairs and not hasattr(entry.options(), "features"):
+            continue  # `aw ablate` lists them as missing until the method can be given features
+        if pairs.get("mask.threshold") in ("hard", "statistics") and not _has_them():
+            continue
+        options = with_options(entry.options(), pairs)
+        for key, text in pairs.items():
+            value = _at(options, key)
+            shown = (
+                {None: "none", True: "true", False: "false"}[value] if value in (None, True, False) else value
+            )
+            # 0.10 and 0.1 are one number
+            assert shown == text or value == float(text), key
+
+
+def _has_them():
+    return "hard" in typing.get_args(threshold.Form)
+
+
+def _at(options, key):
+    for part in key.split("."):
+        options = getattr(options, part)
+    return options

@@ -52,7 +52,11 @@ def plan(args: argparse.Namespace) -> list[Point]:
     settings = [f"{METHOD}.{text}" for text in args.settings]
     default = plan_cells([METHOD], args.scenes, args.seeds or [0], train, settings=settings)
     points = []
-    for key, values in args.intervals.items():
+    for key, values in list(args.intervals.items()):
+        if key == "entropy_every" and not (default[0].options.lambda_id or default[0].options.lambda_cr):
+            print("entropy_every: not swept, both entropy losses are off (--set lambda_cr=... switches on)")
+            del args.intervals[key]
+            continue
         for value in values:
             options = with_options(default[0].options, {key: str(value)})
             same = options == default[0].options
@@ -141,7 +145,7 @@ def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("-o", "--output", type=Path, default=Path("runs-refresh"))
     parser.add_argument("--json", type=Path, default=RESULTS, help="where the figures go")
     args = parser.parse_args(words)
-    args.intervals = dict(args.intervals) if args.intervals else INTERVALS
+    args.intervals = dict(args.intervals or INTERVALS)
     return args
 
 

@@ -125,8 +125,11 @@ def to_markdown(data: dict[str, Any], picture: str = "") -> str:
         head = ["variant", *(label for _, label, _ in DIFFERENCES), *(label for _, label, _ in shown), "what"]
         lines += [_line(head), _line(["---"] + ["---:"] * (len(head) - 2) + ["---"])]
         for row in rows:
-            cells = [_cell(row, "differences", key, digits, sign=True) for key, _, digits in DIFFERENCES]
-            cells += [_cell(row, "values", key, digits) for key, _, digits in shown]
+            if row["status"] == "ok":
+                cells = [_cell(row, "differences", key, digits, sign=True) for key, _, digits in DIFFERENCES]
+                cells += [_cell(row, "values", key, digits) for key, _, digits in shown]
+            else:  # the reason stands below the table
+                cells = [row["status"], *[""] * (len(head) - 3)]
             lines.append(_line([row["variant"], *cells, _what(row)]))
         lines.append("")
         lines += [f"- {r['variant']} {r['status']}: {r['reason']}" for r in rows if r["status"] != "ok"]
@@ -163,7 +166,7 @@ def _cell(row: dict[str, Any], kind: str, key: str, digits: int, sign: bool = Fa
     if row["variant"] == "default" and kind == "differences":
         return ""
     if entry["mean"] is None:
-        return row["status"] if row["status"] != "ok" else "missing"
+        return "missing"
     text = f"{entry['mean']:{'+' if sign else ''},.{digits}f}"
     return text if entry["spread"] is None else f"{text} +- {entry['spread']:,.{digits}f}"
 

@@ -172,9 +172,9 @@ def _cell(row: dict[str, Any], kind: str, key: str, digits: int, sign: bool = Fa
 
 
 def draw(data: dict[str, Any], path: Path) -> bool:
-    """PSNR against ms an iteration, a panel a group, the default as a star; False where nothing is there."""
+    """PSNR against ms an iteration, a panel a group, the default as a star; False where nothing compares."""
     groups = [(g, _points(data, g["name"])) for g in data["groups"]]
-    groups = [(g, points) for g, points in groups if points]
+    groups = [(g, points) for g, points in groups if len(points) > 1]  # one point compares nothing
     if not groups:
         return False
     from matplotlib.backends.backend_agg import FigureCanvasAgg

@@ -1,0 +1,91 @@
+"""`aw ablate` as it is typed."""
+
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.tiny_scene import write_tiny_scene
+
+ROOT = Path(__file__).parents[2]
+PLUGIN = """
+from ambiguous_wild.methods.ablation import Group, Variant
+from ambiguous_wild.methods.registry import MethodEntry, register
+from ambiguous_wild.splat.density import DensityConfig
+from ambiguous_wild.splat.parts import Parts
+
+register(MethodEntry(
+    "mine", "3dgs", lambda options: Parts(density_config=options), config=DensityConfig,
+    ablations=(Group("size", "how large", (
+        Variant("few", ("max_gaussians=450",)), Variant("peer", method="not-here"),
+    )),),
+))
+"""
+
+
+def aw(*arguments) -> subprocess.CompletedProcess:
+    command = [sys.executable, "-m", "ambiguous_wild.cli.main", "ablate", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
+
+
+@pytest.fixture(scope="module")
+def plugin(tmp_path_factory):
+    path = tmp_path_factory.mktemp("plugin") / "mine.py"
+    path.write_text(PLUGIN)
+    return path
+
+
+def test_listing_shows_every_group_and_variant_and_imports_no_torch():
+    code = (
+        "import sys\nfrom ambiguous_wild.cli.main import cli\n"
+        "try:\n    cli.main(['ablate', '--list', '--json'], standalone_mode=False)\n"
+        "except SystemExit:\n    pass\n"
+        "sys.stderr.write(str([m for m in ('torch', 'numba', 'matplotlib', 'cv2') if m in sys.modules]))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr == "[]"
+    groups = {g["group"]: g for g in json.loads(done.stdout)}
+    assert [v["name"] for v in groups["masks"]["variants"]] == ["neither", "local", "global", "both"]
+    plain = aw("--list", "--group", "alpha1").stdout
+    assert "lambda_cr=0.3" in plain and "mask." not in plain
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "no scene"),
+        (["--group", "maskz", "--list"], "did you mean 'masks'"),
+        (["--method", "3dgs", "--list"], "declares no ablations"),
+        (["--scene", "SCENE", "--set", "mask.boxx=3"], "did you mean 'box'"),
+        (["--scene", "SCENE", "--iterations", "5", "--budget", "1m"], "exclude each other"),
+    ],
+)
+def test_mistakes_get_one_line_and_exit_code_2(scene, tmp_path, arguments, message):
+    done = aw("-o", tmp_path / "out", *[scene if a == "SCENE" else a for a in arguments])
+    assert done.returncode == 2, done.stderr
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1 and "Traceback" not in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_study_is_trained_once_and_tabulated(scene, plugin, tmp_path):
+    words = ["--method", "mine", "--plugin", plugin, "--scene", scene, "--iterations", "20", "-o", tmp_path]
+    first = aw(*words)
+    assert first.returncode == 0, first.stderr
+    assert (tmp_path / "scene" / "mine@size-few" / "seed0" / "metrics.json").is_file()
+    rows = {row["variant"]: row for row in csv.DictReader((tmp_path / "ablation.csv").open())}
+    assert list(rows) == ["default", "few", "peer"]
+    assert float(rows["few"]["psnr"]) > 10 and float(rows["default"]["difference_psnr"]) == 0
+    assert rows["peer"]["status"] == "missing" and "not-here" in rows["peer"]["reason"]
+    assert "| few |" in first.stdout and "- peer missing" in first.stdout
+    again = aw(*words)
+    assert again.stderr.count("finished before, kept") == 2
+    assert list(csv.DictReader((tmp_path / "ablation.csv").open())) == list(rows.values())

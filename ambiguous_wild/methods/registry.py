@@ -78,6 +78,33 @@ BUILTIN = (
         paper="Rectifying Mask via Entropy for Distractor-Free 3DGS in Ambiguous Scenarios",
         ablations="ambiguous_wild.methods.refinesplat.ablations:ABLATIONS",
     ),
+    MethodEntry(
+        name="robustsplat",
+        summary="growth delayed until masks stand; a net on frozen features, taught coarse to fine",
+        recipe="ambiguous_wild.methods.robustsplat.recipe:build",
+        config="ambiguous_wild.methods.robustsplat.recipe:Config",
+        paper="Fu et al., ICCV 2025 (arXiv 2506.02751)",
+    ),
+    MethodEntry(
+        name="dronesplat",
+        summary="masks instances whose residual stands out in their photo",
+        recipe="ambiguous_wild.methods.dronesplat:build",
+        config="ambiguous_wild.methods.dronesplat:DroneSplatConfig",
+        paper="Tang et al., CVPR 2025 (arXiv 2503.16964)",
+    ),
+    MethodEntry(
+        name="3dgs+truth",
+        summary="reference: 3dgs under the capture's exact masks",
+        recipe="ambiguous_wild.methods.truth:build_masked",
+        config="ambiguous_wild.methods.truth:TruthConfig",
+        needs="a capture with exact truth",
+    ),
+    MethodEntry(
+        name="3dgs-clean",
+        summary="reference: 3dgs on the capture's photos with nobody there",
+        recipe="ambiguous_wild.methods.truth:build_clean",
+        needs="a capture with exact truth",
+    ),
 )
 
 _registered: dict[str, MethodEntry] = {}

@@ -6,6 +6,7 @@ that is not there is never called and allocates nothing.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -98,3 +99,5 @@ class Parts:
     antialias: bool = False
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     start_opacity: float = 0.1
+    # trains on something else than the capture's photos (references on clean ones); None = the capture
+    train_data: Callable[[TrainData], TrainData] | None = None

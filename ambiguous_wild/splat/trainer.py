@@ -100,6 +100,8 @@ class Trainer:
             probe: gets a function that renders a camera, returns PSNR in dB of the test views.
         """
         torch.set_num_threads(config.torch_threads)
+        if parts.train_data is not None:
+            data = parts.train_data(data)
         self.data, self.parts, self.config, self.folder = data, parts, config, folder
         self.probe = probe
         self.extent = data.scene.extent

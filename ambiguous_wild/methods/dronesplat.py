@@ -1,0 +1,143 @@
+"""DroneSplat: instances whose residual stands out in their photo are masked whole.
+
+Source: "DroneSplat: 3D Gaussian Splatting for Robust 3D Reconstruction from In-the-Wild Drone Imagery",
+CVPR 2025 (arXiv 2503.16964) and its released code, whose local masking this is. The paper's global step
+(tracking of high-residual objects through the sequence) is described there without constants and not
+released: it is left out, and so are its dense initialisation and voxel-guided optimisation. The released code
+takes its instances from SAM 2 (`instances=sam2-large`); without weights they are graph segments, smaller
+than objects.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.splat.density import DensityConfig
+from ambiguous_wild.splat.losses import ssim_map
+from ambiguous_wild.splat.parts import MaskPolicy, Parts, State
+from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData
+from ambiguous_wild.vision.backends import make_instances
+from ambiguous_wild.vision.stage import instance_labels
+
+
+@dataclass(frozen=True)
+class DroneSplatConfig:
+    """Times in nominal iterations (of 30 000); the `min_` fields are real iterations of the run."""
+
+    instances: str = "graph"  # see vision/backends.py; published: sam2-large
+    density: DensityConfig = field(default_factory=DensityConfig)
+    lambda_dssim: float = 0.2
+    mask_start: float = 500.0
+    min_mask_start: int = 300  # a render of fewer iterations means nothing
+    t_local: float = 0.4  # deviations of bonus at the start, none at the end
+    weight_l1: float = 4.0  # in the residual, beside 1 for 1 - SSIM
+
+    def __post_init__(self) -> None:
+        if self.weight_l1 < 0:
+            raise AwError(f"dronesplat.weight_l1 cannot be negative, got {self.weight_l1}")
+
+
+def build(options: DroneSplatConfig) -> Parts:
+    """Local masks; the rest of the loop is 3DGS."""
+    return Parts(
+        mask=DroneSplatMask(options), density_config=options.density, lambda_dssim=options.lambda_dssim
+    )
+
+
+def combined_residual(
+    render: Tensor,  # [H, W, 3]
+    photo: Tensor,  # [H, W, 3] in [0, 1]
+    weight_l1: float = 4.0,
+) -> Tensor:
+    """E = (4 a^ + s^) / 5 [H, W]: mean |render - photo| and 1 - SSIM, each over its range."""
+    a = (render - photo).abs().mean(dim=2)
+    s = (1.0 - ssim_map(render, photo)).mean(dim=2)
+    return (weight_l1 * unit_range(a) + unit_range(s)) / (weight_l1 + 1.0)
+
+
+def unit_range(values: Tensor) -> Tensor:
+    """Values by their own minimum and maximum in [0, 1]; zeros where all are the same."""
+    low, high = values.min(), values.max()
+    return (values - low) / (high - low) if bool(high > low) else torch.zeros_like(values)
+
+
+def heat_map(
+    residual: Tensor,  # [H, W]
+    labels: Tensor,  # [H, W] int64, 0 = unlabelled
+) -> Tensor:
+    """Each pixel its instance's mean residual, 0 where unlabelled, over its own range; float64 [H, W]."""
+    flat, values = labels.reshape(-1), residual.reshape(-1).double()
+    count = int(flat.max()) + 1
+    sums = torch.bincount(flat, weights=values, minlength=count)
+    means = sums / torch.bincount(flat, minlength=count).clamp(min=1)
+    means[0] = 0.0
+    return unit_range(means[flat].reshape(labels.shape))
+
+
+def threshold(heat: Tensor, nominal: float, t_local: float = 0.4) -> float:
+    """T(it) = mu + sd + t_local sd (N - it) / N over all pixels of the photo."""
+    left = max(NOMINAL_ITERATIONS - nominal, 0.0) / NOMINAL_ITERATIONS
+    return float(heat.mean() + heat.std(correction=0) * (1.0 + t_local * left))
+
+
+class DroneSplatMask(MaskPolicy):
+    """Nothing is learnt: statistics of the current render, instance by instance."""
+
+    def __init__(self, config: DroneSplatConfig) -> None:
+        self.config = config
+        self.instances = make_instances(config.instances)
+        self.shares: dict[int, float] = {}  # view: share masked when it was last seen
+
+    def setup(self, data: TrainData) -> None:
+        names = [view.name for view in data.scene.train]
+        found = instance_labels(self.instances, data.photos, names, data.cache_dir).labels
+        self.labels = [
+            torch.from_numpy(np.maximum(label, 0).astype(np.int64)).to(data.device) for label in found
+        ]
+
+    def keep(self, step: Step) -> Tensor | None:
+        keep = self.predict(step)
+        if keep is not None:
+            self.shares[step.view] = float(1.0 - keep.mean())
+        return keep
+
+    @torch.no_grad()
+    def predict(self, step: Step) -> Tensor | None:
+        config = self.config
+        if step.nominal < config.mask_start or step.iteration < config.min_mask_start:
+            return None
+        labels = nearest(self.labels[step.view], *step.photo.shape[:2])
+        heat = heat_map(combined_residual(step.rendered.image, step.photo, config.weight_l1), labels)
+        # a photo of one heat alone has nothing that stands out, and T = 0 would mask it whole
+        stands_out = (heat >= threshold(heat, step.nominal, config.t_local)) & (heat > 0)
+        return (~stands_out).float()
+
+    def facts(self) -> dict[str, Any]:
+        shares = [self.shares[view] for view in sorted(self.shares)]
+        return {
+            "masked_share": sum(shares) / len(shares) if shares else 0.0,
+            "instances": self.instances.name,
+            "instances_per_photo": float(np.mean([int(label.max()) for label in self.labels])),
+        }
+
+    def state_dict(self) -> State:
+        return {"shares": {str(view): share for view, share in self.shares.items()}}
+
+    def load_state_dict(self, state: State) -> None:
+        self.shares = {int(view): float(share) for view, share in state["shares"].items()}
+
+
+def nearest(labels: Tensor, height: int, width: int) -> Tensor:
+    """Labels [H, W] at the centres of the pixels of a smaller picture."""
+    if labels.shape == (height, width):
+        return labels
+    device = labels.device
+    rows = ((torch.arange(height, device=device) * 2 + 1) * labels.shape[0]) // (2 * height)
+    columns = ((torch.arange(width, device=device) * 2 + 1) * labels.shape[1]) // (2 * width)
+    return labels[rows[:, None], columns[None, :]]

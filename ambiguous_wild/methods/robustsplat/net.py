@@ -1,0 +1,63 @@
+"""The per-pixel net: Linear - ReLU - Linear - sigmoid on frozen features of the photo."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+
+class MaskNet(nn.Module):
+    """Features [h, w, C] to a static map [H, W]; the features' mean and std are part of it."""
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, mean: Tensor, std: Tensor, hidden: int, seed: int) -> None:
+        """
+        Args:
+            mean, std: [C], subtracted and divided by; zeros and ones leave the features as they are.
+            hidden: width.
+            seed: of the weights, drawn as `nn.Linear` draws them.
+        """
+        super().__init__()
+        self.register_buffer("mean", mean.clone())
+        self.register_buffer("std", std.clone())
+        self.first = nn.Linear(len(mean), hidden, device=mean.device)
+        self.last = nn.Linear(hidden, 1, device=mean.device)
+        generator = torch.Generator().manual_seed(seed)
+        with torch.no_grad():
+            for layer in (self.first, self.last):
+                limit = layer.in_features**-0.5
+                for values in (layer.weight, layer.bias):
+                    values.copy_((2.0 * torch.rand(values.shape, generator=generator) - 1.0) * limit)
+
+    def forward(self, features: Tensor, height: int, width: int) -> Tensor:
+        """The map [height, width].
+
+        The first layer runs on the grid and its output is enlarged: bilinear weights sum to one, so that is
+        what enlarging all C channels first gives, at hidden / C of the work.
+        """
+        z = self.first((features - self.mean) / self.std)
+        if z.shape[:2] != (height, width):
+            chw = z.permute(2, 0, 1)[None]
+            z = F.interpolate(chw, size=(height, width), mode="bilinear", align_corners=False)[0]
+            z = z.permute(1, 2, 0)
+        return torch.sigmoid(self.last(F.relu(z)).squeeze(2))
+
+
+def adam_state(optimiser: torch.optim.Adam) -> list[dict[str, Any]]:
+    """Moments and counts of every parameter, in the optimiser's order; empty before its first step."""
+    parameters = [p for group in optimiser.param_groups for p in group["params"]]
+    return [dict(optimiser.state[p]) for p in parameters if p in optimiser.state]
+
+
+def load_adam_state(optimiser: torch.optim.Adam, rows: list[dict[str, Any]]) -> None:
+    """Put back what `adam_state` returned."""
+    parameters = [p for group in optimiser.param_groups for p in group["params"]]
+    for parameter, row in zip(parameters, rows):
+        # the count of steps stays on the CPU, as Adam keeps it
+        moved = {k: v.clone() if k == "step" else v.clone().to(parameter) for k, v in row.items()}
+        optimiser.state[parameter] = moved

@@ -1,0 +1,91 @@
+"""What RobustSplat's mask net learns from: the cosine target, residual bounds, and its loss. Pure functions.
+
+Maps are [H, W] float32, 1 = static.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+
+def cosine_target(cosine: Tensor) -> Tensor:
+    """T_cos = 1 - clip(1 - (c - 0.5) / 0.5, 0, 1): 1 where photo and render agree, 0 from 0.5 down."""
+    return 1.0 - (1.0 - (cosine - 0.5) / 0.5).clamp(0.0, 1.0)
+
+
+def calibrated(cosine: Tensor, unit: float, normal: float) -> Tensor:
+    """The cosine over its whole range: 0 at a distance of `normal` units of nuisance, -1 from twice that.
+
+    Hand-made features are all alike: their cosine stays above 0.99, where the published target is 1
+    everywhere. `unit` is the cosine distance that blur and noise alone make (`Features.unit`).
+    """
+    return 1.0 - ((1.0 - cosine) / (unit * normal)).clamp(0.0, 2.0)
+
+
+def residual(photo: Tensor, render: Tensor) -> Tensor:
+    """Mean over channels of |photo - render|, [H, W], of pictures [H, W, 3]; at most 1."""
+    return (photo - render).abs().mean(dim=2).clamp(max=1.0)
+
+
+def update_histogram(histogram: Tensor, values: Tensor, decay: float) -> Tensor:
+    """h <- decay h + hist(values); `histogram` [bins] float64 over [0, 1], values in [0, 1]."""
+    bins = len(histogram)
+    index = (values.reshape(-1).double() * bins).long().clamp(0, bins - 1)
+    return decay * histogram + torch.bincount(index, minlength=bins).double()
+
+
+def percentile(histogram: Tensor, share: float) -> float:
+    """The smallest bin edge below which at least `share` of everything lies; 1 for an empty histogram."""
+    total = float(histogram.sum())
+    if total <= 0:
+        return 1.0
+    # a share of rounding below the target, so that 0.6 of 10 equal counts is six of them
+    reached = torch.cumsum(histogram, 0) >= share * total * (1.0 - 1e-12)
+    return (int(torch.nonzero(reached)[0]) + 1) / len(histogram)
+
+
+def bound(e: Tensor, threshold: float) -> Tensor:
+    """1 where e < threshold, or where more than half of the 3x3 neighbourhood is; zeros beyond the border."""
+    inlier = (e < threshold).float()
+    near = F.avg_pool2d(inlier[None, None], 3, stride=1, padding=1)[0, 0]
+    return ((inlier > 0) | (near > 0.5)).float()
+
+
+def resized(grid: Tensor, height: int, width: int) -> Tensor:
+    """A map [h, w] at [height, width], bilinear."""
+    if grid.shape == (height, width):
+        return grid
+    return F.interpolate(grid[None, None], size=(height, width), mode="bilinear", align_corners=False)[0, 0]
+
+
+def mask_loss(
+    mask: Tensor,  # [H, W] of the net, in (0, 1)
+    target: Tensor,  # [H, W] T_cos
+    lower: Tensor,  # [H, W] bound below
+    upper: Tensor,  # [H, W] bound above
+    nominal: float,
+    *,
+    lambda_cosine: float = 0.5,
+    lambda_residual: float = 0.5,
+    lambda_pull: float = 2.0,
+    beta: float = 2000.0,
+) -> Tensor:
+    """0.5 mean|M - T_cos| + 0.5 mean(relu(M - u) + relu(l - M)) + 2 exp(-it / beta) mean(1 - M).
+
+    The authors' last term, 0.5 max|W1| max|W2|, is made from detached weights: a constant, left out.
+    """
+    pull = lambda_pull * math.exp(-nominal / beta)
+    bounds = (F.relu(mask - upper) + F.relu(lower - mask)).mean()
+    return (
+        lambda_cosine * (mask - target).abs().mean() + lambda_residual * bounds + pull * (1.0 - mask).mean()
+    )
+
+
+def keep_of(mask: Tensor, threshold: float, erosion: int) -> Tensor:
+    """[M > threshold], the static region eroded by a min-pool of side `erosion`."""
+    kept = (mask > threshold).float()
+    return -F.max_pool2d(-kept[None, None], erosion, stride=1, padding=erosion // 2)[0, 0]

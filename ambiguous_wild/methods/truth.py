@@ -1,0 +1,123 @@
+"""Reference rows for captures with exact truth: what is possible, not what a method can do.
+
+`3dgs+truth` trains 3DGS with the exact distractor masks, `3dgs-clean` on photos of the same poses with nobody
+there. Both read SCENE/truth, which `aw simulate` writes and no method may look at.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ambiguous_wild.core import AwError, Scene, View
+from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.io.images import load_image_float, read_gray
+from ambiguous_wild.methods.registry import NoOptions
+from ambiguous_wild.splat.data import shrink_keep
+from ambiguous_wild.splat.parts import MaskPolicy, Parts
+from ambiguous_wild.splat.step import Step, TrainData
+
+
+@dataclass(frozen=True)
+class TruthConfig:
+    """Options of `3dgs+truth`, and of exact masks anywhere (`--mask truth`)."""
+
+    dilation: int = 0  # px by which every mask grows on each side
+
+    def __post_init__(self) -> None:
+        if self.dilation < 0:
+            raise AwError(f"dilation of exact masks is a number of px from 0, got {self.dilation}")
+
+
+def build_masked(options: TruthConfig) -> Parts:
+    """3DGS under the exact masks."""
+    return Parts(mask=TruthMask(options))
+
+
+def build_clean(options: NoOptions) -> Parts:
+    """3DGS on the clean photos; test side, poses and points are the capture's."""
+    return Parts(train_data=clean_data)
+
+
+class TruthMask(MaskPolicy):
+    """The exact masks from the first step on."""
+
+    def __init__(self, config: TruthConfig) -> None:
+        self.config = config
+        self.keeps: list[Tensor] = []
+
+    def setup(self, data: TrainData) -> None:
+        masks = [read_gray(path) >= 128 for path in truth_files(data.scene, "distractor")]
+        _check_sizes(data.scene, masks, "distractor")
+        self.keeps = [keep_outside(mask, self.config.dilation).to(data.device) for mask in masks]
+
+    def keep(self, step: Step) -> Tensor | None:
+        return shrink_keep(self.keeps[step.view], step.divisor)
+
+    def facts(self) -> dict[str, Any]:
+        return {"masked_share": float(np.mean([1.0 - float(keep.mean()) for keep in self.keeps]))}
+
+
+def keep_outside(mask: np.ndarray, dilation: int) -> Tensor:
+    """Keep map [H, W] float32 of a distractor mask [H, W] bool grown by `dilation` px on each side."""
+    transient = torch.from_numpy(mask.astype(np.float32))
+    if dilation:
+        side = 2 * dilation + 1
+        transient = F.max_pool2d(transient[None, None], side, stride=1, padding=dilation)[0, 0]
+    return 1.0 - transient
+
+
+def clean_data(data: TrainData) -> TrainData:
+    """The training side with clean photos, all of which is believed.
+
+    Raises:
+        AwError: the scene has no clean photos, or not of all views, or of another size.
+    """
+    photos = [load_image_float(path) for path in truth_files(data.scene, "clean")]
+    _check_sizes(data.scene, photos, "clean")
+    return dataclasses.replace(
+        data,
+        photos=[torch.from_numpy(photo).to(data.device) for photo in photos],
+        user_keep=[None] * len(photos),
+    )
+
+
+def truth_files(scene: Scene, kind: str) -> list[Path]:
+    """SCENE/truth/<kind>/<stem>.png of every train view.
+
+    Raises:
+        AwError: there is no such folder, or a view has none.
+    """
+    folder = scene.root / "truth" / kind
+    if not folder.is_dir():
+        raise AwError(
+            f"scene {scene.name} has no exact truth ({folder} is absent): only captures of 'aw simulate' do; "
+            "train another method on it"
+        )
+    paths = [folder / Path(view.name).with_suffix(".png").name for view in scene.train]
+    absent = [view.name for view, path in zip(scene.train, paths) if not path.is_file()]
+    if absent:
+        raise AwError(
+            f"{len(absent)} of {len(paths)} train photos have no file in {folder}: {shortlist(absent)}; "
+            "make the capture and its scene again"
+        )
+    return paths
+
+
+def _check_sizes(scene: Scene, images: list[np.ndarray], kind: str) -> None:
+    def fits(view: View, image: np.ndarray) -> bool:
+        return image.shape[:2] == (view.camera.height, view.camera.width)
+
+    wrong = [view.name for view, image in zip(scene.train, images) if not fits(view, image)]
+    if wrong:
+        raise AwError(
+            f"the truth in {scene.root / 'truth' / kind} is not of the photos' size: {shortlist(wrong)}; "
+            "load the scene at the factor it was built for"
+        )

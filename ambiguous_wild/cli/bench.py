@@ -71,6 +71,9 @@ def parse_budget(text: str) -> float:
 @click.option(
     "--max-gaussians", type=click.IntRange(4), help="Growth stops here.  [default: the method's own]"
 )
+@click.option("--mask", metavar="METHOD", help="Masks of another method, none, or truth (exact ones).")
+@click.option("--density", metavar="METHOD", help="Density control of another method.")
+@click.option("--regulariser", metavar="METHOD", help="Loss on the render of another method.")
 @click.option(
     "--set", "settings", multiple=True, metavar="METHOD.KEY=VALUE", help="An option of a method; repeatable."
 )
@@ -117,6 +120,9 @@ def command(
     factor: int | None,
     resolution: str,
     max_gaussians: int | None,
+    mask: str | None,
+    density: str | None,
+    regulariser: str | None,
     settings: tuple[str, ...],
     plugins: tuple[Path, ...],
     output: Path,
@@ -131,6 +137,10 @@ def command(
     \b
     aw bench --method 3dgs --method refinesplat --scene scene -o runs
     aw bench --method refinesplat --scene scene --budget 10m --set refinesplat.lambda_cr=0.1
+    aw bench --method 3dgs --method robustsplat --mask refinesplat --scene scene -o runs
+
+    --mask, --density and --regulariser plug parts of one method into every METHOD: the runs are called
+    3dgs@mask=refinesplat, which is also a METHOD.
     """
     if iterations is not None and budget is not None:
         raise AwError("--iterations and --budget exclude each other: a run is as long as one of them says")
@@ -138,10 +148,13 @@ def command(
     if math.isnan(checkpoint_every):
         raise AwError("--checkpoint-every nan: give a number of seconds")
 
+    from ambiguous_wild.methods.graft import graft_name
     from ambiguous_wild.methods.registry import get_method, load_plugin
 
     for plugin in plugins:
         load_plugin(plugin)
+    donors = {"mask": mask, "density": density, "regulariser": regulariser}
+    methods = tuple(graft_name(name, donors) for name in methods)
     for name in methods:
         get_method(name)  # a misspelt name is answered before torch is imported
 

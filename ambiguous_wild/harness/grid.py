@@ -22,7 +22,7 @@ from ambiguous_wild.harness.run import (
 )
 from ambiguous_wild.io.atomic import check_output
 from ambiguous_wild.io.scene_folder import load_scene
-from ambiguous_wild.methods.registry import get_method
+from ambiguous_wild.methods.registry import MethodEntry, get_method
 from ambiguous_wild.splat.trainer import TrainConfig
 
 
@@ -50,8 +50,9 @@ def plan_cells(
     Raises:
         AwError: unknown method, option or scene; two scenes of the same name.
     """
-    by_method = _settings_by_method(settings, methods)
-    entries = [(get_method(name), by_method.get(name, {})) for name in dict.fromkeys(methods)]
+    named = {entry.name: entry for entry in map(get_method, methods)}  # one graft may be written two ways
+    by_method = _settings_by_method(settings, list(named.values()))
+    entries = [(entry, by_method[name]) for name, entry in named.items()]
     distinct = list({path.resolve(): path for path in scenes}.values())
     loaded = [load_scene(path, factor=factor) for path in distinct]
     names = [scene.name for scene in loaded]
@@ -72,16 +73,21 @@ def plan_cells(
     return cells
 
 
-def _settings_by_method(settings: Iterable[str], methods: Sequence[str]) -> dict[str, dict[str, str]]:
-    grouped: dict[str, dict[str, str]] = {}
+def _settings_by_method(settings: Iterable[str], entries: Sequence[MethodEntry]) -> dict[str, dict[str, str]]:
+    grouped: dict[str, dict[str, str]] = {entry.name: {} for entry in entries}
     for setting in settings:
         key, equals, value = setting.partition("=")
         method, dot, option = key.partition(".")
         if not equals or not dot:
             raise AwError(f"--set {setting!r}: write METHOD.KEY=VALUE, e.g. refinesplat.lambda_cr=0.1")
-        if method not in methods:
-            raise unknown("method in --set", method, methods)
-        grouped.setdefault(method, {})[option] = value
+        reached = False
+        for entry in entries:
+            keys = entry.option_keys(method, option)
+            grouped[entry.name] |= dict.fromkeys(keys, value)
+            reached = reached or bool(keys)
+        if not reached:
+            known = {entry.name for entry in entries} | {name for e in entries for _, name in e.places}
+            raise unknown("method in --set", method, known)
     return grouped
 
 

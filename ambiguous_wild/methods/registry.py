@@ -43,19 +43,26 @@ class MethodEntry:
     needs: str = ""  # extras, weights or hardware; empty = nothing beyond the core
     ablations: str | tuple[Group, ...] = ()  # "module:ABLATIONS" or the groups, see methods/ablation.py
     source_hash: str = ""  # of a plugin's file: a changed plugin is another configuration
+    places: tuple[tuple[str, str], ...] = ()  # of a graft: which field of its options is whose, see graft.py
 
     def options(self) -> Any:
         """The method's options at their defaults (a frozen dataclass instance)."""
-        cls = _resolve(self.config) if self.config else NoOptions
+        cls = resolve(self.config) if self.config else NoOptions
         return cls()
+
+    def option_keys(self, method: str, key: str) -> list[str]:
+        """Where a setting METHOD.KEY goes in this method's options; nowhere if METHOD has no part in it."""
+        if method == self.name:
+            return [key]
+        return [f"{place}.{key}" for place, name in self.places if name == method]
 
     def ablation_groups(self) -> tuple[Group, ...]:
         """The ablations the method declares; empty where there are none."""
-        return tuple(_resolve(self.ablations))
+        return tuple(resolve(self.ablations))
 
     def build(self, options: Any) -> Parts:
         """The parts that fill the training loop."""
-        return _resolve(self.recipe)(options)
+        return resolve(self.recipe)(options)
 
 
 @dataclass(frozen=True)
@@ -127,12 +134,16 @@ def all_methods() -> dict[str, MethodEntry]:
 
 
 def get_method(name: str) -> MethodEntry:
-    """The method of that name.
+    """The method of that name; "host@mask=donor" is a graft, see graft.py.
 
     Raises:
         AwError: there is none; names the nearest.
     """
     methods = all_methods()
+    if name not in methods and "@" in name:
+        from ambiguous_wild.methods.graft import grafted
+
+        return grafted(name)
     if name not in methods:
         raise unknown("method", name, methods, "'aw methods' lists them")
     return methods[name]
@@ -182,7 +193,8 @@ def _line_in(error: BaseException, path: Path) -> str:
     return f", line {lines[-1]}," if lines else ""
 
 
-def _resolve(target: Any) -> Any:
+def resolve(target: Any) -> Any:
+    """What "module:attribute" names; anything else is returned as it is."""
     if not isinstance(target, str):
         return target
     module, _, attribute = target.partition(":")

@@ -1,0 +1,56 @@
+"""A mask policy made of two: one says what is kept, the other adds its loss on the render."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from ambiguous_wild.splat.parts import MaskPolicy, State
+from ambiguous_wild.splat.step import Step, TrainData
+
+
+class GraftedPolicy(MaskPolicy):
+    """Keep maps, pictures and facts of `mask`; cotangents of `regulariser`, where there is one."""
+
+    def __init__(self, mask: MaskPolicy, regulariser: MaskPolicy | None) -> None:
+        self.mask, self.regulariser = mask, regulariser
+
+    def setup(self, data: TrainData) -> None:
+        self.mask.setup(data)
+        if self.regulariser is not None:
+            self.regulariser.setup(data)
+
+    def keep(self, step: Step) -> Tensor | None:
+        return self.mask.keep(step)
+
+    def cotangent(self, step: Step, keep: Tensor | None) -> Tensor | None:
+        return None if self.regulariser is None else self.regulariser.cotangent(step, keep)
+
+    def predict(self, step: Step) -> Tensor | None:
+        return self.mask.predict(step)
+
+    def on_opacity_reset(self, step: Step) -> None:
+        self.mask.on_opacity_reset(step)
+        if self.regulariser is not None:
+            self.regulariser.on_opacity_reset(step)
+
+    def facts(self) -> dict[str, Any]:
+        return self.mask.facts()
+
+    def panels(self, step: Step) -> dict[str, np.ndarray]:
+        return self.mask.panels(step)
+
+    def draw(self, folder: Path) -> list[Path]:
+        return self.mask.draw(folder)
+
+    def state_dict(self) -> State:
+        other = None if self.regulariser is None else self.regulariser.state_dict()
+        return {"mask": self.mask.state_dict(), "regulariser": other}
+
+    def load_state_dict(self, state: State) -> None:
+        self.mask.load_state_dict(state["mask"])
+        if self.regulariser is not None:
+            self.regulariser.load_state_dict(state["regulariser"])

@@ -1,0 +1,87 @@
+"""What the tests of the baselines share: a trainer on the tiny scene, one step at hand, and its bits."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import torch
+
+from ambiguous_wild.core.config import with_options
+from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.methods import get_method
+from ambiguous_wild.splat.data import load_train_data
+from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.step import Step, TrainData
+from ambiguous_wild.splat.trainer import TrainConfig, Trainer
+
+
+def data_of(scene: Path, cache: Path, seed: int = 0) -> TrainData:
+    return load_train_data(load_scene(scene), device=torch.device("cpu"), seed=seed, cache_dir=cache)
+
+
+def parts_of(method: str, **options: str) -> Parts:
+    entry = get_method(method)
+    return entry.build(with_options(entry.options(), options))
+
+
+def trainer_of(scene: Path, folder: Path, parts: Parts, iterations: int = 120, seed: int = 0) -> Trainer:
+    data = data_of(scene, folder.parent / "cache", seed)
+    config = TrainConfig(iterations=iterations, seed=seed, probes=0, checkpoint_every_s=1e9, torch_threads=1)
+    return Trainer(data, parts, config, folder=folder)
+
+
+def trained(scene: Path, folder: Path, parts: Parts, iterations: int = 120, seed: int = 0) -> Trainer:
+    trainer = trainer_of(scene, folder, parts, iterations, seed)
+    trainer.train()
+    return trainer
+
+
+def bits(trainer: Trainer) -> dict[str, bytes]:
+    return {name: tensor.numpy().tobytes() for name, tensor in trainer.gaussians.items()}
+
+
+def step_of(
+    data: TrainData, view: int, image: torch.Tensor, *, iteration: int = 1000, nominal: float = 10_000.0
+) -> Step:
+    """A step whose render is `image`; no Gaussians."""
+    photo = data.photos[view]
+    divisor = photo.shape[0] // image.shape[0]
+    rendered = SimpleNamespace(image=image, alpha=torch.ones(image.shape[:2]))
+    return Step(
+        iteration=iteration,
+        nominal=nominal,
+        view=view,
+        divisor=divisor,
+        ceiling=1000,
+        photo=photo[::divisor, ::divisor].contiguous(),
+        camera=data.cameras[view].resized(image.shape[1], image.shape[0]),
+        rendered=rendered,  # type: ignore[arg-type]
+        gaussians=None,  # type: ignore[arg-type]
+    )
+
+
+def resumed_equals_whole(scene: Path, tmp_path: Path, make: object, stop: int = 71) -> None:
+    """Stop after `stop` of 120 iterations, go on in a new trainer: parameters and policy state agree."""
+    whole = trained(scene, tmp_path / "whole", make())  # type: ignore[operator]
+    first = trainer_of(scene, tmp_path / "parts", make())  # type: ignore[operator]
+    while first.iteration < stop:
+        first.step()
+    first.save()
+    second = trainer_of(scene, tmp_path / "parts", make())  # type: ignore[operator]
+    assert second.resume()
+    assert second.iteration == stop
+    second.train()
+    assert bits(second) == bits(whole)
+    assert _same(second.parts.mask.state_dict(), whole.parts.mask.state_dict())
+    assert second.parts.mask.facts() == whole.parts.mask.facts()
+
+
+def _same(a: object, b: object) -> bool:
+    if isinstance(a, dict) and isinstance(b, dict):
+        return a.keys() == b.keys() and all(_same(a[k], b[k]) for k in a)
+    if isinstance(a, (list, tuple)) and isinstance(b, (list, tuple)):
+        return len(a) == len(b) and all(map(_same, a, b))
+    if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor):
+        return torch.equal(a, b)
+    return bool(a == b)

@@ -1,0 +1,230 @@
+"""RobustSplat: what its net learns from, against plain numpy; its schedule; its state."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from scipy import ndimage
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.methods.robustsplat import supervision
+from ambiguous_wild.methods.robustsplat.config import RobustSplatConfig
+from ambiguous_wild.methods.robustsplat.net import MaskNet
+from ambiguous_wild.methods.robustsplat.policy import RobustSplatMask, coarse_spec
+from ambiguous_wild.methods.robustsplat.recipe import build
+from tests.methods.baselines import data_of, parts_of, resumed_equals_whole, step_of, trained
+from tests.tiny_scene import SQUARE, TRAIN, wall_colour, write_tiny_scene
+
+EARLY = {"min_mask_start": "20"}
+
+
+@pytest.fixture(autouse=True)
+def _one_thread():
+    """Barriers between threads cost more than these small maps do."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
+
+
+def clean_photo(view: int) -> torch.Tensor:
+    """The tiny scene's wall as the train view sees it, without the distractor."""
+    columns, rows = np.meshgrid(np.arange(64) + 0.5, np.arange(48) + 0.5)
+    x = 0.25 * view + (columns - 32) / 60 * 4
+    return torch.from_numpy(wall_colour(x, (rows - 24) / 60 * 4).astype(np.float32))
+
+
+def truth(view: int) -> np.ndarray:
+    mask = np.zeros((48, 64), bool)
+    mask[SQUARE, SQUARE.start + 4 * view : SQUARE.stop + 4 * view] = True
+    return mask
+
+
+# -- supervision --------------------------------------------------------------------------------------
+
+
+def test_percentiles_are_numpys_within_a_bin():
+    rng = np.random.default_rng(0)
+    values = rng.beta(1.5, 6.0, 5000)
+    histogram = supervision.update_histogram(
+        torch.zeros(10_000, dtype=torch.float64), torch.from_numpy(values).float(), 0.95
+    )
+    assert float(histogram.sum()) == 5000
+    for share in (0.01, 0.6, 0.8, 1.0):
+        exact = np.quantile(values, share, method="inverted_cdf")
+        assert 0 <= supervision.percentile(histogram, share) - exact <= 1e-4 + 1e-6
+
+
+def test_percentile_is_the_smallest_edge_that_holds_the_share():
+    ten = torch.tensor([1.0] * 10, dtype=torch.float64)
+    assert supervision.percentile(ten, 0.6) == pytest.approx(0.6)
+    assert supervision.percentile(ten, 0.61) == pytest.approx(0.7)
+    assert supervision.percentile(torch.zeros(10, dtype=torch.float64), 0.6) == 1.0
+
+
+def test_the_histogram_forgets_as_it_should():
+    histogram = torch.zeros(4, dtype=torch.float64)
+    for value in (0.1, 0.6, 1.0):
+        histogram = supervision.update_histogram(histogram, torch.full((8,), value), 0.5)
+    assert histogram.tolist() == [2.0, 0.0, 4.0, 8.0]  # 1.0 falls into the last bin
+
+
+def test_bounds_against_loops():
+    e = torch.from_numpy(np.random.default_rng(1).random((9, 13)).astype(np.float32))
+    got = supervision.bound(e, 0.45).numpy()
+    inlier = np.pad(e.numpy() < 0.45, 1).astype(float)
+    for y in range(9):
+        for x in range(13):
+            near = inlier[y : y + 3, x : x + 3].sum() / 9
+            assert got[y, x] == (inlier[y + 1, x + 1] == 1 or near > 0.5)
+
+
+def test_the_cosine_target_is_the_printed_formula():
+    c = torch.linspace(-1, 1, 41)
+    assert torch.allclose(supervision.cosine_target(c), (2 * c - 1).clamp(0, 1), atol=1e-6)
+
+
+def test_the_calibrated_cosine_is_zero_at_normal_units():
+    unit = 0.002
+    cosine = 1 - unit * torch.tensor([0.0, 2.5, 5.0, 10.0, 40.0], dtype=torch.float64)
+    got = supervision.calibrated(cosine, unit, 10.0)
+    assert torch.allclose(got, torch.tensor([1.0, 0.75, 0.5, 0.0, -1.0], dtype=torch.float64))
+    assert torch.allclose(supervision.cosine_target(got)[:3], torch.tensor([1.0, 0.5, 0.0]).double())
+
+
+def test_the_mask_loss_is_the_printed_sum():
+    rng = np.random.default_rng(2)
+    m, t, low, up = rng.random((4, 6, 8))
+    got = supervision.mask_loss(*map(torch.from_numpy, (m, t, low, up)), nominal=3000.0)
+    bounds = np.maximum(m - up, 0) + np.maximum(low - m, 0)
+    want = 0.5 * np.abs(m - t).mean() + 0.5 * bounds.mean() + 2 * np.exp(-1.5) * (1 - m).mean()
+    assert float(got) == pytest.approx(want, rel=1e-12)
+
+
+def test_the_static_region_is_eroded_by_three_pixels():
+    mask = torch.full((30, 40), 0.26)
+    mask[10:15, 20:24] = 0.25  # not above the threshold
+    keep = supervision.keep_of(mask, 0.25, 7).numpy()
+    want = ndimage.binary_dilation(mask.numpy() <= 0.25, np.ones((7, 7)))
+    assert np.array_equal(keep == 0, want)
+
+
+# -- the net ------------------------------------------------------------------------------------------
+
+
+def test_the_first_layer_before_enlarging_equals_after():
+    g = torch.Generator().manual_seed(0)
+    phi = torch.randn(9, 12, 27, generator=g)
+    net = MaskNet(phi.mean((0, 1)), phi.std((0, 1)), 16, seed=4)
+    big = torch.nn.functional.interpolate(phi.permute(2, 0, 1)[None], size=(36, 48), mode="bilinear")
+    z = (big[0].permute(1, 2, 0) - net.mean) / net.std
+    want = torch.sigmoid(net.last(torch.relu(net.first(z)))).squeeze(2)
+    assert torch.allclose(net(phi, 36, 48), want, atol=1e-5)
+
+
+def test_the_net_is_a_function_of_its_seed():
+    mean, std = torch.zeros(5), torch.ones(5)
+    one, same, other = (MaskNet(mean, std, 8, seed) for seed in (1, 1, 2))
+    assert torch.equal(one.first.weight, same.first.weight)
+    assert not torch.equal(one.first.weight, other.first.weight)
+    assert float(one.first.weight.detach().abs().max()) <= 5**-0.5
+
+
+# -- the policy ---------------------------------------------------------------------------------------
+
+
+def policy_on(scene, tmp_path, **changes) -> RobustSplatMask:
+    policy = RobustSplatMask(replace(RobustSplatConfig(coarse_render="shrink"), **changes))
+    policy.setup(data_of(scene, tmp_path / "cache"))
+    return policy
+
+
+@pytest.mark.parametrize("bootstrap", [0.0, 30_000.0], ids=["fine", "coarse"])
+def test_what_differs_from_the_render_is_learnt(scene, tmp_path, bootstrap):
+    policy = policy_on(scene, tmp_path, bootstrap=bootstrap, lr=2e-2)
+    for step in range(120):
+        view = step % len(TRAIN)
+        policy.keep(step_of(policy.data, view, clean_photo(view)))
+    for view in range(len(TRAIN)):
+        masked = policy.predict(step_of(policy.data, view, clean_photo(view))).numpy() < 0.5
+        grown = cv2.dilate(truth(view).astype(np.uint8), np.ones((17, 17))).astype(bool)
+        assert (masked & truth(view)).sum() > 0.8 * truth(view).sum()
+        assert (masked & ~grown).mean() < 0.05
+
+
+def test_nothing_is_masked_before_its_time_nor_learnt_by_looking(scene, tmp_path):
+    policy = policy_on(scene, tmp_path)
+    before = policy.net.first.weight.detach().clone()
+    for kw in ({"nominal": 499.0}, {"iteration": 299}):
+        assert policy.keep(step_of(policy.data, 0, clean_photo(0), **kw)) is None
+        assert policy.predict(step_of(policy.data, 0, clean_photo(0), **kw)) is None
+    assert policy.predict(step_of(policy.data, 0, clean_photo(0))) is not None
+    assert torch.equal(before, policy.net.first.weight)
+    assert not policy.histogram.any()
+    policy.keep(step_of(policy.data, 0, clean_photo(0)))
+    assert not torch.equal(before, policy.net.first.weight)
+
+
+def test_the_net_rests_after_a_reset(scene, tmp_path):
+    policy = policy_on(scene, tmp_path)
+
+    def moves(iteration: int) -> bool:
+        before = policy.net.first.weight.detach().clone()
+        step = step_of(policy.data, 0, clean_photo(0), iteration=iteration, nominal=float(iteration))
+        assert policy.keep(step) is not None
+        return not torch.equal(before, policy.net.first.weight)
+
+    policy.on_opacity_reset(step_of(policy.data, 0, clean_photo(0), iteration=15_000, nominal=15_000.0))
+    assert [moves(i) for i in (15_001, 15_299, 15_300)] == [False, False, True]
+
+
+def test_smaller_steps_get_masks_of_their_size(scene, tmp_path):
+    policy = policy_on(scene, tmp_path)
+    small = clean_photo(1)[::2, ::2].contiguous()
+    assert policy.keep(step_of(policy.data, 1, small)).shape == (24, 32)
+
+
+def test_the_coarse_stage_has_features_of_its_own():
+    assert coarse_spec(RobustSplatConfig()) == "labhog"
+    published = RobustSplatConfig.__new__(RobustSplatConfig)
+    object.__setattr__(published, "features", "dinov2-small-registers@504,normalise=raw")
+    object.__setattr__(published, "coarse_share", 16 / 36)
+    assert coarse_spec(published) == "dinov2-small-registers@224,normalise=raw"
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"lower": 0.9}, {"coarse_share": 0.0}, {"decay": 1.0}, {"erosion": 4}, {"hidden": 0}]
+)
+def test_options_that_cannot_be_are_refused(wrong):
+    with pytest.raises(AwError, match=next(iter(wrong))):
+        RobustSplatConfig(**wrong)
+
+
+# -- the recipe ---------------------------------------------------------------------------------------
+
+
+def test_the_recipe_delays_growth_and_masks_both_pictures():
+    parts = build(RobustSplatConfig())
+    assert (parts.density_config.start, parts.density_config.stop) == (10_000.0, 20_000.0)
+    assert parts.density_config.resets == (15_000.0, 18_000.0)
+    assert parts.schedule.lr_opacity == 0.025
+    assert parts.weighting == "images"
+
+
+def test_a_resumed_run_gives_the_same_bits(scene, tmp_path):
+    # growth begins at 40 of 120 and fine supervision at 80: both sides of the stop have some of each
+    resumed_equals_whole(scene, tmp_path, lambda: parts_of("robustsplat", **EARLY))
+
+
+def test_the_seed_decides(scene, tmp_path):
+    one, other = (
+        trained(scene, tmp_path / str(seed), parts_of("robustsplat", **EARLY), 40, seed) for seed in (0, 1)
+    )
+    assert not torch.equal(one.parts.mask.net.first.weight, other.parts.mask.net.first.weight)

@@ -14,7 +14,7 @@ import numpy as np
 from ambiguous_wild.core.camera import Camera
 from ambiguous_wild.simulate.kernels import BOX, ELLIPSOID
 from ambiguous_wild.simulate.presets import CaptureSpec, Distractor
-from ambiguous_wild.simulate.shapes import Shape, figure, placed, shape_table
+from ambiguous_wild.simulate.shapes import Shape, banner, barrier, figure, placed, pole, shape_table
 from ambiguous_wild.simulate.tracer import ShapeTable, trace
 from ambiguous_wild.simulate.world import BACK_M, FRONT_M, HALF_WIDTH_M, World
 
@@ -38,19 +38,40 @@ class Placement:
 
 def shapes_of(distractor: Distractor, placement: Placement) -> list[Shape]:
     """The distractor's shapes in the world, owned by ``placement.which + 1``."""
-    at = (placement.x_m, placement.y_m, 0.0)
+    at = (placement.x_m, placement.y_m, distractor.lift_m * placement.pose)
+    parts = [_tinted(s, distractor) for s in _parts(distractor, placement.pose)]
+    moved = placed(parts, at, placement.yaw_deg, distractor.size)
+    return [replace(s, owner=placement.which + 1) for s in moved]
+
+
+def _parts(distractor: Distractor, pose: float) -> list[Shape]:
+    """The distractor at its natural size, standing at the origin."""
     texture = distractor.texture
-    if distractor.kind == "visitor":
-        parts = figure(texture, distractor.head or texture, 0.06 + 0.26 * placement.pose, placement.pose)
-    elif distractor.kind == "twin":
-        base = Shape(BOX, (0, 0, 0.06), (0.33, 0.33, 0.06), texture, offset=(0.4, 0.2))
-        parts = [base, *placed(figure(texture, texture, 0.07, 0.8), (0, 0, 0.12), 0.0)]
-    elif distractor.kind == "parcel":
-        top = Shape(BOX, (0, 0, 0.2), (0.24, 0.22, 0.2), texture, offset=(0.35, 0.6))
-        parts = [Shape(BOX, (0, 0, 0.35), (0.36, 0.28, 0.35), texture), *placed([top], (0.05, 0, 0.7), 30.0)]
-    else:
-        parts = [Shape(ELLIPSOID, (0, 0, 0.4), (0.4, 0.4, 0.4), texture)]
-    return [replace(s, owner=placement.which + 1) for s in placed(parts, at, placement.yaw_deg)]
+    match distractor.kind:
+        case "visitor":
+            return figure(texture, distractor.head or texture, 0.06 + 0.26 * pose, pose)
+        case "twin":
+            base = Shape(BOX, (0, 0, 0.06), (0.33, 0.33, 0.06), texture, offset=(0.4, 0.2))
+            return [base, *placed(figure(texture, texture, 0.07, 0.8), (0, 0, 0.12), 0.0)]
+        case "parcel":
+            top = Shape(BOX, (0, 0, 0.2), (0.24, 0.22, 0.2), texture, offset=(0.35, 0.6))
+            below = Shape(BOX, (0, 0, 0.35), (0.36, 0.28, 0.35), texture)
+            return [below, *placed([top], (0.05, 0, 0.7), 30.0)]
+        case "pole":
+            return pole(texture)
+        case "barrier":
+            return barrier(texture)
+        case "banner":
+            return banner(texture)
+    return [Shape(ELLIPSOID, (0, 0, 0.4), (0.4, 0.4, 0.4), texture)]
+
+
+def _tinted(shape: Shape, distractor: Distractor) -> Shape:
+    """What is of the distractor's own sheet takes its tint; a head of another sheet stays as it is."""
+    if shape.texture != distractor.texture:
+        return shape
+    r, g, b = (x * y for x, y in zip(shape.tint, distractor.tint))
+    return replace(shape, tint=(r, g, b))
 
 
 def movers(spec: CaptureSpec, placements: tuple[Placement, ...], world: World) -> ShapeTable:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from ambiguous_wild.simulate.atlas import Atlas
-from ambiguous_wild.simulate.kernels import BY_FACE, CAPSULE, CYLINDER, ELLIPSOID, QUAD
+from ambiguous_wild.simulate.kernels import BOX, BY_FACE, CAPSULE, CYLINDER, ELLIPSOID, QUAD
 from ambiguous_wild.simulate.tracer import ShapeTable
 
 SHEET_M = 2.0  # side of the square that an object's texture covers before it mirrors
@@ -142,3 +143,25 @@ def figure(body: str, head: str, stride: float = 0.1, lift: float = 0.0, tint: f
         Shape(ELLIPSOID, (0, -0.02, 1.635), (0.093, 0.112, 0.13), head, offset=(0.4, 0.55)),
         Shape(ELLIPSOID, (0, 0.015, 1.665), (0.102, 0.112, 0.115), body, tint=(0.35 * tint,) * 3),
     ]
+
+
+def pole(texture: str) -> list[Shape]:
+    """A pole of 2 m, 5 cm thick, on a small foot."""
+    foot = Shape(BOX, (0, 0, 0.02), (0.14, 0.14, 0.02), texture)
+    return [between((0, 0, 0.03), (0, 0, 2.0), 0.025, texture), foot]
+
+
+def barrier(texture: str) -> list[Shape]:
+    """Two posts of 1 m, 1.5 m apart, and a rope of 3 cm that sags between them."""
+    posts = [between((x, 0, 0.02), (x, 0, 1.0), 0.022, texture) for x in (-0.75, 0.75)]
+    feet = [Shape(BOX, (x, 0, 0.015), (0.12, 0.12, 0.015), texture) for x in (-0.75, 0.75)]
+    x = np.linspace(-0.75, 0.75, 9)
+    knots = np.stack([x, np.zeros(9), 0.65 + 0.3 * (x / 0.75) ** 2], axis=1)
+    rope = [between(a, b, 0.015, texture) for a, b in pairwise(knots)]
+    return [*posts, *feet, *rope]
+
+
+def banner(texture: str) -> list[Shape]:
+    """A strip of cloth, 1.3 x 0.26 m, held up by two sticks of 2 cm."""
+    sticks = [between((x, 0, 0.02), (x, 0, 1.75), 0.012, texture) for x in (-0.62, 0.62)]
+    return [Shape(BOX, (0, 0, 1.6), (0.65, 0.008, 0.13), texture), *sticks]

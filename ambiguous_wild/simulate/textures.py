@@ -239,6 +239,14 @@ def vivid(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: f
     return np.asarray(colours[band] * grain, dtype=np.float32)
 
 
+def cloth(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: float) -> np.ndarray:
+    """White cloth with folds and a weave, to be tinted, [H, W, 3] linear light."""
+    h, w = round(height_m * px_per_m), round(width_m * px_per_m)
+    folds = np.clip(0.05 + 1.3 * octaves(rng, h, w, 0.35 * px_per_m, 3), 0.1, 1.2)
+    weave = _scattered("gravel", rng, h, w, px_per_m, 1.5) ** 0.6
+    return np.asarray(np.repeat((folds[..., None] * weave).mean(2, keepdims=True), 3, 2), dtype=np.float32)
+
+
 def sky(rng: np.random.Generator, height: int = 512, width: int = 2048) -> np.ndarray:
     """A backdrop around the place: crowns of trees, haze, clouds; row 0 is the horizon's foot."""
     elevation = np.linspace(0.0, np.pi / 2, height, dtype=np.float32)[:, None]

@@ -15,7 +15,10 @@ from PIL import Image
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.simulate import capture
+from ambiguous_wild.simulate import world as world_module
+from ambiguous_wild.simulate.distractors import Placement, movers, shapes_of
 from ambiguous_wild.simulate.presets import PRESETS, TWIN, preset, resized
+from ambiguous_wild.simulate.tracer import trace
 
 SMALL = replace(resized(preset("tiny"), views=6, width=128), detail_px_per_m=20.0)
 
@@ -200,9 +203,78 @@ def test_presets_name_what_they_use() -> None:
         assert all(d.texture in SHEETS and (not d.head or d.head in SHEETS) for d in spec.distractors)
     assert not PRESETS["courtyard-clean"].distractors
     assert {d.ambiguity for d in PRESETS["courtyard"].distractors} == {"colour", "semantic", "none"}
+    assert {d.ambiguity for d in PRESETS["courtyard-plain"].distractors} == {"none"}
+    assert {"pole", "barrier", "banner", "ball"} == {d.kind for d in PRESETS["courtyard-thin"].distractors}
     with pytest.raises(AwError, match="did you mean 'courtyard-twin'"):
         preset("courtyard-twins")
     with pytest.raises(AwError, match="--views 2"):
         resized(preset("tiny"), views=2)
     with pytest.raises(AwError, match="--width 10"):
         resized(preset("tiny"), width=10)
+
+
+@pytest.mark.parametrize(
+    ("name", "low", "high"),
+    [("courtyard-sparse", 0.03, 0.07), ("courtyard", 0.14, 0.22), ("courtyard-crowd", 0.41, 0.49)],
+)
+def test_presets_cover_what_they_say(name: str, low: float, high: float) -> None:
+    """Mean share of distractor pixels over the train photos, at a size where all is quick to trace."""
+    spec = replace(resized(preset(name), views=12, width=96), detail_px_per_m=12.0)
+    world, shots = capture.plan(spec, 3)
+    shares = []
+    for shot in (s for s in shots if s.split == "train"):
+        seen = trace(
+            shot.camera, world.table(), movers(spec, shot.placements, world), world.atlas, world.light
+        )
+        shares.append(float((seen.owner > 0).mean()))
+    assert low < np.mean(shares) < high
+
+
+def test_thin_distractors_are_a_few_pixels_wide() -> None:
+    """Opening the mask with a square of 3.5 % of the width leaves little of thin things, most of figures."""
+    left = {}
+    for name in ("courtyard-thin", "courtyard"):
+        spec = replace(resized(preset(name), views=6, width=320), detail_px_per_m=12.0)
+        world, shots = capture.plan(spec, 2)
+        kernel, inside, total = np.ones((11, 11), np.uint8), 0, 0
+        for shot in (s for s in shots if s.split == "train"):
+            things = movers(spec, shot.placements, world)
+            mask = (trace(shot.camera, world.table(), things, world.atlas, world.light).owner > 0).astype(
+                np.uint8
+            )
+            inside += int(cv2.morphologyEx(mask, cv2.MORPH_OPEN, kernel).sum())
+            total += int(mask.sum())
+        left[name] = inside / total
+    assert left["courtyard-thin"] < 0.5 < 0.9 < left["courtyard"]
+
+
+def test_a_tint_colours_its_own_sheet_and_leaves_the_head() -> None:
+    red = next(d for d in PRESETS["courtyard-plain"].distractors if d.kind == "visitor")
+    shapes = shapes_of(red, Placement(0, 0.0, 0.0, 0.0, 0.5))
+    assert all(s.tint[1] < 0.1 * s.tint[0] for s in shapes if s.texture == red.texture)
+    heads = [s.tint for s in shapes if s.texture == "skin"]
+    assert heads and all(t == (1.0, 1.0, 1.0) for t in heads)
+
+
+def test_size_and_lift_move_a_ball_off_the_ground() -> None:
+    ball = replace(PRESETS["courtyard-plain"].distractors[1], size=0.25, lift_m=2.0)
+    (shape,) = shapes_of(ball, Placement(1, 0.5, -1.0, 0.0, 0.5))
+    assert shape.center == pytest.approx((0.5, -1.0, 1.0 + 0.1)) and shape.half == pytest.approx((0.1,) * 3)
+    assert shape.owner == 2
+
+
+def test_a_sheet_that_came_later_changes_no_earlier_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """World of the same seed with and without it: the same light, the same texels under the same names."""
+    spec = replace(SMALL, detail_px_per_m=12.0, distractors=())
+    now, _ = capture.plan(spec, 5)
+    monkeypatch.delitem(world_module.SHEETS, "cloth")
+    before, _ = capture.plan(spec, 5)
+    assert np.array_equal(now.light.sun, before.light.sun)
+    for name, old in before.atlas.index.items():
+        new = now.atlas.index[name]
+        for level in range(before.atlas.levels[old]):
+            texels = []
+            for atlas, t in ((before.atlas, old), (now.atlas, new)):
+                count = atlas.width[t, level] * atlas.height[t, level]
+                texels.append(atlas.texels[atlas.offset[t, level] :][:count])
+            assert np.array_equal(*texels), name

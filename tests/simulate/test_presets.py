@@ -69,8 +69,8 @@ def only(distractor: Distractor) -> tuple[np.ndarray, float]:
     """Mask of the distractor alone, 2.5 m before a camera that looks at it, and its px a metre."""
     spec, world = empty()
     spec = replace(spec, distractors=(distractor,))
-    eye, f = np.array([0.0, -4.5, 1.2]), 700.0
-    camera = Camera(960, 960, f, f, 480.0, 480.0, capture.look_at(eye, np.array([0.0, -2.0, 1.2]), 0.0))
+    eye, f = np.array([0.0, -4.5, 1.2]), 400.0
+    camera = Camera(560, 560, f, f, 280.0, 280.0, capture.look_at(eye, np.array([0.0, -2.0, 1.2]), 0.0))
     here = movers(spec, (Placement(0, 0.0, -2.0, 0.0, 0.4),), world)
     return trace(camera, world.table(), here, world.atlas, world.light).owner > 0, f / 2.5
 
@@ -78,7 +78,7 @@ def only(distractor: Distractor) -> tuple[np.ndarray, float]:
 def width_m(distractor: Distractor) -> float:
     """Mean width of the mask, m: a strip w wide has a mean distance to its edge of w / 4."""
     mask, px_per_m = only(distractor)
-    assert mask.sum() > 50
+    assert mask.sum() > 200
     return float(4 * ndimage.distance_transform_edt(mask)[mask].mean() / px_per_m)
 
 

@@ -31,6 +31,9 @@ class RobustSplatConfig:
     cosine: Literal["auto", "calibrated", "plain"] = "auto"  # what the cosine target is made of
     normal_units: float = 10.0  # calibrated: distance at which the cosine is 0 and half of it the target
     inputs: Literal["auto", "standardised", "raw"] = "auto"  # of the net
+    # cells over which hand-made features are averaged and put beside the cell's own: a net's token sees the
+    # whole photo, a hand-made cell 20 px
+    context: tuple[int, ...] = ()
     hidden: int = 16
     lr: float = 1e-3
     density: DensityConfig = field(default_factory=_delayed_growth)
@@ -63,6 +66,8 @@ class RobustSplatConfig:
             raise AwError(f"robustsplat.decay is from 0 to below 1, got {self.decay}")
         if self.erosion < 1 or self.erosion % 2 == 0:
             raise AwError(f"robustsplat.erosion is an odd number of px, got {self.erosion}")
+        if any(size < 1 or size % 2 == 0 for size in self.context):
+            raise AwError(f"robustsplat.context holds odd numbers of cells, got {self.context}")
         for name in ("hidden", "bins", "coarse_divisor", "lr", "beta", "normal_units"):
             if getattr(self, name) <= 0:
                 raise AwError(f"robustsplat.{name} must be above 0, got {getattr(self, name)}")

@@ -45,6 +45,7 @@ class RobustSplatMask(MaskPolicy):
         small = [self._coarse_picture(photo) for photo in data.photos]
         self.coarse.fit(small)
         self.phi_coarse = photo_features(self.coarse, small, data.cache_dir)
+        self.inputs = [self._inputs(phi) for phi in self.phi]
         self.net = MaskNet(*self._statistics(), self.config.hidden, data.seed)
         self.optimiser = torch.optim.Adam(self.net.parameters(), lr=self.config.lr)
 
@@ -85,8 +86,8 @@ class RobustSplatMask(MaskPolicy):
         """M [H, W] in (0, 1) at the step's resolution; differentiable where gradients are enabled."""
         height, width = step.photo.shape[:2]
         if torch.is_grad_enabled():
-            return self.net(self.phi[step.view], height, width)
-        return self.net(self.phi[step.view], height, width).detach()
+            return self.net(self.inputs[step.view], height, width)
+        return self.net(self.inputs[step.view], height, width).detach()
 
     def _cut(self, mask: Tensor) -> Tensor:
         return supervision.keep_of(mask.detach(), self.config.threshold, self.config.erosion)
@@ -160,14 +161,25 @@ class RobustSplatMask(MaskPolicy):
     def _calibrate(self) -> bool:
         return self.config.cosine == "calibrated" or (self.config.cosine == "auto" and self.config.hand_made)
 
+    def _inputs(self, phi: Tensor) -> Tensor:
+        """What the net sees of a photo, [h, w, C']: its features, and hand-made ones averaged more widely."""
+        if not self.config.hand_made or not self.config.context:
+            return phi
+        maps = phi.permute(2, 0, 1)[None]
+        wide = [
+            F.avg_pool2d(maps, size, stride=1, padding=size // 2, count_include_pad=False)
+            for size in self.config.context
+        ]
+        return torch.cat([maps, *wide], dim=1)[0].permute(1, 2, 0).contiguous()
+
     def _statistics(self) -> tuple[Tensor, Tensor]:
         """Mean and std [C] that the net's inputs are standardised by."""
-        channels = self.phi[0].shape[2]
+        channels = self.inputs[0].shape[2]
         raw = self.config.inputs == "raw" or (self.config.inputs == "auto" and not self.config.hand_made)
         if raw:
             device = self.data.device
             return torch.zeros(channels, device=device), torch.ones(channels, device=device)
-        cells = torch.cat([phi.reshape(-1, channels) for phi in self.phi]).double()
+        cells = torch.cat([x.reshape(-1, channels) for x in self.inputs]).double()
         return cells.mean(0).float(), cells.std(0, correction=0).clamp(min=1e-6).float()
 
     # -- when -------------------------------------------------------------------------------------

@@ -1,0 +1,148 @@
+"""Methods x captures x seeds on captures with exact truth: how much of the possible each method reaches.
+
+    python benchmarks/captures.py --captures DIR... --out DIR [--methods ...] [--seeds 0 1 2]
+        [--iterations 3000] [--jobs 2] [--set METHOD.KEY=VALUE ...] [--results STEM]
+
+A DIR is a scene folder or a folder of them. Every run is an `aw bench` of its own with one kernel thread, so
+--jobs of them share the machine; runs are ordinary run folders under --out: what is finished is kept, what
+stopped resumes. Writes benchmarks/results/captures.json, .csv and .md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from pathlib import Path
+
+from captures_report import facts_of, summarise, tabulate, to_csv, to_markdown
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.environment import environment
+from ambiguous_wild.harness.grid import cell_folder, plan_cells
+from ambiguous_wild.harness.run import RESULT, Cell, refuse_other_config
+from ambiguous_wild.harness.store import read_runs
+from ambiguous_wild.io.atomic import write_json, write_text
+from ambiguous_wild.splat.trainer import TrainConfig
+
+RESULTS = Path(__file__).parent / "results" / "captures"
+METHODS = ("3dgs", "robustsplat", "dronesplat", "refinesplat", "3dgs+truth", "3dgs-clean")
+
+
+def find_scenes(folders: Iterable[Path]) -> list[Path]:
+    """Scene folders among the folders and one level below them.
+
+    Raises:
+        AwError: a folder that is and holds none.
+    """
+    scenes: list[Path] = []
+    for folder in folders:
+        below = sorted(p.parent for p in folder.glob("*/scene.json")) if folder.is_dir() else []
+        if (folder / "sparse").is_dir() or (folder / "scene.json").is_file():
+            scenes.append(folder)
+        elif below:
+            scenes += below
+        else:
+            raise AwError(f"{folder} is no scene folder and holds none; 'aw build-scene' makes them")
+    return scenes
+
+
+def command(cell: Cell, args: argparse.Namespace) -> list[str]:
+    """The `aw bench` of one cell."""
+    words = ["bench", "--method", cell.method.name, "--scene", str(cell.scene.root)]
+    words += ["--seed", str(cell.train.seed), "--iterations", str(cell.train.iterations)]
+    words += ["--device", "cpu", "--threads", "1", "--no-pictures", "-o", str(args.out)]
+    for setting in args.settings:
+        method, _, key = setting.partition("=")[0].partition(".")
+        if cell.method.option_keys(method, key):
+            words += ["--set", setting]
+    return [sys.executable, "-m", "ambiguous_wild.cli.main", *words]
+
+
+def run_all(cells: Sequence[Cell], args: argparse.Namespace) -> list[str]:
+    """Run what is missing, `jobs` at a time; returns a line for each that failed.
+
+    Raises:
+        AwError: a run folder holds another configuration (found before anything is trained).
+    """
+    todo = []
+    for cell in cells:
+        folder = cell_folder(args.out, cell)
+        if folder.exists():
+            refuse_other_config(folder, cell)
+        if not (folder / RESULT).is_file():
+            todo.append(cell)
+    print(f"{len(cells)} runs: {len(cells) - len(todo)} finished before, {len(todo)} to go", flush=True)
+    failed = []
+    with ThreadPoolExecutor(args.jobs) as pool:
+        waiting = {
+            pool.submit(subprocess.run, command(cell, args), capture_output=True, text=True): cell
+            for cell in todo
+        }
+        for number, done in enumerate(as_completed(waiting), start=1):
+            cell, process = waiting[done], done.result()
+            name = f"{cell.method.name} on {cell.scene.name}, seed {cell.train.seed}"
+            lines = [line.strip() for line in process.stderr.splitlines() if line.strip()] or ["no output"]
+            if process.returncode:
+                failed.append(f"{name}: {lines[-1]}")
+            told = lines[-1] if process.returncode else next((x for x in lines if "PSNR" in x), lines[-1])
+            print(f"[{number}/{len(todo)}] {name}: {told}", flush=True)
+    return failed
+
+
+def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--captures", nargs="+", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the runs")
+    parser.add_argument("--methods", nargs="+", default=list(METHODS))
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--iterations", type=int, default=3000)
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--set", dest="settings", action="append", default=[], metavar="METHOD.KEY=VALUE")
+    parser.add_argument("--results", type=Path, default=RESULTS, help="where .json, .csv and .md go")
+    parser.add_argument("--only-report", action="store_true", help="train nothing, tabulate what is there")
+    args = parser.parse_args(words)
+    if args.jobs < 1 or args.iterations < 1:
+        parser.error("--jobs and --iterations count from 1")
+    return args
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    args = arguments(words)
+    train = TrainConfig(iterations=args.iterations)
+    cells = plan_cells(
+        args.methods, find_scenes(args.captures), args.seeds, train, settings=args.settings, device="cpu"
+    )
+    failed = [] if args.only_report else run_all(cells, args)
+    runs = read_runs(args.out)
+    scenes = {cell.scene.name: cell.scene for cell in cells}
+    methods = list(dict.fromkeys(cell.method.name for cell in cells))
+    rows = tabulate(runs, list(scenes), methods, args.seeds)
+    data = {
+        "environment": environment("cpu"),
+        "iterations": args.iterations,
+        "seeds": args.seeds,
+        "jobs": args.jobs,
+        "settings": args.settings,
+        "captures": [facts_of(scene) for scene in scenes.values()],
+        "rows": rows,
+        "summary": summarise(rows, [facts_of(scene) for scene in scenes.values()]),
+        "failed": failed,
+    }
+    stem = args.results
+    write_json(stem.with_name(stem.name + ".json"), data)
+    write_text(stem.with_name(stem.name + ".csv"), to_csv(rows))
+    write_text(stem.with_name(stem.name + ".md"), to_markdown(data))
+    print(to_markdown(data))
+    for line in failed:
+        print(f"failed: {line}", file=sys.stderr)
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main())
+    except AwError as error:
+        sys.exit(f"error: {error}")

@@ -1,0 +1,219 @@
+"""From runs on captures to a table and the few numbers that answer whether a method is worth it."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from ambiguous_wild.core import Scene
+from ambiguous_wild.harness.evaluate import true_distractor
+from ambiguous_wild.harness.store import Runs
+from ambiguous_wild.io.images import read_gray
+from ambiguous_wild.metrics import stats
+
+OURS, PLAIN, EXACT = "refinesplat", "3dgs", "3dgs+truth"
+BASELINES = ("robustsplat", "dronesplat")
+REFERENCES = ("3dgs+truth", "3dgs-clean")  # they know the truth: not ranked
+GAP_DB = 1.0  # of exact masks over none: below it a share of the gap is noise
+Row = dict[str, Any]
+# key, label, digits
+COLUMNS = (
+    ("psnr", "PSNR dB", 2),
+    ("ssim", "SSIM", 3),
+    ("iou", "IoU", 3),
+    ("precision", "precision", 3),
+    ("recall", "recall", 3),
+    ("masked_share", "masked %", 1),
+    ("gaussians", "Gaussians", 0),
+    ("model_mb", "MB", 2),
+    ("seconds", "s", 0),
+    ("ms_per_iteration", "ms/it", 1),
+)
+
+
+def facts_of(scene: Scene) -> dict[str, Any]:
+    """Name, photos, and the mean share of distractor pixels in the train photos (None without truth)."""
+    masks = [true_distractor(scene, view) for view in scene.train]
+    known = [float(mask.mean()) for mask in masks if mask is not None]
+    share = float(np.mean(known)) if len(known) == len(masks) else None
+    return {"name": scene.name, "train": len(scene.train), "test": len(scene.test), "distractor_share": share}
+
+
+def masked_share(run: Path) -> float:
+    """Mean share of masked pixels over the train photos; 0 where the method wrote no masks."""
+    shares = [float((read_gray(path) < 128).mean()) for path in sorted((run / "masks").rglob("*.png"))]
+    return float(np.mean(shares)) if shares else 0.0
+
+
+def run_numbers(run: pd.Series, images: pd.DataFrame) -> dict[str, float]:
+    """The columns of one run; image metrics are means over the test photos."""
+    mine = images[(images.scene == run.scene) & (images.method == run.method) & (images.seed == run.seed)]
+    means = {m: stats.mean(mine[mine.metric == m]["value"].to_numpy()) for m in ("psnr", "ssim")}
+    return means | {
+        "iou": float(run.mask_iou),
+        "precision": float(run.mask_precision),
+        "recall": float(run.mask_recall),
+        "masked_share": 100.0 * masked_share(Path(run.folder)),
+        "gaussians": float(run.gaussians),
+        "model_mb": float(run.model_mb),
+        "seconds": float(run.train_s) + float(run.setup_s),
+        "ms_per_iteration": float(run.ms_per_iteration),
+    }
+
+
+def tabulate(runs: Runs, scenes: Sequence[str], methods: Sequence[str], seeds: Sequence[int]) -> list[Row]:
+    """A row a capture and method: mean and sample deviation over the seeds, None where one is missing."""
+    ok = runs.runs[runs.runs.status == "ok"] if len(runs.runs) else runs.runs
+    rows = []
+    for scene in scenes:
+        for method in methods:
+            here = ok[(ok.scene == scene) & (ok.method == method) & ok.seed.isin(list(seeds))]
+            numbers = [run_numbers(run, runs.images) for _, run in here.iterrows()]
+            row: Row = {"capture": scene, "method": method, "runs": len(numbers)}
+            complete = len(numbers) == len(set(seeds))
+            for key, _, _ in COLUMNS:
+                values = [n[key] for n in numbers] if complete else []
+                row[key] = _plain(stats.mean(values))
+                row[f"{key}_sd"] = _plain(stats.spread(values))
+            rows.append(row)
+    return rows
+
+
+def summarise(rows: Sequence[Row], captures: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Share of the gap, ranking, masks against the baselines, the clean captures, model sizes."""
+    of = {(row["capture"], row["method"]): row for row in rows}
+    names = [capture["name"] for capture in captures]
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+
+    def value(capture: str, method: str, key: str) -> float:
+        found = of.get((capture, method), {}).get(key)
+        return math.nan if found is None else float(found)
+
+    gaps = {name: _gap({m: value(name, m, "psnr") for m in (OURS, PLAIN, EXACT)}) for name in names}
+    wide = {name: gap for name, gap in gaps.items() if gap["gap_db"] >= GAP_DB}
+    means = {m: stats.mean([value(name, m, "psnr") for name in names]) for m in methods}
+    ranked = {m: v for m, v in means.items() if m not in REFERENCES and not math.isnan(v)}
+    iou = {name: {m: value(name, m, "iou") for m in (OURS, *BASELINES)} for name in names}
+    ratios = {name: value(name, OURS, "gaussians") / value(name, BASELINES[0], "gaussians") for name in names}
+    clean = [c["name"] for c in captures if c["distractor_share"] == 0.0]
+    return _plain_tree(
+        {
+            "gap": wide,
+            "gap_share_mean": stats.mean([gap["share"] for gap in wide.values()]),
+            "psnr_mean": means,
+            "best": max(ranked, key=lambda m: ranked[m]) if ranked else None,
+            "best_by_capture": {name: _best(name, methods, value) for name in names},
+            "iou": iou,
+            "iou_beats_both": [n for n in names if all(iou[n][OURS] > iou[n][b] for b in BASELINES)],
+            "clean": {
+                name: {
+                    "difference_db": value(name, OURS, "psnr") - value(name, PLAIN, "psnr"),
+                    "masked_share": value(name, OURS, "masked_share"),
+                }
+                for name in clean
+            },
+            "gaussians_ratio": ratios,
+            "gaussians_ratio_mean": stats.mean(list(ratios.values())),
+        }
+    )
+
+
+def _gap(psnr: dict[str, float]) -> dict[str, float]:
+    gap = psnr[EXACT] - psnr[PLAIN]
+    return {
+        "gap_db": gap,
+        "gained_db": psnr[OURS] - psnr[PLAIN],
+        "share": (psnr[OURS] - psnr[PLAIN]) / gap if gap else math.nan,
+    }
+
+
+def _best(capture: str, methods: Sequence[str], value: Any) -> str | None:
+    found = {m: value(capture, m, "psnr") for m in methods if m not in REFERENCES}
+    found = {m: v for m, v in found.items() if not math.isnan(v)}
+    return max(found, key=lambda m: found[m]) if found else None
+
+
+def to_csv(rows: Sequence[Row]) -> str:
+    """All rows and columns; an empty cell is a missing value."""
+    text = io.StringIO()
+    names = ["capture", "method", "runs"] + [f"{k}{s}" for k, _, _ in COLUMNS for s in ("", "_sd")]
+    writer = csv.DictWriter(text, names, lineterminator="\n", restval="")
+    writer.writeheader()
+    writer.writerows({k: "" if v is None else v for k, v in row.items()} for row in rows)
+    return text.getvalue()
+
+
+def to_markdown(data: dict[str, Any]) -> str:
+    """The table a capture, then the summary."""
+    seeds = ", ".join(map(str, data["seeds"]))
+    lines = [
+        "# Captures with exact truth",
+        "",
+        f"{data['iterations']} iterations, seeds {seeds}, one kernel thread a run, {data['jobs']} runs at a "
+        f"time; {data['environment']['cpu']}. Mean +- sample deviation over the seeds; a cell that is `-` is "
+        "missing. IoU, precision and recall are of masked pixels, counted over all train photos.",
+    ]
+    for capture in data["captures"]:
+        share = capture["distractor_share"]
+        about = "no truth" if share is None else f"{100 * share:.1f} % distractors"
+        lines += ["", f"## {capture['name']} ({capture['train']} + {capture['test']} photos, {about})", ""]
+        lines.append("| method | " + " | ".join(label for _, label, _ in COLUMNS) + " |")
+        lines.append("| --- |" + " ---: |" * len(COLUMNS))
+        for row in data["rows"]:
+            if row["capture"] == capture["name"]:
+                cells = [_cell(row, key, digits) for key, _, digits in COLUMNS]
+                lines.append(f"| {row['method']} | " + " | ".join(cells) + " |")
+    return "\n".join([*lines, "", "## Summary", "", *_summary_lines(data["summary"])]) + "\n"
+
+
+def _summary_lines(summary: dict[str, Any]) -> list[str]:
+    lines = [
+        f"- {name}: {_number(gap['gained_db'], 2)} of {_number(gap['gap_db'], 2)} dB that exact masks bring "
+        f"({_number(gap['share'], 2)})"
+        for name, gap in summary["gap"].items()
+    ]
+    lines.append(
+        f"- mean share of the gap, over captures where it is at least {GAP_DB:g} dB: "
+        + _number(summary["gap_share_mean"], 2)
+    )
+    psnr = ", ".join(f"{m} {_number(v, 2)}" for m, v in summary["psnr_mean"].items())
+    lines.append(f"- mean PSNR over all captures: {psnr}; best without the truth: {summary['best'] or '-'}")
+    beaten = ", ".join(summary["iou_beats_both"]) or "none"
+    lines.append(f"- {OURS}'s IoU is above that of {' and '.join(BASELINES)} on: {beaten}")
+    for name, clean in summary["clean"].items():
+        lines.append(
+            f"- {name} has no distractor: {OURS} differs from {PLAIN} by "
+            f"{_number(clean['difference_db'], 2)} dB and masks {_number(clean['masked_share'], 1)} %"
+        )
+    lines.append(f"- Gaussians, {OURS} over {BASELINES[0]}: {_number(summary['gaussians_ratio_mean'], 2)}")
+    return lines
+
+
+def _cell(row: Row, key: str, digits: int) -> str:
+    mean, sd = row[key], row[f"{key}_sd"]
+    if mean is None:
+        return "-"
+    return f"{mean:,.{digits}f}" + ("" if sd is None else f" +- {sd:,.{digits}f}")
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _plain(value: float) -> float | None:
+    return round(value, 6) if math.isfinite(value) else None
+
+
+def _plain_tree(tree: Any) -> Any:
+    if isinstance(tree, dict):
+        return {key: _plain_tree(item) for key, item in tree.items()}
+    if isinstance(tree, list):
+        return [_plain_tree(item) for item in tree]
+    return _plain(tree) if isinstance(tree, float) else tree

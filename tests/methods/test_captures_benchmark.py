@@ -1,0 +1,111 @@
+"""The benchmark over captures: its sums by hand, and the script as it is typed on a tiny scene."""
+
+import csv
+import importlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.tiny_scene import write_tiny_scene
+
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+
+
+@pytest.fixture(scope="module")
+def report():
+    sys.path.insert(0, str(BENCHMARKS))
+    try:
+        yield importlib.import_module("captures_report")
+    finally:
+        sys.path.remove(str(BENCHMARKS))
+
+
+def row(capture, method, psnr, iou=None, gaussians=100.0, masked=0.0):
+    return {
+        "capture": capture, "method": method, "psnr": psnr, "iou": iou, "gaussians": gaussians,
+        "masked_share": masked,
+    }  # fmt: skip
+
+
+def test_the_summary_by_hand(report):
+    rows = [
+        row("a", "3dgs", 26.0), row("a", "refinesplat", 29.0, 0.7, 90.0),
+        row("a", "robustsplat", 28.0, 0.6), row("a", "dronesplat", 27.0, 0.5), row("a", "3dgs+truth", 30.0),
+        row("b", "3dgs", 30.0), row("b", "refinesplat", 31.0, 0.5, 120.0),
+        row("b", "robustsplat", 31.5, 0.6), row("b", "dronesplat", 30.0, 0.2), row("b", "3dgs+truth", 32.0),
+        row("c", "3dgs", 33.0), row("c", "refinesplat", 32.75, None, 60.0, 1.5),
+        row("c", "robustsplat", 32.0), row("c", "dronesplat", 30.0), row("c", "3dgs+truth", 33.0),
+    ]  # fmt: skip
+    captures = [{"name": n, "distractor_share": s} for n, s in (("a", 0.2), ("b", 0.1), ("c", 0.0))]
+    got = report.summarise(rows, captures)
+    assert set(got["gap"]) == {"a", "b"}  # on c exact masks bring nothing
+    assert got["gap"]["a"] == {"gap_db": 4.0, "gained_db": 3.0, "share": 0.75}
+    assert got["gap_share_mean"] == pytest.approx((0.75 + 0.5) / 2)
+    assert got["psnr_mean"]["refinesplat"] == pytest.approx((29 + 31 + 32.75) / 3, abs=1e-6)
+    assert got["best"] == "refinesplat"  # the references are not ranked
+    assert got["best_by_capture"] == {"a": "refinesplat", "b": "robustsplat", "c": "3dgs"}
+    assert got["iou_beats_both"] == ["a"]
+    assert got["clean"] == {"c": {"difference_db": -0.25, "masked_share": 1.5}}
+    assert got["gaussians_ratio"] == {"a": 0.9, "b": 1.2, "c": 0.6}
+    assert got["gaussians_ratio_mean"] == pytest.approx(0.9)
+
+
+def test_a_missing_run_is_missing_and_not_zero(report):
+    rows = [row("a", "3dgs", 26.0), row("a", "refinesplat", None), row("a", "3dgs+truth", 30.0)]
+    got = report.summarise(rows, [{"name": "a", "distractor_share": 0.2}])
+    assert got["gap"]["a"]["share"] is None
+    assert got["gap_share_mean"] is None
+    assert got["psnr_mean"]["refinesplat"] is None
+    assert got["best"] == "3dgs"
+    assert got["iou_beats_both"] == []
+    assert got["gaussians_ratio"]["a"] is None
+
+
+def test_the_masked_share_is_counted_in_the_written_masks(report, tmp_path):
+    (tmp_path / "masks").mkdir()
+    assert report.masked_share(tmp_path) == 0.0
+    for name, rows in (("a", 2), ("b", 4)):
+        keep = np.full((8, 8), 255, np.uint8)
+        keep[:rows] = 0
+        cv2.imwrite(str(tmp_path / "masks" / f"{name}.png"), keep)
+    assert report.masked_share(tmp_path) == pytest.approx((2 / 8 + 4 / 8) / 2)
+
+
+def test_the_script_trains_what_is_missing_and_tabulates(tmp_path):
+    write_tiny_scene(tmp_path / "captures" / "with")
+    (tmp_path / "captures" / "with" / "nested").mkdir()
+    words = [sys.executable, BENCHMARKS / "captures.py", "--captures", tmp_path / "captures" / "with"]
+    words += ["--out", tmp_path / "runs", "--results", tmp_path / "out", "--iterations", "10"]
+    words += ["--methods", "3dgs", "3dgs@mask=truth", "--seeds", "0", "1", "--set", "truth.dilation=1"]
+    words = [str(word) for word in words]
+    first = subprocess.run(words, capture_output=True, text=True, check=True)
+    assert "4 runs: 0 finished before, 4 to go" in first.stdout
+    data = json.loads((tmp_path / "out.json").read_text())
+    assert data["captures"] == [
+        {"name": "with", "train": 6, "test": 2, "distractor_share": pytest.approx(144 / (64 * 48))}
+    ]
+    truth = {r["method"]: r for r in data["rows"]}["3dgs@mask=truth"]
+    assert truth["masked_share"] == pytest.approx(100 * 14 * 14 / (64 * 48), abs=1e-4)
+    values = []
+    for seed in (0, 1):
+        folder = tmp_path / "runs" / "with" / "3dgs@mask=truth" / f"seed{seed}"
+        images = json.loads((folder / "metrics.json").read_text())["per_image"]
+        values.append(sum(image["psnr"] for image in images) / len(images))
+    assert truth["psnr"] == pytest.approx(sum(values) / 2, abs=1e-5)
+    assert truth["psnr_sd"] == pytest.approx(abs(values[0] - values[1]) / 2**0.5, abs=1e-5)
+    rows = list(csv.DictReader((tmp_path / "out.csv").open()))
+    assert [r["method"] for r in rows] == ["3dgs", "3dgs@mask=truth"]
+    assert "| 3dgs@mask=truth |" in (tmp_path / "out.md").read_text()
+
+    again = subprocess.run(words, capture_output=True, text=True, check=True)
+    assert "4 finished before, 0 to go" in again.stdout
+    other = subprocess.run([*words, "--iterations", "12"], capture_output=True, text=True)
+    assert other.returncode == 1
+    assert "another configuration (train.iterations was 10, is 12)" in other.stderr
+    empty = subprocess.run([*words, "--captures", str(tmp_path / "runs")], capture_output=True, text=True)
+    assert "is no scene folder" in empty.stderr

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.io.palette import MASKED, faded, ramp, tint
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.losses import ssim_map
 from ambiguous_wild.splat.parts import MaskPolicy, Parts, State
@@ -109,14 +110,28 @@ class DroneSplatMask(MaskPolicy):
 
     @torch.no_grad()
     def predict(self, step: Step) -> Tensor | None:
-        config = self.config
-        if step.nominal < config.mask_start or step.iteration < config.min_mask_start:
-            return None
+        return (~self._stands_out(step)[1]).float() if self._begun(step) else None
+
+    def _begun(self, step: Step) -> bool:
+        return step.nominal >= self.config.mask_start and step.iteration >= self.config.min_mask_start
+
+    def _stands_out(self, step: Step) -> tuple[Tensor, Tensor]:
+        """Heat map, and which pixels are above its threshold."""
         labels = nearest(self.labels[step.view], *step.photo.shape[:2])
-        heat = heat_map(combined_residual(step.rendered.image, step.photo, config.weight_l1), labels)
+        heat = heat_map(combined_residual(step.rendered.image, step.photo, self.config.weight_l1), labels)
         # a photo of one heat alone has nothing that stands out, and T = 0 would mask it whole
-        stands_out = (heat >= threshold(heat, step.nominal, config.t_local)) & (heat > 0)
-        return (~stands_out).float()
+        return heat, (heat >= threshold(heat, step.nominal, self.config.t_local)) & (heat > 0)
+
+    @torch.no_grad()
+    def panels(self, step: Step) -> dict[str, np.ndarray]:
+        heat, out = self._stands_out(step)
+        photo = faded((step.photo.cpu().numpy() * 255 + 0.5).astype(np.uint8))
+        used = "" if self._begun(step) else ", not used yet"
+        limit = threshold(heat, step.nominal, self.config.t_local)
+        return {
+            f"heat of instances, T {limit:.2f}": ramp(heat.cpu().numpy(), 0.0, 1.0),
+            f"masked {100 * float(out.float().mean()):.0f} %{used}": tint(photo, out.cpu().numpy(), MASKED),
+        }
 
     def facts(self) -> dict[str, Any]:
         shares = [self.shares[view] for view in sorted(self.shares)]

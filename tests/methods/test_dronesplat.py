@@ -99,6 +99,10 @@ def test_the_object_goes_whole_and_unlabelled_pixels_stay(scene, tmp_path):
     want = np.ones((48, 64))
     want[14:26, 14:26] = 0
     assert np.array_equal(keep, want)
+    panels = list(policy.panels(step_of(data, 0, wrong)).values())
+    assert [p.shape for p in panels] == [(48, 64, 3)] * 2
+    hot = panels[0].astype(int)
+    assert (hot[14:26, 14:26, 0] > hot[14:26, 14:26, 1]).all() and (hot[0, 0, 0] < hot[0, 0, 1]).all()
     assert policy.facts()["masked_share"] == pytest.approx(144 / (48 * 64))
     assert policy.keep(step_of(data, 0, wrong[::2, ::2].contiguous())).shape == (24, 32)
 

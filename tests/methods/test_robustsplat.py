@@ -185,6 +185,28 @@ def test_the_net_rests_after_a_reset(scene, tmp_path):
     assert [moves(i) for i in (15_001, 15_299, 15_300)] == [False, False, True]
 
 
+def test_panels_show_and_learn_nothing(scene, tmp_path):
+    policy = policy_on(scene, tmp_path)
+    policy.keep(step_of(policy.data, 0, clean_photo(0)))
+    state = [policy.histogram.clone(), policy.net.first.weight.detach().clone()]
+    panels = policy.panels(step_of(policy.data, 0, clean_photo(0)))
+    assert all(p.shape == (48, 64, 3) and p.dtype == np.uint8 for p in panels.values())
+    red = next(p for name, p in panels.items() if name.startswith("disagreement"))
+    inner = red[18:22, 18:22].astype(int)
+    assert (inner[..., 0] > inner[..., 1]).all()  # the distractor differs from the render
+    assert torch.equal(state[0], policy.histogram) and torch.equal(state[1], policy.net.first.weight)
+
+
+def test_context_widens_what_the_net_sees_and_nothing_else(scene, tmp_path):
+    plain, wide = policy_on(scene, tmp_path), policy_on(scene, tmp_path, context=(3,))
+    phi = plain.inputs[0].numpy()
+    assert np.array_equal(wide.inputs[0].numpy()[..., :27], phi)
+    assert np.allclose(wide.inputs[0].numpy()[4, 6, 27:], phi[3:6, 5:8].mean((0, 1)), atol=1e-5)
+    assert np.allclose(wide.inputs[0].numpy()[0, 0, 27:], phi[:2, :2].mean((0, 1)), atol=1e-5)
+    with pytest.raises(AwError, match="context"):
+        RobustSplatConfig(context=(4,))
+
+
 def test_smaller_steps_get_masks_of_their_size(scene, tmp_path):
     policy = policy_on(scene, tmp_path)
     small = clean_photo(1)[::2, ::2].contiguous()

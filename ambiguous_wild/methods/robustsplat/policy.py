@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ambiguous_wild.io.palette import MASKED, faded, ramp, tint
 from ambiguous_wild.methods.robustsplat import supervision
 from ambiguous_wild.methods.robustsplat.config import RobustSplatConfig
 from ambiguous_wild.methods.robustsplat.net import MaskNet, adam_state, load_adam_state
@@ -78,6 +80,19 @@ class RobustSplatMask(MaskPolicy):
             "masked_share": sum(shares) / len(shares) if shares else 0.0,
             "mask_loss_mean": self.losses[0] / self.losses[1] if self.losses[1] else None,
             "features": self.fine.name,
+        }
+
+    @torch.no_grad()
+    def panels(self, step: Step) -> dict[str, np.ndarray]:
+        mask = self._map(step)
+        masked = self._cut(mask).cpu().numpy() < 0.5
+        stage = "coarse" if step.nominal < self.config.bootstrap else "fine"
+        photo = faded((step.photo.cpu().numpy() * 255 + 0.5).astype(np.uint8))
+        used = "" if self._begun(step) else ", not used yet"
+        return {
+            f"disagreement, {stage}": ramp(1.0 - self._target(step).cpu().numpy(), 0.0, 1.0),
+            "the net": ramp(1.0 - mask.cpu().numpy(), 0.0, 1.0),
+            f"masked {100 * masked.mean():.0f} %{used}": tint(photo, masked, MASKED),
         }
 
     # -- the net ----------------------------------------------------------------------------------

@@ -98,14 +98,11 @@ def build(entries: Mapping[str, MethodEntry], options: Any) -> Parts:
 def compose(mask: Any, regulariser: Any) -> Any:
     """One policy of two: keep maps of `mask`, cotangents of `regulariser`."""
     from ambiguous_wild.methods.grafted_policy import GraftedPolicy
-    from ambiguous_wild.splat.parts import MaskPolicy
 
     if regulariser is mask:
         return mask
-    if type(regulariser).cotangent is MaskPolicy.cotangent:
-        # It has no loss of its own, and one that the mask's donor has was not asked for.
-        return GraftedPolicy(mask, None)
-    return GraftedPolicy(mask, regulariser)
+    # Without one that regularises: a loss that the mask's donor may have was not asked for.
+    return GraftedPolicy(mask, regulariser if regulariser.regularises() else None)
 
 
 def _pairs(name: str) -> list[tuple[str, str]]:

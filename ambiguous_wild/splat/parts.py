@@ -38,6 +38,10 @@ class MaskPolicy:
         """dL/dimage [H, W, 3] of losses of the method's own; kept apart for density control."""
         return None
 
+    def regularises(self) -> bool:
+        """Whether `cotangent` can return anything; where not, a graft leaves the policy out altogether."""
+        return type(self).cotangent is not MaskPolicy.cotangent
+
     def predict(self, step: Step) -> Tensor | None:
         """The keep map for pictures and mask metrics: as `keep`, but nothing is learnt or cached."""
         return self.keep(step)

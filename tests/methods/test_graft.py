@@ -80,7 +80,8 @@ def test_places_come_from_their_donors_and_the_rest_from_the_host():
 
     parts = parts_of("refinesplat@mask=truth")
     assert isinstance(parts.mask.mask, TruthMask)
-    assert isinstance(parts.mask.regulariser, RefineSplatMask)  # the host's own stays
+    own = parts_of("refinesplat@mask=truth", **{"host.lambda_cr": "0.2"}).mask.regulariser
+    assert isinstance(own, RefineSplatMask)  # the host's own stays, where it has one
     assert parts.density is EntropyAwareDensity
     assert type(parts_of("refinesplat@mask=none").mask.mask) is MaskPolicy
     assert parts_of("refinesplat@density=3dgs").density is DensityControl

@@ -15,6 +15,7 @@ from ambiguous_wild.core.errors import AwError, unknown
 COMMANDS = {
     "doctor": ("doctor", "What is installed, what is missing, and the command that brings it."),
     "simulate": ("simulate", "Make a capture with exact truth: poses, distractor masks, clean views."),
+    "composite": ("composite", "Put distractors with exact masks into a scene of real photos."),
     "build-scene": ("build_scene", "From a folder of photos to a scene: check, COLMAP, downsample, split."),
     "ambiguity-report": ("ambiguity_report", "How hard are this scene's distractors to tell apart?"),
     "bench": ("bench", "Train methods on scenes and measure them."),

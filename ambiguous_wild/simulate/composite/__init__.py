@@ -1,0 +1,1 @@
+"""Distractors with exact masks on a scene of real photographs."""

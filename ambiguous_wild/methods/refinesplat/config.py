@@ -10,43 +10,56 @@ from ambiguous_wild.methods.refinesplat.density import EntropyDensityConfig
 from ambiguous_wild.methods.refinesplat.entropy import Statistic, Variant
 from ambiguous_wild.methods.refinesplat.identity import PsiConfig
 from ambiguous_wild.methods.refinesplat.masking import Spread
+from ambiguous_wild.methods.refinesplat.multiview import MultiViewConfig
 from ambiguous_wild.methods.refinesplat.threshold import Form
 from ambiguous_wild.vision.segments import SegmentConfig
 
 
 @dataclass(frozen=True)
 class MaskConfig:
-    """From maps on the feature grid to M_final.
+    """From photo and render to M_final. docs/refinesplat.md holds the figures behind every default.
 
-    Where a default is not the printed form, it was measured with weight-free features on 30 simulated photos
-    against renders of 3DGS after 300, 600 and 1500 iterations. Telling distractor instances from static ones
-    (AUC): mean entropy of the render, as printed, 0.40, 0.44, 0.45, worse than chance; contrast 0.976, 0.982,
-    0.984; evidence, its geometric mean with the distance, 0.974, 0.981, 0.983. Best IoU of whole instances:
-    0.72 to 0.79 with a threshold of the scene, which lies at 3 to 5 at every iteration. mean + var of U / H
-    flags nothing at all, mean + std has precision 0.86 to 0.92.
+    `structure` judges pixels by colour and structure (structure.py), and needs no features; all other
+    statistics live on the feature grid and are the paper's or nearer to it. Fields marked F are read with
+    those alone.
     """
 
+    statistic: Statistic = "structure"  # what is judged; `entropy` is printed
+    combine: Literal["fused", "union"] = "fused"  # local and global: geometric mean, or the printed union
+    threshold: Form = "hard"  # of `statistic` between static and transient; `literal` is printed
+    hard: float = 12.0  # T_hard, units of the statistic
+    hold: float = 0.67  # a masked region reaches down to this share of the threshold
+    fill: float = 0.01  # of the photo: enclosed gaps below it are filled
+    base: float = 0.3  # of the residual counts even where the structure agrees perfectly
+    memory: float = 0.5  # of a photo's earlier residuals in the present one; `structure` only
+    multiview: MultiViewConfig = field(
+        default_factory=MultiViewConfig
+    )  # what other views say; `structure` only
+    entropy_weight: float = 0.0  # how much the contrast of identities scales `structure`, 0 to 1
     variant: Variant = "softmax"  # of psi and its entropy; `sigmoid` is printed
-    statistic: Statistic = "evidence"  # per instance; `entropy` is printed
-    scope: Literal["scene", "photo"] = "scene"  # whose instances T_ent cuts in two; `photo` is printed
-    threshold: Form = "kapur"  # T_ent; `literal` is printed
+    scope: Literal["scene", "photo"] = "scene"  # whose instances the threshold cuts; `photo` is printed
     gate: float = 3.0  # robust deviations an instance must stand above the median; 0 = printed
     least: float = 4.0  # and the statistic at least, in its own unit; 0 = printed
-    disagree: float = 3.0  # `gate` for the feature distance between photo and render; 0 = printed
-    disagree_units: float = 3.0  # and at least this many units of what blur and noise make; 0 = printed
+    disagree: float = 3.0  # F: `gate` for the feature distance between photo and render; 0 = printed
+    disagree_units: float = 3.0  # F: and at least this many units of what blur and noise make; 0 = printed
     use_local: bool = True  # M_local; off is an ablation row
     use_global: bool = True  # M_global; off is an ablation row
-    static_tracks: float = 0.35  # of the photo's mean SfM track density keeps an instance; 0 = printed
+    static_tracks: float = 0.0  # of the photo's mean SfM track density keeps an instance; 0 = printed
     least_alpha: float = 0.5  # below this opacity a render is no evidence: not learnt yet; 0 = printed
-    cosine: Literal["calibrated", "plain"] = "calibrated"  # in U; `plain` is printed
-    normal_units: float = 10.0  # distance in units at which the calibrated cosine is 0
-    box: int = 3  # cells, box filter over U / H
-    spread: Spread = "std"  # T_glb = mean + this; `var` is printed
-    global_gate: float = 6.0  # robust deviations above the median that M_global needs; 0 = printed
-    global_units: float = 8.0  # and the distance of the cell itself at least; 0 = printed
-    dilation: int = 5  # px at the photo's resolution; 3, 5, 7 tried in the paper
-    most: float = 0.6  # of a photo is masked at most: the surest pixels go first
+    cosine: Literal["calibrated", "plain"] = "calibrated"  # F: in U; `plain` is printed
+    normal_units: float = 10.0  # F: distance in units at which the calibrated cosine is 0
+    box: int = 3  # F: cells, box filter over U / H
+    spread: Spread = "std"  # F: T_glb = mean + this; `var` is printed
+    global_gate: float = 6.0  # F: robust deviations above the median that M_global needs; 0 = printed
+    global_units: float = 8.0  # F: and the distance of the cell itself at least; 0 = printed
+    dilation: int = 3  # px at the photo's resolution; 3, 5 (printed), 7 tried in the paper
+    most: float = 0.7  # of a photo is masked at most: the surest pixels go first
     w2: float | None = None  # fixed weight of T_ent's lower subset; None = learnt
+
+    @property
+    def needs_identities(self) -> bool:
+        """Whether masks read psi at all."""
+        return self.statistic != "structure" or self.entropy_weight > 0
 
 
 @dataclass(frozen=True)
@@ -54,14 +67,16 @@ class RefineSplatConfig:
     """Times in nominal iterations (of 30 000); the `min_` fields are real iterations of the run."""
 
     mask: MaskConfig = field(default_factory=MaskConfig)
-    segments: SegmentConfig = field(default_factory=SegmentConfig)  # instance masks without weights
+    features: str = "labhog"  # back end of phi, see docs/foundation-models.md; `dinov2-small` is the paper's
+    instances: str = "graph"  # back end of the instance masks; `grounded-video:...` is the paper's
+    segments: SegmentConfig = field(default_factory=SegmentConfig)  # of `graph`
     psi: PsiConfig = field(default_factory=PsiConfig)  # the frozen identity classifier
     density: EntropyDensityConfig = field(default_factory=EntropyDensityConfig)  # growth and merging
     mask_start: float = 500.0  # warm-up: before it every pixel counts
-    min_mask_start: int = 300  # a render of fewer iterations means nothing
+    min_mask_start: int = 400  # a render of fewer iterations means nothing
     reset_pause: float = 300.0  # masks are not refreshed for so long after an opacity reset
     min_reset_pause: int = 200
-    mask_every: int = 4  # each view's mask is refreshed at every k-th of its visits
+    mask_every: int = 2  # each view's mask is refreshed at every k-th of its visits
     entropy_every: int = 4  # iterations between entropy terms, each weighing that many times as much
     # Both losses are off with weight-free features, whose gradient to the image is that of colours and
     # edges: 900 iterations on a simulated courtyard gave 28.2 dB without them, 26.4 with 0.001 and 0.0002,

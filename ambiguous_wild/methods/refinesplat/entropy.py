@@ -16,7 +16,7 @@ from torch import Tensor
 from ambiguous_wild.core.errors import unknown
 
 Variant = Literal["sigmoid", "softmax"]
-Statistic = Literal["entropy", "surprise", "contrast", "evidence"]
+Statistic = Literal["structure", "entropy", "surprise", "contrast", "evidence"]
 
 
 def entropy(logits: Tensor, variant: Variant = "sigmoid") -> Tensor:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import get_args
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -12,19 +14,19 @@ from torch import Tensor
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.methods.refinesplat import masking
 from ambiguous_wild.methods.refinesplat.config import MaskConfig
-from ambiguous_wild.methods.refinesplat.entropy import contrast, entropy, surprise
+from ambiguous_wild.methods.refinesplat.entropy import Statistic, contrast, entropy, surprise
 from ambiguous_wild.methods.refinesplat.identity import Psi
 from ambiguous_wild.methods.refinesplat.threshold import Cut, robust_floor, t_ent
 
 
 @dataclass(frozen=True)
 class Maps:
-    """On the feature grid, [h, w] float64."""
+    """Float arrays of one photo against one render: on the feature grid [h, w], or on pixels [H, W]."""
 
-    entropy: np.ndarray  # H of the render, in [0, 1]
-    statistic: np.ndarray  # what instances are judged by
-    cosine: np.ndarray  # cos(phi(I), phi(render))
-    distance: np.ndarray  # 1 - cosine, in units of what blur and noise alone make
+    statistic: np.ndarray  # what is judged, in its unit
+    distance: np.ndarray  # how far photo and render are apart, in units of what is normal
+    entropy: np.ndarray | None = None  # H of the render, in [0, 1]
+    cosine: np.ndarray | None = None  # cos(phi(I), phi(render))
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,7 @@ def compare(phi_photo: Tensor, phi_render: Tensor, psi: Psi | None, unit: float,
     distance = (1.0 - cosine).clamp(min=0.0) / unit
     if psi is None:
         zero = np.zeros(tuple(distance.shape))
-        return Maps(zero, _array(distance), _array(cosine), _array(distance))
+        return Maps(_array(distance), _array(distance), zero, _array(cosine))
     render = psi(phi_render)
     h = entropy(render, config.variant)
     if config.statistic == "entropy":
@@ -68,11 +70,11 @@ def compare(phi_photo: Tensor, phi_render: Tensor, psi: Psi | None, unit: float,
         statistic = surprise(render, psi(phi_photo), config.variant)
     elif config.statistic == "contrast":
         statistic = contrast(render, psi(phi_photo), config.variant)
-    elif config.statistic == "evidence":
+    elif config.statistic in ("evidence", "structure"):
         statistic = torch.sqrt(contrast(render, psi(phi_photo), config.variant) * distance)
     else:
-        raise unknown("statistic", config.statistic, ("entropy", "surprise", "contrast", "evidence"))
-    return Maps(_array(h), _array(statistic), _array(cosine), _array(distance))
+        raise unknown("statistic", config.statistic, get_args(Statistic))
+    return Maps(_array(statistic), _array(distance), _array(h), _array(cosine))
 
 
 def silence(maps: Maps, unseen: np.ndarray) -> Maps:
@@ -81,11 +83,28 @@ def silence(maps: Maps, unseen: np.ndarray) -> Maps:
     A sky without points differs from every photo until it is learnt; masked, it would never be learnt.
     """
     return Maps(
-        maps.entropy,
         np.where(unseen, 0.0, maps.statistic),
-        np.where(unseen, 1.0, maps.cosine),
         np.where(unseen, 0.0, maps.distance),
+        maps.entropy,
+        None if maps.cosine is None else np.where(unseen, 1.0, maps.cosine),
     )
+
+
+def scaled_by(structure: np.ndarray, evidence: np.ndarray, weight: float) -> np.ndarray:
+    """Pixel evidence [H, W] raised where identities disagree and lowered where they agree.
+
+    The factor 1 + weight (2 g - 1), g = evidence / (evidence + 4), lies in [1 - weight, 1 + weight]: the unit
+    of the scene stays what it is.
+
+    Args:
+        structure: from `PixelEvidence`.
+        evidence: [h, w] on the feature grid, in units; 4 is where instances begin to be suspect.
+        weight: 0 = identities say nothing.
+    """
+    share = np.maximum(evidence, 0.0)
+    factor = 1.0 + weight * (2.0 * share / (share + 4.0) - 1.0)
+    size = (structure.shape[1], structure.shape[0])
+    return structure * cv2.resize(factor.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
 
 
 def make_masks(
@@ -108,29 +127,46 @@ def make_masks(
     """
     height, width = labels.shape
     count = len(static)
-    values, areas = masking.instance_means(maps.statistic, labels, count)
+    means, areas = masking.instance_means(maps.statistic, labels, count)
     distances, _ = masking.instance_means(maps.distance, labels, count)
     known = areas > 0
-    judged = Judged(values[known], distances[known], areas[known])
+    judged = Judged(means[known], distances[known], areas[known])
     pool = pooled([judged, *others] if config.scope == "scene" else [judged])
-    cut = t_ent(pool.values, w2, config.threshold, config.gate, config.least)
+    cut = t_ent(pool.values, w2, config.threshold, config.gate, config.least, config.hard)
     flagged = np.zeros(count, dtype=bool)
-    flagged[known] = (judged.values > cut.threshold) & differs(judged, pool, config)
+    flagged[known] = judged.values > cut.threshold
+    if config.statistic != "structure":
+        flagged[known] &= differs(judged, pool, config)
     flagged &= ~static
     local = masking.local_mask(labels, flagged) if config.use_local else np.zeros(labels.shape, bool)
-
-    coarse = np.zeros(maps.distance.shape, dtype=bool)
+    pixels = masking.enlarge(maps.statistic, height, width)
     if config.use_global:
-        cosine = maps.cosine
-        if config.cosine == "calibrated":
-            cosine = masking.calibrated_cosine(maps.distance, config.normal_units)
-        r = masking.ratio(masking.uncertainty(cosine), maps.entropy)
-        coarse = masking.global_mask(r, config.box, config.spread, config.global_gate)
-        coarse &= maps.distance > config.global_units
-    global_ = masking.enlarge(coarse, height, width) & ~masking.local_mask(labels, static)
-    final = masking.dilate(local | global_, config.dilation)
-    keep = masking.keep_map(final, config.most, masking.enlarge(maps.distance, height, width))
-    return Masks(local, global_, keep, judged, cut)
+        global_ = _global(maps, pixels, cut.threshold, config) & ~masking.local_mask(labels, static)
+    else:
+        global_ = np.zeros(labels.shape, bool)
+    final = local | global_
+    if config.combine == "fused" and config.use_local and config.use_global:
+        of_pixel = np.r_[0.0, np.nan_to_num(means)][np.clip(labels, 0, count)]
+        # a pixel of no instance stands for itself
+        both = np.where(labels > 0, np.sqrt(pixels * of_pixel), pixels)
+        final = masking.hysteresis(both, config.hold * cut.threshold, cut.threshold)
+        final &= ~masking.local_mask(labels, static)
+    final = masking.dilate(masking.fill_holes(final, config.fill), config.dilation)
+    return Masks(local, global_, masking.keep_map(final, config.most, pixels), judged, cut)
+
+
+def _global(maps: Maps, pixels: np.ndarray, threshold: float, config: MaskConfig) -> np.ndarray:
+    """M_global [H, W]: pixels above the threshold, or on the feature grid Eq. 7's ratio of U and H."""
+    if config.statistic == "structure":
+        return masking.hysteresis(pixels, config.hold * threshold, threshold)
+    assert maps.cosine is not None and maps.entropy is not None  # `compare` fills them
+    cosine = maps.cosine
+    if config.cosine == "calibrated":
+        cosine = masking.calibrated_cosine(maps.distance, config.normal_units)
+    r = masking.ratio(masking.uncertainty(cosine), maps.entropy)
+    coarse = masking.global_mask(r, config.box, config.spread, config.global_gate)
+    coarse &= maps.distance > config.global_units
+    return masking.enlarge(coarse, *pixels.shape)
 
 
 def pooled(parts: Sequence[Judged]) -> Judged:

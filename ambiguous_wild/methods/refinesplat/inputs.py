@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,50 +17,92 @@ from ambiguous_wild.methods.refinesplat.masking import grid_labels, instance_mea
 from ambiguous_wild.splat.step import TrainData
 from ambiguous_wild.vision.cache import cache_key, cached
 from ambiguous_wild.vision.protocols import Features, Instances
+from ambiguous_wild.vision.stage import instance_labels, photo_features
 
 
-@dataclass
-class FrozenInputs:
-    """What the mask policy looks up by train view."""
+@dataclass(frozen=True)
+class Semantics:
+    """What psi needs and gives, by train view."""
 
-    features: Features
     phi: list[Tensor]  # [h, w, C] of each photo
-    labels: list[np.ndarray]  # [H, W] int32, 0 = none
-    counts: list[int]  # K of each photo
     identities: list[Tensor]  # [h, w] int64, 0 = none: L_id's target
     grid: list[Tensor]  # [h, w] int64, instance labels on the feature grid
-    static: list[np.ndarray]  # [K] bool, instances that structure from motion vouches for
     psi: Psi | None  # None where no instance has an identity
     found: Identities
 
 
-def prepare(
-    data: TrainData, features: Features, instances: Instances, config: RefineSplatConfig
-) -> FrozenInputs:
-    """Everything frozen, from the cache where it is there."""
-    features.fit(data.photos)
-    arrays = [photo.detach().cpu().numpy() for photo in data.photos]
-    phi = [_features(data, features, i, array) for i, array in enumerate(arrays)]
-    labels = [_labels(data, instances, config, i, array) for i, array in enumerate(arrays)]
-    counts = [max(int(label.max(initial=0)), 0) for label in labels]
-    found = associate(
-        labels,
-        _mean_features(phi, labels, counts),
-        train_tracks(data.scene),
-        min_shared=config.identity_tracks,
-        min_share=config.identity_share,
-        min_similarity=config.identity_similarity,
-        most=config.identities,
-    )
-    grid, identities = [], []
-    for index, label in enumerate(labels):
-        cells = grid_labels(np.maximum(label, 0), *phi[index].shape[:2])
-        grid.append(torch.from_numpy(cells.astype(np.int64)).to(data.device))
-        ids = found.of_instance[index][cells].astype(np.int64)
-        identities.append(torch.from_numpy(ids).to(data.device))
-    psi = _psi(data, phi, identities, found.count, config)
-    static = static_instances(labels, counts, train_tracks(data.scene), config.mask.static_tracks)
-    return FrozenInputs(features, phi, labels, counts, identities, grid, static, psi, found)
+class FrozenInputs:
+    """What the mask policy looks up by train view; features and identities are made when first asked for."""
+
+    def __init__(
+        self, data: TrainData, features: Features, instances: Instances, config: RefineSplatConfig
+    ) -> None:
+        self._data, self.features, self._config = data, features, config
+        names = [view.name for view in data.scene.train]
+        found = instance_labels(instances, data.photos, names, data.cache_dir)
+        self._scene_wide = found.scene_wide
+        own = found.labels
+        # ids of a whole scene have gaps in a photo: labels there count from 1, the ids are kept beside them
+        compact = [_compact(label) for label in own] if found.scene_wide else []
+        self.labels = [label for label, _ in compact] if compact else own  # [H, W] int32, 0 = none
+        self._ids = [ids for _, ids in compact]
+        self.counts = [max(int(label.max(initial=0)), 0) for label in self.labels]  # K of each photo
+        # [K] bool of each photo: instances that structure from motion vouches for
+        self.static = static_instances(
+            self.labels, self.counts, train_tracks(data.scene), config.mask.static_tracks
+        )
+
+    @property
+    def has_semantics(self) -> bool:
+        """Whether features and identities were asked for yet."""
+        return "semantics" in self.__dict__
+
+    @functools.cached_property
+    def semantics(self) -> Semantics:
+        data, config = self._data, self._config
+        self.features.fit(data.photos)
+        phi = photo_features(self.features, data.photos, data.cache_dir)
+        found = self._identities(phi)
+        grid, identities = [], []
+        for index, label in enumerate(self.labels):
+            cells = grid_labels(np.maximum(label, 0), *phi[index].shape[:2])
+            grid.append(torch.from_numpy(cells.astype(np.int64)).to(data.device))
+            ids = found.of_instance[index][cells].astype(np.int64)
+            identities.append(torch.from_numpy(ids).to(data.device))
+        psi = _psi(data, phi, identities, found.count, config)
+        return Semantics(phi, identities, grid, psi, found)
+
+    def _identities(self, phi: list[Tensor]) -> Identities:
+        """The back end's own ids, else by SfM tracks, then by features."""
+        config = self._config
+        if self._scene_wide:
+            return most_seen(self._ids, config.identities)
+        return associate(
+            self.labels,
+            _mean_features(phi, self.labels, self.counts),
+            train_tracks(self._data.scene),
+            min_shared=config.identity_tracks,
+            min_share=config.identity_share,
+            min_similarity=config.identity_similarity,
+            most=config.identities,
+        )
+
+
+def _compact(label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Labels counted from 1 [H, W], and the id each had [K]."""
+    ids = np.unique(label[label > 0])
+    return np.where(label > 0, np.searchsorted(ids, label) + 1, 0).astype(np.int32), ids
+
+
+def most_seen(ids: list[np.ndarray], most: int) -> Identities:
+    """Identities 1..P from scene-wide ids of each photo's instances; those in the most photos are kept."""
+    every = np.concatenate([np.zeros(0, np.int64), *ids])
+    found, photos = np.unique(every, return_counts=True)
+    order = np.lexsort((found, -photos))[:most]
+    rank = np.zeros(len(found), dtype=np.int32)
+    rank[order] = np.arange(1, len(order) + 1)
+    of_instance = [np.r_[np.int32(0), rank[np.searchsorted(found, i)]].astype(np.int32) for i in ids]
+    return Identities(of_instance, len(order), photos[order].astype(np.int32))
 
 
 def train_tracks(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -111,27 +154,6 @@ def static_instances(
         areas = np.bincount(np.clip(label, 0, None).ravel(), minlength=count + 1)[1:]
         result.append(runs > share * len(here) / label.size * np.maximum(areas, 1))
     return result
-
-
-def _features(data: TrainData, features: Features, index: int, array: np.ndarray) -> Tensor:
-    state = {k: v.tolist() if isinstance(v, Tensor) else v for k, v in features.state_dict().items()}
-    key = cache_key("features", features.name, state, array)
-
-    def compute() -> dict[str, np.ndarray]:
-        with torch.no_grad():
-            return {"phi": features(data.photos[index]).cpu().numpy()}
-
-    found = cached(data.cache_dir, key, {"phi": np.float32}, compute)["phi"]
-    return torch.from_numpy(found).to(data.device)
-
-
-def _labels(
-    data: TrainData, instances: Instances, config: RefineSplatConfig, index: int, array: np.ndarray
-) -> np.ndarray:
-    key = cache_key("instances", instances.name, config.segments, array)
-    return cached(
-        data.cache_dir, key, {"labels": np.int32}, lambda: {"labels": instances.labels(data.photos[index])}
-    )["labels"]
 
 
 def _mean_features(phi: list[Tensor], labels: list[np.ndarray], counts: list[int]) -> list[np.ndarray]:

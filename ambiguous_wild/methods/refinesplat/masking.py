@@ -109,6 +109,25 @@ def dilate(mask: np.ndarray, size: int) -> np.ndarray:
     return cv2.dilate(mask.astype(np.uint8), np.ones((size, size), np.uint8)).astype(bool)
 
 
+def hysteresis(values: np.ndarray, low: float, high: float) -> np.ndarray:
+    """[H, W] bool: connected regions above `low` that somewhere exceed `high` (Canny's rule)."""
+    count, regions = cv2.connectedComponents((values > low).astype(np.uint8), connectivity=8)
+    strong = np.zeros(count, dtype=bool)
+    strong[np.unique(regions[values > max(low, high)])] = True
+    strong[0] = False
+    return strong[regions]
+
+
+def fill_holes(mask: np.ndarray, share: float) -> np.ndarray:
+    """The mask [H, W] with every enclosed gap filled that is smaller than `share` of the photo."""
+    if share <= 0 or not mask.any():
+        return mask
+    _, regions, stats, _ = cv2.connectedComponentsWithStats((~mask).astype(np.uint8), connectivity=4)
+    small = stats[:, cv2.CC_STAT_AREA] < share * mask.size
+    small[0] = False  # the mask itself
+    return mask | small[regions]
+
+
 def keep_map(transient: np.ndarray, most: float, evidence: np.ndarray | None = None) -> np.ndarray:
     """keep = 1 - M_final [H, W] float32; where more than `most` of the photo would go, the surest go first.
 

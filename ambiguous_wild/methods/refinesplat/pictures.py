@@ -26,6 +26,8 @@ def panels(policy: RefineSplatMask, step: Step, *, begun: bool = True) -> dict[s
         begun: whether masks are in force at this step.
     """
     maps, masks = policy.examine(step)
+    entropy = maps.entropy if maps.entropy is not None else policy.compare(step).entropy
+    assert entropy is not None  # `compare` fills it
     labels = policy.inputs.labels[step.view]
     photo = (policy.data.photos[step.view].cpu().numpy() * 255 + 0.5).astype(np.uint8)
     grey = faded(photo)
@@ -38,9 +40,7 @@ def panels(policy: RefineSplatMask, step: Step, *, begun: bool = True) -> dict[s
     final = masks.keep < 0.5
     used = "" if begun else ", not used yet"
     return {
-        f"entropy, mean {maps.entropy.mean():.2f}": masking.enlarge(
-            ramp(maps.entropy, 0.0, 1.0), height, width
-        ),
+        f"entropy, mean {entropy.mean():.2f}": masking.enlarge(ramp(entropy, 0.0, 1.0), height, width),
         f"instances, {cut}": _outlined(ramp(of_pixel, 0.0, top), labels),
         f"local {100 * masks.local.mean():.0f} %": tint(grey, masks.local, LOCAL),
         f"global {100 * masks.global_.mean():.0f} %": tint(grey, masks.global_, GLOBAL),

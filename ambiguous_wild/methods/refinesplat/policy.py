@@ -19,15 +19,17 @@ from ambiguous_wild.methods.refinesplat.evidence import (
     compare,
     make_masks,
     pooled,
+    scaled_by,
     silence,
 )
-from ambiguous_wild.methods.refinesplat.inputs import FrozenInputs, prepare
+from ambiguous_wild.methods.refinesplat.inputs import FrozenInputs
 from ambiguous_wild.methods.refinesplat.losses import consistency_loss, identity_loss, instance_matrix
+from ambiguous_wild.methods.refinesplat.pixels import PixelEvidence
 from ambiguous_wild.methods.refinesplat.threshold import LearntWeight, robust_floor
 from ambiguous_wild.splat.data import shrink_keep
 from ambiguous_wild.splat.parts import MaskPolicy, State
 from ambiguous_wild.splat.step import Step, TrainData
-from ambiguous_wild.vision.labhog import LabHog
+from ambiguous_wild.vision.backends import make_features, make_instances
 from ambiguous_wild.vision.protocols import Features, Instances
 from ambiguous_wild.vision.segments import GraphSegments
 
@@ -44,8 +46,8 @@ class RefineSplatMask(MaskPolicy):
         instances: Instances | None = None,
     ) -> None:
         self.config = config
-        self.features = features or LabHog()
-        self.instances = instances or GraphSegments(config.segments)
+        self.features = features or make_features(config.features)
+        self.instances = instances or _instances(config)
         self.weight = LearntWeight()
         self.keeps: dict[int, Tensor] = {}  # view: [H, W] float32 at the photo's size
         self.visits: dict[int, int] = {}  # view: steps since masks began
@@ -55,7 +57,18 @@ class RefineSplatMask(MaskPolicy):
 
     def setup(self, data: TrainData) -> None:
         self.data = data
-        self.inputs = prepare(data, self.features, self.instances, self.config)
+        self.inputs = FrozenInputs(data, self.features, self.instances, self.config)
+        config = self.config
+        if config.mask.needs_identities or config.lambda_id > 0 or config.lambda_cr > 0:
+            _ = self.inputs.semantics  # part of what the method costs before its first step
+        self.pixels = PixelEvidence(
+            [photo.cpu().numpy() for photo in data.photos],
+            data.cameras,
+            config.mask.multiview,
+            base=config.mask.base,
+            least_alpha=config.mask.least_alpha,
+            memory=config.mask.memory,
+        )
 
     def keep(self, step: Step) -> Tensor | None:
         if not self._begun(step):
@@ -63,7 +76,7 @@ class RefineSplatMask(MaskPolicy):
         visit = self.visits.get(step.view, 0)
         due = step.view not in self.keeps or visit % self.config.mask_every == 0
         if due and not self._paused(step):
-            _, masks = self.examine(step)
+            _, masks = self.examine(step, remember=True)
             self.judged[step.view] = masks.judged
             if self.config.mask.w2 is None:
                 self._learn(masks)
@@ -82,7 +95,9 @@ class RefineSplatMask(MaskPolicy):
         """d(lambda_id L_id + lambda_cr L_cr)/dimage through the frozen features and psi."""
         config = self.config
         off = config.lambda_id <= 0 and config.lambda_cr <= 0
-        if off or self.inputs.psi is None or not self._begun(step) or step.iteration % config.entropy_every:
+        if off or not self._begun(step) or step.iteration % config.entropy_every:
+            return None
+        if self.inputs.semantics.psi is None:
             return None
         image = step.rendered.image.detach().clone().requires_grad_(True)
         with torch.enable_grad():
@@ -109,7 +124,7 @@ class RefineSplatMask(MaskPolicy):
             "masked_share_global": float(mean[2]),
             "t_ent_mean": float(finite.mean()) if len(finite) else None,
             "w2": self.w2,
-            "identities": self.inputs.found.count,
+            "identities": self.inputs.semantics.found.count if self.inputs.has_semantics else None,
         }
 
     @property
@@ -128,17 +143,40 @@ class RefineSplatMask(MaskPolicy):
         return step.iteration - self.last_reset < pause
 
     @torch.no_grad()
-    def examine(self, step: Step) -> tuple[Maps, Masks]:
-        """The maps of the step's view and its masks at the photo's own size; learns and keeps nothing."""
-        inputs, view = self.inputs, step.view
-        image = _enlarge(step.rendered.image, self.data.photos[view])
-        mask = self.config.mask
-        maps = compare(inputs.phi[view], inputs.features(image), inputs.psi, inputs.features.unit, mask)
-        h, w = maps.distance.shape
-        alpha = F.adaptive_avg_pool2d(step.rendered.alpha[None, None], (h, w))[0, 0]
-        maps = silence(maps, (alpha < mask.least_alpha).cpu().numpy())
+    def examine(self, step: Step, *, remember: bool = False) -> tuple[Maps, Masks]:
+        """The maps of the step's view and its masks at the photo's own size.
+
+        Args:
+            step: of any train view.
+            remember: whether other views hear what this one shows; else nothing is kept.
+        """
+        inputs, view, mask = self.inputs, step.view, self.config.mask
+        if mask.statistic == "structure":
+            rendered = step.rendered
+            evidence = self.pixels.look(
+                view,
+                rendered.image.cpu().numpy(),
+                rendered.alpha.cpu().numpy(),
+                rendered.depth.cpu().numpy(),
+                remember=remember,
+            )
+            if mask.entropy_weight > 0:
+                evidence = scaled_by(evidence, self.compare(step).statistic, mask.entropy_weight)
+            maps = Maps(evidence, evidence)
+        else:
+            maps = self.compare(step)
         others = [self.judged[v] for v in sorted(self.judged) if v != view]
         return maps, make_masks(maps, inputs.labels[view], inputs.static[view], others, self.w2, mask)
+
+    @torch.no_grad()
+    def compare(self, step: Step) -> Maps:
+        """Entropy and distances on the feature grid, from the step's render."""
+        found, mask = self.inputs.semantics, self.config.mask
+        features = self.inputs.features
+        image = _enlarge(step.rendered.image, self.data.photos[step.view])
+        maps = compare(found.phi[step.view], features(image), found.psi, features.unit, mask)
+        alpha = F.adaptive_avg_pool2d(step.rendered.alpha[None, None], maps.distance.shape)[0, 0]
+        return silence(maps, (alpha < mask.least_alpha).cpu().numpy())
 
     def _learn(self, masks: Masks) -> None:
         """w2 from all instances; the price of a masked pixel is a robustly high residual."""
@@ -151,9 +189,9 @@ class RefineSplatMask(MaskPolicy):
             self.weight.learn(everything.values, residuals, everything.areas, masks.cut.floor)
 
     def _entropy_terms(self, image: Tensor, step: Step, keep: Tensor | None) -> Tensor:
-        inputs, config = self.inputs, self.config
+        inputs, config = self.inputs.semantics, self.config
         assert inputs.psi is not None  # cotangent returned before
-        logits = inputs.psi(inputs.features(_enlarge(image, self.data.photos[step.view])))
+        logits = inputs.psi(self.inputs.features(_enlarge(image, self.data.photos[step.view])))
         h, w, channels = logits.shape
         flat = logits.reshape(-1, channels)
         weights = torch.ones(h * w, device=image.device)
@@ -165,8 +203,9 @@ class RefineSplatMask(MaskPolicy):
         if config.lambda_id > 0:
             ids = inputs.identities[step.view].reshape(-1)
             loss = loss + config.lambda_id * identity_loss(flat, ids, weights, variant)
-        if config.lambda_cr > 0 and inputs.counts[step.view]:
-            member = instance_matrix(inputs.grid[step.view].reshape(-1), inputs.counts[step.view], weights)
+        count = self.inputs.counts[step.view]
+        if config.lambda_cr > 0 and count:
+            member = instance_matrix(inputs.grid[step.view].reshape(-1), count, weights)
             loss = loss + config.lambda_cr * consistency_loss(flat, member, variant)
         return loss
 
@@ -177,7 +216,7 @@ class RefineSplatMask(MaskPolicy):
         return pictures.draw_entropies(self, folder)
 
     def state_dict(self) -> State:
-        psi = self.inputs.psi
+        psi = self.inputs.semantics.psi if self.inputs.has_semantics else None
         return {
             "keeps": {str(view): (keep > 0.5).to(torch.uint8) for view, keep in self.keeps.items()},
             "visits": {str(view): count for view, count in self.visits.items()},
@@ -188,6 +227,7 @@ class RefineSplatMask(MaskPolicy):
             },
             "theta": self.weight.theta,
             "last_reset": self.last_reset,
+            "pixels": self.pixels.state_dict(),
             # the last bits of psi's training may differ on another machine: a run goes on with the same one
             "psi": None if psi is None else dict(psi.state_dict()),
         }
@@ -200,8 +240,9 @@ class RefineSplatMask(MaskPolicy):
         self.judged = {int(v): Judged(*rows.numpy()) for v, rows in state["judged"].items()}
         self.weight.theta = float(state["theta"])
         self.last_reset = int(state["last_reset"])
-        if self.inputs.psi is not None and state["psi"] is not None:
-            self.inputs.psi.load_state_dict(state["psi"])
+        self.pixels.load_state_dict(state["pixels"])
+        if state["psi"] is not None and self.inputs.semantics.psi is not None:
+            self.inputs.semantics.psi.load_state_dict(state["psi"])
 
 
 def _enlarge(image: Tensor, like: Tensor) -> Tensor:
@@ -212,6 +253,10 @@ def _enlarge(image: Tensor, like: Tensor) -> Tensor:
     return F.interpolate(chw, size=tuple(like.shape[:2]), mode="bilinear", align_corners=False)[0].permute(
         1, 2, 0
     )
+
+
+def _instances(config: RefineSplatConfig) -> Instances:
+    return GraphSegments(config.segments) if config.instances == "graph" else make_instances(config.instances)
 
 
 def _four(row: list[str]) -> tuple[float, float, float, float]:

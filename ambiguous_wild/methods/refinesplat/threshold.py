@@ -10,13 +10,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
-Form = Literal["kapur", "literal"]
+from ambiguous_wild.core.errors import unknown
+
+Form = Literal["kapur", "literal", "hard", "statistics"]
 _THETA_LIMIT = 8.0  # |theta| beyond this, sigmoid(theta) rounds to 0 or 1 in float32
 
 
@@ -35,25 +37,35 @@ def t_ent(
     form: Form = "kapur",
     gate: float = 0.0,
     least: float = 0.0,
+    hard: float = 0.0,
 ) -> Cut:
-    """The threshold T_ent and the instances above it.
+    """The threshold T_ent, or one of the two it is compared with, and the instances above it.
 
     Args:
         values: Hbar of each instance; NaN is refused by the caller.
         w2: weight of the lower subset, in (0, 1).
-        form: `literal` is the printed objective.
+        form: `kapur` or `literal` (the printed objective) for T_ent; `hard` for T_hard, a fixed value;
+            `statistics` for T_statistics, mean + standard deviation (DroneSplat's).
         gate: only values this many robust deviations above the median may be flagged; 0 = no gate.
         least: and only values above this; 0 = no such bound.
+        hard: the value of T_hard.
 
     Returns:
-        The cut; K <= 1 or equal values flag nothing.
+        The cut; with T_ent and T_statistics, K <= 1 or equal values flag nothing.
     """
     values = np.asarray(values, dtype=np.float64)
+    if form not in get_args(Form):
+        raise unknown("threshold", form, get_args(Form))
     floor = max(robust_floor(values, gate) if gate > 0 else -math.inf, least if least > 0 else -math.inf)
     nothing = Cut(math.inf, np.zeros(len(values), dtype=bool), floor)
+    if form == "hard":
+        return Cut(hard, values > hard, hard)  # the fixed value, whatever the values are
     order = np.sort(values)
     if len(order) <= 1 or order[-1] - order[0] <= 1e-9 * max(abs(order[-1]), 1e-300):
         return nothing
+    if form == "statistics":
+        statistics = max(float(values.mean() + values.std()), floor)
+        return Cut(statistics, values > statistics, floor)
     # a candidate is the smallest value of an upper set; each lies above the gate's floor
     starts = np.flatnonzero(np.r_[form == "literal", np.diff(order) > 0])
     starts = starts[order[starts] > floor]

@@ -1,0 +1,109 @@
+"""Evidence of a distractor at every pixel of a photo, in units of what is normal in the scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from ambiguous_wild.core import Camera
+from ambiguous_wild.methods.refinesplat.multiview import Elsewhere, MultiViewConfig, discount
+from ambiguous_wild.methods.refinesplat.structure import structure_residual
+
+_STATIC_QUANTILE = 0.25  # of a photo's pixels: static even where distractors cover two thirds of it
+
+
+class PixelEvidence:
+    """The structure residual of each view, discounted by what other views say of the same surface."""
+
+    def __init__(
+        self,
+        photos: Sequence[np.ndarray],  # [H, W, 3] float32 in [0, 1]
+        cameras: Sequence[Camera],
+        config: MultiViewConfig,
+        *,
+        base: float,
+        least_alpha: float,
+        memory: float,
+    ) -> None:
+        self.photos = list(photos)
+        self.config, self.base, self.least_alpha, self.memory = config, base, least_alpha, memory
+        self.elsewhere = Elsewhere(cameras, config)
+        self.normal: dict[int, float] = {}  # view: quantile of its residual that static pixels have
+        # view: [H, W], its residual averaged over its visits; half precision, a checkpoint holds all of them
+        self.before: dict[int, np.ndarray] = {}
+
+    @property
+    def unit(self) -> float:
+        """Residual that is normal in the scene: median over views; 0 before any was seen."""
+        return float(np.median([self.normal[v] for v in sorted(self.normal)])) if self.normal else 0.0
+
+    def look(
+        self, view: int, image: np.ndarray, alpha: np.ndarray, depth: np.ndarray, *, remember: bool
+    ) -> np.ndarray:
+        """Evidence [H, W] float32 in units, at the photo's size.
+
+        Args:
+            view: which photo.
+            image: [h, w, 3] render of its camera, any size.
+            alpha: [h, w] its opacity; below `least_alpha` nothing is learnt yet and nothing is evidence.
+            depth: [h, w] sum of weight times z.
+            remember: whether other views hear of it.
+        """
+        photo = self.photos[view]
+        size = (photo.shape[1], photo.shape[0])
+        solid = _resized(alpha, size) >= self.least_alpha
+        evidence = structure_residual(photo, _resized(image, size), self.base)
+        evidence[~solid] = 0.0
+        if self.memory > 0 and view in self.before:
+            evidence = self.memory * self.before[view].astype(np.float32) + (1.0 - self.memory) * evidence
+        normal = float(np.quantile(evidence[solid], _STATIC_QUANTILE)) if solid.any() else 0.0
+        others = None
+        if self.config.strength > 0:
+            mean_depth = np.where(alpha > 1e-3, depth / np.maximum(alpha, 1e-3), 0.0)
+            others = self._others(view, evidence, mean_depth, remember)
+        if remember:
+            self.normal[view] = normal
+            if self.memory > 0:
+                self.before[view] = evidence.astype(np.float16)
+        unit = max(self.unit or normal, 1e-4)  # a perfect render of a synthetic scene has no noise at all
+        return discount(evidence, others, unit, self.config) / unit
+
+    def _others(
+        self, view: int, evidence: np.ndarray, depth: np.ndarray, remember: bool
+    ) -> np.ndarray | None:
+        heard = self.elsewhere
+        before = heard.evidence.get(view), heard.depth.get(view)
+        heard.remember(view, evidence, depth)
+        others = heard.median(view)
+        if not remember:
+            for kept, old in zip((heard.evidence, heard.depth), before):
+                if old is None:
+                    del kept[view]
+                else:
+                    kept[view] = old
+        return others
+
+    def state_dict(self) -> dict[str, Any]:
+        return {
+            "normal": {str(v): x for v, x in self.normal.items()},
+            "before": {str(v): torch.from_numpy(x) for v, x in self.before.items()},
+            "evidence": {str(v): torch.from_numpy(x) for v, x in self.elsewhere.evidence.items()},
+            "depth": {str(v): torch.from_numpy(x) for v, x in self.elsewhere.depth.items()},
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.normal = {int(v): float(x) for v, x in state["normal"].items()}
+        self.before = {int(v): x.numpy() for v, x in state["before"].items()}
+        self.elsewhere.evidence = {int(v): x.numpy() for v, x in state["evidence"].items()}
+        self.elsewhere.depth = {int(v): x.numpy() for v, x in state["depth"].items()}
+
+
+def _resized(x: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """[h, w] or [h, w, 3] at (width, height), bilinear."""
+    if x.shape[1::-1] == size:
+        return x
+    return cv2.resize(np.ascontiguousarray(x), size, interpolation=cv2.INTER_LINEAR)

@@ -25,7 +25,7 @@ from ambiguous_wild.splat.step import Step, TrainData
 HEIGHT, WIDTH, VIEWS = 72, 128, 4
 PRINTED = {"lambda_id": 1.0, "lambda_cr": 0.2}  # the entropy terms are off by default
 FAST = RefineSplatConfig(
-    mask=MaskConfig(hard=6.0),  # a blurred copy is no trained render: its normal residual is large
+    mask=MaskConfig(least=6.0),  # a blurred copy is no trained render: its normal residual is large
     psi=PsiConfig(hidden=16, steps=150, batch=512),
     min_mask_start=1,
     mask_every=2,

@@ -26,8 +26,8 @@ class MaskConfig:
 
     statistic: Statistic = "structure"  # what is judged; `entropy` is printed
     combine: Literal["fused", "union"] = "fused"  # local and global: geometric mean, or the printed union
-    threshold: Form = "hard"  # of `statistic` between static and transient; `literal` is printed
-    hard: float = 12.0  # T_hard, units of the statistic
+    threshold: Form = "kapur"  # of `statistic` between static and transient; `literal` is printed
+    hard: float = 10.0  # T_hard, units of the statistic
     hold: float = 0.67  # a masked region reaches down to this share of the threshold
     fill: float = 0.01  # of the photo: enclosed gaps below it are filled
     base: float = 0.3  # of the residual counts even where the structure agrees perfectly
@@ -39,7 +39,9 @@ class MaskConfig:
     variant: Variant = "softmax"  # of psi and its entropy; `sigmoid` is printed
     scope: Literal["scene", "photo"] = "scene"  # whose instances the threshold cuts; `photo` is printed
     gate: float = 3.0  # robust deviations an instance must stand above the median; 0 = printed
-    least: float = 4.0  # and the statistic at least, in its own unit; 0 = printed
+    least: float | None = (
+        None  # and the statistic at least, in its unit: 10 of `structure`, else 4; 0 = printed
+    )
     disagree: float = 3.0  # F: `gate` for the feature distance between photo and render; 0 = printed
     disagree_units: float = 3.0  # F: and at least this many units of what blur and noise make; 0 = printed
     use_local: bool = True  # M_local; off is an ablation row
@@ -55,6 +57,13 @@ class MaskConfig:
     dilation: int = 3  # px at the photo's resolution; 3, 5 (printed), 7 tried in the paper
     most: float = 0.7  # of a photo is masked at most: the surest pixels go first
     w2: float | None = None  # fixed weight of T_ent's lower subset; None = learnt
+
+    @property
+    def floor(self) -> float:
+        """`least` in the unit of the statistic."""
+        if self.least is not None:
+            return self.least
+        return 10.0 if self.statistic == "structure" else 4.0
 
     @property
     def needs_identities(self) -> bool:

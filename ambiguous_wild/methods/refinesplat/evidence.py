@@ -132,7 +132,7 @@ def make_masks(
     known = areas > 0
     judged = Judged(means[known], distances[known], areas[known])
     pool = pooled([judged, *others] if config.scope == "scene" else [judged])
-    cut = t_ent(pool.values, w2, config.threshold, config.gate, config.least, config.hard)
+    cut = t_ent(pool.values, w2, config.threshold, config.gate, config.floor, config.hard)
     flagged = np.zeros(count, dtype=bool)
     flagged[known] = judged.values > cut.threshold
     if config.statistic != "structure":

@@ -26,7 +26,7 @@ _SHRINK = 2  # maps are kept at half the photo's size
 class MultiViewConfig:
     """Whom to ask, and how much their word counts."""
 
-    strength: float = 2.0  # of the discount; 0 = nobody is asked
+    strength: float = 1.0  # of the discount; 0 = nobody is asked
     views: int = 8  # nearest train views asked
     depth: float = 0.15  # relative difference of depth up to which two views see the same surface
     free: float = 2.0  # units of evidence elsewhere that are normal and discount nothing

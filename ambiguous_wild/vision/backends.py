@@ -38,7 +38,7 @@ SAM_VIDEO = {
     "sam2-base-plus-video": "sam2.1-hiera-base-plus",
     "sam2-large-video": "sam2.1-hiera-large",
 }
-FEATURES = ("labhog", *DINO)
+FEATURES = ("labhog", "sceneconv", *DINO)
 INSTANCES = ("graph", *SAM, *SAM_VIDEO, "grounded", "grounded-video", "labels")
 _OPTION = re.compile(r",\s*([A-Za-z_][\w.]*)=([^,]*)$")
 
@@ -75,7 +75,8 @@ def parse(text: str) -> Spec:
 def make_features(spec: str) -> Features:
     """Features by name.
 
-    ``labhog``; or one of `DINO`, with ``@px`` (longer side), ``blocks=``, ``normalise=``, ``fit_photos=`` and
+    ``labhog``; ``sceneconv``, trained on the scene; or one of `DINO`, with
+    ``@px`` (longer side), ``blocks=``, ``normalise=``, ``fit_photos=`` and
     ``weights=FOLDER``.
 
     Raises:
@@ -91,6 +92,13 @@ def make_features(spec: str) -> Features:
 
         _no_options(found, spec)
         return LabHog()
+    if found.name == "sceneconv":
+        from ambiguous_wild.vision.sceneconv import SceneConv
+        from ambiguous_wild.vision.sceneconv_train import SceneConvConfig
+
+        if found.size is not None:
+            raise AwError(f"features {spec!r}: sceneconv takes no size")
+        return SceneConv(with_options(SceneConvConfig(), found.options, "option of sceneconv"))
     from ambiguous_wild.vision.dino import DinoConfig, DinoFeatures
 
     folder, options = _weights(found.options)

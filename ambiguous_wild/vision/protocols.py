@@ -32,6 +32,20 @@ class Features(Protocol):
     def load_state_dict(self, state: dict[str, Any]) -> None: ...
 
 
+@runtime_checkable
+class SceneFeatures(Protocol):
+    """Features that learn from the scene: `fit_scene` takes the place of `fit` the first time."""
+
+    def fit_scene(
+        self,
+        photos: Sequence[Tensor],
+        tracks: tuple[np.ndarray, np.ndarray, np.ndarray],
+        folder: Path | None = None,
+    ) -> None:
+        """Train on photos [H, W, 3] and SfM observations: point [L], photo [L], xy px [L, 2]."""
+        ...
+
+
 class Instances(Protocol):
     """Instance label maps of photos."""
 

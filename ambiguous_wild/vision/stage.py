@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +31,7 @@ def photo_features(
 
     A stopped stage goes on where it was: what is in the cache is not computed again.
     """
-    state = {k: v.tolist() if isinstance(v, Tensor) else v for k, v in features.state_dict().items()}
+    state = {k: _digest(v) if isinstance(v, Tensor) else v for k, v in features.state_dict().items()}
     result = []
     for photo in (bar or terminal_bar("features"))(photos):
         key = cache_key("features", features.name, state, photo.detach().cpu().numpy())
@@ -42,6 +43,12 @@ def photo_features(
         phi = cached(folder, key, {"phi": np.float32}, compute)["phi"]
         result.append(torch.from_numpy(phi).to(photo.device))
     return result
+
+
+def _digest(tensor: Tensor) -> str:
+    """Stands for a tensor in a cache key: weights as text would cost more than the features."""
+    array = np.ascontiguousarray(tensor.detach().cpu().numpy())
+    return f"{array.dtype}{array.shape}{hashlib.sha256(array.tobytes()).hexdigest()}"
 
 
 def instance_labels(

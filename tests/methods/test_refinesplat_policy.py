@@ -465,3 +465,12 @@ def test_recipe_and_config_round_trip():
     assert parts.density_config.resets == (15_000.0, 18_000.0)
     config = RefineSplatConfig(mask=MaskConfig(statistic="entropy", w2=0.5))
     assert from_plain(RefineSplatConfig, to_plain(config)) == config
+
+
+def test_features_that_learn_from_the_scene_are_given_its_tracks(scene):
+    config = dataclasses.replace(FEATURES, features="sceneconv,steps=4", lambda_id=0.0, lambda_cr=0.0)
+    policy = RefineSplatMask(config)
+    policy.setup(scene.data)
+    found = policy.inputs.semantics
+    assert found.phi[0].shape == (HEIGHT // 4, WIDTH // 4, policy.features.channels)
+    assert policy.keep(step_of(scene.data, 0, blurred(scene.clean[0], 0))) is not None

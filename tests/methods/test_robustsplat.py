@@ -198,7 +198,7 @@ def test_panels_show_and_learn_nothing(scene, tmp_path):
 
 
 def test_context_widens_what_the_net_sees_and_nothing_else(scene, tmp_path):
-    plain, wide = policy_on(scene, tmp_path), policy_on(scene, tmp_path, context=(3,))
+    plain, wide = policy_on(scene, tmp_path, context=()), policy_on(scene, tmp_path, context=(3,))
     phi = plain.inputs[0].numpy()
     assert np.array_equal(wide.inputs[0].numpy()[..., :27], phi)
     assert np.allclose(wide.inputs[0].numpy()[4, 6, 27:], phi[3:6, 5:8].mean((0, 1)), atol=1e-5)
@@ -215,10 +215,15 @@ def test_smaller_steps_get_masks_of_their_size(scene, tmp_path):
 
 def test_the_coarse_stage_has_features_of_its_own():
     assert coarse_spec(RobustSplatConfig()) == "labhog"
-    published = RobustSplatConfig.__new__(RobustSplatConfig)
-    object.__setattr__(published, "features", "dinov2-small-registers@504,normalise=raw")
-    object.__setattr__(published, "coarse_share", 16 / 36)
+    published = RobustSplatConfig(features="dinov2-small-registers@504,normalise=raw")
     assert coarse_spec(published) == "dinov2-small-registers@224,normalise=raw"
+
+
+def test_with_a_nets_features_everything_is_published():
+    config = RobustSplatConfig(features="dinov2-small-registers@504,normalise=raw", context=(5,))
+    assert (config.net_context, config.net_hidden, config.net_lr, config.hand_made) == ((), 16, 1e-3, False)
+    config = RobustSplatConfig(hidden=16, lr=1e-3, context=())
+    assert (config.net_context, config.net_hidden, config.net_lr) == ((), 16, 1e-3)
 
 
 @pytest.mark.parametrize(

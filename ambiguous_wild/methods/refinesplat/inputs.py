@@ -16,7 +16,7 @@ from ambiguous_wild.methods.refinesplat.identity import Psi, psi_arrays, psi_fro
 from ambiguous_wild.methods.refinesplat.masking import grid_labels, instance_means
 from ambiguous_wild.splat.step import TrainData
 from ambiguous_wild.vision.cache import cache_key, cached
-from ambiguous_wild.vision.protocols import Features, Instances
+from ambiguous_wild.vision.protocols import Features, Instances, SceneFeatures
 from ambiguous_wild.vision.stage import instance_labels, photo_features
 
 
@@ -60,7 +60,10 @@ class FrozenInputs:
     @functools.cached_property
     def semantics(self) -> Semantics:
         data, config = self._data, self._config
-        self.features.fit(data.photos)
+        if isinstance(self.features, SceneFeatures):
+            self.features.fit_scene(data.photos, train_tracks(data.scene), data.cache_dir)
+        else:
+            self.features.fit(data.photos)
         phi = photo_features(self.features, data.photos, data.cache_dir)
         found = self._identities(phi)
         grid, identities = [], []

@@ -48,8 +48,8 @@ class RobustSplatMask(MaskPolicy):
         self.coarse.fit(small)
         self.phi_coarse = photo_features(self.coarse, small, data.cache_dir)
         self.inputs = [self._inputs(phi) for phi in self.phi]
-        self.net = MaskNet(*self._statistics(), self.config.hidden, data.seed)
-        self.optimiser = torch.optim.Adam(self.net.parameters(), lr=self.config.lr)
+        self.net = MaskNet(*self._statistics(), self.config.net_hidden, data.seed)
+        self.optimiser = torch.optim.Adam(self.net.parameters(), lr=self.config.net_lr)
 
     def keep(self, step: Step) -> Tensor | None:
         if not self._begun(step):
@@ -178,12 +178,12 @@ class RobustSplatMask(MaskPolicy):
 
     def _inputs(self, phi: Tensor) -> Tensor:
         """What the net sees of a photo, [h, w, C']: its features, and hand-made ones averaged more widely."""
-        if not self.config.hand_made or not self.config.context:
+        if not self.config.net_context:
             return phi
         maps = phi.permute(2, 0, 1)[None]
         wide = [
             F.avg_pool2d(maps, size, stride=1, padding=size // 2, count_include_pad=False)
-            for size in self.config.context
+            for size in self.config.net_context
         ]
         return torch.cat([maps, *wide], dim=1)[0].permute(1, 2, 0).contiguous()
 

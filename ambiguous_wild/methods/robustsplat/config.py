@@ -22,9 +22,9 @@ class RobustSplatConfig:
     """Times in nominal iterations (of 30 000); the `min_` fields are real iterations of the run.
 
     "auto" and None are the published form with a net's features, and with hand-made ones what was tuned on
-    two simulated captures that are not reported (240x135, 2000 iterations, 10 900 Gaussians), in colours of the
-    background: 26.3 dB, IoU 0.41 with features of the cell alone, 29.1 dB and 0.62 with wider context and a
-    wider net (both with lr 0.003); with twins of static things 29.5 dB and 0.68.
+    two simulated captures that are not reported (240x135, 2000 iterations, 10 900 Gaussians). Distractors in
+    the background's colours: 26.3 dB and IoU 0.41 with features of the cell alone, 29.1 dB and 0.62 with
+    wider context and a wider net, both at lr 0.003; twins of static things: 29.5 dB and 0.68 with the latter.
     """
 
     features: str = "labhog"  # see vision/backends.py; published: dinov2-small-registers@504,normalise=raw

@@ -251,6 +251,9 @@ def test_identities_are_not_made_where_nothing_reads_them(scene):
     policy.keep(step_of(scene.data, 0, blurred(scene.clean[0], 0)))
     assert not policy.inputs.has_semantics
     assert policy.facts()["identities"] is None
+    # a picture asks for the entropy map in the middle of a run
+    maps = policy.compare(step_of(scene.data, 0, blurred(scene.clean[0], 0)))
+    assert 0.0 <= maps.entropy.min() <= maps.entropy.max() <= 1.0
 
 
 def test_identities_scale_the_evidence_of_pixels(scene):

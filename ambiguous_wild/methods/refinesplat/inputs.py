@@ -72,7 +72,8 @@ class FrozenInputs:
             grid.append(torch.from_numpy(cells.astype(np.int64)).to(data.device))
             ids = found.of_instance[index][cells].astype(np.int64)
             identities.append(torch.from_numpy(ids).to(data.device))
-        psi = _psi(data, phi, identities, found.count, config)
+        with torch.enable_grad():  # whoever asks first may stand where nothing is to be learnt
+            psi = _psi(data, phi, identities, found.count, config)
         return Semantics(phi, identities, grid, psi, found)
 
     def _identities(self, phi: list[Tensor]) -> Identities:

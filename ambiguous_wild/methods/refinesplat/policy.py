@@ -59,7 +59,7 @@ class RefineSplatMask(MaskPolicy):
         self.data = data
         self.inputs = FrozenInputs(data, self.features, self.instances, self.config)
         config = self.config
-        if config.mask.needs_identities or config.lambda_id > 0 or config.lambda_cr > 0:
+        if config.mask.needs_identities or self.regularises():
             _ = self.inputs.semantics  # part of what the method costs before its first step
         self.pixels = PixelEvidence(
             [photo.cpu().numpy() for photo in data.photos],
@@ -94,8 +94,7 @@ class RefineSplatMask(MaskPolicy):
     def cotangent(self, step: Step, keep: Tensor | None) -> Tensor | None:
         """d(lambda_id L_id + lambda_cr L_cr)/dimage through the frozen features and psi."""
         config = self.config
-        off = config.lambda_id <= 0 and config.lambda_cr <= 0
-        if off or not self._begun(step) or step.iteration % config.entropy_every:
+        if not self.regularises() or not self._begun(step) or step.iteration % config.entropy_every:
             return None
         if self.inputs.semantics.psi is None:
             return None
@@ -104,6 +103,9 @@ class RefineSplatMask(MaskPolicy):
             loss = self._entropy_terms(image, step, keep)
             (gradient,) = torch.autograd.grad(loss, image)
         return gradient * config.entropy_every
+
+    def regularises(self) -> bool:
+        return self.config.lambda_id > 0 or self.config.lambda_cr > 0
 
     def predict(self, step: Step) -> Tensor | None:
         if not self._begun(step):

@@ -93,6 +93,7 @@ class RefineSplatConfig:
     lambda_id: float = 0.0  # of L_id; 1 = printed
     lambda_cr: float = 0.0  # alpha_1, of L_cr; 0.2 = printed, 0.1 to 0.3 tried in the paper
     lambda_dssim: float = 0.2  # of D-SSIM in L_GS
+    per_pixel_short: float = 0.85  # Gaussians per photo pixel at most, in short runs; others are given 1
     identities: int = 255  # P at most
     identity_tracks: int = 3  # SfM tracks that two instances must share to be one identity
     identity_share: float = 0.25  # and their share of the tracks of the one with fewer

@@ -8,7 +8,7 @@ from __future__ import annotations
 from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.density import EntropyAwareDensity
 from ambiguous_wild.methods.refinesplat.policy import RefineSplatMask
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.parts import Parts, Schedule
 
 Config = RefineSplatConfig
 
@@ -20,4 +20,5 @@ def build(options: RefineSplatConfig) -> Parts:
         density=EntropyAwareDensity,
         density_config=options.density,
         lambda_dssim=options.lambda_dssim,
+        schedule=Schedule(per_pixel_short=options.per_pixel_short),
     )

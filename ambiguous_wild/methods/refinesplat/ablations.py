@@ -14,10 +14,13 @@ _PRINTED_LOSSES = ("lambda_id=1", "lambda_cr=0.2")
 _NO_GATE = ("mask.gate=0", "mask.least=0")
 _NO_AGREEMENT = ("mask.disagree=0", "mask.disagree_units=0")
 _NO_GLOBAL_GATE = ("mask.global_gate=0", "mask.global_units=0")
+# instances judged on the feature grid and united with the global mask, as the paper does
+_ON_FEATURES = ("mask.statistic=evidence", "mask.combine=union", "mask.static_tracks=0.35", "mask.dilation=5")
 _ALL_PRINTED = (
-    "mask.variant=sigmoid", "mask.statistic=entropy", "mask.scope=photo", "mask.threshold=literal", *_NO_GATE,
-    *_NO_AGREEMENT, "mask.static_tracks=0", "mask.least_alpha=0", "mask.cosine=plain", "mask.spread=var",
-    *_NO_GLOBAL_GATE, "density.merge.form=literal", "density.merge.most=0", *_PRINTED_LOSSES,
+    "mask.variant=sigmoid", "mask.statistic=entropy", "mask.combine=union", "mask.scope=photo",
+    "mask.threshold=literal", *_NO_GATE, *_NO_AGREEMENT, "mask.static_tracks=0", "mask.least_alpha=0",
+    "mask.cosine=plain", "mask.spread=var", *_NO_GLOBAL_GATE, "mask.fill=0", "mask.dilation=5",
+    "density.merge.form=literal", "density.merge.most=0", *_PRINTED_LOSSES,
 )  # fmt: skip
 
 ABLATIONS = (
@@ -42,9 +45,27 @@ ABLATIONS = (
             Variant("neither", _NO_MASKS),
             Variant("local", ("mask.use_global=false",), "(b) M_local alone"),
             Variant("global", ("mask.use_local=false",), "(c) M_global alone"),
-            Variant("both", ("mask.use_local=true", "mask.use_global=true"), "(d)"),
+            Variant("union", ("mask.combine=union",), "(d) as printed"),
+            Variant("fused", ("mask.combine=fused",), "geometric mean of pixel and instance"),
         ),
         "Tab. ablation of the entropy-aware adaptive masking",
+    ),
+    Group(
+        "evidence",
+        "What is judged, and whether other views and visits have a say",
+        (
+            Variant("structure", ("mask.statistic=structure",), "colour and structure of pixels"),
+            Variant("no-other-views", ("mask.multiview.strength=0",), "each view believes itself"),
+            *(
+                Variant(f"strength-{value}", (f"mask.multiview.strength={value}",))
+                for value in ("0.5", "2", "4")
+            ),
+            *(Variant(f"views-{value}", (f"mask.multiview.views={value}",)) for value in ("4", "16")),
+            Variant("no-memory", ("mask.memory=0",), "the present render alone"),
+            Variant("no-hold", ("mask.hold=1",), "regions do not grow below the threshold"),
+            Variant("identities", ("mask.entropy_weight=0.5",), "scaled by the contrast of identities"),
+            Variant("on-features", _ON_FEATURES, "identities and features on their grid"),
+        ),
     ),
     Group(
         "thresholds",
@@ -79,8 +100,8 @@ ABLATIONS = (
         "filters",
         "Box filter over U / H (cells) and dilation (px)",
         (
-            Variant("no-box", ("mask.box=1",)),
-            *(Variant(f"box-{size}", (f"mask.box={size}",)) for size in (3, 5, 7)),
+            Variant("no-box", (*_ON_FEATURES, "mask.box=1")),
+            *(Variant(f"box-{size}", (*_ON_FEATURES, f"mask.box={size}")) for size in (3, 5, 7)),
             Variant("no-dilation", ("mask.dilation=1",)),
             *(Variant(f"dilation-{size}", (f"mask.dilation={size}",)) for size in (3, 5, 7)),
         ),
@@ -105,9 +126,10 @@ ABLATIONS = (
         "features",
         "What photo and render are compared by",
         tuple(
-            Variant(name, (f"features={name}",), features=name, text=text)
+            Variant(name, (*_ON_FEATURES, f"features={name}"), features=name, text=text)
             for name, text in (
                 ("labhog", "weight-free: colours and edges"),
+                ("sceneconv", "weight-free: trained on the scene"),
                 ("dinov2-small", "14 x 14 patches, the paper's"),
                 ("dino-vits16", "16 x 16 patches, DINOv1"),
                 ("dino-vits8", "8 x 8 patches, DINOv1"),
@@ -124,17 +146,19 @@ ABLATIONS = (
         "printed",
         "Each printed form in the place of ours",
         (
-            Variant("sigmoid", ("mask.variant=sigmoid",), "psi one-against-rest"),
-            Variant("statistic-entropy", ("mask.statistic=entropy",), "mean entropy of the render"),
+            Variant("on-features", _ON_FEATURES, "what the rows on features are compared with"),
+            Variant("sigmoid", (*_ON_FEATURES, "mask.variant=sigmoid"), "psi one-against-rest"),
+            Variant("statistic-entropy", (*_ON_FEATURES, "mask.statistic=entropy"), "entropy of the render"),
+            Variant("union", ("mask.combine=union",), "local or global"),
             Variant("scope-photo", ("mask.scope=photo",), "each photo cut by itself"),
             Variant("t-ent-literal", ("mask.threshold=literal",), "additive objective"),
             Variant("no-gate", _NO_GATE, "always cuts in two"),
-            Variant("no-agreement", _NO_AGREEMENT, "an unsure identity is enough"),
-            Variant("no-tracks", ("mask.static_tracks=0",), "structure from motion vouches for nothing"),
+            Variant("no-agreement", (*_ON_FEATURES, *_NO_AGREEMENT), "an unsure identity is enough"),
+            Variant("no-tracks", (*_ON_FEATURES, "mask.static_tracks=0"), "SfM vouches for nothing"),
             Variant("no-alpha", ("mask.least_alpha=0",), "what is not learnt yet is judged"),
-            Variant("cosine-plain", ("mask.cosine=plain",)),
-            Variant("spread-var", ("mask.spread=var",), "mean + variance"),
-            Variant("no-global-gate", _NO_GLOBAL_GATE),
+            Variant("cosine-plain", (*_ON_FEATURES, "mask.cosine=plain")),
+            Variant("spread-var", (*_ON_FEATURES, "mask.spread=var"), "mean + variance"),
+            Variant("no-global-gate", (*_ON_FEATURES, *_NO_GLOBAL_GATE)),
             Variant("overlap-literal", ("density.merge.form=literal",), "a density, not a share"),
             Variant("whole-components", ("density.merge.most=0",), "clusters of any size merge"),
             Variant("losses", _PRINTED_LOSSES, "L_id + 0.2 L_cr"),

@@ -190,10 +190,6 @@ def test_refinesplats_ablations_name_options_it_has():
     for variant in (v for g in groups for v in g.variants):
         pairs = dict(setting.split("=") for setting in variant.settings)
         assert len(pairs) == len(variant.settings), f"{variant.name} sets an option twice"
-        if "features" in pairs and not hasattr(entry.options(), "features"):
-            continue  # `aw ablate` lists them as missing until the method can be given features
-        if pairs.get("mask.threshold") in ("hard", "statistics") and not _has_them():
-            continue
         options = with_options(entry.options(), pairs)
         for key, text in pairs.items():
             value = _at(options, key)
@@ -202,10 +198,6 @@ def test_refinesplats_ablations_name_options_it_has():
             )
             # 0.10 and 0.1 are one number
             assert shown == text or value == float(text), key
-
-
-def _has_them():
-    return "hard" in typing.get_args(threshold.Form)
 
 
 def _at(options, key):

@@ -51,23 +51,6 @@ ABLATIONS = (
         "Tab. ablation of the entropy-aware adaptive masking",
     ),
     Group(
-        "evidence",
-        "What is judged, and whether other views and visits have a say",
-        (
-            Variant("structure", ("mask.statistic=structure",), "colour and structure of pixels"),
-            Variant("no-other-views", ("mask.multiview.strength=0",), "each view believes itself"),
-            *(
-                Variant(f"strength-{value}", (f"mask.multiview.strength={value}",))
-                for value in ("0.5", "2", "4")
-            ),
-            *(Variant(f"views-{value}", (f"mask.multiview.views={value}",)) for value in ("4", "16")),
-            Variant("no-memory", ("mask.memory=0",), "the present render alone"),
-            Variant("no-hold", ("mask.hold=1",), "regions do not grow below the threshold"),
-            Variant("identities", ("mask.entropy_weight=0.5",), "scaled by the contrast of identities"),
-            Variant("on-features", _ON_FEATURES, "identities and features on their grid"),
-        ),
-    ),
-    Group(
         "thresholds",
         "What cuts the instances in two",
         (
@@ -95,6 +78,23 @@ ABLATIONS = (
             Variant("losses-entropy", (*_PRINTED_LOSSES, "density.decides=entropy"), "they decide"),
         ),
         "Tab. analysis of the entropy-aware density control",
+    ),
+    Group(
+        "evidence",
+        "What is judged, and whether other views and visits have a say",
+        (
+            Variant("structure", ("mask.statistic=structure",), "colour and structure of pixels"),
+            Variant("no-other-views", ("mask.multiview.strength=0",), "each view believes itself"),
+            *(
+                Variant(f"strength-{value}", (f"mask.multiview.strength={value}",))
+                for value in ("0.5", "2", "4")
+            ),
+            *(Variant(f"views-{value}", (f"mask.multiview.views={value}",)) for value in ("4", "16")),
+            Variant("no-memory", ("mask.memory=0",), "the present render alone"),
+            Variant("no-hold", ("mask.hold=1",), "regions do not grow below the threshold"),
+            Variant("identities", ("mask.entropy_weight=0.5",), "scaled by the contrast of identities"),
+            Variant("on-features", _ON_FEATURES, "identities and features on their grid"),
+        ),
     ),
     Group(
         "filters",
@@ -148,13 +148,19 @@ ABLATIONS = (
         (
             Variant("on-features", _ON_FEATURES, "what the rows on features are compared with"),
             Variant("sigmoid", (*_ON_FEATURES, "mask.variant=sigmoid"), "psi one-against-rest"),
-            Variant("statistic-entropy", (*_ON_FEATURES, "mask.statistic=entropy"), "entropy of the render"),
+            Variant(
+                "statistic-entropy", ("mask.statistic=entropy", *_ON_FEATURES[1:]), "entropy of the render"
+            ),
             Variant("union", ("mask.combine=union",), "local or global"),
             Variant("scope-photo", ("mask.scope=photo",), "each photo cut by itself"),
             Variant("t-ent-literal", ("mask.threshold=literal",), "additive objective"),
             Variant("no-gate", _NO_GATE, "always cuts in two"),
             Variant("no-agreement", (*_ON_FEATURES, *_NO_AGREEMENT), "an unsure identity is enough"),
-            Variant("no-tracks", (*_ON_FEATURES, "mask.static_tracks=0"), "SfM vouches for nothing"),
+            Variant(
+                "no-tracks",
+                (*(x for x in _ON_FEATURES if "static_tracks" not in x), "mask.static_tracks=0"),
+                "SfM vouches for nothing",
+            ),
             Variant("no-alpha", ("mask.least_alpha=0",), "what is not learnt yet is judged"),
             Variant("cosine-plain", (*_ON_FEATURES, "mask.cosine=plain")),
             Variant("spread-var", (*_ON_FEATURES, "mask.spread=var"), "mean + variance"),

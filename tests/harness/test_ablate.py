@@ -2,7 +2,6 @@
 
 import csv
 import json
-import typing
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +15,6 @@ from ambiguous_wild.harness.grid import cell_folder, run_cells
 from ambiguous_wild.harness.store import read_runs, write_result
 from ambiguous_wild.methods import MethodEntry, get_method, register, registry
 from ambiguous_wild.methods.ablation import Group, Variant, check_groups, choose_groups
-from ambiguous_wild.methods.refinesplat import threshold
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.trainer import TrainConfig

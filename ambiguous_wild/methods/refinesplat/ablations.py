@@ -16,6 +16,7 @@ _NO_AGREEMENT = ("mask.disagree=0", "mask.disagree_units=0")
 _NO_GLOBAL_GATE = ("mask.global_gate=0", "mask.global_units=0")
 # instances judged on the feature grid and united with the global mask, as the paper does
 _ON_FEATURES = ("mask.statistic=evidence", "mask.combine=union", "mask.static_tracks=0.35", "mask.dilation=5")
+_NO_TRACKS = (*_ON_FEATURES[:2], "mask.static_tracks=0", _ON_FEATURES[3])
 _ALL_PRINTED = (
     "mask.variant=sigmoid", "mask.statistic=entropy", "mask.combine=union", "mask.scope=photo",
     "mask.threshold=literal", *_NO_GATE, *_NO_AGREEMENT, "mask.static_tracks=0", "mask.least_alpha=0",
@@ -158,7 +159,7 @@ ABLATIONS = (
             Variant("no-agreement", (*_ON_FEATURES, *_NO_AGREEMENT), "an unsure identity is enough"),
             Variant(
                 "no-tracks",
-                (*(x for x in _ON_FEATURES if "static_tracks" not in x), "mask.static_tracks=0"),
+                _NO_TRACKS,
                 "SfM vouches for nothing",
             ),
             Variant("no-alpha", ("mask.least_alpha=0",), "what is not learnt yet is judged"),

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import click
 
+from ambiguous_wild.cli.options import training_options
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.methods.ablation import Group
 
@@ -19,42 +20,11 @@ from ambiguous_wild.methods.ablation import Group
     "--scene", "scenes", multiple=True, type=click.Path(path_type=Path), help="A scene folder; repeatable."
 )
 @click.option("--group", "groups", multiple=True, help="Only this group; repeatable.  [default: all]")
-@click.option(
-    "--seed",
-    "seeds",
-    multiple=True,
-    type=click.IntRange(0),
-    default=(0,),
-    show_default=True,
-    help="Repeatable.",
-)
-@click.option("--iterations", type=click.IntRange(1), help="Length of each training.  [default: 30000]")
-@click.option("--budget", help="Training time instead: 90s, 10m, 1.5h.")
-@click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True)
-@click.option("--threads", type=click.IntRange(1), help="CPU threads; the result does not depend on it.")
-@click.option("--factor", type=click.IntRange(1), help="Train on images_N.")
-@click.option("--max-gaussians", type=click.IntRange(4), help="Growth stops here.")
+@training_options
 @click.option(
     "--set", "settings", multiple=True, metavar="KEY=VALUE", help="An option in every row; repeatable."
 )
-@click.option(
-    "--plugin",
-    "plugins",
-    multiple=True,
-    type=click.Path(path_type=Path),
-    help="A file that registers methods.",
-)
 @click.option("-o", "--output", type=click.Path(path_type=Path), default=Path("ablation"), show_default=True)
-@click.option(
-    "--overwrite",
-    type=click.Choice(["never", "missing", "always"]),
-    default="missing",
-    show_default=True,
-    help="missing: keep what is finished, resume what stopped.",
-)
-@click.option(
-    "--cache", type=click.Path(path_type=Path), help="Features and masks.  [default: OUTPUT/.cache]"
-)
 @click.option("--pictures/--no-pictures", default=False, show_default=True, help="Draw every run's pictures.")
 @click.option("--list", "listing", is_flag=True, help="Show groups and variants, train nothing.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")

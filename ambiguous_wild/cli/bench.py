@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ambiguous_wild.cli.options import training_options
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.extras import install_command
 
@@ -45,22 +46,7 @@ def parse_budget(text: str) -> float:
     type=click.Path(path_type=Path),
     help="A scene folder; repeatable.",
 )
-@click.option(
-    "--seed",
-    "seeds",
-    multiple=True,
-    type=click.IntRange(0),
-    default=(0,),
-    show_default=True,
-    help="Repeatable.",
-)
-@click.option("--iterations", type=click.IntRange(1), help="Length of the training.  [default: 30000]")
-@click.option("--budget", help="Training time instead: 90s, 10m, 1.5h. Schedules scale with it.")
-@click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True)
-@click.option("--threads", type=click.IntRange(1), help="CPU threads; the result does not depend on it.")
-@click.option(
-    "--factor", type=click.IntRange(1), help="Train on images_N.  [default: what the scene was built for]"
-)
+@training_options
 @click.option(
     "--resolution",
     type=click.Choice(["auto", "full", "coarse-to-fine"]),
@@ -68,33 +54,13 @@ def parse_budget(text: str) -> float:
     show_default=True,
     help="auto: coarse-to-fine under a budget, else full.",
 )
-@click.option(
-    "--max-gaussians", type=click.IntRange(4), help="Growth stops here.  [default: the method's own]"
-)
 @click.option("--mask", metavar="METHOD", help="Masks of another method, none, or truth (exact ones).")
 @click.option("--density", metavar="METHOD", help="Density control of another method.")
 @click.option("--regulariser", metavar="METHOD", help="Loss on the render of another method.")
 @click.option(
     "--set", "settings", multiple=True, metavar="METHOD.KEY=VALUE", help="An option of a method; repeatable."
 )
-@click.option(
-    "--plugin",
-    "plugins",
-    multiple=True,
-    type=click.Path(path_type=Path),
-    help="A Python file that registers methods of your own.",
-)
 @click.option("-o", "--output", type=click.Path(path_type=Path), default=Path("runs"), show_default=True)
-@click.option(
-    "--overwrite",
-    type=click.Choice(["never", "missing", "always"]),
-    default="missing",
-    show_default=True,
-    help="missing: keep what is finished, resume what stopped.",
-)
-@click.option(
-    "--cache", type=click.Path(path_type=Path), help="Features and instance masks.  [default: OUTPUT/.cache]"
-)
 @click.option(
     "--checkpoint-every",
     type=click.FloatRange(min=0.0, min_open=True),

@@ -53,7 +53,13 @@ def test_listing_shows_every_group_and_variant_and_imports_no_torch():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stderr == "[]"
     groups = {g["group"]: g for g in json.loads(done.stdout)}
-    assert [v["name"] for v in groups["masks"]["variants"]] == ["neither", "local", "global", "both"]
+    assert [v["name"] for v in groups["masks"]["variants"]] == [
+        "neither",
+        "local",
+        "global",
+        "union",
+        "fused",
+    ]
     plain = aw("--list", "--group", "alpha1").stdout
     assert "lambda_cr=0.3" in plain and "mask." not in plain
 

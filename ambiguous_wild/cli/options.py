@@ -1,0 +1,60 @@
+"""Options that every command that trains has: how long, on what, with which code, what is kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+_OPTIONS = (
+    click.option(
+        "--seed",
+        "seeds",
+        multiple=True,
+        type=click.IntRange(0),
+        default=(0,),
+        show_default=True,
+        help="Repeatable.",
+    ),
+    click.option("--iterations", type=click.IntRange(1), help="Length of a training.  [default: 30000]"),
+    click.option("--budget", help="Training time instead: 90s, 10m, 1.5h. Schedules scale with it."),
+    click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True),
+    click.option("--threads", type=click.IntRange(1), help="CPU threads; the result does not depend on it."),
+    click.option(
+        "--factor",
+        type=click.IntRange(1),
+        help="Train on images_N.  [default: what the scene was built for]",
+    ),
+    click.option(
+        "--max-gaussians", type=click.IntRange(4), help="Growth stops here.  [default: the method's own]"
+    ),
+    click.option(
+        "--plugin",
+        "plugins",
+        multiple=True,
+        type=click.Path(path_type=Path),
+        help="A Python file that registers methods of your own.",
+    ),
+    click.option(
+        "--overwrite",
+        type=click.Choice(["never", "missing", "always"]),
+        default="missing",
+        show_default=True,
+        help="missing: keep what is finished, resume what stopped.",
+    ),
+    click.option(
+        "--cache",
+        type=click.Path(path_type=Path),
+        help="Features and instance masks.  [default: OUTPUT/.cache]",
+    ),
+)
+
+
+def training_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add them to a click command, as seeds, iterations, budget, device, threads, factor, max_gaussians,
+    plugins, overwrite and cache."""
+    for option in reversed(_OPTIONS):
+        command = option(command)
+    return command

@@ -5,7 +5,13 @@ import pytest
 
 from ambiguous_wild.core import AwError, Camera
 from ambiguous_wild.methods.refinesplat import masking
-from ambiguous_wild.methods.refinesplat.multiview import Elsewhere, MultiViewConfig, discount, nearest_views
+from ambiguous_wild.methods.refinesplat.multiview import (
+    Elsewhere,
+    MultiViewConfig,
+    _quantile,
+    discount,
+    nearest_views,
+)
 from ambiguous_wild.methods.refinesplat.pixels import PixelEvidence
 from ambiguous_wild.methods.refinesplat.structure import correlation, structure_residual
 from ambiguous_wild.methods.refinesplat.threshold import t_ent
@@ -59,7 +65,7 @@ def test_other_views_are_read_where_they_show_the_same_surface():
         evidence = np.zeros((H, W), np.float32)
         evidence[:, max(column - 1, 0) : column + 2] = 1.0
         elsewhere.remember(view, evidence, depth)
-    found = elsewhere.median(0)
+    found = elsewhere.ask(0)
     assert found.shape == (H // 2, W // 2)
     expected = (FOCAL * 1.0 / PLANE + W / 2) / 2
     assert abs(int(np.nanargmax(found[H // 4])) - expected) <= 1.0
@@ -69,15 +75,25 @@ def test_a_surface_at_another_depth_or_outside_says_nothing():
     cameras = [camera(0.0), camera(0.1)]
     elsewhere = Elsewhere(cameras, MultiViewConfig())
     elsewhere.remember(0, np.ones((H, W)), np.full((H, W), PLANE))
-    assert elsewhere.median(0) is None  # nobody else was asked
+    assert elsewhere.ask(0) is None  # nobody else was asked
     elsewhere.remember(1, np.ones((H, W)), np.full((H, W), 2 * PLANE))
-    assert np.isnan(elsewhere.median(0)).all()
+    assert np.isnan(elsewhere.ask(0)).all()
     elsewhere.remember(1, np.ones((H, W)), np.full((H, W), 1.05 * PLANE))
-    assert np.nanmin(elsewhere.median(0)) == pytest.approx(1.0)
+    assert np.nanmin(elsewhere.ask(0)) == pytest.approx(1.0)
     far = Elsewhere([camera(0.0), camera(1000.0)], MultiViewConfig())
     far.remember(0, np.ones((H, W)), np.full((H, W), PLANE))
     far.remember(1, np.ones((H, W)), np.full((H, W), PLANE))
-    assert np.isnan(far.median(0)).all()
+    assert np.isnan(far.ask(0)).all()
+
+
+def test_quantiles_are_numpys_without_what_is_missing():
+    stack = noise(4, 7, 5, 6)
+    stack[noise(5, 7, 5, 6) < 0.4] = np.nan
+    stack[:, 0, 0] = np.nan
+    for quantile in (0.0, 0.25, 0.5, 0.8, 1.0):
+        with pytest.warns(RuntimeWarning):
+            expected = np.nanquantile(stack, quantile, axis=0)
+        assert np.allclose(_quantile(stack, quantile), expected, equal_nan=True, atol=1e-6)
 
 
 def test_discount_by_hand():

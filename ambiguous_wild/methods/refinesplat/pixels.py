@@ -78,7 +78,7 @@ class PixelEvidence:
         heard = self.elsewhere
         before = heard.evidence.get(view), heard.depth.get(view)
         heard.remember(view, evidence, depth)
-        others = heard.median(view)
+        others = heard.ask(view)
         if not remember:
             for kept, old in zip((heard.evidence, heard.depth), before):
                 if old is None:

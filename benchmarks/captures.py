@@ -1,11 +1,12 @@
 """Methods x captures x seeds on captures with exact truth: how much of the possible each method reaches.
 
     python benchmarks/captures.py --captures DIR... --out DIR [--methods ...] [--seeds 0 1 2]
-        [--iterations 3000] [--jobs 2] [--set METHOD.KEY=VALUE ...] [--results STEM]
+        [--iterations 2000] [--jobs 2] [--set METHOD.KEY=VALUE ...] [--results STEM] [--report-only]
 
 A DIR is a scene folder or a folder of them. Every run is an `aw bench` of its own with one kernel thread, so
 --jobs of them share the machine; runs are ordinary run folders under --out: what is finished is kept, what
-stopped resumes. Writes benchmarks/results/captures.json, .csv and .md.
+stopped resumes. Writes benchmarks/results/captures.json, .csv and .md, which name scenes and no paths;
+--report-only writes them from the runs that are there.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 
-from captures_report import facts_of, summarise, tabulate, to_csv, to_markdown
+from captures_report import facts_of, missing_runs, summarise, tabulate, threads_of, to_csv, to_markdown
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.environment import environment
@@ -62,18 +63,8 @@ def command(cell: Cell, args: argparse.Namespace) -> list[str]:
 
 
 def run_all(cells: Sequence[Cell], args: argparse.Namespace) -> list[str]:
-    """Run what is missing, `jobs` at a time; returns a line for each that failed.
-
-    Raises:
-        AwError: a run folder holds another configuration (found before anything is trained).
-    """
-    todo = []
-    for cell in cells:
-        folder = cell_folder(args.out, cell)
-        if folder.exists():
-            refuse_other_config(folder, cell)
-        if not (folder / RESULT).is_file():
-            todo.append(cell)
+    """Run what is missing, `jobs` at a time; returns a line for each that failed."""
+    todo = [cell for cell in cells if not (cell_folder(args.out, cell) / RESULT).is_file()]
     print(f"{len(cells)} runs: {len(cells) - len(todo)} finished before, {len(todo)} to go", flush=True)
     failed = []
     with ThreadPoolExecutor(args.jobs) as pool:
@@ -92,17 +83,31 @@ def run_all(cells: Sequence[Cell], args: argparse.Namespace) -> list[str]:
     return failed
 
 
+def refuse_other_configs(cells: Sequence[Cell], out: Path) -> None:
+    """Raise AwError where a run folder holds another configuration: neither trained over nor tabulated."""
+    for cell in cells:
+        folder = cell_folder(out, cell)
+        if folder.exists():
+            refuse_other_config(folder, cell)
+
+
+def without_folders(setting: str) -> str:
+    """METHOD.KEY=VALUE as it may be published: of a value that is a path, its last name."""
+    key, equals, value = setting.partition("=")
+    return f"{key}{equals}{value.replace(chr(92), '/').rsplit('/', 1)[-1]}"
+
+
 def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--captures", nargs="+", type=Path, required=True, metavar="DIR")
     parser.add_argument("--out", type=Path, required=True, help="folder of the runs")
     parser.add_argument("--methods", nargs="+", default=list(METHODS))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
-    parser.add_argument("--iterations", type=int, default=3000)
+    parser.add_argument("--iterations", type=int, default=2000)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--set", dest="settings", action="append", default=[], metavar="METHOD.KEY=VALUE")
     parser.add_argument("--results", type=Path, default=RESULTS, help="where .json, .csv and .md go")
-    parser.add_argument("--only-report", action="store_true", help="train nothing, tabulate what is there")
+    parser.add_argument("--report-only", action="store_true", help="train nothing, tabulate what is there")
     args = parser.parse_args(words)
     if args.jobs < 1 or args.iterations < 1:
         parser.error("--jobs and --iterations count from 1")
@@ -115,21 +120,24 @@ def main(words: Sequence[str] | None = None) -> int:
     cells = plan_cells(
         args.methods, find_scenes(args.captures), args.seeds, train, settings=args.settings, device="cpu"
     )
-    failed = [] if args.only_report else run_all(cells, args)
+    refuse_other_configs(cells, args.out)  # before anything is trained
+    failed = [] if args.report_only else run_all(cells, args)
     runs = read_runs(args.out)
     scenes = {cell.scene.name: cell.scene for cell in cells}
     methods = list(dict.fromkeys(cell.method.name for cell in cells))
     rows = tabulate(runs, list(scenes), methods, args.seeds)
+    captures = [facts_of(scene) for scene in scenes.values()]
     data = {
         "environment": environment("cpu"),
         "iterations": args.iterations,
         "seeds": args.seeds,
         "jobs": args.jobs,
-        "settings": args.settings,
-        "captures": [facts_of(scene) for scene in scenes.values()],
+        "threads": threads_of(runs, list(scenes), methods, args.seeds),
+        "settings": [without_folders(setting) for setting in args.settings],
+        "captures": captures,
         "rows": rows,
-        "summary": summarise(rows, [facts_of(scene) for scene in scenes.values()]),
-        "failed": failed,
+        "summary": summarise(rows, captures),
+        "missing": missing_runs(runs, list(scenes), methods, args.seeds),
     }
     stem = args.results
     write_json(stem.with_name(stem.name + ".json"), data)

@@ -33,7 +33,8 @@ COLUMNS = (
     ("masked_share", "masked %", 1),
     ("gaussians", "Gaussians", 0),
     ("model_mb", "MB", 2),
-    ("seconds", "s", 0),
+    ("train_s", "train s", 1),
+    ("setup_s", "setup s", 1),
     ("ms_per_iteration", "ms/it", 1),
 )
 
@@ -63,7 +64,8 @@ def run_numbers(run: pd.Series, images: pd.DataFrame) -> dict[str, float]:
         "masked_share": 100.0 * masked_share(Path(run.folder)),
         "gaussians": float(run.gaussians),
         "model_mb": float(run.model_mb),
-        "seconds": float(run.train_s) + float(run.setup_s),
+        "train_s": float(run.train_s),
+        "setup_s": float(run.setup_s),
         "ms_per_iteration": float(run.ms_per_iteration),
     }
 
@@ -86,6 +88,31 @@ def tabulate(runs: Runs, scenes: Sequence[str], methods: Sequence[str], seeds: S
     return rows
 
 
+def threads_of(runs: Runs, scenes: Sequence[str], methods: Sequence[str], seeds: Sequence[int]) -> list[int]:
+    """Kernel threads that the finished runs had: times of differing threads do not compare."""
+    frame = runs.runs
+    if "threads" not in frame:
+        return []
+    mine = frame[
+        frame.scene.isin(list(scenes)) & frame.method.isin(list(methods)) & frame.seed.isin(list(seeds))
+    ]
+    return sorted({int(count) for count in mine["threads"].dropna()})
+
+
+def missing_runs(
+    runs: Runs, scenes: Sequence[str], methods: Sequence[str], seeds: Sequence[int]
+) -> list[dict[str, Any]]:
+    """Capture, method and seed of every run that has no result, and whether it failed or is not finished."""
+    status = {(run.scene, run.method, run.seed): run.status for run in runs.runs.itertuples()}
+    return [
+        {"capture": scene, "method": method, "seed": seed, "why": "failed" if found else "not finished"}
+        for scene in scenes
+        for method in methods
+        for seed in dict.fromkeys(seeds)
+        if (found := status.get((scene, method, seed))) != "ok"
+    ]
+
+
 def summarise(rows: Sequence[Row], captures: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Share of the gap, ranking, masks against the baselines, the clean captures, model sizes."""
     of = {(row["capture"], row["method"]): row for row in rows}
@@ -98,6 +125,8 @@ def summarise(rows: Sequence[Row], captures: Sequence[dict[str, Any]]) -> dict[s
 
     gaps = {name: _gap({m: value(name, m, "psnr") for m in (OURS, PLAIN, EXACT)}) for name in names}
     wide = {name: gap for name, gap in gaps.items() if gap["gap_db"] >= GAP_DB}
+    # A capture that may belong to the mean makes it missing; one without distractors has no gap to close.
+    unknown = [c["name"] for c in captures if c["distractor_share"] and math.isnan(gaps[c["name"]]["gap_db"])]
     means = {m: stats.mean([value(name, m, "psnr") for name in names]) for m in methods}
     ranked = {m: v for m, v in means.items() if m not in REFERENCES and not math.isnan(v)}
     iou = {name: {m: value(name, m, "iou") for m in (OURS, *BASELINES)} for name in names}
@@ -106,7 +135,8 @@ def summarise(rows: Sequence[Row], captures: Sequence[dict[str, Any]]) -> dict[s
     return _plain_tree(
         {
             "gap": wide,
-            "gap_share_mean": stats.mean([gap["share"] for gap in wide.values()]),
+            "gap_unknown": unknown,
+            "gap_share_mean": math.nan if unknown else stats.mean([g["share"] for g in wide.values()]),
             "psnr_mean": means,
             "best": max(ranked, key=lambda m: ranked[m]) if ranked else None,
             "best_by_capture": {name: _best(name, methods, value) for name in names},
@@ -156,9 +186,11 @@ def to_markdown(data: dict[str, Any]) -> str:
     lines = [
         "# Captures with exact truth",
         "",
-        f"{data['iterations']} iterations, seeds {seeds}, one kernel thread a run, {data['jobs']} runs at a "
-        f"time; {data['environment']['cpu']}. Mean +- sample deviation over the seeds; a cell that is `-` is "
-        "missing. IoU, precision and recall are of masked pixels, counted over all train photos.",
+        f"{data['iterations']} iterations, seeds {seeds}, {data['jobs']} runs at a time, kernel threads a "
+        f"run: {' or '.join(map(str, data['threads']))}; {data['environment']['cpu']}. Mean +- sample "
+        "deviation over the seeds; a cell that is `-` is missing. IoU, precision and recall are of masked "
+        "pixels, counted over all train photos. Setup is what a method prepares before its first step, less "
+        "what an earlier run left in the cache.",
     ]
     for capture in data["captures"]:
         share = capture["distractor_share"]
@@ -170,7 +202,11 @@ def to_markdown(data: dict[str, Any]) -> str:
             if row["capture"] == capture["name"]:
                 cells = [_cell(row, key, digits) for key, _, digits in COLUMNS]
                 lines.append(f"| {row['method']} | " + " | ".join(cells) + " |")
-    return "\n".join([*lines, "", "## Summary", "", *_summary_lines(data["summary"])]) + "\n"
+    lines += ["", "## Summary", "", *_summary_lines(data["summary"])]
+    if data["missing"]:
+        named = [f"{m['method']} on {m['capture']}, seed {m['seed']} ({m['why']})" for m in data["missing"]]
+        lines += ["", "## Missing runs", "", *(f"- {name}" for name in named)]
+    return "\n".join(lines) + "\n"
 
 
 def _summary_lines(summary: dict[str, Any]) -> list[str]:
@@ -179,12 +215,18 @@ def _summary_lines(summary: dict[str, Any]) -> list[str]:
         f"({_number(gap['share'], 2)})"
         for name, gap in summary["gap"].items()
     ]
+    lines += [f"- {name}: what exact masks bring is unknown" for name in summary["gap_unknown"]]
     lines.append(
         f"- mean share of the gap, over captures where it is at least {GAP_DB:g} dB: "
         + _number(summary["gap_share_mean"], 2)
     )
     psnr = ", ".join(f"{m} {_number(v, 2)}" for m, v in summary["psnr_mean"].items())
-    lines.append(f"- mean PSNR over all captures: {psnr}; best without the truth: {summary['best'] or '-'}")
+    best = summary["best"] or "-"
+    lines.append(f"- mean PSNR over all captures: {psnr}; best without the truth, of those complete: {best}")
+    lines += [
+        f"- best without the truth on {name}: {best or '-'}"
+        for name, best in summary["best_by_capture"].items()
+    ]
     beaten = ", ".join(summary["iou_beats_both"]) or "none"
     lines.append(f"- {OURS}'s IoU is above that of {' and '.join(BASELINES)} on: {beaten}")
     for name, clean in summary["clean"].items():

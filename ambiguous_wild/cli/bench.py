@@ -114,7 +114,7 @@ def command(
     if math.isnan(checkpoint_every):
         raise AwError("--checkpoint-every nan: give a number of seconds")
 
-    from ambiguous_wild.methods.graft import graft_name
+    from ambiguous_wild.methods.graft import graft_name, idle_regulariser
     from ambiguous_wild.methods.registry import get_method, load_plugin
 
     for plugin in plugins:
@@ -140,6 +140,13 @@ def command(
     for scene in {cell.scene.name: cell.scene for cell in cells}.values():
         for warning in scene.info.get("warnings", ()):
             click.echo(f"warning: {scene.name}: {warning}", err=True)
+    for cell in {cell.method.name: cell for cell in cells}.values():
+        if idle := idle_regulariser(cell.method, cell.options):
+            click.echo(
+                f"warning: {cell.method.name}: {idle} adds no loss on the render with these options; "
+                f"switch it on with --set {idle}.KEY=VALUE, or leave the regulariser out",
+                err=True,
+            )
     check_output(output / "run")  # before half a minute of compiling
     if chosen == "cpu":
         prepare_cpu(threads)

@@ -105,6 +105,15 @@ def compose(mask: Any, regulariser: Any) -> Any:
     return GraftedPolicy(mask, regulariser if regulariser.regularises() else None)
 
 
+def idle_regulariser(method: MethodEntry, options: Any) -> str:
+    """The donor whose loss was asked for and which adds none under these options; empty where all is well."""
+    donor = dict(method.places).get("regulariser", "")
+    if ALIASES.get(donor, donor) in ("", "3dgs"):
+        return ""
+    parts = _donor("regulariser", donor).build(options.regulariser)
+    return "" if parts.mask.regularises() else donor
+
+
 def _pairs(name: str) -> list[tuple[str, str]]:
     """(place, donor) as written after the @."""
     host, at, rest = name.partition("@")

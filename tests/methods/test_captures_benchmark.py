@@ -66,6 +66,20 @@ def test_a_missing_run_is_missing_and_not_zero(report):
     assert got["gaussians_ratio"]["a"] is None
 
 
+def test_an_unknown_gap_makes_the_mean_of_gaps_missing(report):
+    rows = [
+        row(c, m, p) for c in "ab" for m, p in (("3dgs", 26.0), ("refinesplat", 28.0), ("3dgs+truth", 30.0))
+    ]
+    captures = [{"name": n, "distractor_share": 0.2} for n in "ab"]
+    assert report.summarise(rows, captures)["gap_share_mean"] == 0.5
+    rows[-1]["psnr"] = None
+    got = report.summarise(rows, captures)
+    assert got["gap_unknown"] == ["b"]
+    assert got["gap_share_mean"] is None
+    captures[1]["distractor_share"] = 0.0  # nothing to mask: no gap, whatever was trained
+    assert report.summarise(rows, captures)["gap_share_mean"] == 0.5
+
+
 def test_the_masked_share_is_counted_in_the_written_masks(report, tmp_path):
     (tmp_path / "masks").mkdir()
     assert report.masked_share(tmp_path) == 0.0
@@ -89,6 +103,7 @@ def test_the_script_trains_what_is_missing_and_tabulates(tmp_path):
     assert data["captures"] == [
         {"name": "with", "train": 6, "test": 2, "distractor_share": pytest.approx(144 / (64 * 48))}
     ]
+    assert data["threads"] == [1]
     truth = {r["method"]: r for r in data["rows"]}["3dgs@mask=truth"]
     assert truth["masked_share"] == pytest.approx(100 * 14 * 14 / (64 * 48), abs=1e-4)
     values = []
@@ -104,7 +119,18 @@ def test_the_script_trains_what_is_missing_and_tabulates(tmp_path):
 
     again = subprocess.run(words, capture_output=True, text=True, check=True)
     assert "4 finished before, 0 to go" in again.stdout
-    other = subprocess.run([*words, "--iterations", "12"], capture_output=True, text=True)
+    for name in ("out.json", "out.csv", "out.md"):
+        assert str(tmp_path) not in (tmp_path / name).read_text()
+
+    report = [*words, "--report-only"]
+    with_third = subprocess.run([*report, "--seeds", "0", "2"], capture_output=True, text=True, check=True)
+    assert "to go" not in with_third.stdout
+    assert "- 3dgs on with, seed 2 (not finished)" in with_third.stdout
+    data = json.loads((tmp_path / "out.json").read_text())
+    assert [m["seed"] for m in data["missing"]] == [2, 2]
+    assert data["rows"][0]["psnr"] is None  # one seed of two is no mean
+
+    other = subprocess.run([*report, "--iterations", "12"], capture_output=True, text=True)
     assert other.returncode == 1
     assert "another configuration (train.iterations was 10, is 12)" in other.stderr
     empty = subprocess.run([*words, "--captures", str(tmp_path / "runs")], capture_output=True, text=True)

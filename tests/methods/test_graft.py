@@ -13,7 +13,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import with_options
 from ambiguous_wild.harness.grid import plan_cells
 from ambiguous_wild.methods import MethodEntry, get_method, register, registry
-from ambiguous_wild.methods.graft import compose, graft_name
+from ambiguous_wild.methods.graft import compose, graft_name, idle_regulariser
 from ambiguous_wild.methods.grafted_policy import GraftedPolicy
 from ambiguous_wild.methods.refinesplat.density import EntropyAwareDensity
 from ambiguous_wild.methods.refinesplat.policy import RefineSplatMask
@@ -137,10 +137,39 @@ def test_a_methods_own_mask_changes_no_bit(scene, tmp_path):
     both = {f"{place}.{key}": value for place in ("host", "mask") for key, value in options.items()}
     graft = trained(scene, tmp_path / "graft", parts_of("robustsplat@mask=robustsplat", **both), 60)
     assert bits(graft) == bits(own)
+    both |= {f"density.{key}": value for key, value in options.items()}
+    name = "robustsplat@mask=robustsplat,density=robustsplat"
+    assert bits(trained(scene, tmp_path / "density", parts_of(name, **both), 60)) == bits(own)
     # and where it is a second instance of its own, which knows nothing of the host's
     parts = parts_of("robustsplat", **options)
     second = Parts(**{**vars(parts), "mask": GraftedPolicy(RobustSplatMask(parts.mask.config), None)})
     assert bits(trained(scene, tmp_path / "second", second, 60)) == bits(own)
+
+
+def test_refinesplat_over_refinesplat_is_refinesplat(scene, tmp_path):
+    options = {"min_mask_start": "20", "mask_start": "0"}
+    own = trained(scene, tmp_path / "own", parts_of("refinesplat", **options), 60)
+    grown = {f"{place}.{k}": v for place in ("host", "mask", "density") for k, v in options.items()}
+    name = "refinesplat@mask=refinesplat,density=refinesplat"
+    assert bits(trained(scene, tmp_path / "graft", parts_of(name, **grown), 60)) == bits(own)
+    assert bits(trained(scene, tmp_path / "plain", Parts(), 60)) != bits(own)
+
+
+def test_a_regulariser_that_adds_nothing_is_told(scene):
+    (off, on, none) = (
+        plan_cells([f"3dgs@regulariser={donor}"], [scene], [0], TrainConfig(iterations=5), settings=settings)[
+            0
+        ]
+        for donor, settings in (
+            ("refinesplat", []),
+            ("refinesplat", ["refinesplat.lambda_cr=0.2"]),
+            ("none", []),
+        )
+    )
+    assert idle_regulariser(off.method, off.options) == "refinesplat"
+    assert idle_regulariser(on.method, on.options) == ""
+    assert idle_regulariser(none.method, none.options) == ""
+    assert idle_regulariser(get_method("3dgs"), None) == ""
 
 
 def test_the_regulariser_sees_the_hosts_keep_map():

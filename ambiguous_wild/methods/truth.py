@@ -98,7 +98,7 @@ def truth_files(scene: Scene, kind: str) -> list[Path]:
     folder = scene.root / "truth" / kind
     if not folder.is_dir():
         raise AwError(
-            f"scene {scene.name} has no exact truth ({folder} is absent): only captures of 'aw simulate' do; "
+            f"scene {scene.name} has no exact truth ({folder} is absent): only captures of 'aw simulate' and 'aw composite' do; "
             "train another method on it"
         )
     paths = [folder / Path(view.name).with_suffix(".png").name for view in scene.train]

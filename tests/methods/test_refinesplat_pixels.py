@@ -5,15 +5,25 @@ import pytest
 
 from ambiguous_wild.core import AwError, Camera
 from ambiguous_wild.methods.refinesplat import masking
+from ambiguous_wild.methods.refinesplat.config import MaskConfig
+from ambiguous_wild.methods.refinesplat.evidence import Maps, make_masks
 from ambiguous_wild.methods.refinesplat.multiview import (
     Elsewhere,
+    Hearsay,
     MultiViewConfig,
+    _apart,
     _quantile,
+    _weight,
     discount,
     nearest_views,
 )
 from ambiguous_wild.methods.refinesplat.pixels import PixelEvidence
-from ambiguous_wild.methods.refinesplat.structure import correlation, structure_residual
+from ambiguous_wild.methods.refinesplat.structure import (
+    correlation,
+    mean_difference,
+    structure_residual,
+    unrelated_residual,
+)
 from ambiguous_wild.methods.refinesplat.threshold import t_ent
 
 H, W, FOCAL, PLANE = 40, 64, 60.0, 5.0
@@ -27,6 +37,10 @@ def camera(x: float) -> Camera:
 
 def noise(seed: int, *shape: int) -> np.ndarray:
     return np.random.default_rng(seed).random(shape).astype(np.float32)
+
+
+def plain(count: int) -> list[np.ndarray]:
+    return [np.full((H, W, 3), 0.5, np.float32)] * count
 
 
 def test_correlation_is_pearsons_over_each_box():
@@ -58,14 +72,14 @@ def test_a_blurred_render_is_less_evidence_than_another_texture_of_the_same_resi
 def test_other_views_are_read_where_they_show_the_same_surface():
     """A mark on a plane, put into every view's evidence at its projection, is found where a view shows it."""
     cameras = [camera(x) for x in (0.0, 0.5, 1.0)]
-    elsewhere = Elsewhere(cameras, MultiViewConfig(views=2))
+    elsewhere = Elsewhere(cameras, plain(3), MultiViewConfig(views=2))
     depth = np.full((H, W), PLANE, np.float32)
     for view in range(len(cameras)):
         column = int(FOCAL * (1.0 - (view * 0.5)) / PLANE + W / 2)  # of the world point (1, 0, PLANE)
         evidence = np.zeros((H, W), np.float32)
         evidence[:, max(column - 1, 0) : column + 2] = 1.0
         elsewhere.remember(view, evidence, depth)
-    found = elsewhere.ask(0)
+    found = elsewhere.ask(0).evidence
     assert found.shape == (H // 2, W // 2)
     expected = (FOCAL * 1.0 / PLANE + W / 2) / 2
     assert abs(int(np.nanargmax(found[H // 4])) - expected) <= 1.0
@@ -73,17 +87,17 @@ def test_other_views_are_read_where_they_show_the_same_surface():
 
 def test_a_surface_at_another_depth_or_outside_says_nothing():
     cameras = [camera(0.0), camera(0.1)]
-    elsewhere = Elsewhere(cameras, MultiViewConfig())
+    elsewhere = Elsewhere(cameras, plain(2), MultiViewConfig())
     elsewhere.remember(0, np.ones((H, W)), np.full((H, W), PLANE))
     assert elsewhere.ask(0) is None  # nobody else was asked
     elsewhere.remember(1, np.ones((H, W)), np.full((H, W), 2 * PLANE))
-    assert np.isnan(elsewhere.ask(0)).all()
+    assert np.isnan(elsewhere.ask(0).evidence).all()
     elsewhere.remember(1, np.ones((H, W)), np.full((H, W), 1.05 * PLANE))
-    assert np.nanmin(elsewhere.ask(0)) == pytest.approx(1.0)
-    far = Elsewhere([camera(0.0), camera(1000.0)], MultiViewConfig())
+    assert np.nanmin(elsewhere.ask(0).evidence) == pytest.approx(1.0)
+    far = Elsewhere([camera(0.0), camera(1000.0)], plain(2), MultiViewConfig())
     far.remember(0, np.ones((H, W)), np.full((H, W), PLANE))
     far.remember(1, np.ones((H, W)), np.full((H, W), PLANE))
-    assert np.isnan(far.ask(0)).all()
+    assert np.isnan(far.ask(0).evidence).all()
 
 
 def test_quantiles_are_numpys_without_what_is_missing():
@@ -99,11 +113,87 @@ def test_quantiles_are_numpys_without_what_is_missing():
 def test_discount_by_hand():
     config = MultiViewConfig(strength=2.0, free=2.0)
     evidence = np.full((4, 6), 10.0, np.float32)
-    elsewhere = np.full((2, 3), 0.6)  # 6 units: 4 above what is free
-    assert np.allclose(discount(evidence, elsewhere, 0.1, config), 10.0 / np.sqrt(1 + 2 * 4))
-    assert np.array_equal(discount(evidence, elsewhere * np.nan, 0.1, config), evidence)
-    assert np.array_equal(discount(evidence, elsewhere * 0.1, 0.1, config), evidence)
+    said = np.full((2, 3), 0.6)  # 6 units: 4 above what is free
+    whole, half = np.ones((2, 3), np.float32), np.full((2, 3), 0.5, np.float32)
+    assert np.allclose(discount(evidence, Hearsay(said, whole), 0.1, config), 10.0 / np.sqrt(1 + 2 * 4))
+    assert np.allclose(discount(evidence, Hearsay(said, half), 0.1, config), 10.0 / np.sqrt(1 + 2 * 2))
+    assert np.array_equal(discount(evidence, Hearsay(said, 0 * whole), 0.1, config), evidence)
+    assert np.array_equal(discount(evidence, Hearsay(said * np.nan, whole), 0.1, config), evidence)
+    assert np.array_equal(discount(evidence, Hearsay(said * 0.1, whole), 0.1, config), evidence)
     assert discount(evidence, None, 0.1, config) is evidence
+
+
+def test_views_that_show_another_colour_have_no_word():
+    """Half of the others see the same wall; in the rest something else stands before it."""
+    cameras = [camera(0.02 * i) for i in range(7)]
+    photos = [np.full((H, W, 3), 0.5, np.float32) for _ in cameras]
+    photos[0][:, 3 * W // 4 :] = 0.9  # what stands before view 0 no other photo shows
+    for photo in photos[1:4]:
+        photo[:, : W // 5] = 0.1
+    elsewhere = Elsewhere(cameras, photos, MultiViewConfig(views=6, agreeing=0.5))
+    for view in range(7):
+        elsewhere.remember(view, np.ones((H, W)), np.full((H, W), PLANE))
+    weight = elsewhere.ask(0).weight
+    middle = weight[H // 4]
+    assert middle[3 * W // 8 + 3 :].max() == 0.0
+    assert middle[W // 10 + 3 : 3 * W // 8 - 3].min() == 1.0  # all others agree
+    assert middle[2 : W // 10 - 3].min() == 1.0  # three of six do: half is enough
+    never = Elsewhere(cameras, photos, MultiViewConfig(views=6, agree=0.0))
+    for view in range(7):
+        never.remember(view, np.ones((H, W)), np.full((H, W), PLANE))
+    assert (never.ask(0).weight == 1.0).all()
+
+
+def test_weight_is_the_share_of_those_who_see_it_and_few_are_always_heard():
+    seen = np.array([[[True, True, True]]] * 2 + [[[True, True, False]]] * 2)  # 4, 4, 2 views
+    agree = np.array([[[True, False, False]]] + [[[False, False, False]]] * 3)
+    config = MultiViewConfig(agreeing=0.5, known_by=3)
+    assert _weight(seen, agree, config).tolist() == [[0.5, 0.0, 1.0]]
+
+
+def test_exposure_and_white_balance_are_no_other_content():
+    ours = (noise(3, 20, 24, 3) * 150).astype(np.uint8)
+    brighter = ours + np.array([30, 40, 50], np.uint8)
+    brighter[:6, :6] = 255 - brighter[:6, :6]
+    everywhere = np.ones(ours.shape[:2], bool)
+    found = _apart(ours, brighter, everywhere)
+    assert found[8:, 8:].max() < 0.01
+    assert found[:6, :6].mean() > 0.15
+    assert np.isfinite(_apart(ours, brighter, ~everywhere)).all()  # nobody sees anything
+
+
+def test_unrelated_content_gives_far_more_than_a_blurred_render():
+    photos = [noise(i, H, W, 3) for i in range(4)]
+    whole = unrelated_residual(photos)
+    smooth = [p.mean() + 0.5 * (p - p.mean()) for p in photos]
+    assert whole > 3 * np.median([structure_residual(p, q) for p, q in zip(photos, smooth)])
+    assert unrelated_residual([*photos, noise(9, H // 2, W, 3)]) == pytest.approx(whole, rel=0.2)
+    assert unrelated_residual([]) == 0.0
+    a, b = noise(0, 9, 7, 3), noise(1, 9, 7, 3)
+    assert np.allclose(mean_difference(a, b), np.abs(a - b).mean(axis=2), atol=1e-6)
+
+
+def test_no_threshold_is_above_the_ceiling():
+    """Where half of everything is a distractor nothing stands apart: what is unrelated is masked anyway."""
+    labels = np.ones((8, 8), np.int32)
+    values = np.full((8, 8), 6.0)
+    values[:, 4:] = 1.0
+    config = MaskConfig(dilation=1)
+    open_, capped = (
+        make_masks(Maps(values, values), labels, np.zeros(1, bool), [], 0.5, config, ceiling)
+        for ceiling in (np.inf, 3.0)
+    )
+    assert open_.keep.min() == 1.0
+    assert capped.cut.threshold == 3.0
+    assert (capped.keep[:, :4] == 0.0).all()
+    assert (capped.keep[:, 4:] == 1.0).all()
+    pixels = PixelEvidence(
+        [noise(i, H, W, 3) for i in range(3)], [camera(0.1 * i) for i in range(3)], MultiViewConfig(),
+        base=0.3, least_alpha=0.5, memory=0.0,
+    )  # fmt: skip
+    assert pixels.ceiling(0, 0.0) == np.inf
+    looked(pixels, 0, noise(7, H, W, 3), remember=True)
+    assert pixels.ceiling(0, 0.25) == pytest.approx(0.25 * pixels.unrelated / pixels.unit)
 
 
 def test_nearest_views_are_near_and_look_the_same_way():

@@ -20,8 +20,8 @@ _NO_TRACKS = (*_ON_FEATURES[:2], "mask.static_tracks=0", _ON_FEATURES[3])
 _ALL_PRINTED = (
     "mask.variant=sigmoid", "mask.statistic=entropy", "mask.combine=union", "mask.scope=photo",
     "mask.threshold=literal", *_NO_GATE, *_NO_AGREEMENT, "mask.static_tracks=0", "mask.least_alpha=0",
-    "mask.cosine=plain", "mask.spread=var", *_NO_GLOBAL_GATE, "mask.fill=0", "mask.dilation=5",
-    "density.merge.form=literal", "density.merge.most=0", *_PRINTED_LOSSES,
+    "mask.ceiling=0", "mask.cosine=plain", "mask.spread=var", *_NO_GLOBAL_GATE, "mask.fill=0",
+    "mask.dilation=5", "density.merge.form=literal", "density.merge.most=0", *_PRINTED_LOSSES,
 )  # fmt: skip
 
 ABLATIONS = (
@@ -88,9 +88,11 @@ ABLATIONS = (
             Variant("no-other-views", ("mask.multiview.strength=0",), "each view believes itself"),
             *(
                 Variant(f"strength-{value}", (f"mask.multiview.strength={value}",))
-                for value in ("0.5", "2", "4")
+                for value in ("0.5", "1", "3")
             ),
             *(Variant(f"views-{value}", (f"mask.multiview.views={value}",)) for value in ("4", "16")),
+            Variant("any-photo", ("mask.multiview.agree=0",), "views count whatever their photos show"),
+            Variant("no-ceiling", ("mask.ceiling=0",), "thresholds as high as the scene's residuals"),
             Variant("no-memory", ("mask.memory=0",), "the present render alone"),
             Variant("no-hold", ("mask.hold=1",), "regions do not grow below the threshold"),
             Variant("identities", ("mask.entropy_weight=0.5",), "scaled by the contrast of identities"),

@@ -44,6 +44,8 @@ class MaskConfig:
     )
     disagree: float = 3.0  # F: `gate` for the feature distance between photo and render; 0 = printed
     disagree_units: float = 3.0  # F: and at least this many units of what blur and noise make; 0 = printed
+    # no threshold above this share of what unrelated content gives (`unrelated_residual`); 0 = printed
+    ceiling: float = 0.25  # `structure` only
     use_local: bool = True  # M_local; off is an ablation row
     use_global: bool = True  # M_global; off is an ablation row
     static_tracks: float = 0.0  # of the photo's mean SfM track density keeps an instance; 0 = printed
@@ -82,10 +84,10 @@ class RefineSplatConfig:
     psi: PsiConfig = field(default_factory=PsiConfig)  # the frozen identity classifier
     density: EntropyDensityConfig = field(default_factory=EntropyDensityConfig)  # growth and merging
     mask_start: float = 500.0  # warm-up: before it every pixel counts
-    min_mask_start: int = 400  # a render of fewer iterations means nothing
+    min_mask_start: int = 250  # a render of fewer iterations means nothing
     reset_pause: float = 300.0  # masks are not refreshed for so long after an opacity reset
     min_reset_pause: int = 200
-    mask_every: int = 2  # each view's mask is refreshed at every k-th of its visits
+    mask_every: int = 4  # each view's mask is refreshed at every k-th of its visits
     entropy_every: int = 4  # iterations between entropy terms, each weighing that many times as much
     # Both losses are off with weight-free features, whose gradient to the image is that of colours and
     # edges: 900 iterations on a simulated courtyard gave 28.2 dB without them, 26.4 with 0.001 and 0.0002,

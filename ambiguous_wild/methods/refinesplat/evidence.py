@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import get_args
@@ -114,6 +115,7 @@ def make_masks(
     others: Sequence[Judged],
     w2: float,
     config: MaskConfig,
+    ceiling: float = math.inf,
 ) -> Masks:
     """M_local, M_global and the keep map of one photo (Eqs. 4-8).
 
@@ -124,6 +126,7 @@ def make_masks(
         others: instances of the scene's other photos when they were last judged (`scope` = scene).
         w2: weight of T_ent's lower subset.
         config: thresholds.
+        ceiling: the threshold is no higher than this, whatever stands apart from what.
     """
     height, width = labels.shape
     count = len(static)
@@ -133,6 +136,8 @@ def make_masks(
     judged = Judged(means[known], distances[known], areas[known])
     pool = pooled([judged, *others] if config.scope == "scene" else [judged])
     cut = t_ent(pool.values, w2, config.threshold, config.gate, config.floor, config.hard)
+    if cut.threshold > ceiling:
+        cut = Cut(ceiling, pool.values > ceiling, min(cut.floor, ceiling))
     flagged = np.zeros(count, dtype=bool)
     flagged[known] = judged.values > cut.threshold
     if config.statistic != "structure":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,8 +11,8 @@ import numpy as np
 import torch
 
 from ambiguous_wild.core import Camera
-from ambiguous_wild.methods.refinesplat.multiview import Elsewhere, MultiViewConfig, discount
-from ambiguous_wild.methods.refinesplat.structure import structure_residual
+from ambiguous_wild.methods.refinesplat.multiview import Elsewhere, Hearsay, MultiViewConfig, discount
+from ambiguous_wild.methods.refinesplat.structure import structure_residual, unrelated_residual
 
 _STATIC_QUANTILE = 0.25  # of a photo's pixels: static even where distractors cover two thirds of it
 
@@ -31,7 +32,8 @@ class PixelEvidence:
     ) -> None:
         self.photos = list(photos)
         self.config, self.base, self.least_alpha, self.memory = config, base, least_alpha, memory
-        self.elsewhere = Elsewhere(cameras, config)
+        self.elsewhere = Elsewhere(cameras, self.photos, config)
+        self.unrelated = unrelated_residual(self.photos, base)
         self.normal: dict[int, float] = {}  # view: quantile of its residual that static pixels have
         # view: [H, W], its residual averaged over its visits; half precision, a checkpoint holds all of them
         self.before: dict[int, np.ndarray] = {}
@@ -69,12 +71,19 @@ class PixelEvidence:
             self.normal[view] = normal
             if self.memory > 0:
                 self.before[view] = evidence.astype(np.float16)
-        unit = max(self.unit or normal, 1e-4)  # a perfect render of a synthetic scene has no noise at all
+        unit = self._unit(normal)
         return discount(evidence, others, unit, self.config) / unit
 
-    def _others(
-        self, view: int, evidence: np.ndarray, depth: np.ndarray, remember: bool
-    ) -> np.ndarray | None:
+    def ceiling(self, view: int, share: float) -> float:
+        """That share of what unrelated content gives, in units, as `look` of the view divided by; 0 = inf."""
+        if share <= 0 or self.unrelated <= 0:
+            return math.inf
+        return share * self.unrelated / self._unit(self.normal.get(view, 0.0))
+
+    def _unit(self, normal: float) -> float:
+        return max(self.unit or normal, 1e-4)  # a perfect render of a synthetic scene has no noise at all
+
+    def _others(self, view: int, evidence: np.ndarray, depth: np.ndarray, remember: bool) -> Hearsay | None:
         heard = self.elsewhere
         before = heard.evidence.get(view), heard.depth.get(view)
         heard.remember(view, evidence, depth)

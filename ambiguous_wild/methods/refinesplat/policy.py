@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -153,6 +154,7 @@ class RefineSplatMask(MaskPolicy):
             remember: whether other views hear what this one shows; else nothing is kept.
         """
         inputs, view, mask = self.inputs, step.view, self.config.mask
+        ceiling = math.inf
         if mask.statistic == "structure":
             rendered = step.rendered
             evidence = self.pixels.look(
@@ -165,10 +167,12 @@ class RefineSplatMask(MaskPolicy):
             if mask.entropy_weight > 0:
                 evidence = scaled_by(evidence, self.compare(step).statistic, mask.entropy_weight)
             maps = Maps(evidence, evidence)
+            ceiling = self.pixels.ceiling(view, mask.ceiling)
         else:
             maps = self.compare(step)
         others = [self.judged[v] for v in sorted(self.judged) if v != view]
-        return maps, make_masks(maps, inputs.labels[view], inputs.static[view], others, self.w2, mask)
+        labels, static = inputs.labels[view], inputs.static[view]
+        return maps, make_masks(maps, labels, static, others, self.w2, mask, ceiling)
 
     @torch.no_grad()
     def compare(self, step: Step) -> Maps:

@@ -9,6 +9,8 @@ of Lab + HOG.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 
@@ -26,8 +28,34 @@ def structure_residual(photo: np.ndarray, render: np.ndarray, base: float = 0.3)
         render: of the same camera, same size.
         base: what is left of the residual where the structure agrees perfectly.
     """
-    residual = _box(np.abs(photo - render).mean(axis=2), RESIDUAL_BOX)
+    residual = _box(mean_difference(photo, render), RESIDUAL_BOX)
     return residual * (1.0 + base - correlation(photo @ _GREY, render @ _GREY))
+
+
+def mean_difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Mean over channels of |a - b|, both [H, W, 3] float32: [H, W] float32."""
+    third = np.full((1, 3), 1.0 / 3.0, dtype=np.float32)
+    return cv2.transform(cv2.absdiff(np.ascontiguousarray(a), np.ascontiguousarray(b)), third)
+
+
+def unrelated_residual(photos: Sequence[np.ndarray], base: float = 0.3) -> float:
+    """What `structure_residual` gives where two pictures have nothing to do with each other.
+
+    Median over pixels, then over photos, of each photo against the mirror image of another one: same place,
+    same light, other content. An absolute scale that no render has a part in, so it holds where nothing is
+    learnt well: before a crowd even "normal" residuals are large.
+
+    Args:
+        photos: [H, W, 3] float32 in [0, 1] each, sizes may differ.
+        base: of `structure_residual`.
+    """
+    values = []
+    for index, photo in enumerate(photos):
+        other = photos[(index + len(photos) // 2) % len(photos)][:, ::-1]
+        if other.shape != photo.shape:
+            other = cv2.resize(np.ascontiguousarray(other), photo.shape[1::-1], interpolation=cv2.INTER_AREA)
+        values.append(float(np.median(structure_residual(photo, other, base))))
+    return float(np.median(values)) if values else 0.0
 
 
 def correlation(a: np.ndarray, b: np.ndarray, box: int = STRUCTURE_BOX) -> np.ndarray:

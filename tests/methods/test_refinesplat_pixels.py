@@ -11,7 +11,7 @@ from ambiguous_wild.methods.refinesplat.multiview import (
     Elsewhere,
     Hearsay,
     MultiViewConfig,
-    _apart,
+    _agree,
     _quantile,
     _weight,
     discount,
@@ -156,10 +156,16 @@ def test_exposure_and_white_balance_are_no_other_content():
     brighter = ours + np.array([30, 40, 50], np.uint8)
     brighter[:6, :6] = 255 - brighter[:6, :6]
     everywhere = np.ones(ours.shape[:2], bool)
-    found = _apart(ours, brighter, everywhere)
-    assert found[8:, 8:].max() < 0.01
-    assert found[:6, :6].mean() > 0.15
-    assert np.isfinite(_apart(ours, brighter, ~everywhere)).all()  # nobody sees anything
+    found = _agree(ours, brighter, everywhere, 0.06)
+    assert found[8:, 8:].all()
+    assert found[:6, :6].mean() < 0.3
+    assert not _agree(ours, brighter, ~everywhere, 0.06).any()  # nobody sees anything
+    # a shift that few have in common is theirs
+    half = ours.copy()
+    half[:, :14] += np.uint8(60)
+    found = _agree(ours, half, everywhere, 0.06)
+    assert found[:, 14:].all()
+    assert not found[:, :14].any()
 
 
 def test_unrelated_content_gives_far_more_than_a_blurred_render():

@@ -22,6 +22,7 @@ from ambiguous_wild.core import Camera
 
 _SPREAD = 9  # px, box over a view's evidence before others read it: depth is off by a few pixels
 _BLUR = 5  # px, box over photos before their colours are compared, for the same reason
+_FAR_MORE = 1.5  # times as many pixels
 _SHRINK = 2  # maps are kept at half the photo's size
 
 
@@ -116,20 +117,23 @@ class Elsewhere:
         if self.config.agree <= 0:
             return heard, same
         theirs = cv2.remap(self.colours[view], x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return heard, same & (_apart(colour, theirs, same) < self.config.agree)
+        return heard, _agree(colour, theirs, same, self.config.agree)
 
 
-def _apart(ours: np.ndarray, theirs: np.ndarray, same: np.ndarray) -> np.ndarray:
-    """Difference of colour [h, w] in [0, 1] of two pictures [h, w, 3] uint8, beyond what exposure makes.
+def _agree(ours: np.ndarray, theirs: np.ndarray, same: np.ndarray, most: float) -> np.ndarray:
+    """Where two pictures [h, w, 3] uint8 show the same colour, bool [h, w]: at most `most` (of 1) apart.
 
-    What all of `same` have in common (the median difference of each channel) is the camera's or the
-    weather's, and no other content.
+    What all of `same` have in common (the median difference of each channel) is exposure or weather and no
+    other content, but only if far more agree without it: before a crowd it is chance.
     """
     difference = np.subtract(ours, theirs, dtype=np.float32) / np.float32(255.0)
-    common = difference[::2, ::2][same[::2, ::2]]
-    if len(common):
-        difference -= np.median(common, axis=0).astype(np.float32)
-    return np.abs(difference).mean(axis=2)
+    some = difference[::2, ::2][same[::2, ::2]]
+    if len(some):
+        common = np.median(some, axis=0)
+        as_they_are = np.count_nonzero(np.abs(some).mean(axis=1) < most)
+        if np.count_nonzero(np.abs(some - common).mean(axis=1) < most) > _FAR_MORE * as_they_are:
+            difference -= common.astype(np.float32)
+    return same & (np.abs(difference).mean(axis=2) < most)
 
 
 def _weight(seen: np.ndarray, agree: np.ndarray, config: MultiViewConfig) -> np.ndarray:

@@ -5,8 +5,9 @@
 
 A DIR is a scene folder or a folder of them. Every run is an `aw bench` of its own with one kernel thread, so
 --jobs of them share the machine; runs are ordinary run folders under --out: what is finished is kept, what
-stopped resumes. Writes benchmarks/results/captures.json, .csv and .md, which name scenes and no paths;
---report-only writes them from the runs that are there.
+stopped resumes. Writes benchmarks/results/captures.json, .csv and .md, which name scenes and no paths, and
+captures-runs.csv, a row a run: what is in it and has the same configuration and scene is not trained again,
+on whatever machine it was. --report-only trains nothing.
 """
 
 from __future__ import annotations
@@ -18,7 +19,19 @@ from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 
-from captures_report import facts_of, missing_runs, summarise, tabulate, threads_of, to_csv, to_markdown
+import pandas as pd
+from captures_report import (
+    book_of,
+    facts_of,
+    merged,
+    missing_runs,
+    read_book,
+    summarise,
+    tabulate,
+    threads_of,
+    to_csv,
+    to_markdown,
+)
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.environment import environment
@@ -62,9 +75,15 @@ def command(cell: Cell, args: argparse.Namespace) -> list[str]:
     return [sys.executable, "-m", "ambiguous_wild.cli.main", *words]
 
 
-def run_all(cells: Sequence[Cell], args: argparse.Namespace) -> list[str]:
+def current(book: pd.DataFrame, cells: Sequence[Cell]) -> pd.DataFrame:
+    """The rows of the book that are of these cells as they are configured now."""
+    return book[book.config_hash.isin([cell.identity for cell in cells])]
+
+
+def run_all(cells: Sequence[Cell], book: pd.DataFrame, args: argparse.Namespace) -> list[str]:
     """Run what is missing, `jobs` at a time; returns a line for each that failed."""
-    todo = [cell for cell in cells if not (cell_folder(args.out, cell) / RESULT).is_file()]
+    known = set(book.config_hash)
+    todo = [c for c in cells if c.identity not in known and not (cell_folder(args.out, c) / RESULT).is_file()]
     print(f"{len(cells)} runs: {len(cells) - len(todo)} finished before, {len(todo)} to go", flush=True)
     failed = []
     with ThreadPoolExecutor(args.jobs) as pool:
@@ -121,23 +140,28 @@ def main(words: Sequence[str] | None = None) -> int:
         args.methods, find_scenes(args.captures), args.seeds, train, settings=args.settings, device="cpu"
     )
     refuse_other_configs(cells, args.out)  # before anything is trained
-    failed = [] if args.report_only else run_all(cells, args)
+    book_path = args.results.with_name(args.results.name + "-runs.csv")
+    book = read_book(book_path)
+    failed = [] if args.report_only else run_all(cells, book, args)
     runs = read_runs(args.out)
+    book = merged(book, book_of(runs))
+    write_text(book_path, book.to_csv(index=False, float_format="%.7g"))
+    book = current(book, cells)
     scenes = {cell.scene.name: cell.scene for cell in cells}
     methods = list(dict.fromkeys(cell.method.name for cell in cells))
-    rows = tabulate(runs, list(scenes), methods, args.seeds)
+    rows = tabulate(book, list(scenes), methods, args.seeds)
     captures = [facts_of(scene) for scene in scenes.values()]
     data = {
         "environment": environment("cpu"),
         "iterations": args.iterations,
         "seeds": args.seeds,
         "jobs": args.jobs,
-        "threads": threads_of(runs, list(scenes), methods, args.seeds),
+        "threads": threads_of(book),
         "settings": [without_folders(setting) for setting in args.settings],
         "captures": captures,
         "rows": rows,
         "summary": summarise(rows, captures),
-        "missing": missing_runs(runs, list(scenes), methods, args.seeds),
+        "missing": missing_runs(book, runs, list(scenes), methods, args.seeds),
     }
     stem = args.results
     write_json(stem.with_name(stem.name + ".json"), data)

@@ -38,6 +38,8 @@ COLUMNS = (
     ("ms_per_iteration", "ms/it", 1),
 )
 
+BOOK = ["capture", "method", "seed", "config_hash", "threads", *(key for key, _, _ in COLUMNS)]
+
 
 def facts_of(scene: Scene) -> dict[str, Any]:
     """Name, photos, and the mean share of distractor pixels in the train photos (None without truth)."""
@@ -70,46 +72,77 @@ def run_numbers(run: pd.Series, images: pd.DataFrame) -> dict[str, float]:
     }
 
 
-def tabulate(runs: Runs, scenes: Sequence[str], methods: Sequence[str], seeds: Sequence[int]) -> list[Row]:
-    """A row a capture and method: mean and sample deviation over the seeds, None where one is missing."""
+def book_of(runs: Runs) -> pd.DataFrame:
+    """A row a finished run: capture, method, seed, config_hash, threads and the columns."""
     ok = runs.runs[runs.runs.status == "ok"] if len(runs.runs) else runs.runs
+    rows = [
+        {
+            "capture": run.scene,
+            "method": run.method,
+            "seed": int(run.seed),
+            "config_hash": run.config_hash,
+            "threads": int(run.threads),
+            **run_numbers(run, runs.images),
+        }
+        for _, run in ok.iterrows()
+    ]
+    return pd.DataFrame(rows, columns=BOOK)
+
+
+def read_book(path: Path) -> pd.DataFrame:
+    """The book as it was written; empty where there is none."""
+    return pd.read_csv(path, dtype={"config_hash": str}) if path.is_file() else pd.DataFrame(columns=BOOK)
+
+
+def merged(old: pd.DataFrame, new: pd.DataFrame) -> pd.DataFrame:
+    """Both books, sorted; a run of `new` takes the place of the same run in `old`."""
+    filled = [book for book in (old, new) if len(book)]
+    if not filled:
+        return old
+    both = pd.concat(filled).drop_duplicates(["capture", "method", "seed"], keep="last")
+    return both.sort_values(["capture", "method", "seed"]).reset_index(drop=True)
+
+
+def tabulate(
+    book: pd.DataFrame, scenes: Sequence[str], methods: Sequence[str], seeds: Sequence[int]
+) -> list[Row]:
+    """A row a capture and method: mean and sample deviation over the seeds, None where one is missing."""
     rows = []
     for scene in scenes:
         for method in methods:
-            here = ok[(ok.scene == scene) & (ok.method == method) & ok.seed.isin(list(seeds))]
-            numbers = [run_numbers(run, runs.images) for _, run in here.iterrows()]
-            row: Row = {"capture": scene, "method": method, "runs": len(numbers)}
-            complete = len(numbers) == len(set(seeds))
+            here = book[(book.capture == scene) & (book.method == method) & book.seed.isin(list(seeds))]
+            row: Row = {"capture": scene, "method": method, "runs": len(here)}
+            complete = len(here) == len(set(seeds))
             for key, _, _ in COLUMNS:
-                values = [n[key] for n in numbers] if complete else []
+                values = [float(x) for x in here[key]] if complete else []
                 row[key] = _plain(stats.mean(values))
                 row[f"{key}_sd"] = _plain(stats.spread(values))
             rows.append(row)
     return rows
 
 
-def threads_of(runs: Runs, scenes: Sequence[str], methods: Sequence[str], seeds: Sequence[int]) -> list[int]:
-    """Kernel threads that the finished runs had: times of differing threads do not compare."""
-    frame = runs.runs
-    if "threads" not in frame:
-        return []
-    mine = frame[
-        frame.scene.isin(list(scenes)) & frame.method.isin(list(methods)) & frame.seed.isin(list(seeds))
-    ]
-    return sorted({int(count) for count in mine["threads"].dropna()})
+def threads_of(book: pd.DataFrame) -> list[int]:
+    """Kernel threads that the runs had: times of differing threads do not compare."""
+    return sorted({int(count) for count in book["threads"]})
 
 
 def missing_runs(
-    runs: Runs, scenes: Sequence[str], methods: Sequence[str], seeds: Sequence[int]
+    book: pd.DataFrame, runs: Runs, scenes: Sequence[str], methods: Sequence[str], seeds: Sequence[int]
 ) -> list[dict[str, Any]]:
-    """Capture, method and seed of every run that has no result, and whether it failed or is not finished."""
-    status = {(run.scene, run.method, run.seed): run.status for run in runs.runs.itertuples()}
+    """Every run that is not in the book: capture, method, seed, and whether it failed or is not finished."""
+    known = set(zip(book.capture, book.method, book.seed, strict=True))
+    tried = {(run.scene, run.method, run.seed) for run in runs.runs.itertuples()}
     return [
-        {"capture": scene, "method": method, "seed": seed, "why": "failed" if found else "not finished"}
+        {
+            "capture": scene,
+            "method": method,
+            "seed": seed,
+            "why": "failed" if run in tried else "not finished",
+        }
         for scene in scenes
         for method in methods
         for seed in dict.fromkeys(seeds)
-        if (found := status.get((scene, method, seed))) != "ok"
+        if (run := (scene, method, seed)) not in known
     ]
 
 

@@ -3,6 +3,7 @@
 import csv
 import importlib
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -130,8 +131,17 @@ def test_the_script_trains_what_is_missing_and_tabulates(tmp_path):
     assert [m["seed"] for m in data["missing"]] == [2, 2]
     assert data["rows"][0]["psnr"] is None  # one seed of two is no mean
 
-    other = subprocess.run([*report, "--iterations", "12"], capture_output=True, text=True)
+    shutil.rmtree(tmp_path / "runs")  # another machine: the book is enough
+    lost = subprocess.run(words, capture_output=True, text=True, check=True)
+    assert "4 finished before, 0 to go" in lost.stdout
+    assert {r["method"]: r for r in json.loads((tmp_path / "out.json").read_text())["rows"]}[
+        "3dgs@mask=truth"
+    ]["psnr"] == pytest.approx(truth["psnr"], abs=1e-5)
+    changed = subprocess.run([*words, "--iterations", "12"], capture_output=True, text=True, check=True)
+    assert "0 finished before, 4 to go" in changed.stdout  # what was configured otherwise is no result
+
+    other = subprocess.run([*report, "--iterations", "14"], capture_output=True, text=True)
     assert other.returncode == 1
-    assert "another configuration (train.iterations was 10, is 12)" in other.stderr
+    assert "another configuration (train.iterations was 12, is 14)" in other.stderr
     empty = subprocess.run([*words, "--captures", str(tmp_path / "runs")], capture_output=True, text=True)
     assert "is no scene folder" in empty.stderr

@@ -15,11 +15,34 @@ import click
     "--masks",
     help="truth, scene (build-scene's masks), run, or a folder of <stem>.png, white = distractor.  [default: the first there is]",
 )
-@click.option("--masks-white", type=click.Choice(["distractor", "keep"]), default="distractor", show_default=True, help="What white means in a folder given with --masks.")
-@click.option("--background", type=click.Choice(["clean", "run", "none"]), help="What distractors are compared with: clean versions of the photos, or the run's render.  [default: the first there is]")
-@click.option("--run", type=click.Path(path_type=Path, file_okay=False), help="A trained run of this scene: its render, and its masks.")
-@click.option("--features", default="labhog", show_default=True, help="Back end of the semantic score: labhog, dinov2-small, ... (docs/foundation-models.md).")
-@click.option("--objects", type=click.Path(path_type=Path, file_okay=False), help="Masks of the static objects to compare with, <stem>.png, white = object.  [default: every static segment]")
+@click.option(
+    "--masks-white",
+    type=click.Choice(["distractor", "keep"]),
+    default="distractor",
+    show_default=True,
+    help="What white means in a folder given with --masks.",
+)
+@click.option(
+    "--background",
+    type=click.Choice(["clean", "run", "none"]),
+    help="What distractors are compared with: clean versions of the photos, or the run's render.  [default: the first there is]",
+)
+@click.option(
+    "--run",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="A trained run of this scene: its render, and its masks.",
+)
+@click.option(
+    "--features",
+    default="labhog",
+    show_default=True,
+    help="Back end of the semantic score: labhog, dinov2-small, ... (docs/foundation-models.md).",
+)
+@click.option(
+    "--objects",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Masks of the static objects to compare with, <stem>.png, white = object.  [default: every static segment]",
+)
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the bootstrap.")
 @click.option("--record/--no-record", default=True, show_default=True, help="Note the scores in scene.json.")
 @click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")

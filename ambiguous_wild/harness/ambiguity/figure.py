@@ -82,7 +82,11 @@ def write_figure(
             cosine_picture(look, index, photo, distractor),
         ]
         name = view.name if len(view.name) <= 28 else f"…{view.name[-27:]}"
-        captions = [f"{name}: {100 * distractor.mean():.0f} % covered", "residual to the background", "cosine to the largest distractor"]
+        captions = [
+            f"{name}: {100 * distractor.mean():.0f} % covered",
+            "residual to the background",
+            "cosine to the largest distractor",
+        ]
         span = slice(12 * column // len(picks), 12 * (column + 1) // len(picks))
         for line, (picture, caption) in enumerate(zip(pictures, captions)):
             _panel(figure.add_subplot(grid[line, span]), picture, caption)
@@ -115,9 +119,16 @@ def _legend(figure: Any) -> None:
 
     colours = ListedColormap(ramp(np.linspace(0, 1, 64), 0.0, 1.0) / 255.0)
     bar = figure.colorbar(
-        ScalarMappable(cmap=colours), ax=figure.axes[: -3 or None], location="right", shrink=0.4, aspect=30, pad=0.01
+        ScalarMappable(cmap=colours),
+        ax=figure.axes[: -3 or None],
+        location="right",
+        shrink=0.4,
+        aspect=30,
+        pad=0.01,
     )
-    bar.set_ticks([0, 1], labels=["alike: residual 0,\ncosine 1", "different: residual 1,\ncosine 0"], fontsize=8)
+    bar.set_ticks(
+        [0, 1], labels=["alike: residual 0,\ncosine 1", "different: residual 1,\ncosine 0"], fontsize=8
+    )
 
 
 def _histograms(figure: Any, grid: Any, measured: list[Measured]) -> None:

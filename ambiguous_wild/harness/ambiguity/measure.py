@@ -107,7 +107,9 @@ def measure(
         if named is None:
             things = segments.labels(torch.from_numpy(photo))
         else:
-            things, _ = ndimage.label(load_mask(named[view.name], view)) if view.name in named else (0 * regions, 0)
+            things, _ = (
+                ndimage.label(load_mask(named[view.name], view)) if view.name in named else (0 * regions, 0)
+            )
         moving.append(sem.region_means(grid, regions, sem.MIN_SHARE))
         static.append(sem.region_means(grid, np.where(distractor, 0, things), sem.MIN_SHARE))
         scores.append((view.name, counts, np.histogram(residual, BINS)[0]))
@@ -170,5 +172,7 @@ def _object_masks(folder: Path, views: list[View]) -> dict[str, Path]:
         raise AwError(f"there is no folder {folder} of object masks (--objects)")
     found = {v.name: folder / f"{stem(v)}.png" for v in views if (folder / f"{stem(v)}.png").is_file()}
     if not found:
-        raise AwError(f"{folder} holds no mask of a train photo: name them as the photos, {stem(views[0])}.png")
+        raise AwError(
+            f"{folder} holds no mask of a train photo: name them as the photos, {stem(views[0])}.png"
+        )
     return found

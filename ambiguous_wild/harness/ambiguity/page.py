@@ -31,7 +31,9 @@ def check_folder(folder: Path) -> None:
         return
     strange = sorted(p.name for p in folder.iterdir() if p.name not in FILES)
     if strange or not (folder / FILES[0]).is_file():
-        raise AwError(f"{folder} holds something else than a report ({strange[0] if strange else 'half of one'}); choose another -o")
+        raise AwError(
+            f"{folder} holds something else than a report ({strange[0] if strange else 'half of one'}); choose another -o"
+        )
 
 
 def write_report(
@@ -54,7 +56,9 @@ def write_report(
         write_json(folder / "ambiguity.json", {**summary, "per_photo": rows})
         figure.write_figure(scene, masks, background, measured, look, folder / "ambiguity.png")
         pictures = list(_pictures(scene, masks, background, measured, look))
-        write_text(folder / "index.html", page(summary, rows, (folder / "ambiguity.png").read_bytes(), pictures))
+        write_text(
+            folder / "index.html", page(summary, rows, (folder / "ambiguity.png").read_bytes(), pictures)
+        )
 
 
 def _pictures(
@@ -80,7 +84,9 @@ def _jpeg(image: np.ndarray) -> bytes:
     scale = WIDTH / image.shape[1]
     if scale < 1:
         image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return bytes(cv2.imencode(".jpg", np.ascontiguousarray(image[:, :, ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 85])[1])
+    return bytes(
+        cv2.imencode(".jpg", np.ascontiguousarray(image[:, :, ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 85])[1]
+    )
 
 
 _STYLE = """

@@ -80,7 +80,9 @@ def check_run(scene: Scene, run: Path) -> None:
 
     path = run / "config.yaml"
     if not path.is_file() or not (run / "point_cloud.ply").is_file():
-        raise AwError(f"{run} is no finished run (config.yaml and point_cloud.ply); give RUNS/.../seed_0 of 'aw bench'")
+        raise AwError(
+            f"{run} is no finished run (config.yaml and point_cloud.ply); give RUNS/.../seed_0 of 'aw bench'"
+        )
     try:
         config = yaml.safe_load(path.read_text(encoding="utf-8"))
         known, name = config["scene"]["sha256"], config["scene"]["name"]

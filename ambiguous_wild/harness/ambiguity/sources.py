@@ -72,7 +72,9 @@ def find_masks(scene: Scene, choice: str | None, run: Path | None, keep: bool = 
 
 def _all(scene: Scene, folder: Path, advice: str) -> dict[str, Path]:
     if not folder.is_dir():
-        raise AwError(f"there is no mask folder {folder} for {scene.name}: give --masks DIR, truth, scene or run")
+        raise AwError(
+            f"there is no mask folder {folder} for {scene.name}: give --masks DIR, truth, scene or run"
+        )
     found = {v.name: folder / f"{stem(v)}.png" for v in scene.train}
     missing = [name for name, path in found.items() if not path.is_file()]
     if missing:

@@ -59,7 +59,9 @@ def classify(colour: bool | None, semantic: bool | None) -> str:
     if colour is None or semantic is None:
         known = "colour" if colour else "semantic" if semantic else ""
         return f"{known}, rest unknown" if known else "unknown"
-    return {(1, 1): "both", (1, 0): "colour", (0, 1): "semantic", (0, 0): "neither"}[(int(colour), int(semantic))]
+    return {(1, 1): "both", (1, 0): "colour", (0, 1): "semantic", (0, 0): "neither"}[
+        (int(colour), int(semantic))
+    ]
 
 
 def _colour(measured: list[Measured], seed: int) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Capture checks: what was locked, what drifted, which photos to leave out, and what to do about it.
 
 Each check says on what it rests: EXIF where the camera wrote it, the pixels of shared surfaces where not,
-and "unknown" where neither tells. Limits were set on captures that reconstruct well; docs/capture.md has them.
+and "unknown" where neither tells. Limits were set on captures that reconstruct well, see docs/capture.md.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from ambiguous_wild.core.errors import shortlist
 State = Literal["ok", "warning", "unknown"]
 EXIF_STOPS = 0.5  # stops between the darkest and the lightest setting
 PIXEL_STOPS = 0.7  # stops between the 5th and 95th percentile photo, on the same surfaces
-PIXEL_BALANCE = 0.25  # log2 of red or blue over green, the same percentiles: 19 %
-ISO_RATIO = 1.5
+PIXEL_BALANCE = 0.4  # log2 of red or blue over green, the same percentiles: 32 %
+ISO_RATIO = 2.0  # one stop
 FOCAL_RATIO = 1.01
 SOFT = -0.8  # log2 of fine detail on the same surfaces: below it a photo is soft where others are sharp
 FOCUS_SPREAD = 1.2  # log2, the same percentiles: the focus moves
@@ -62,12 +62,16 @@ def exposure(facts: Sequence[dict[str, Any]], compared: Compared) -> Check:
     """Exposure time, aperture and ISO together as stops; else brightness of the same surfaces."""
     advice = "lock exposure (hold the finger on the screen: AE/AF lock), or train with an appearance model"
     stops = [exposure_stops(f["exif"]) for f in facts]
+    spread = _spread(compared, 0)
     if all(s is not None for s in stops):
         span = max(s for s in stops if s is not None) - min(s for s in stops if s is not None)
-        finding = f"settings span {span:.1f} stops"
-        # Automatic exposure keeps the picture's brightness: what counts is whether settings moved at all.
-        return _row("exposure", "EXIF", span > EXIF_STOPS, finding, advice)
-    spread = _spread(compared, 0)
+        if span <= EXIF_STOPS:
+            return Check("exposure", "ok", "EXIF", f"locked: settings span {span:.1f} stops")
+        if spread is None:
+            return Check("exposure", "warning", "EXIF", f"drifts: settings span {span:.1f} stops", advice)
+        # Settings may follow the light, as under clouds: what harms is a surface that changes its brightness.
+        finding = f"automatic: settings span {span:.1f} stops, the same surfaces differ by {spread:.1f}"
+        return _row("exposure", "EXIF and pixels", spread > PIXEL_STOPS, finding, advice)
     if spread is None:
         return Check("exposure", "unknown", _silent(facts, stops), "no shared surfaces to measure on")
     finding = f"the same surfaces differ by {spread:.1f} stops"
@@ -175,7 +179,8 @@ def overlap(facts: Sequence[dict[str, Any]], compared: Compared) -> Check:
     advice = "take more photos between these, each sharing two thirds of the picture with the next"
     if apart:
         groups = int(compared.group.max()) + 1
-        finding = f"{len(apart)} of {count} photos do not hang together with the rest ({groups} groups): {shortlist(apart, 3)}"
+        finding = f"{len(apart)} of {count} photos do not hang together with the rest ({groups} groups): "
+        finding += shortlist(apart, 3)
         return Check("overlap", "warning", "pixels", finding, advice, tuple(apart))
     few = [f["source"] for f, p in zip(facts, compared.partners) if p < min(MIN_PARTNERS, count - 1)]
     median = float(np.median(compared.partners))

@@ -17,7 +17,8 @@ SIDE = 800  # px, longer side at which photos are compared
 FEATURES = 1000
 RATIO = 0.8  # Lowe's ratio test
 MIN_INLIERS = 16  # matches of one geometry from which two photos overlap
-AFTER, ALIKE = 4, 8  # partners of a photo: the next ones, and those whose features are most alike
+AFTER, ALIKE = 4, 8  # partners of a photo: the next ones, and those whose coarse colours are most alike
+LAST_RESORT = 60  # partners tried for a photo that seems to stand alone
 _PATCH = 4  # px, half a patch around a feature
 QUANTITIES = ("exposure", "red", "blue", "sharpness")  # log2 each; red and blue over green
 
@@ -50,11 +51,9 @@ def signature(
     gray = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
     points, descriptors = cv2.SIFT_create(FEATURES).detectAndCompute(gray, None)
     if descriptors is None:
-        return Signature(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8), np.zeros((0, 4), np.float32),
-                         np.zeros(96, np.float32))  # fmt: skip
-    xy = np.array([p.pt for p in points], np.float32)
-    look = _look(small)
-    return Signature(xy, descriptors.astype(np.uint8), _values(small, gray, xy), look)
+        points, descriptors = [], np.zeros((0, 128))
+    xy = np.array([p.pt for p in points], np.float32).reshape(-1, 2)
+    return Signature(xy, descriptors.astype(np.uint8), _values(small, gray, xy), _look(small))
 
 
 def _values(small: np.ndarray, gray: np.ndarray, xy: np.ndarray) -> np.ndarray:
@@ -93,19 +92,30 @@ def compare(
 ) -> Compared:
     """Match photos with those that follow and those that look alike; solve for one number a photo."""
     count = len(signatures)
-    pairs = partners_of(signatures)
     graph = np.zeros((count, count), bool)
     rows: list[tuple[int, int, np.ndarray, float]] = []
-    for i, j in pairs:
+
+    def try_pair(i: int, j: int) -> None:
         found = _match(signatures[i], signatures[j])
-        step()
         if found is None:
-            continue
+            return
         graph[i, j] = graph[j, i] = True
         difference = signatures[i].values[found[0]] - signatures[j].values[found[1]]
         good = np.isfinite(difference).all(axis=1)
         if good.sum() >= MIN_INLIERS // 2:
             rows.append((i, j, np.median(difference[good], axis=0), float(np.sqrt(good.sum()))))
+
+    tried = set(partners_of(signatures))
+    for i, j in sorted(tried):
+        try_pair(i, j)
+        step()
+    # Before a photo is said to stand alone it is tried with all that look at all like it.
+    groups = _groups(graph)
+    for i in np.flatnonzero((groups != 0) | (graph.sum(axis=1) < 2)).tolist():
+        for j in nearest_looks(signatures, i, LAST_RESORT):
+            if (pair := (min(i, j), max(i, j))) not in tried:
+                tried.add(pair)
+                try_pair(*pair)
     return Compared(_solve(count, rows), graph.sum(axis=1), _groups(graph))
 
 
@@ -121,6 +131,12 @@ def partners_of(signatures: Sequence[Signature]) -> list[tuple[int, int]]:
     for i in range(count):
         pairs |= {(min(i, int(j)), max(i, int(j))) for j in np.argsort(-alike[i], kind="stable")[:ALIKE]}
     return sorted(pairs)
+
+
+def nearest_looks(signatures: Sequence[Signature], index: int, most: int) -> list[int]:
+    """The photos most like one, nearest first."""
+    alike = np.array([s.look @ signatures[index].look for s in signatures])
+    return [int(j) for j in np.argsort(-alike, kind="stable") if j != index][:most]
 
 
 def _match(a: Signature, b: Signature) -> tuple[np.ndarray, np.ndarray] | None:

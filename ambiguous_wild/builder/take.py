@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -193,7 +193,7 @@ def _opened(video: Path) -> cv2.VideoCapture:
     # An absolute path: a name such as "http:x" or "%d.png" must not be taken for something else.
     if "%" in video.name:
         raise AwError(
-            f"{ascii(str(video))} has a '%' in its name, which video readers take for a pattern; rename it"
+            f"{str(video)!a} has a '%' in its name, which video readers take for a pattern; rename it"
         )
     reader = _open(video.resolve())
     if not reader.isOpened():

@@ -113,7 +113,7 @@ def test_a_camera_that_stops_leaves_nothing(tmp_path: Path, monkeypatch: pytest.
         def __init__(self) -> None:
             self.left = 40
 
-        def isOpened(self) -> bool:  # noqa: N802 - OpenCV's name
+        def isOpened(self) -> bool:
             return True
 
         def get(self, _: int) -> float:
@@ -124,7 +124,7 @@ def test_a_camera_that_stops_leaves_nothing(tmp_path: Path, monkeypatch: pytest.
 
         def read(self) -> tuple[bool, np.ndarray]:
             self.left -= 1
-            return self.left >= 0, texture(1)[:64, :64] + np.uint8(self.left)
+            return self.left >= 0, texture(1)[:64, :64] + np.uint8(max(self.left, 0))
 
         def release(self) -> None:
             pass

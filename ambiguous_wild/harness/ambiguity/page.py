@@ -32,7 +32,8 @@ def check_folder(folder: Path) -> None:
     strange = sorted(p.name for p in folder.iterdir() if p.name not in FILES)
     if strange or not (folder / FILES[0]).is_file():
         raise AwError(
-            f"{folder} holds something else than a report ({strange[0] if strange else 'half of one'}); choose another -o"
+            f"{folder} holds something else than a report ({strange[0] if strange else 'half of one'}); "
+            "choose another -o"
         )
 
 
@@ -90,7 +91,7 @@ def _jpeg(image: np.ndarray) -> bytes:
 
 
 _STYLE = """
-body{font:16px/1.45 system-ui,sans-serif;max-width:80em;margin:1.5em auto;padding:0 1em;color:#222;background:#fff}
+body{font:16px/1.45 system-ui,sans-serif;max-width:80em;margin:1.5em auto;padding:0 1em;color:#222}
 img{max-width:100%;height:auto}table{border-collapse:collapse;font-size:14px}
 td,th{padding:3px 9px;text-align:right;border-bottom:1px solid #ddd;white-space:nowrap}
 td:first-child,th:first-child{text-align:left}.wide{overflow-x:auto}.class{font-size:1.25em;font-weight:600}
@@ -142,8 +143,8 @@ def page(
         "distractor everything in the photo is.</p><div class=bar></div><div class=ends><span>alike</span>"
         f"<span>different</span></div>{shown}"
         f"<h2>Distributions</h2>{_image(picture, 'png', 'masks, maps and distributions')}"
-        f"<h2>Every photo</h2><div class=wide><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
-        "</div></body></html>\n"
+        f"<h2>Every photo</h2><div class=wide><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody>"
+        "</table></div></body></html>\n"
     )
 
 

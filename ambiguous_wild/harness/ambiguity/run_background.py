@@ -90,8 +90,8 @@ def check_run(scene: Scene, run: Path) -> None:
         raise AwError(f"{path} is damaged ({' '.join(str(error).split())}); train the run again") from None
     if known != scene_identity(scene):
         raise AwError(
-            f"{run} was trained on scene {name!r} with other photos, split or size than {scene.root}; train on this "
-            "one: 'aw bench --scene'"
+            f"{run} was trained on scene {name!r} with other photos, split or size than {scene.root}; "
+            "train on this one: 'aw bench --scene'"
         )
 
 

@@ -54,8 +54,9 @@ def find_masks(scene: Scene, choice: str | None, run: Path | None, keep: bool = 
             choice = "scene"
         else:
             raise AwError(
-                f"{scene.name} has no distractor masks: neither truth/distractor nor masks/train; give --masks "
-                "DIR (PNG of the photo's stem, white = distractor) or --run RUN of a method that masks"
+                f"{scene.name} has no distractor masks: neither truth/distractor nor masks/train; give "
+                "--masks DIR (PNG of the photo's stem, white = distractor) or --run RUN of a method that "
+                "masks"
             )
     if choice == "truth":
         return Masks("truth", _all(scene, truth, "add them (all black where nobody stands)"), False)
@@ -79,7 +80,8 @@ def _all(scene: Scene, folder: Path, advice: str) -> dict[str, Path]:
     missing = [name for name, path in found.items() if not path.is_file()]
     if missing:
         raise AwError(
-            f"{len(missing)} of {len(found)} train photos have no mask in {folder}: {shortlist(missing)}; {advice}"
+            f"{len(missing)} of {len(found)} train photos have no mask in {folder}: {shortlist(missing)}; "
+            + advice
         )
     return found
 
@@ -172,8 +174,8 @@ def find_background(scene: Scene, choice: str | None, run: Path | None, masks: M
     if choice == "run":
         raise AwError("--background run needs --run RUN, a folder of 'aw bench'")
     raise AwError(
-        f"{scene.name} has no clean versions in {clean}: nothing is known behind its distractors; give --run RUN "
-        "of a trained run, or --background none to leave colour out"
+        f"{scene.name} has no clean versions in {clean}: nothing is known behind its distractors; give "
+        "--run RUN of a trained run, or --background none to leave colour out"
     )
 
 

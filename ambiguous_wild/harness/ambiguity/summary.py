@@ -13,8 +13,9 @@ from ambiguous_wild.metrics import semantic as sem
 from ambiguous_wild.metrics.stats import Interval, bootstrap_interval
 
 LOOKS = (
-    "weight-free features see looks, not meaning: a distractor in the texture of something static counts as like "
-    "it; --objects names the static objects to compare with, --features dinov2-small sees kinds of things"
+    "weight-free features see looks, not meaning: a distractor in the texture of something static counts as "
+    "like it; --objects names the static objects to compare with, --features dinov2-small sees kinds "
+    "of things"
 )
 NAMED = "weight-free features see looks, not meaning; compared with the objects named"
 REAL = "raw cosine, as the paper's"
@@ -124,13 +125,13 @@ def describe(summary: dict[str, Any]) -> list[str]:
         f"{100 * covered['max']:.1f} %",
         f"colour: {_percent(colour)} of the distractor pixels are within {am.COLOUR_THRESHOLD} of their "
         f"background: {_word(colour)} (limit {100 * am.COLOUR_AMBIGUOUS_ABOVE:.0f} %)",
-        f"semantic: cosine {_value(look)} of a photo's most similar distractor to the {look['compared_with']}: "
-        f"{_word(look)} (limit {sem.AMBIGUOUS_ABOVE})",
+        f"semantic: cosine {_value(look)} of a photo's most similar distractor to the "
+        f"{look['compared_with']}: {_word(look)} (limit {sem.AMBIGUOUS_ABOVE})",
     ]
     if look["same_surface"] is not None:
         lines.append(
-            f"with {summary['features']}, a static region scores {look['same_surface']:.2f} against other photos of "
-            f"itself and {look['unrelated']:.2f} against unrelated ones; {look['note']}"
+            f"with {summary['features']}, a static region scores {look['same_surface']:.2f} against other "
+            f"photos of itself and {look['unrelated']:.2f} against unrelated ones; {look['note']}"
         )
     if colour["unknown_px"]:
         share = 100 * colour["unknown_px"] / colour["distractor_px"]
@@ -155,7 +156,9 @@ def _value(score: dict[str, Any]) -> str:
 
 
 def _word(score: dict[str, Any]) -> str:
-    return {None: "no verdict", True: "AMBIGUOUS", False: "not ambiguous"}[score["ambiguous"]]
+    word = {None: "no verdict", True: "AMBIGUOUS", False: "not ambiguous"}[score["ambiguous"]]
+    close = score["low"] is not None and score["low"] <= score["ambiguous_above"] <= score["high"]
+    return f"{word}, but the interval crosses the limit" if close else word
 
 
 def _interval(interval: Interval) -> dict[str, float | None]:

@@ -63,10 +63,10 @@ class Anchors:
 
 
 class ChannelStatistics:
-    """Mean and spread of each channel over all photos, from running sums.
+    """Mean and spread of each channel over the static cells of all photos, from running sums.
 
-    Features whose mean is far from zero have cosines near 1 whatever they show. Taking the scene's mean off
-    first makes 0 the similarity of two unrelated regions.
+    Features whose mean is far from zero have cosines near 1 whatever they show. Taking the static scene's
+    mean off first makes 0 the similarity of two unrelated static regions.
     """
 
     def __init__(self) -> None:
@@ -74,9 +74,15 @@ class ChannelStatistics:
         self.sum: np.ndarray | float = 0.0
         self.squares: np.ndarray | float = 0.0
 
-    def add(self, features: np.ndarray) -> None:  # [h, w, C]
-        """Count one photo's features in."""
-        flat = features.reshape(-1, features.shape[2]).astype(np.float64)
+    def add(
+        self,
+        features: np.ndarray,  # [h, w, C]
+        distractor: np.ndarray,  # [H, W] bool
+    ) -> None:
+        """Count in one photo's cells that hold no distractor pixel."""
+        h, w, channels = features.shape
+        touched = np.bincount(_cells(distractor.shape, h, w)[distractor], minlength=h * w) > 0
+        flat = features.reshape(-1, channels)[~touched].astype(np.float64)
         self.count += len(flat)
         self.sum, self.squares = self.sum + flat.sum(0), self.squares + (flat * flat).sum(0)
 
@@ -96,9 +102,7 @@ def region_means(
 ) -> Regions:
     """Mean feature of each labelled region; a cell counts by how many of its pixels the region holds."""
     h, w, channels = features.shape
-    rows = np.minimum(np.arange(labels.shape[0]) * h // labels.shape[0], h - 1)
-    cols = np.minimum(np.arange(labels.shape[1]) * w // labels.shape[1], w - 1)
-    cell = (rows[:, None] * w + cols[None, :])[labels > 0]
+    cell = _cells(labels.shape, h, w)[labels > 0]
     names, index = np.unique(labels[labels > 0], return_inverse=True)
     weight = np.bincount(index * (h * w) + cell, minlength=len(names) * h * w).reshape(len(names), h * w)
     pixels = weight.sum(axis=1)
@@ -160,6 +164,13 @@ def mean_cosine(found: Sequence[RegionMatch]) -> float:
     """Mean cosine over distractor regions, by their pixels; NaN without regions."""
     pixels = sum(m.pixels for m in found)
     return sum(m.pixels * m.cosine for m in found) / pixels if pixels else math.nan
+
+
+def _cells(shape: tuple[int, ...], h: int, w: int) -> np.ndarray:  # [H, W] int
+    """The cell of an h x w grid that each pixel of a picture falls into."""
+    rows = np.arange(shape[0]) * h // shape[0]
+    cols = np.arange(shape[1]) * w // shape[1]
+    return np.asarray(rows[:, None] * w + cols[None, :])
 
 
 def _stacked(statics: Sequence[Regions]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -102,7 +102,7 @@ def measure(
         residual = am.colour_residual(photo, behind)[use] if behind is not None else np.empty(0)
         with torch.no_grad():
             grid = backend(torch.from_numpy(photo)).numpy()
-        statistics.add(grid)
+        statistics.add(grid, distractor)
         regions, _ = ndimage.label(distractor)
         if named is None:
             things = segments.labels(torch.from_numpy(photo))

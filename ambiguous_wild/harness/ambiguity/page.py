@@ -97,8 +97,8 @@ td,th{padding:3px 9px;text-align:right;border-bottom:1px solid #ddd;white-space:
 td:first-child,th:first-child{text-align:left}.wide{overflow-x:auto}.class{font-size:1.25em;font-weight:600}
 .row{display:grid;grid-template-columns:repeat(auto-fit,minmax(15em,1fr));gap:6px;margin-bottom:1.2em}
 .row img{width:100%;display:block}h3{margin:.6em 0 .2em;font-size:1em;overflow-wrap:anywhere}
-.bar{height:.9em;max-width:24em;background:linear-gradient(90deg,#5fbaa8,#b2e0a2,#ffffbf,#fdb466,#f06744)}
-.ends{display:flex;justify-content:space-between;max-width:24em;font-size:13px}
+.bar{height:.9em;max-width:24rem;background:linear-gradient(90deg,#5fbaa8,#b2e0a2,#ffffbf,#fdb466,#f06744)}
+.ends{display:flex;justify-content:space-between;max-width:24rem;font-size:13px}
 """
 _CLASSES = {
     "both": "ambiguous in colour and semantically",

@@ -25,6 +25,7 @@ ISO_RATIO = 2.0  # one stop
 FOCAL_RATIO = 1.01
 SOFT = -0.8  # log2 of fine detail on the same surfaces: below it a photo is soft where others are sharp
 FOCUS_SPREAD = 1.2  # log2, the same percentiles: the focus moves
+FORWARD = 0.6  # share of the overlapping pairs that differ by motion along the line of sight
 MIN_PARTNERS = 2  # overlapping photos a photo needs
 
 
@@ -55,6 +56,7 @@ def run_checks(
         blur(facts, compared),
         near_duplicates(facts, thumbnails),
         overlap(facts, compared),
+        motion(compared),
     ]
 
 
@@ -190,6 +192,15 @@ def overlap(facts: Sequence[dict[str, Any]], compared: Compared) -> Check:
             f"{len(few)} of {count} photos overlap with fewer than {MIN_PARTNERS} others: {shortlist(few, 3)}"
         )
     return _row("overlap", "pixels", bool(few), finding, advice, tuple(few))
+
+
+def motion(compared: Compared) -> Check:
+    """Whether the camera went where it looked: such photos overlap and yet give no depth."""
+    if math.isnan(compared.forward):
+        return Check("motion", "unknown", "pixels", "no overlapping photos to measure on")
+    finding = f"{100 * compared.forward:.0f} % of overlapping pairs differ by motion along the line of sight"
+    advice = "walk sideways or around the subject: along the line of sight there is no parallax"
+    return _row("motion", "pixels", compared.forward > FORWARD, finding, advice)
 
 
 def _row(name: str, basis: str, bad: bool, finding: str, advice: str, photos: tuple[str, ...] = ()) -> Check:

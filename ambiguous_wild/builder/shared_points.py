@@ -7,6 +7,7 @@ that of the camera's settings. Least squares over all pairs gives one number a p
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -40,6 +41,7 @@ class Compared:
     offsets: np.ndarray  # [N, 4] float64, log2, median 0; NaN for photos without a partner
     partners: np.ndarray  # [N] int, photos that overlap with it
     group: np.ndarray  # [N] int, connected groups of overlapping photos; 0 is the largest
+    forward: float  # share of the overlapping pairs that differ by motion along the line of sight; NaN: none
 
 
 def signature(
@@ -94,12 +96,14 @@ def compare(
     count = len(signatures)
     graph = np.zeros((count, count), bool)
     rows: list[tuple[int, int, np.ndarray, float]] = []
+    forward: list[bool] = []
 
     def try_pair(i: int, j: int) -> None:
         found = _match(signatures[i], signatures[j])
         if found is None:
             return
         graph[i, j] = graph[j, i] = True
+        forward.append(is_forward(signatures[i].xy[found[0]], signatures[j].xy[found[1]]))
         difference = signatures[i].values[found[0]] - signatures[j].values[found[1]]
         good = np.isfinite(difference).all(axis=1)
         if good.sum() >= MIN_INLIERS // 2:
@@ -116,7 +120,30 @@ def compare(
             if (pair := (min(i, j), max(i, j))) not in tried:
                 tried.add(pair)
                 try_pair(*pair)
-    return Compared(_solve(count, rows), graph.sum(axis=1), _groups(graph))
+    share = float(np.mean(forward)) if forward else math.nan
+    return Compared(_solve(count, rows), graph.sum(axis=1), _groups(graph), share)
+
+
+def is_forward(
+    a: np.ndarray,  # [M, 2] px, matches of one geometry
+    b: np.ndarray,  # [M, 2] px
+) -> bool:
+    """Whether the picture grows or shrinks about a point inside it: motion along the line of sight.
+
+    A similarity fits the matches; it must scale by over 3 %, turn by less than it scales, and have its fixed
+    point among the matches. Points near it hardly move, so their depth cannot be triangulated.
+    """
+    cv2.setRNGSeed(0)
+    fit, _ = cv2.estimateAffinePartial2D(a, b, ransacReprojThreshold=0.02 * SIDE)
+    if fit is None:
+        return False
+    cos, sin = float(fit[0, 0]), float(fit[1, 0])
+    growth = abs(math.log(max(math.hypot(cos, sin), 1e-6)))
+    if growth < math.log(1.03) or abs(math.atan2(sin, cos)) > growth:
+        return False
+    fixed = np.linalg.solve(np.eye(2) - fit[:, :2], fit[:, 2])
+    low, high = np.percentile(a, [5, 95], axis=0)
+    return bool(((fixed > low) & (fixed < high)).all())
 
 
 def partners_of(signatures: Sequence[Signature]) -> list[tuple[int, int]]:

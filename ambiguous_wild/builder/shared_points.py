@@ -51,7 +51,8 @@ def signature(
     scale = SIDE / max(rgb.shape[:2])
     small = cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else rgb
     gray = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
-    points, descriptors = cv2.SIFT_create(FEATURES).detectAndCompute(gray, None)
+    sift = getattr(cv2, "SIFT_create")  # noqa: B009 - absent from OpenCV's own stubs
+    points, descriptors = sift(FEATURES).detectAndCompute(gray, None)
     if descriptors is None:
         points, descriptors = [], np.zeros((0, 128))
     xy = np.array([p.pt for p in points], np.float32).reshape(-1, 2)

@@ -141,17 +141,20 @@ def matches(
     return found
 
 
-def anchors(statics: Sequence[Regions]) -> Anchors:
+def anchors(
+    statics: Sequence[Regions],  # what distractors are compared with, one per photo
+    every: Sequence[Regions] | None = None,  # all static regions, where that is more
+) -> Anchors:
     """What static regions score against those of other photos; NaN where fewer than two photos have any."""
     units, photo, _ = _stacked(statics)
-    if len(np.unique(photo)) < 2:
+    others, other_photo, _ = _stacked(statics if every is None else every)
+    if len(np.unique(photo)) < 2 or len(np.unique(other_photo)) < 2:
         return Anchors(math.nan, math.nan)
     step = max(len(units) // _ANCHOR_REGIONS, 1)
     same, different = [], []
     for k in range(0, len(units), step):
-        cosines = (units @ units[k])[photo != photo[k]]
-        same.append(cosines.max())
-        different.append(cosines.mean())
+        same.append((units @ units[k])[photo != photo[k]].max())
+        different.append((others @ units[k])[other_photo != photo[k]].mean())
     return Anchors(float(np.mean(same)), float(np.mean(different)))
 
 

@@ -73,6 +73,12 @@ def test_anchors_are_the_means_over_other_photos() -> None:
     got = sem.anchors(statics)
     assert got.same == pytest.approx(np.mean(best)) and got.different == pytest.approx(np.mean(every))
     assert got.calibrated(got.same) == pytest.approx(1) and got.calibrated(got.different) == pytest.approx(0)
+    few = [sem.Regions(s.labels[:1], s.means[:1], s.pixels[:1]) for s in statics]
+    named = sem.anchors(few, statics)
+    units = [[m / np.linalg.norm(m) for m in s.means] for s in statics]
+    assert named.same == sem.anchors(few).same
+    pairs = [[a @ u[0] for j, v in enumerate(units) if j != k for a in v] for k, u in enumerate(units)]
+    assert named.different == pytest.approx(np.mean(pairs))
     assert math.isnan(sem.anchors(statics[:1]).same)
     assert math.isnan(sem.Anchors(0.5, 0.5).calibrated(0.5))
 

@@ -93,7 +93,7 @@ def measure(
     segments = GraphSegments()
     statistics = sem.ChannelStatistics()
     named = _object_masks(objects, views) if objects is not None else None
-    moving, static, scores = [], [], []
+    moving, static, every, scores = [], [], [], []
     for index, view in enumerate(progress(views)):
         photo, distractor = load_photo(view), masks.load(view)
         behind, known = background.load(index, view)
@@ -104,22 +104,24 @@ def measure(
             grid = backend(torch.from_numpy(photo)).numpy()
         statistics.add(grid, distractor)
         regions, _ = ndimage.label(distractor)
-        if named is None:
-            things = segments.labels(torch.from_numpy(photo))
-        else:
-            things, _ = (
-                ndimage.label(load_mask(named[view.name], view)) if view.name in named else (0 * regions, 0)
-            )
+        parts = np.where(distractor, 0, segments.labels(torch.from_numpy(photo)))
         moving.append(sem.region_means(grid, regions, sem.MIN_SHARE))
-        static.append(sem.region_means(grid, np.where(distractor, 0, things), sem.MIN_SHARE))
+        every.append(sem.region_means(grid, parts, sem.MIN_SHARE))
+        static.append(every[-1])
+        if named is not None:
+            things = _objects(named, view, distractor)
+            static[-1] = sem.region_means(grid, things, sem.MIN_SHARE)
         scores.append((view.name, counts, np.histogram(residual, BINS)[0]))
     mean, spread = statistics.mean_and_spread()
     standardise = weight_free(features)
     if standardise:
         moving = [r.standardised(mean, spread) for r in moving]
         static = [r.standardised(mean, spread) for r in static]
+        every = [r.standardised(mean, spread) for r in every]
     found = sem.matches(moving, static)
-    look = Look(backend, standardise, mean, spread, moving, static, sem.anchors(static), objects is not None)
+    look = Look(
+        backend, standardise, mean, spread, moving, static, sem.anchors(static, every), objects is not None
+    )
     return [Measured(*score, matches) for score, matches in zip(scores, found)], look
 
 
@@ -165,6 +167,15 @@ def cosine_map(look: Look, index: int, photo: np.ndarray) -> np.ndarray | None: 
 def load_photo(view: View) -> np.ndarray:  # [H, W, 3] float32 in [0, 1]
     """The photo as measured."""
     return load_image_float(view.image_path)
+
+
+def _objects(named: dict[str, Path], view: View, distractor: np.ndarray) -> np.ndarray:  # [H, W] int
+    """The static objects of a photo from 1, without what distractors hide; 0 throughout without a mask."""
+    from scipy import ndimage
+
+    if view.name not in named:
+        return np.zeros(distractor.shape, int)
+    return np.asarray(ndimage.label(load_mask(named[view.name], view) & ~distractor)[0])
 
 
 def _object_masks(folder: Path, views: list[View]) -> dict[str, Path]:

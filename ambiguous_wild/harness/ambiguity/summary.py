@@ -10,7 +10,7 @@ from ambiguous_wild.core import Scene
 from ambiguous_wild.harness.ambiguity.measure import Look, Measured, feature_family, weight_free
 from ambiguous_wild.metrics import ambiguity as am
 from ambiguous_wild.metrics import semantic as sem
-from ambiguous_wild.metrics.stats import Interval, bootstrap_interval
+from ambiguous_wild.metrics.stats import Interval
 
 LOOKS = (
     "weight-free features see looks, not meaning: a distractor in the texture of something static counts as "
@@ -82,7 +82,8 @@ def _colour(measured: list[Measured], seed: int) -> dict[str, Any]:
 
 def _semantic(measured: list[Measured], look: Look, features: str, seed: int) -> dict[str, Any]:
     photos = [m.matches for m in measured if m.matches]
-    best = bootstrap_interval([sem.photo_cosine(p) for p in photos], seed=seed)
+    # A mean is a ratio to the number of photos; without any it is missing, and not an error.
+    best = am.ratio_interval([sem.photo_cosine(p) for p in photos], [1.0] * len(photos), seed=seed)
     every = [m for p in photos for m in p]
     alike = [m for m in every if m.cosine > sem.AMBIGUOUS_ABOVE]
     px = sum(m.pixels for m in every)

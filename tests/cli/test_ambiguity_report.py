@@ -109,11 +109,12 @@ def test_own_masks_and_what_is_said_where_there_are_none(scene: Path, tmp_path: 
     shutil.copytree(scene / "truth/distractor", own)
     shutil.rmtree(scene / "truth")
     assert "--masks DIR" in error(scene)
-    assert report(scene, "--masks", own, "-o", tmp_path / "out")["occlusion"]["value"] > 0
+    blind = ("--background", "none")
+    assert report(scene, "--masks", own, "-o", tmp_path / "out", *blind)["occlusion"]["value"] > 0
     (own / TRAIN[2]).unlink()
     assert TRAIN[2] in error(scene, "--masks", own)
     cv2.imwrite(str(own / TRAIN[2]), np.zeros((48, 20), np.uint8))
-    assert "another shape" in error(scene, "--masks", own)
+    assert "another shape" in error(scene, "--masks", own, *blind)
 
 
 def test_scores_are_noted_in_scene_json_unless_told_not_to(scene: Path, tmp_path: Path) -> None:

@@ -63,10 +63,11 @@ class Anchors:
 
 
 class ChannelStatistics:
-    """Mean and spread of each channel over the static cells of all photos, from running sums.
+    """Mean and spread of each channel over all photos, distractors included, from running sums.
 
-    Features whose mean is far from zero have cosines near 1 whatever they show. Taking the static scene's
-    mean off first makes 0 the similarity of two unrelated static regions.
+    Features whose mean is far from zero have cosines near 1 whatever they show. Taking the mean off first
+    makes 0 the similarity of two unrelated regions. Over static cells alone it is worse: distractors in
+    colours that nothing else has then all lie in the same far direction (0.82 instead of 0.68 on a preset).
     """
 
     def __init__(self) -> None:
@@ -74,15 +75,9 @@ class ChannelStatistics:
         self.sum: np.ndarray | float = 0.0
         self.squares: np.ndarray | float = 0.0
 
-    def add(
-        self,
-        features: np.ndarray,  # [h, w, C]
-        distractor: np.ndarray,  # [H, W] bool
-    ) -> None:
-        """Count in one photo's cells that hold no distractor pixel."""
-        h, w, channels = features.shape
-        touched = np.bincount(_cells(distractor.shape, h, w)[distractor], minlength=h * w) > 0
-        flat = features.reshape(-1, channels)[~touched].astype(np.float64)
+    def add(self, features: np.ndarray) -> None:  # [h, w, C]
+        """Count one photo's features in."""
+        flat = features.reshape(-1, features.shape[2]).astype(np.float64)
         self.count += len(flat)
         self.sum, self.squares = self.sum + flat.sum(0), self.squares + (flat * flat).sum(0)
 

@@ -102,7 +102,7 @@ def measure(
         residual = am.colour_residual(photo, behind)[use] if behind is not None else np.empty(0)
         with torch.no_grad():
             grid = backend(torch.from_numpy(photo)).numpy()
-        statistics.add(grid, distractor)
+        statistics.add(grid)
         regions, _ = ndimage.label(distractor)
         parts = np.where(distractor, 0, segments.labels(torch.from_numpy(photo)))
         moving.append(sem.region_means(grid, regions, sem.MIN_SHARE))

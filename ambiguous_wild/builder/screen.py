@@ -49,21 +49,8 @@ def screen(capture: Capture, folder: Path, *, strict: bool, jobs: int, bar: Bar)
             return {"source": source.relative, "skipped": error.reason}, None
         finally:
             bar.step()
-        name = _lay_out(source, photo, pixels, photos)
-        facts = {
-            "source": source.relative,
-            "stem": source.stem,
-            "work_name": name,
-            "side": source.side,
-            "sha256": source.sha256,
-            "width": photo.width,
-            "height": photo.height,
-            "exif": {k: v for k, v in dataclasses.asdict(photo.exif).items() if v is not None},
-            "camera": photo.exif.camera,
-            "blur": round(sharpness(pixels), 3),
-            "mean_luma": round(float(pixels.mean()), 2),
-            "notes": list(photo.notes),
-        }
+        facts = photo_facts(source, photo, pixels)
+        facts["work_name"] = _lay_out(source, photo, pixels, photos)
         return facts, thumbnail(pixels)
 
     with ThreadPoolExecutor(jobs) as pool:
@@ -71,7 +58,7 @@ def screen(capture: Capture, folder: Path, *, strict: bool, jobs: int, bar: Bar)
     bar.finish()
     skipped = [r for r, _ in rows if "skipped" in r]
     good = [(r, t) for r, t in rows if t is not None]
-    _refuse_bad(capture, skipped, copies, len(good), strict)
+    refuse_bad(capture, skipped, copies, len(good), strict)
     facts = [r for r, _ in good]
     for fact in facts:
         fact["copies"] = [copy for copy, kept in copies.items() if kept == fact["source"]]
@@ -84,6 +71,23 @@ def screen(capture: Capture, folder: Path, *, strict: bool, jobs: int, bar: Bar)
         *drift_warnings(facts),
     ]
     return {"photos": facts, "skipped": skipped, "warnings": warnings}
+
+
+def photo_facts(source: Source, photo: Photo, pixels: np.ndarray) -> dict[str, Any]:
+    """What is recorded of one photo; `screen` adds the name structure from motion sees."""
+    return {
+        "source": source.relative,
+        "stem": source.stem,
+        "side": source.side,
+        "sha256": source.sha256,
+        "width": photo.width,
+        "height": photo.height,
+        "exif": {k: v for k, v in dataclasses.asdict(photo.exif).items() if v is not None},
+        "camera": photo.exif.camera,
+        "blur": round(sharpness(pixels), 3),
+        "mean_luma": round(float(pixels.mean()), 2),
+        "notes": list(photo.notes),
+    }
 
 
 def without_copies(capture: Capture) -> tuple[list[Source], dict[str, str]]:
@@ -206,9 +210,10 @@ def _copy_rows(copies: dict[str, str]) -> list[dict[str, Any]]:
     return [{"source": copy, "skipped": f"the same file as {kept}"} for copy, kept in copies.items()]
 
 
-def _refuse_bad(
+def refuse_bad(
     capture: Capture, skipped: list[dict[str, Any]], copies: dict[str, str], good: int, strict: bool
 ) -> None:
+    """Raise AwError where a photo cannot be read and `strict`, or too few can."""
     reasons = shortlist([f"{r['source']} ({r['skipped']})" for r in skipped], 4)
     total = len(capture.sources)
     if skipped and strict:

@@ -16,6 +16,8 @@ COMMANDS = {
     "doctor": ("doctor", "What is installed, what is missing, and the command that brings it."),
     "simulate": ("simulate", "Make a capture with exact truth: poses, distractor masks, clean views."),
     "composite": ("composite", "Put distractors with exact masks into a scene of real photos."),
+    "capture": ("capture", "Sharp, evenly spaced photos from a video, a folder or a camera."),
+    "screen": ("screen", "Check a capture: exposure, white balance, focus, blur, overlap; what to do."),
     "build-scene": ("build_scene", "From a folder of photos to a scene: check, COLMAP, downsample, split."),
     "ambiguity-report": ("ambiguity_report", "How hard are this scene's distractors to tell apart?"),
     "bench": ("bench", "Train methods on scenes and measure them."),

@@ -95,10 +95,10 @@ def to_csv(table: Table) -> str:
         head += [f"{column.key}_low", f"{column.key}_high"] if column.per_image else []
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow([_csv_text(name) for name in head])
+    writer.writerow([csv_text(name) for name in head])
     for block in table.blocks:
         for row in block.rows:
-            cells = [_csv_text(block.scene or ""), _csv_text(row.method), _status(row), str(row.runs)]
+            cells = [csv_text(block.scene or ""), csv_text(row.method), _status(row), str(row.runs)]
             for column, cell in zip(table.columns, row.cells):
                 values = [cell.value, cell.spread, *([cell.low, cell.high] if column.per_image else [])]
                 cells += [_csv_number(v) for v in values]
@@ -191,7 +191,7 @@ def _bold(text: str, cell: Cell) -> str:
     return f"**{value}** ({mark}"
 
 
-def _csv_text(text: str) -> str:
+def csv_text(text: str) -> str:
     """A cell that a spreadsheet takes for text: a leading formula character gets an apostrophe."""
     text = plain(text) if not str(text).startswith("\t") else "'" + plain(text)
     return "'" + text if text.lstrip()[:1] in ("=", "+", "-", "@") else text

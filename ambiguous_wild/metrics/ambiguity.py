@@ -1,10 +1,10 @@
-"""How hard distractors are to tell from the static scene: by colour, by look, by the share they cover.
+"""How hard distractors are to tell from what is behind them: by colour, and by the share they cover.
 
 The paper (supplement, "Evaluation of ambiguity") calls a scene colour-ambiguous when more than 30 % of the
-distractor pixels differ from the background by less than 0.3, and semantically ambiguous when the cosine
-similarity of distractors and static objects exceeds 0.7. It leaves open which norm, which background and
-which pixels; here: the L2 norm over RGB in [0, 1], the background that is truly behind the distractor,
-and distractor pixels pooled over the training photos. What is not known is counted and left out.
+distractor pixels differ from the background by less than 0.3. It leaves open which norm, which background
+and which pixels; here: the L2 norm over RGB in [0, 1], the background that is truly behind the distractor,
+and distractor pixels pooled over the training photos. What is not known is counted and left out. The
+semantic criterion is in `metrics.semantic`.
 """
 
 from __future__ import annotations
@@ -20,9 +20,7 @@ from ambiguous_wild.metrics.stats import Interval
 
 COLOUR_THRESHOLD = 0.3  # of the L2 distance in RGB; its range is [0, sqrt(3)]
 COLOUR_AMBIGUOUS_ABOVE = 0.3  # share of the distractor pixels
-SEMANTIC_AMBIGUOUS_ABOVE = 0.7  # cosine; stated by the paper for DINOv2 features
 COLOUR_METRIC = "colour_share_rgb_l2_below_0.3"
-SEMANTIC_METRIC = "semantic_cosine_labhog"
 
 
 @dataclass(frozen=True)
@@ -63,15 +61,6 @@ class ColourCounts:
     def mean_residual(self) -> float:
         """Mean colour difference over the known distractor pixels; NaN where there is none."""
         return self.residual_sum / self.known if self.known else math.nan
-
-
-@dataclass(frozen=True)
-class RegionMatch:
-    """One distractor region and the static region that looks most like it."""
-
-    pixels: int
-    cosine: float  # in [-1, 1]
-    static_label: int
 
 
 def colour_residual(
@@ -162,75 +151,6 @@ def ratio_interval(
     tail = (1.0 - level) / 2.0
     low, high = np.quantile(ratios, [tail, 1.0 - tail])
     return Interval(centre, float(low), float(high), count)
-
-
-def channel_statistics(
-    features: Sequence[np.ndarray],  # [h, w, C] each
-) -> tuple[np.ndarray, np.ndarray]:  # ([C], [C]) float64
-    """Mean and spread of each channel over all photos; a channel without spread gets 1.
-
-    Features whose mean is far from zero have cosines near 1 whatever they show. Subtracting the scene's
-    mean first makes 0 the similarity of two unrelated regions.
-    """
-    stacked = np.concatenate([f.reshape(-1, f.shape[2]) for f in features]).astype(np.float64)
-    spread = stacked.std(axis=0)
-    return stacked.mean(axis=0), np.where(spread > 1e-9, spread, 1.0)
-
-
-def region_means(
-    features: np.ndarray,  # [h, w, C], a coarser grid over the same picture
-    labels: np.ndarray,  # [H, W] int, 0 = no region
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # labels [R], means [R, C], pixels [R]
-    """Mean feature of each labelled region; a cell counts by how many of its pixels the region holds."""
-    h, w, channels = features.shape
-    rows = np.minimum(np.arange(labels.shape[0]) * h // labels.shape[0], h - 1)
-    cols = np.minimum(np.arange(labels.shape[1]) * w // labels.shape[1], w - 1)
-    cell = (rows[:, None] * w + cols[None, :])[labels > 0]
-    names, index = np.unique(labels[labels > 0], return_inverse=True)
-    weight = np.zeros((len(names), h * w))
-    np.add.at(weight, (index, cell), 1.0)
-    pixels = weight.sum(axis=1)
-    means = weight @ features.reshape(h * w, channels).astype(np.float64) / np.maximum(pixels, 1)[:, None]
-    return names, means, pixels
-
-
-def semantic_matches(
-    features: np.ndarray,  # [h, w, C] of the photo, standardised over the scene
-    distractors: np.ndarray,  # [H, W] int: distractor regions from 1, 0 = static
-    segments: np.ndarray,  # [H, W] int: segments of the photo from 1, 0 = none
-    *,
-    min_share: float = 0.002,  # of the photo's pixels; smaller regions say nothing
-) -> list[RegionMatch]:
-    """For each distractor region the static segment of the same photo that is most like it.
-
-    Pixels of distractors are taken out of the segments first. A region whose mean feature is zero has no
-    direction and is left out.
-
-    Raises:
-        AwError: label maps of different size.
-    """
-    if distractors.shape != segments.shape:
-        raise AwError(f"label maps differ in size: {list(distractors.shape)} and {list(segments.shape)}")
-    least = min_share * distractors.size
-    _, moving_mean, moving_px = region_means(features, distractors)
-    static, static_mean, static_px = region_means(features, np.where(distractors > 0, 0, segments))
-    moving_norm, static_norm = np.linalg.norm(moving_mean, axis=1), np.linalg.norm(static_mean, axis=1)
-    fixed = np.flatnonzero((static_px >= least) & (static_norm > 0))
-    matches: list[RegionMatch] = []
-    for k in np.flatnonzero((moving_px >= least) & (moving_norm > 0)):
-        if not len(fixed):
-            break
-        cosines = static_mean[fixed] @ moving_mean[k] / (static_norm[fixed] * moving_norm[k])
-        best = int(np.argmax(cosines))
-        cosine = float(np.clip(cosines[best], -1.0, 1.0))
-        matches.append(RegionMatch(int(moving_px[k]), cosine, int(static[fixed[best]])))
-    return matches
-
-
-def semantic_cosine(matches: Sequence[RegionMatch]) -> float:
-    """Mean cosine over distractor regions, by their pixels; NaN without regions."""
-    pixels = sum(m.pixels for m in matches)
-    return sum(m.pixels * m.cosine for m in matches) / pixels if pixels else math.nan
 
 
 def verdict(value: float, above: float) -> bool | None:

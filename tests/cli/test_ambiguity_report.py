@@ -15,10 +15,13 @@ from click.testing import CliRunner
 
 from ambiguous_wild.cli.ambiguity_report import command
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.ambiguity import describe
+from ambiguous_wild.harness.ambiguity.summary import describe
+from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.scene_folder import load_scene
-from ambiguous_wild.metrics.ambiguity import COLOUR_METRIC, SEMANTIC_METRIC
+from ambiguous_wild.metrics.ambiguity import COLOUR_METRIC
 from tests.tiny_scene import TRAIN, write_tiny_scene
+
+SEMANTIC_METRIC = "semantic_cosine_labhog"
 
 
 @pytest.fixture
@@ -65,7 +68,10 @@ def test_scores_are_those_of_the_files(scene: Path, tmp_path: Path) -> None:
     saved = json.loads((tmp_path / "out/ambiguity.json").read_text())
     assert saved["occlusion"] == facts["occlusion"] and len(saved["per_photo"]) == len(TRAIN)
     assert cv2.imread(str(tmp_path / "out/ambiguity.png")).std() > 5
-    assert "<table>" in (tmp_path / "out/index.html").read_text()
+    page = (tmp_path / "out/index.html").read_text()
+    assert page.count("<tr>") == 1 + len(TRAIN) and "viewport" in page
+    # It needs no other file, here or elsewhere.
+    assert "http" not in page and page.count("src=") == page.count('src="data:image/') > len(TRAIN)
 
 
 def test_a_distractor_in_the_background_s_colours_is_ambiguous(scene: Path, tmp_path: Path) -> None:
@@ -75,11 +81,17 @@ def test_a_distractor_in_the_background_s_colours_is_ambiguous(scene: Path, tmp_
     assert facts[COLOUR_METRIC]["value"] == 1.0 and facts[COLOUR_METRIC]["ambiguous"] is True
 
 
-def test_without_clean_views_colour_is_missing_and_said(scene: Path, tmp_path: Path) -> None:
+def test_without_a_background_colour_is_refused_or_left_out_on_request(scene: Path, tmp_path: Path) -> None:
     shutil.rmtree(scene / "truth/clean")
-    done = CliRunner().invoke(command, [str(scene), "-o", str(tmp_path / "out")], catch_exceptions=False)
+    assert "--background none" in error(scene, "-o", tmp_path / "out") and not (tmp_path / "out").exists()
+    words = [str(scene), "-o", str(tmp_path / "out"), "--background", "none"]
+    done = CliRunner().invoke(command, words, catch_exceptions=False)
     assert "colour: missing" in done.stdout and "no verdict" in done.stdout
     assert "100 % of the distractor pixels is unknown" in done.stdout
+    assert json.loads((tmp_path / "out/ambiguity.json").read_text())["class"] in (
+        "unknown",
+        "semantic, rest unknown",
+    )
 
 
 def test_no_distractor_pixels_give_no_verdict(scene: Path, tmp_path: Path) -> None:
@@ -97,11 +109,12 @@ def test_own_masks_and_what_is_said_where_there_are_none(scene: Path, tmp_path: 
     shutil.copytree(scene / "truth/distractor", own)
     shutil.rmtree(scene / "truth")
     assert "--masks DIR" in error(scene)
-    assert report(scene, "--masks", own, "-o", tmp_path / "out")["occlusion"]["value"] > 0
+    blind = ("--background", "none")
+    assert report(scene, "--masks", own, "-o", tmp_path / "out", *blind)["occlusion"]["value"] > 0
     (own / TRAIN[2]).unlink()
     assert TRAIN[2] in error(scene, "--masks", own)
     cv2.imwrite(str(own / TRAIN[2]), np.zeros((48, 20), np.uint8))
-    assert "another shape" in error(scene, "--masks", own)
+    assert "another shape" in error(scene, "--masks", own, *blind)
 
 
 def test_scores_are_noted_in_scene_json_unless_told_not_to(scene: Path, tmp_path: Path) -> None:
@@ -112,6 +125,60 @@ def test_scores_are_noted_in_scene_json_unless_told_not_to(scene: Path, tmp_path
     facts = report(scene, "-o", tmp_path / "out")
     noted = load_scene(scene).info["ambiguity"]
     assert noted["occlusion"] == facts["occlusion"] and noted["masks"] == "truth"
+    rest = json.loads((scene / "scene.json").read_text())
+    del rest["ambiguity"]
+    assert rest == account
+
+
+def test_nothing_but_scene_json_changes_and_the_same_call_gives_the_same_files(
+    scene: Path, tmp_path: Path
+) -> None:
+    (scene / "scene.json").write_text(
+        json.dumps({"schema_version": 1, "name": "y", "factor": 1, "files": {}})
+    )
+    files = [p for p in sorted(scene.rglob("*")) if p.is_file() and p.name != "scene.json"]
+    before = [sha256_file(p) for p in files]
+    report(scene, "-o", tmp_path / "a")
+    report(scene, "-o", tmp_path / "b")
+    assert [sha256_file(p) for p in files] == before
+    for name in ("ambiguity.json", "ambiguity.png", "index.html", "photos.csv"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
+
+
+def test_a_folder_that_is_no_report_is_not_replaced(scene: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/letter.txt").write_text("dear")
+    assert "letter.txt" in error(scene, "-o", tmp_path / "mine")
+    assert (tmp_path / "mine/letter.txt").read_text() == "dear"
+
+
+def test_keep_masks_are_the_inverse(scene: Path, tmp_path: Path) -> None:
+    facts = report(scene, "-o", tmp_path / "a")
+    (scene / "masks/train").mkdir(parents=True)
+    for name in TRAIN:
+        mask = cv2.imread(str(scene / "truth/distractor" / name), 0)
+        cv2.imwrite(str(scene / "masks/train" / name), 255 - mask)
+    kept = report(scene, "-o", tmp_path / "b", "--masks", "scene")
+    other = report(scene, "-o", tmp_path / "c", "--masks", scene / "masks/train", "--masks-white", "keep")
+    assert kept["masks"] == "scene" and other["masks"] == "folder"
+    assert kept[COLOUR_METRIC] == other[COLOUR_METRIC] == facts[COLOUR_METRIC]
+    assert "needs --run" in error(scene, "--masks", "run") and "needs --run" in error(
+        scene, "--background", "run"
+    )
+
+
+def test_names_are_escaped_on_the_page() -> None:
+    from ambiguous_wild.harness.ambiguity.page import page
+
+    interval = {"value": 0.5, "low": None, "high": None}
+    summary = {
+        "scene": "<b>x", "class": "both", "photos": 1, "masks": "m", "background": "b", "features": "labhog",
+        "seed": 0, "occlusion": {**interval, "min": 0.5, "max": 0.5},
+        COLOUR_METRIC: {**interval, "ambiguous": True, "unknown_px": 0, "distractor_px": 1},
+        SEMANTIC_METRIC: {**interval, "ambiguous": True, "compared_with": "o", "same_surface": None},
+    }  # fmt: skip
+    text = page(summary, [{"photo": "<script>"}], b"", [('"><img src=x', [b"j"])])
+    assert "<script>" not in text and "<b>x" not in text and '"><img src=x' not in text
 
 
 def test_the_report_never_goes_into_the_scene(scene: Path, tmp_path: Path) -> None:
@@ -127,7 +194,9 @@ def test_an_output_that_cannot_be_is_found_before_the_work(
     out: str, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "file").write_text("x")
-    monkeypatch.setattr("ambiguous_wild.harness.ambiguity.measure", lambda *_: pytest.fail("worked first"))
+    monkeypatch.setattr(
+        "ambiguous_wild.harness.ambiguity.measure.measure", lambda *_, **__: pytest.fail("worked first")
+    )
     assert "cannot write" in error(scene, "-o", out.format(tmp_path))
 
 

@@ -1,0 +1,63 @@
+"""`aw capture`: photos for a scene, from a video, a folder or a camera."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from pathlib import Path
+
+import click
+
+
+@click.command("capture")
+@click.argument("source")
+@click.option(
+    "-o", "--output", required=True, type=click.Path(path_type=Path), help="Folder of photos to make."
+)
+@click.option(
+    "--frames",
+    type=click.IntRange(3, 5000),
+    default=60,
+    show_default=True,
+    help="Photos to take from a video or a camera.",
+)
+@click.option(
+    "--every",
+    type=click.FloatRange(0.05, 3600),
+    default=1.0,
+    show_default=True,
+    help="Seconds between photos of a camera.",
+)
+@click.option("--jobs", type=click.IntRange(min=1), help="Threads; the result does not depend on it.")
+@click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
+def command(source: str, output: Path, frames: int, every: float, jobs: int | None, as_json: bool) -> None:
+    """Take photos from SOURCE: a video (sharp, evenly spaced frames), a folder of photos (copied with their
+    EXIF), or 'camera' ('camera:1' is the second one)."""
+    import os
+
+    from ambiguous_wild.builder import take
+    from ambiguous_wild.builder.progress import Bar
+    from ambiguous_wild.core.errors import AwError
+
+    bar = Bar(not as_json)
+    path = Path(source)
+    camera = re.fullmatch(r"camera(?::(\d{1,3}))?", source)
+    if path.is_dir():
+        facts = take.take_folder(path, output, jobs=jobs or os.cpu_count() or 1, bar=bar)
+    elif path.is_file():
+        facts = take.take_video(path, output, frames=frames, bar=bar)
+    elif camera:
+        facts = take.take_camera(int(camera[1] or 0), output, frames=frames, every_s=every, bar=bar)
+    elif source.startswith("camera"):
+        raise AwError(f"unknown camera {source!r}: write 'camera' or 'camera:1'")
+    else:
+        raise AwError(f"{source} does not exist: give a video, a folder of photos, or 'camera'")
+    if as_json:
+        click.echo(json.dumps({**facts, "capture": str(output)}, indent=2, ensure_ascii=False))
+        return
+    left = facts["left_out"]
+    if left:
+        names = ", ".join(f"{x['source']} ({x['why']})" for x in left[:3]) + (" ..." if len(left) > 3 else "")
+        click.echo("left out: " + "".join(c if c.isprintable() else "?" for c in names))
+    click.echo(f"{len(facts['photos'])} photos in {output}; next: aw screen {shlex.quote(str(output))}")

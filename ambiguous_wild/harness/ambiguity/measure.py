@@ -1,0 +1,189 @@
+"""Score every train photo; photos are read one at a time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ambiguous_wild.core import AwError, Scene, View
+from ambiguous_wild.harness.ambiguity.sources import Background, Masks, load_mask, stem
+from ambiguous_wild.io.images import load_image_float
+from ambiguous_wild.metrics import ambiguity as am
+from ambiguous_wild.metrics import semantic as sem
+
+BINS = np.linspace(0.0, math.sqrt(3.0), 53)  # of the residual; 0.3 is on no edge, so counts are kept apart
+FIT_PHOTOS = 24  # features look at so many photos, evenly chosen
+Bar = Callable[[list[View]], Iterable[View]]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One train photo."""
+
+    name: str
+    counts: am.ColourCounts
+    histogram: np.ndarray  # [52] int64, residual over the known distractor pixels
+    matches: list[sem.RegionMatch]  # of its distractors
+
+
+@dataclass(frozen=True)
+class Look:
+    """The features of a measurement, for maps: what was taken off, and every distractor's feature."""
+
+    features: Any
+    standardise: bool
+    mean: np.ndarray  # [C]
+    spread: np.ndarray  # [C]
+    distractors: list[sem.Regions]  # per photo, standardised where the features are
+    statics: list[sem.Regions]
+    anchors: sem.Anchors
+    objects: bool  # compared with static objects that the user named, not with every static region
+
+
+def feature_family(spec: str) -> str:
+    """The name of a back end without size and options: ``labhog``, ``dinov2-small``."""
+    from ambiguous_wild.vision.backends import parse
+
+    return parse(spec).name
+
+
+def weight_free(spec: str) -> bool:
+    """Whether the features carry no pretrained meaning: their channels are standardised over the scene."""
+    from ambiguous_wild.vision.backends import DINO
+
+    return feature_family(spec) not in DINO
+
+
+def measure(
+    scene: Scene,
+    masks: Masks,
+    background: Background,
+    *,
+    features: str = "labhog",
+    objects: Path | None = None,
+    cache: Path | None = None,
+    progress: Bar = iter,
+) -> tuple[list[Measured], Look]:
+    """Score every train photo.
+
+    Args:
+        scene: to measure.
+        masks: of its distractors.
+        background: what is behind them.
+        features: a back end's name, see `vision.backends`.
+        objects: masks of the static objects to compare with, white = object; None: every static segment.
+        cache: for features that learn from the scene.
+        progress: wraps the list of views, for a bar.
+
+    Raises:
+        AwError: masks, photos or features that cannot be used.
+    """
+    import torch
+    from scipy import ndimage
+
+    from ambiguous_wild.vision.segments import GraphSegments
+
+    views = list(scene.train)
+    backend = fitted(scene, features, cache)
+    segments = GraphSegments()
+    statistics = sem.ChannelStatistics()
+    named = _object_masks(objects, views) if objects is not None else None
+    moving, static, every, scores = [], [], [], []
+    for index, view in enumerate(progress(views)):
+        photo, distractor = load_photo(view), masks.load(view)
+        behind, known = background.load(index, view)
+        counts = am.colour_counts(photo, behind, distractor, known=known)
+        use = distractor if known is None else distractor & known
+        residual = am.colour_residual(photo, behind)[use] if behind is not None else np.empty(0)
+        with torch.no_grad():
+            grid = backend(torch.from_numpy(photo)).numpy()
+        statistics.add(grid)
+        regions, _ = ndimage.label(distractor)
+        parts = np.where(distractor, 0, segments.labels(torch.from_numpy(photo)))
+        moving.append(sem.region_means(grid, regions, sem.MIN_SHARE))
+        every.append(sem.region_means(grid, parts, sem.MIN_SHARE))
+        static.append(every[-1])
+        if named is not None:
+            things = _objects(named, view, distractor)
+            static[-1] = sem.region_means(grid, things, sem.MIN_SHARE)
+        scores.append((view.name, counts, np.histogram(residual, BINS)[0]))
+    mean, spread = statistics.mean_and_spread()
+    standardise = weight_free(features)
+    if standardise:
+        moving = [r.standardised(mean, spread) for r in moving]
+        static = [r.standardised(mean, spread) for r in static]
+        every = [r.standardised(mean, spread) for r in every]
+    found = sem.matches(moving, static)
+    look = Look(
+        backend, standardise, mean, spread, moving, static, sem.anchors(static, every), objects is not None
+    )
+    return [Measured(*score, matches) for score, matches in zip(scores, found)], look
+
+
+def fitted(scene: Scene, spec: str, cache: Path | None) -> Any:
+    """The features by name, fitted to the scene's train photos.
+
+    Raises:
+        AwError: unknown, without weights, or no folder for what they learn.
+    """
+    import torch
+
+    from ambiguous_wild.methods.refinesplat.inputs import train_tracks
+    from ambiguous_wild.vision.backends import make_features
+    from ambiguous_wild.vision.protocols import SceneFeatures
+
+    backend = make_features(spec)
+    views = list(scene.train)
+    if isinstance(backend, SceneFeatures):
+        photos = [torch.from_numpy(load_photo(v)) for v in views]
+        backend.fit_scene(photos, train_tracks(scene), cache)
+        return backend
+    chosen = sorted({round(i) for i in np.linspace(0, len(views) - 1, min(FIT_PHOTOS, len(views)))})
+    backend.fit([torch.from_numpy(load_photo(views[i])) for i in chosen])
+    return backend
+
+
+def cosine_map(look: Look, index: int, photo: np.ndarray) -> np.ndarray | None:  # [h, w] in [-1, 1]
+    """How like the photo's largest distractor each cell of it is; None where it has no distractor."""
+    import torch
+
+    regions = look.distractors[index]
+    if not len(regions):
+        return None
+    which = int(np.argmax(regions.pixels))
+    direction = regions.means[which] / max(float(np.linalg.norm(regions.means[which])), 1e-12)
+    with torch.no_grad():
+        grid = look.features(torch.from_numpy(photo)).numpy().astype(np.float64)
+    if look.standardise:
+        grid = (grid - look.mean) / look.spread
+    return grid @ direction / np.maximum(np.linalg.norm(grid, axis=2), 1e-12)
+
+
+def load_photo(view: View) -> np.ndarray:  # [H, W, 3] float32 in [0, 1]
+    """The photo as measured."""
+    return load_image_float(view.image_path)
+
+
+def _objects(named: dict[str, Path], view: View, distractor: np.ndarray) -> np.ndarray:  # [H, W] int
+    """The static objects of a photo from 1, without what distractors hide; 0 throughout without a mask."""
+    from scipy import ndimage
+
+    if view.name not in named:
+        return np.zeros(distractor.shape, int)
+    return np.asarray(ndimage.label(load_mask(named[view.name], view) & ~distractor)[0])
+
+
+def _object_masks(folder: Path, views: list[View]) -> dict[str, Path]:
+    if not folder.is_dir():
+        raise AwError(f"there is no folder {folder} of object masks (--objects)")
+    found = {v.name: folder / f"{stem(v)}.png" for v in views if (folder / f"{stem(v)}.png").is_file()}
+    if not found:
+        raise AwError(
+            f"{folder} holds no mask of a train photo: name them as the photos, {stem(views[0])}.png"
+        )
+    return found

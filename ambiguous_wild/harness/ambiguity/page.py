@@ -1,0 +1,159 @@
+"""The report's folder: one page that needs no other file, the picture, CSV and JSON."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import html
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ambiguous_wild.core import AwError, Scene
+from ambiguous_wild.harness.ambiguity import figure
+from ambiguous_wild.harness.ambiguity.measure import Look, Measured, load_photo
+from ambiguous_wild.harness.ambiguity.sources import Background, Masks
+from ambiguous_wild.harness.ambiguity.summary import describe, row, semantic_metric
+from ambiguous_wild.harness.render_tables import csv_text
+from ambiguous_wild.io.atomic import atomic_dir, write_json, write_text
+from ambiguous_wild.metrics import ambiguity as am
+
+FILES = ("ambiguity.json", "ambiguity.png", "index.html", "photos.csv")
+SHOWN = 8  # photos with maps on the page
+WIDTH = 420  # px of a picture on the page
+
+
+def check_folder(folder: Path) -> None:
+    """Raise AwError where the folder holds something else than a report: it would be lost."""
+    if not folder.is_dir() or not any(folder.iterdir()):
+        return
+    strange = sorted(p.name for p in folder.iterdir() if p.name not in FILES)
+    if strange or not (folder / FILES[0]).is_file():
+        raise AwError(
+            f"{folder} holds something else than a report ({strange[0] if strange else 'half of one'}); "
+            "choose another -o"
+        )
+
+
+def write_report(
+    scene: Scene,
+    masks: Masks,
+    background: Background,
+    measured: list[Measured],
+    look: Look,
+    summary: dict[str, Any],
+    out: Path,
+) -> None:
+    """Write the report into `out`, whole or not at all; an earlier report is replaced."""
+    metric = semantic_metric(summary["features"])
+    rows = [row(m, metric) for m in measured]
+    with atomic_dir(out) as folder:
+        with open(folder / "photos.csv", "w", newline="", encoding="utf-8") as f:
+            writer = csv.DictWriter(f, list(rows[0]), lineterminator="\n")
+            writer.writeheader()
+            writer.writerows({**r, "photo": csv_text(r["photo"])} for r in rows)
+        write_json(folder / "ambiguity.json", {**summary, "per_photo": rows})
+        figure.write_figure(scene, masks, background, measured, look, folder / "ambiguity.png")
+        pictures = list(_pictures(scene, masks, background, measured, look))
+        write_text(
+            folder / "index.html", page(summary, rows, (folder / "ambiguity.png").read_bytes(), pictures)
+        )
+
+
+def _pictures(
+    scene: Scene, masks: Masks, background: Background, measured: list[Measured], look: Look
+) -> Iterator[tuple[str, list[bytes]]]:
+    """Name and JPEGs (overlay, residual, cosine) of the photos on the page, by name."""
+    for index in sorted(figure.chosen(measured, SHOWN)):
+        view = scene.train[index]
+        photo, distractor = load_photo(view), masks.load(view)
+        behind, known = background.load(index, view)
+        images = [figure.overlay(photo, distractor)]
+        if behind is not None:
+            images.append(figure.residual_picture(photo, behind, known, distractor))
+        cosine = figure.cosine_picture(look, index, photo, distractor)
+        if cosine is not None:
+            images.append(cosine)
+        yield view.name, [_jpeg(image) for image in images]
+
+
+def _jpeg(image: np.ndarray) -> bytes:
+    import cv2
+
+    scale = WIDTH / image.shape[1]
+    if scale < 1:
+        image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return bytes(
+        cv2.imencode(".jpg", np.ascontiguousarray(image[:, :, ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 85])[1]
+    )
+
+
+_STYLE = """
+body{font:16px/1.45 system-ui,sans-serif;max-width:80em;margin:1.5em auto;padding:0 1em;color:#222}
+img{max-width:100%;height:auto}table{border-collapse:collapse;font-size:14px}
+td,th{padding:3px 9px;text-align:right;border-bottom:1px solid #ddd;white-space:nowrap}
+td:first-child,th:first-child{text-align:left}.wide{overflow-x:auto}.class{font-size:1.25em;font-weight:600}
+.row{display:grid;grid-template-columns:repeat(auto-fit,minmax(15em,1fr));gap:6px;margin-bottom:1.2em}
+.row img{width:100%;display:block}h3{margin:.6em 0 .2em;font-size:1em;overflow-wrap:anywhere}
+.bar{height:.9em;max-width:24rem;background:linear-gradient(90deg,#5fbaa8,#b2e0a2,#ffffbf,#fdb466,#f06744)}
+.ends{display:flex;justify-content:space-between;max-width:24rem;font-size:13px}
+"""
+_CLASSES = {
+    "both": "ambiguous in colour and semantically",
+    "colour": "ambiguous in colour",
+    "semantic": "semantically ambiguous",
+    "neither": "neither ambiguous in colour nor semantically",
+}
+_HEADS = {
+    "photo": "photo",
+    "occlusion": "covered",
+    am.COLOUR_METRIC: "colour: close share",
+    "mean_residual": "mean residual",
+    "distractor_px": "distractor px",
+    "unknown_px": "unknown px",
+    "regions": "distractors",
+}
+
+
+def page(
+    summary: dict[str, Any], rows: list[dict[str, Any]], picture: bytes, photos: list[tuple[str, list[bytes]]]
+) -> str:
+    """The page; every text of the scene is escaped, every picture is in it."""
+    title = html.escape(f"Ambiguity of {summary['scene']}")
+    verdict = _CLASSES.get(summary["class"], f"class: {summary['class']}")
+    lines = "".join(f"<li>{html.escape(line)}</li>" for line in describe(summary))
+    sources = (
+        f"{summary['photos']} train photos; masks: {summary['masks']}; background: {summary['background']}; "
+        f"features: {summary['features']}; 95 % intervals by bootstrap over photos, seed {summary['seed']}"
+    )
+    shown = "".join(
+        f"<h3>{html.escape(name)}</h3><div class=row>{''.join(_image(j, 'jpeg', name) for j in images)}</div>"
+        for name, images in photos
+    )
+    head = "".join(f"<th>{html.escape(_HEADS.get(k, 'semantic: cosine'))}</th>" for k in rows[0])
+    body = "".join("<tr>" + "".join(f"<td>{_cell(v)}</td>" for v in r.values()) + "</tr>" for r in rows)
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width,initial-scale=1">'
+        f"<title>{title}</title><style>{_STYLE}</style></head><body><h1>{title}</h1>"
+        f"<p class=class>{html.escape(verdict)}</p><ul>{lines}</ul><p>{html.escape(sources)}</p>"
+        f"<h2>Photos</h2><p>Distractors in red; their residual to the background; and how like the largest "
+        "distractor everything in the photo is.</p><div class=bar></div><div class=ends><span>alike</span>"
+        f"<span>different</span></div>{shown}"
+        f"<h2>Distributions</h2>{_image(picture, 'png', 'masks, maps and distributions')}"
+        f"<h2>Every photo</h2><div class=wide><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody>"
+        "</table></div></body></html>\n"
+    )
+
+
+def _image(data: bytes, kind: str, name: str) -> str:
+    text = base64.b64encode(data).decode("ascii")
+    return f'<img alt="{html.escape(name)}" src="data:image/{kind};base64,{text}">'
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return "–"
+    return html.escape(f"{value:.3f}" if isinstance(value, float) else str(value))

@@ -1,0 +1,170 @@
+"""From measured photos to the scene's scores, its class, and the sentences that say so."""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Any
+
+from ambiguous_wild.core import Scene
+from ambiguous_wild.harness.ambiguity.measure import Look, Measured, feature_family, weight_free
+from ambiguous_wild.metrics import ambiguity as am
+from ambiguous_wild.metrics import semantic as sem
+from ambiguous_wild.metrics.stats import Interval
+
+LOOKS = (
+    "weight-free features see looks, not meaning: a distractor in the texture of something static counts as "
+    "like it; --objects names the static objects to compare with, --features dinov2-small sees kinds "
+    "of things"
+)
+NAMED = "weight-free features see looks, not meaning; compared with the objects named"
+REAL = "raw cosine, as the paper's"
+
+
+def semantic_metric(features: str) -> str:
+    """The score's name with its variant: ``semantic_cosine_labhog``."""
+    return "semantic_cosine_" + re.sub(r"[^a-z0-9]+", "_", feature_family(features).lower())
+
+
+def summarise(
+    scene: Scene,
+    measured: list[Measured],
+    look: Look,
+    *,
+    features: str = "labhog",
+    masks: str = "truth",
+    background: str = "clean",
+    seed: int = 0,
+) -> dict[str, Any]:
+    """The scene's scores with 95 % intervals over photos; what is undefined is None."""
+    colour, semantic = _colour(measured, seed), _semantic(measured, look, features, seed)
+    counts = [m.counts for m in measured]
+    covered = am.ratio_interval([c.distractor for c in counts], [c.pixels for c in counts], seed=seed)
+    shares = [c.occlusion for c in counts]
+    return {
+        "scene": scene.name,
+        "photos": len(measured),
+        "masks": masks,
+        "background": background,
+        "features": features,
+        "seed": seed,
+        "class": classify(colour["ambiguous"], semantic["ambiguous"]),
+        "occlusion": {**_interval(covered), "min": min(shares), "max": max(shares)},
+        am.COLOUR_METRIC: colour,
+        semantic_metric(features): semantic,
+    }
+
+
+def classify(colour: bool | None, semantic: bool | None) -> str:
+    """colour, semantic, both or neither; where a verdict is missing, what is known, and "unknown"."""
+    if colour is None or semantic is None:
+        known = "colour" if colour else "semantic" if semantic else ""
+        return f"{known}, rest unknown" if known else "unknown"
+    return {(1, 1): "both", (1, 0): "colour", (0, 1): "semantic", (0, 0): "neither"}[
+        (int(colour), int(semantic))
+    ]
+
+
+def _colour(measured: list[Measured], seed: int) -> dict[str, Any]:
+    counts = [m.counts for m in measured]
+    total = am.pooled(counts)
+    share = am.ratio_interval([c.close for c in counts], [c.known for c in counts], seed=seed)
+    return {
+        **_interval(share),
+        "threshold": am.COLOUR_THRESHOLD,
+        "ambiguous_above": am.COLOUR_AMBIGUOUS_ABOVE,
+        "ambiguous": am.verdict(share.mean, am.COLOUR_AMBIGUOUS_ABOVE),
+        "mean_residual": _number(total.mean_residual),
+        "distractor_px": total.distractor,
+        "unknown_px": total.unknown,
+    }
+
+
+def _semantic(measured: list[Measured], look: Look, features: str, seed: int) -> dict[str, Any]:
+    photos = [m.matches for m in measured if m.matches]
+    # A mean is a ratio to the number of photos; without any it is missing, and not an error.
+    best = am.ratio_interval([sem.photo_cosine(p) for p in photos], [1.0] * len(photos), seed=seed)
+    every = [m for p in photos for m in p]
+    alike = [m for m in every if m.cosine > sem.AMBIGUOUS_ABOVE]
+    px = sum(m.pixels for m in every)
+    note = REAL if not weight_free(features) else NAMED if look.objects else LOOKS
+    return {
+        **_interval(best),
+        "ambiguous_above": sem.AMBIGUOUS_ABOVE,
+        "ambiguous": am.verdict(best.mean, sem.AMBIGUOUS_ABOVE),
+        "compared_with": "objects" if look.objects else "static segments",
+        "mean_over_distractors": _number(sem.mean_cosine(every)),
+        "share_above": _number(sum(m.pixels for m in alike) / px) if px else None,
+        "same_surface": _number(look.anchors.same),
+        "unrelated": _number(look.anchors.different),
+        "calibrated": _number(look.anchors.calibrated(best.mean)),
+        "photos": len(photos),
+        "note": note,
+    }
+
+
+def row(m: Measured, metric: str) -> dict[str, Any]:
+    """One line of the table of photos."""
+    return {
+        "photo": m.name,
+        "occlusion": _number(m.counts.occlusion),
+        am.COLOUR_METRIC: _number(m.counts.close_share),
+        "mean_residual": _number(m.counts.mean_residual),
+        metric: _number(sem.photo_cosine(m.matches)),
+        "distractor_px": m.counts.distractor,
+        "unknown_px": m.counts.unknown,
+        "regions": len(m.matches),
+    }
+
+
+def describe(summary: dict[str, Any]) -> list[str]:
+    """The scores as sentences, for the terminal and the page."""
+    colour, covered = summary[am.COLOUR_METRIC], summary["occlusion"]
+    look = summary[semantic_metric(summary["features"])]
+    lines = [
+        f"occlusion: {_percent(covered)} of a train photo, from {100 * covered['min']:.1f} to "
+        f"{100 * covered['max']:.1f} %",
+        f"colour: {_percent(colour)} of the distractor pixels are within {am.COLOUR_THRESHOLD} of their "
+        f"background: {_word(colour)} (limit {100 * am.COLOUR_AMBIGUOUS_ABOVE:.0f} %)",
+        f"semantic: cosine {_value(look)} of a photo's most similar distractor to the "
+        f"{look['compared_with']}: {_word(look)} (limit {sem.AMBIGUOUS_ABOVE})",
+    ]
+    if look["same_surface"] is not None:
+        lines.append(
+            f"with {summary['features']}, a static region scores {look['same_surface']:.2f} against other "
+            f"photos of itself and {look['unrelated']:.2f} against unrelated ones; {look['note']}"
+        )
+    if colour["unknown_px"]:
+        share = 100 * colour["unknown_px"] / colour["distractor_px"]
+        lines.append(
+            f"the background of {share:.0f} % of the distractor pixels is unknown: left out of colour"
+        )
+    return lines
+
+
+def _percent(score: dict[str, Any]) -> str:
+    if score["value"] is None:
+        return "missing"
+    text = f"{100 * score['value']:.1f} %"
+    return text if score["low"] is None else f"{text} [{100 * score['low']:.1f}, {100 * score['high']:.1f}]"
+
+
+def _value(score: dict[str, Any]) -> str:
+    if score["value"] is None:
+        return "missing"
+    text = f"{score['value']:.3f}"
+    return text if score["low"] is None else f"{text} [{score['low']:.3f}, {score['high']:.3f}]"
+
+
+def _word(score: dict[str, Any]) -> str:
+    word = {None: "no verdict", True: "AMBIGUOUS", False: "not ambiguous"}[score["ambiguous"]]
+    close = score["low"] is not None and score["low"] <= score["ambiguous_above"] <= score["high"]
+    return f"{word}, but the interval crosses the limit" if close else word
+
+
+def _interval(interval: Interval) -> dict[str, float | None]:
+    return {"value": _number(interval.mean), "low": _number(interval.low), "high": _number(interval.high)}
+
+
+def _number(value: float) -> float | None:
+    return None if math.isnan(value) else round(float(value), 6)

@@ -1,0 +1,137 @@
+"""`aw capture` on videos and folders made on the spot."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from ambiguous_wild.builder import take
+from ambiguous_wild.cli.capture import command
+from ambiguous_wild.core import AwError
+from tests.builder.capture_maker import texture, write_capture
+
+FRAMES, SHARP_EVERY = 48, 8
+
+
+def write_video(path: Path, frames: int = FRAMES) -> Path:
+    """A pan over a texture; frames 4, 12, 20, ... are sharp, the others are not."""
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 24.0, (160, 120))
+    assert writer.isOpened()
+    for i in range(frames):
+        frame = np.ascontiguousarray(texture(1)[100:220, 2 * i : 2 * i + 160])
+        if i % SHARP_EVERY != SHARP_EVERY // 2:
+            frame = cv2.GaussianBlur(frame, (0, 0), 3)
+        writer.write(frame)
+    writer.release()
+    return path
+
+
+def error(*words: object) -> str:
+    raised = CliRunner().invoke(command, [str(w) for w in words]).exception
+    assert isinstance(raised, AwError), raised
+    assert "\n" not in str(raised)
+    return str(raised)
+
+
+def test_frames_are_the_sharp_ones_and_evenly_spaced(tmp_path: Path) -> None:
+    video, out = write_video(tmp_path / "v.avi"), tmp_path / "raw"
+    done = CliRunner().invoke(
+        command, [str(video), "-o", str(out), "--frames", "6", "--json"], catch_exceptions=False
+    )
+    facts = json.loads(done.stdout)
+    assert [p["frame"] for p in facts["photos"]] == list(range(4, FRAMES, SHARP_EVERY))
+    assert facts["photos"][1]["time_s"] == pytest.approx(12 / 24)
+    assert sorted(p.name for p in out.iterdir()) == [
+        "capture.json",
+        *(f"frame_{k:05d}.jpg" for k in range(1, 7)),
+    ]
+    saved = cv2.imread(str(out / "frame_00001.jpg")).astype(int)
+    assert np.abs(saved - texture(1)[100:220, 8:168].astype(int)).mean() < 12  # two times JPEG
+
+
+def test_stretches_of_equals_keep_their_distance() -> None:
+    flat = np.full((16, 16, 3), 7, np.uint8)
+    frames = ((i, i / 10, flat) for i in range(40))
+    got = [f.index for f in take.sharpest(frames, [0, 10, 20, 30, 40])]
+    assert len(got) == 4 and np.diff(got).min() >= 5
+    one_each = [f.index for f in take.sharpest(((i, 0.0, flat) for i in range(4)), [0, 1, 2, 3, 4])]
+    assert one_each == [0, 1, 2, 3]
+
+
+def test_a_folder_is_copied_byte_for_byte_once_each(tmp_path: Path) -> None:
+    paths = write_capture(tmp_path / "in", 4)
+    (tmp_path / "in/a b;$(x)\n.jpg").write_bytes(paths[0].read_bytes())
+    (tmp_path / "in/bad.jpg").write_bytes(b"none")
+    done = CliRunner().invoke(
+        command, [str(tmp_path / "in"), "-o", str(tmp_path / "raw")], catch_exceptions=False
+    )
+    assert "4 photos in" in done.stdout and "bad.jpg (no image" in done.stdout
+    facts = json.loads((tmp_path / "raw/capture.json").read_text())
+    assert len(facts["photos"]) == 4 and len(facts["left_out"]) == 2
+    for photo in facts["photos"]:
+        assert "\n" not in photo["photo"] and " " not in photo["photo"]
+        assert (tmp_path / "raw" / photo["photo"]).read_bytes() == (
+            tmp_path / "in" / photo["source"]
+        ).read_bytes()
+
+
+def test_bad_sources_are_one_line_and_leave_nothing(tmp_path: Path) -> None:
+    out = tmp_path / "raw"
+    (tmp_path / "text.mp4").write_text("no video " * 100)
+    (tmp_path / "empty.mp4").write_bytes(b"")
+    (tmp_path / "nothing").mkdir()
+    assert "no video that can be read" in error(tmp_path / "text.mp4", "-o", out)
+    assert "is empty" in error(tmp_path / "empty.mp4", "-o", out)
+    assert "holds no photos" in error(tmp_path / "nothing", "-o", out)
+    assert "does not exist" in error(tmp_path / "absent", "-o", out)
+    assert "unknown camera" in error("camera:front", "-o", out)
+    assert "there is no camera 99" in error("camera:99", "-o", out)
+    video = write_video(tmp_path / "v.avi", 5)
+    assert "has 5 frames, 6 were asked for" in error(video, "-o", out, "--frames", 6)
+    pattern = tmp_path / "%02d.avi"
+    video.rename(pattern)
+    assert "'%' in its name" in error(pattern, "-o", out, "--frames", 3)
+    assert [p.name for p in tmp_path.iterdir() if "raw" in p.name] == []
+
+
+def test_an_output_that_exists_is_left_alone(tmp_path: Path) -> None:
+    write_capture(tmp_path / "in", 3)
+    (tmp_path / "raw").mkdir()
+    (tmp_path / "raw/mine.txt").write_text("x")
+    assert "nothing is overwritten" in error(tmp_path / "in", "-o", tmp_path / "raw")
+    assert "lies inside" in error(tmp_path / "in", "-o", tmp_path / "in/raw")
+    assert [p.name for p in (tmp_path / "raw").iterdir()] == ["mine.txt"]
+
+
+def test_a_camera_that_stops_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Camera:
+        def __init__(self) -> None:
+            self.left = 40
+
+        def isOpened(self) -> bool:
+            return True
+
+        def get(self, _: int) -> float:
+            return 10.0
+
+        def grab(self) -> bool:
+            return True
+
+        def read(self) -> tuple[bool, np.ndarray]:
+            self.left -= 1
+            return self.left >= 0, texture(1)[:64, :64] + np.uint8(max(self.left, 0))
+
+        def release(self) -> None:
+            pass
+
+    monkeypatch.setattr(take, "_open", lambda _: Camera())
+    facts = take.take_camera(0, tmp_path / "ok", frames=4, every_s=1.0)
+    assert [p["frame"] // 10 for p in facts["photos"]] == [0, 1, 2, 3]
+    with pytest.raises(AwError, match="stopped after 4 of 9"):
+        take.take_camera(0, tmp_path / "raw", frames=9, every_s=1.0)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["ok"]

@@ -1,0 +1,44 @@
+"""`aw screen`: the table, its JSON, and what --strict refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from ambiguous_wild.cli.screen import command
+from ambiguous_wild.core import AwError
+from tests.builder.capture_maker import write_capture
+
+
+@pytest.fixture(scope="module")
+def raw(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A good capture with one file that is no photo, under a name that would colour a terminal."""
+    folder = tmp_path_factory.mktemp("capture") / "raw"
+    write_capture(folder, 5)
+    (folder / "\x1b[31mz.jpg").write_bytes(b"none")
+    return folder
+
+
+def test_the_table_says_what_and_why_and_writes_nothing(raw: Path) -> None:
+    before = sorted(raw.iterdir())
+    done = CliRunner().invoke(command, [str(raw)], catch_exceptions=False)
+    assert done.exit_code == 0 and sorted(raw.iterdir()) == before
+    assert "1 of 6 photos are left out" in done.stdout and "-> mend or remove them" in done.stdout
+    assert "5 photos: 1 of 10 checks failed" in done.stdout and "\x1b[31mz" not in done.stdout
+
+
+def test_json_holds_the_same_and_strict_refuses(raw: Path) -> None:
+    done = CliRunner().invoke(command, [str(raw), "--json", "--strict"])
+    assert isinstance(done.exception, AwError) and done.exception.exit_code == 2
+    assert str(done.exception).count("files:") == 1
+    facts = json.loads(done.stdout)
+    assert {c["name"]: c["state"] for c in facts["checks"]}["overlap"] == "ok"
+    assert facts["photos"] == 5 and len(facts["skipped"]) == 1
+
+
+def test_no_capture_is_one_line(tmp_path: Path) -> None:
+    raised = CliRunner().invoke(command, [str(tmp_path / "absent")]).exception
+    assert isinstance(raised, AwError) and "does not exist" in str(raised)

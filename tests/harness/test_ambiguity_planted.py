@@ -1,0 +1,155 @@
+"""The report on scenes whose class is planted, and on a simulated capture against its truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from scipy import ndimage
+
+from ambiguous_wild.harness.ambiguity import measure, sources, summary
+from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.metrics.ambiguity import COLOUR_METRIC
+from ambiguous_wild.simulate.capture import simulate
+from ambiguous_wild.simulate.presets import preset
+from ambiguous_wild.vision.labhog import LabHog
+from tests.tiny_scene import TRAIN, write_tiny_scene
+
+W, H = 160, 120
+OBJECT = (slice(70, 110), slice(10, 50))  # the static thing, in every photo at its place
+SEMANTIC = "semantic_cosine_labhog"
+
+
+def stripes(h: int, w: int) -> np.ndarray:
+    """Slanted stripes of blue and white."""
+    i, j = np.mgrid[:h, :w]
+    return np.where(((i + j) // 5 % 2)[..., None], [230, 235, 240], [30, 40, 200]).astype(np.uint8)
+
+
+def plant(root: Path, kind: str) -> tuple[Path, Path]:
+    """A scene of the class, and the masks of its static thing."""
+    write_tiny_scene(root)
+    (root / "truth/clean").mkdir()
+    objects = root.parent / "objects"
+    objects.mkdir()
+    rng = np.random.default_rng(0)
+    wall = cv2.resize(
+        rng.integers(90, 150, (12, 16, 3)).astype(np.uint8), (W, H), interpolation=cv2.INTER_CUBIC
+    )
+    for k, name in enumerate(TRAIN):
+        clean = np.roll(wall, 7 * k, axis=1)
+        clean[OBJECT] = stripes(40, 40)
+        photo, mask = clean.copy(), np.zeros((H, W), np.uint8)
+        like_wall = (slice(8, 60), slice(10 + 4 * k, 60 + 4 * k))
+        twin = (slice(10, 50), slice(100 + 3 * k, 140 + 3 * k))
+        if kind in ("colour", "both"):
+            photo[like_wall] = photo[like_wall] + 12
+            mask[like_wall] = 255
+        if kind in ("semantic", "both"):
+            photo[twin] = stripes(40, 40)
+            mask[twin] = 255
+        if kind == "neither":
+            photo[twin] = (250, 10, 120)
+            mask[twin] = 255
+        still = np.zeros((H, W), np.uint8)
+        still[OBJECT] = 255
+        for path, image in (("images", photo), ("truth/clean", clean)):
+            cv2.imwrite(str(root / path / name), image[:, :, ::-1])
+        cv2.imwrite(str(root / "truth/distractor" / name), mask)
+        cv2.imwrite(str(objects / name), still)
+    for name in ("test_0.png", "test_1.png"):
+        cv2.imwrite(str(root / "images" / name), wall[:, :, ::-1])
+    return root, objects
+
+
+@pytest.mark.parametrize("kind", ["colour", "semantic", "both", "neither"])
+def test_a_scene_is_classified_as_it_was_made(kind: str, tmp_path: Path) -> None:
+    root, objects = plant(tmp_path / "scene", kind)
+    facts = report(root, objects)
+    assert facts["class"] == kind, facts
+    assert facts[SEMANTIC]["unrelated"] < facts[SEMANTIC]["same_surface"] <= 1
+
+
+def report(root: Path, objects: Path | None = None) -> dict:
+    scene = load_scene(root)
+    masks = sources.find_masks(scene, None, None)
+    behind = sources.find_background(scene, None, None, masks)
+    measured, look = measure.measure(scene, masks, behind, objects=objects)
+    return summary.summarise(scene, measured, look)
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scene straight from a capture's truth: no COLMAP between."""
+    root = tmp_path_factory.mktemp("simulated")
+    spec = replace(preset("tiny"), train_views=4, test_views=2, width=160, height=90, detail_px_per_m=30.0)
+    facts = simulate(spec, root / "raw", seed=3)
+    scene = write_tiny_scene(root / "scene")
+    for old in [*(scene / "images").iterdir(), *(scene / "truth/distractor").iterdir()]:
+        old.unlink()
+    (scene / "truth/clean").mkdir()
+    names = []
+    for photo in sorted((root / "raw/train").iterdir()):
+        names.append(f"{photo.stem}.png")
+        cv2.imwrite(str(scene / "images" / names[-1]), cv2.imread(str(photo)))
+        for part in ("distractor", "clean"):
+            data = (root / "raw/truth" / part / names[-1]).read_bytes()
+            (scene / "truth" / part / names[-1]).write_bytes(data)
+    poses = "".join(f"{k} 1 0 0 0 {-k} 0 0 1 {n}\n\n" for k, n in enumerate(names, 1))
+    (scene / "sparse/0/images.txt").write_text(poses)
+    (scene / "sparse/0/cameras.txt").write_text("1 PINHOLE 160 90 120 120 80 45\n")
+    (scene / "sparse/0/points3D.txt").write_text("")
+    (scene / "train_list.txt").write_text("\n".join(names) + "\n")
+    (scene / "test_list.txt").write_text("")
+    assert len(names) == len(facts["photos"]) == 4
+    return scene
+
+
+def test_scores_equal_a_direct_computation_from_the_truth(simulated: Path) -> None:
+    facts = report(simulated)
+    photos, masks, cleans = (
+        [cv2.imread(str(p))[:, :, ::-1] / 255 for p in sorted((simulated / part).iterdir())]
+        for part in ("images", "truth/distractor", "truth/clean")
+    )
+    covered = [m[..., 0] > 0.5 for m in masks]
+    close = away = total = 0
+    for photo, clean, mask in zip(photos, cleans, covered):
+        for i, j in zip(*np.nonzero(mask)):
+            distance = sum((photo[i, j, c] - clean[i, j, c]) ** 2 for c in range(3)) ** 0.5
+            close, away, total = close + (distance < 0.3), away + distance, total + 1
+    assert facts["occlusion"]["value"] == pytest.approx(np.mean([m.mean() for m in covered]), abs=1e-6)
+    assert facts[COLOUR_METRIC]["value"] == pytest.approx(close / total, abs=1e-6)
+    assert facts[COLOUR_METRIC]["mean_residual"] == pytest.approx(away / total, abs=1e-6)
+    assert facts[COLOUR_METRIC]["distractor_px"] == total
+
+
+def test_the_cosine_equals_a_direct_computation(tmp_path: Path) -> None:
+    root, objects = plant(tmp_path / "scene", "both")
+    facts = report(root, objects)
+    photos = [
+        torch.from_numpy((cv2.imread(str(root / "images" / n))[:, :, ::-1] / 255).astype(np.float32))
+        for n in TRAIN
+    ]
+    features = LabHog()
+    features.fit(photos)
+    grids = np.stack([features(p).numpy() for p in photos]).astype(float)
+    grids = (grids - grids.mean((0, 1, 2))) / grids.std((0, 1, 2))
+
+    def mean(k: int, mask: np.ndarray) -> np.ndarray:
+        big = grids[k].repeat(4, 0).repeat(4, 1)  # cells of 4 px
+        return big[mask].mean(0) / np.linalg.norm(big[mask].mean(0))
+
+    still = [cv2.imread(str(objects / n), 0) > 127 for n in TRAIN]
+    things = [mean(k, still[k]) for k in range(len(TRAIN))]
+    best = []
+    for k, name in enumerate(TRAIN):
+        regions, count = ndimage.label(cv2.imread(str(root / "truth/distractor" / name), 0) > 127)
+        cosines = [
+            mean(k, regions == r) @ t for r in range(1, count + 1) for j, t in enumerate(things) if j != k
+        ]
+        best.append(max(cosines))
+    assert facts[SEMANTIC]["value"] == pytest.approx(np.mean(best), abs=1e-4)

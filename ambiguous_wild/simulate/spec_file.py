@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,18 @@ class _Loader(yaml.SafeLoader):
                 raise AwError(f"line {key.start_mark.line + 1}: the key {key.value!r} is there twice")
             seen.add(key.value)
         return super().construct_mapping(node, deep)
+
+
+class _Dumper(yaml.SafeDumper):
+    """YAML's safe dumper; lists of numbers and words on one line, and no aliases."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+    def represent_sequence(self, tag: str, sequence: Any, flow_style: Any = None) -> Any:
+        node = super().represent_sequence(tag, sequence, flow_style)
+        node.flow_style = not any(isinstance(child, yaml.MappingNode) for child in node.value)
+        return node
 
 
 def is_spec_file(name: str) -> bool:
@@ -85,8 +97,6 @@ def parse_spec(text: str) -> CaptureSpec:
 
 
 def _built(data: dict[Any, Any], effects: Effects) -> CaptureSpec:
-    from dataclasses import replace
-
     try:
         spec = from_plain(CaptureSpec, {str(k): v for k, v in data.items()}, "spec")
     except TypeError as error:  # a distractor without its kind
@@ -126,7 +136,7 @@ def _effects(named: Any) -> Effects:
 
 def dump_spec(spec: CaptureSpec) -> str:
     """The spec as YAML, every value of it; `parse_spec` gives the same spec back."""
-    return yaml.safe_dump(plain_spec(spec), sort_keys=False, allow_unicode=True, width=110)
+    return yaml.dump(plain_spec(spec), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=110)
 
 
 def plain_spec(spec: CaptureSpec) -> dict[str, Any]:

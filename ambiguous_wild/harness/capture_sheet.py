@@ -10,7 +10,7 @@ import numpy as np
 
 from ambiguous_wild.harness import strips
 from ambiguous_wild.io.images import read_gray, read_png_rgb
-from ambiguous_wild.io.palette import MASKED, tint
+from ambiguous_wild.io.palette import ADDED, MASKED, tint
 
 NAME = "sheet.jpg"
 COLUMNS, WIDTH = 4, 320  # photos in a row, px of each
@@ -59,9 +59,12 @@ def _caption(name: str, facts: dict[str, Any]) -> str:
 def _truth(raw: Path, name: str) -> list[np.ndarray]:
     stem = Path(name).stem
     mask = read_gray(raw / "truth" / "distractor" / f"{stem}.png") >= 128
-    photo = read_png_rgb(raw / "train" / name)
+    shown = tint(read_png_rgb(raw / "train" / name), mask, MASKED)
+    shadow = raw / "truth" / "shadow" / f"{stem}.png"
+    if shadow.is_file():
+        shown = tint(shown, read_gray(shadow) >= 128, ADDED)
     return [
-        _cell(f"{stem} mask", tint(photo, mask, MASKED)),
+        _cell(f"{stem} mask, shadow" if shadow.is_file() else f"{stem} mask", shown),
         _cell(f"{stem} clean", read_png_rgb(raw / "truth" / "clean" / f"{stem}.png")),
     ]
 

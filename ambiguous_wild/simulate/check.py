@@ -8,6 +8,7 @@ from dataclasses import fields
 
 from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.simulate.effects.settings import Effects
+from ambiguous_wild.simulate.ground_plan import SURFACES
 from ambiguous_wild.simulate.spec import CaptureSpec, Distractor, Thing
 
 # What the courtyard can be painted with; `world.py` bakes them (a test compares the two).
@@ -15,7 +16,6 @@ SHEET_NAMES = ("stone", "foliage", "timber", "clay", "skin", "brick", "gravel", 
 PICTURES = tuple(
     f"poster_{name}" for name in ("coffee", "rocket", "chelsea", "hubble", "coins", "camera", "retina")
 )
-SURFACES = ("ground", "wall_back", "wall_left", "wall_right")
 
 
 def check_spec(spec: CaptureSpec) -> CaptureSpec:

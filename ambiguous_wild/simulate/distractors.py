@@ -13,12 +13,13 @@ import numpy as np
 
 from ambiguous_wild.core.camera import Camera
 from ambiguous_wild.simulate.effects import specular
+from ambiguous_wild.simulate.ground_plan import BACK_M, FRONT_M, HALF_WIDTH_M
 from ambiguous_wild.simulate.kernels import BOX, ELLIPSOID
 from ambiguous_wild.simulate.shapes import Shape, banner, barrier, figure, placed, pole, shape_table
 from ambiguous_wild.simulate.spec import STATUES, CaptureSpec, Distractor
 from ambiguous_wild.simulate.things import placard, statue
 from ambiguous_wild.simulate.tracer import ShapeTable, trace
-from ambiguous_wild.simulate.world import BACK_M, FRONT_M, HALF_WIDTH_M, World
+from ambiguous_wild.simulate.world import World
 
 _TRIES = 80  # layouts drawn for a photo before the best of them is taken
 _SAME_PLACE_M = 0.6  # closer than this is the same place

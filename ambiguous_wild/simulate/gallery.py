@@ -62,7 +62,7 @@ def _placard(name: str, texture: str, ambiguity: str, **more: object) -> Distrac
 
 
 _PLAIN = (RED, BLUE, PARCEL)
-_WALK = ((-3.0, -2.2), (3.0, -1.6))
+_WALK = ((-3.0, -1.5), (3.0, -1.0))
 
 _WORLDS = (
     CaptureSpec(
@@ -72,6 +72,17 @@ _WORLDS = (
             _statue("second bust", "bust", "stone"),
             _statue("second hound", "hound", "clay"),
             _statue("second knot", "knot", "stone"),
+        ),
+        world=_STATUES,
+        designed=designed("both"),
+    ),
+    CaptureSpec(
+        "painted",
+        "the same field; the bust, hound and knot that are carried about are painted in loud colours",
+        (
+            _statue("blue bust", "bust", "cloth", tint=AZURE),
+            _statue("red hound", "hound", "cloth", tint=CRIMSON),
+            _statue("magenta knot", "knot", "cloth", tint=MAGENTA),
         ),
         world=_STATUES,
         designed=designed("semantic"),
@@ -107,8 +118,8 @@ _WORLDS = (
         "flat banners: a blue one, and copies of two pictures that hang on the walls",
         (
             _placard("blue banner", "cloth", "none", tint=AZURE, size=1.2),
-            _placard("second cat", "poster_chelsea", "semantic"),
-            _placard("second coffee", "poster_coffee", "semantic"),
+            _placard("second galaxy", "poster_hubble", "semantic"),
+            _placard("second rocket", "poster_rocket", "semantic"),
         ),
         designed=designed("semantic"),
     ),
@@ -116,8 +127,10 @@ _WORLDS = (
         "walkers",
         "three visitors who walk to and fro through the whole capture",
         (
-            replace(VISITOR, path="walk", waypoints=_WALK, laps=2.5, presence=0.95),
-            replace(RED, path="walk", waypoints=((2.6, -0.9), (-2.6, -2.4)), laps=3.5, presence=0.8),
+            replace(
+                RED, name="visitor in blue", tint=AZURE, path="walk", waypoints=_WALK, laps=2.5, presence=0.95
+            ),
+            replace(RED, path="walk", waypoints=((2.6, -0.5), (-2.6, -2.0)), laps=3.5, presence=0.8),
             replace(
                 RED,
                 name="visitor in yellow",
@@ -147,7 +160,10 @@ _CAMERAS = (
         "shaky",
         "an unsteady hand: rolling shutter and motion blur",
         _PLAIN,
-        effects=fx.Effects(rolling_shutter=fx.RollingShutter(), motion_blur=fx.MotionBlur()),
+        effects=fx.Effects(
+            rolling_shutter=fx.RollingShutter(speed_deg_s=18.0),
+            motion_blur=fx.MotionBlur(exposure_s=1 / 30, speed_deg_s=18.0),
+        ),
         designed=designed("neither", "pose"),
     ),
     CaptureSpec(
@@ -207,7 +223,7 @@ _DAYS = (
         "glossy",
         "polished stone, clay and timber, nobody there",
         occlusion=(0.0, 0.0),
-        effects=fx.Effects(specular=fx.Specular(textures=("stone", "clay", "timber"))),
+        effects=fx.Effects(specular=fx.Specular(("stone", "clay", "timber"), strength=1.0, sharpness=30.0)),
         designed=designed("neither", "sh", anyone=False),
     ),
     CaptureSpec(

@@ -53,7 +53,7 @@ PRESETS = {
             "courtyard-twin",
             "two statues like the one that stands still",
             (TWIN, replace(TWIN, name="third statue")),
-            designed=designed("semantic"),
+            designed=designed("both"),
         ),
         CaptureSpec(
             "courtyard-plain",

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from ambiguous_wild.simulate.ground_plan import SURFACES
 from ambiguous_wild.simulate.kernels import BOX, BY_FACE, CYLINDER, ELLIPSOID, VOLUME
-from ambiguous_wild.simulate.shapes import Shape, between, figure, placed
+from ambiguous_wild.simulate.shapes import SHEET_M, Shape, between, figure, placed
 from ambiguous_wild.simulate.spec import STATUES, Thing
 
 
@@ -16,10 +17,17 @@ def statue(name: str, texture: str, height_m: float) -> Shape:
 
 
 def board(texture: str, width_m: float, height_m: float, thick_m: float, lift_m: float = 0.0) -> Shape:
-    """An upright board that faces -y and that its texture covers once."""
+    """An upright board that faces -y: a picture covers it once, of anything else it shows a piece.
+
+    Of a wall the piece is one that is as high up as the board: what it covers looks like that.
+    """
     half = (width_m / 2, thick_m / 2, height_m / 2)
-    once = (1.0 / width_m, 1.0 / height_m)
-    return Shape(BOX, (0, 0, lift_m + height_m / 2), half, texture, scale=once)
+    middle = (0.0, 0.0, lift_m + height_m / 2)
+    if texture.startswith("poster_"):
+        return Shape(BOX, middle, half, texture, scale=(1.0 / width_m, 1.0 / height_m))
+    across, up = SURFACES.get(texture, (SHEET_M, SHEET_M))
+    level = middle[2] / up if texture.startswith("wall_") else 0.5
+    return Shape(BOX, middle, half, texture, scale=(1.0 / across, 1.0 / up), offset=(0.5, level))
 
 
 def placard(texture: str) -> list[Shape]:

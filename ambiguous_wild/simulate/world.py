@@ -14,16 +14,12 @@ import numpy as np
 
 from ambiguous_wild.simulate import textures as tx
 from ambiguous_wild.simulate.atlas import Atlas, build_atlas
+from ambiguous_wild.simulate.ground_plan import BACK_M, FRONT_M, GROUND_M, HALF_WIDTH_M, WALL_HEIGHT_M
 from ambiguous_wild.simulate.kernels import BOX, CYLINDER, DOME, ELLIPSOID, PLANAR, QUAD
 from ambiguous_wild.simulate.shapes import SHEET_M, Axes, Shape, between, figure, placed, shape_table, vector
 from ambiguous_wild.simulate.spec import WorldSpec
 from ambiguous_wild.simulate.things import circle_of, shapes_of_thing
 from ambiguous_wild.simulate.tracer import Light, ShapeTable
-
-GROUND_M = (16.0, 14.0)
-WALL_HEIGHT_M = 3.4
-HALF_WIDTH_M, BACK_M, FRONT_M = 5.6, 4.2, -6.0  # side walls at x = +-5.6, back wall at y = 4.2
-
 
 POSTERS = ("coffee", "rocket", "chelsea", "hubble", "coins", "camera", "retina")
 

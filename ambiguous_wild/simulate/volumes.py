@@ -1,7 +1,7 @@
 """Statues as signed distance functions, baked to grids that the ray caster marches through.
 
-A volume fills the cube [-1, 1]^3 around a shape's centre, z up, and stays inside the unit sphere; the
-shape's half size scales it. Distances are those of a smooth union of primitives: a lower bound, close to
+A volume lies in the cube [-1, 1]^3 around a shape's centre, z up, its foot at z = -0.9; the shape's half
+size scales it. Distances are those of a smooth union of primitives: a lower bound, close to
 exact near the surface (Quilez, "distance functions").
 """
 
@@ -68,7 +68,7 @@ def _bust(p: np.ndarray) -> np.ndarray:
     """Head and shoulders on a foot."""
     return _joined(
         [
-            _block(p, (0, 0, -0.78), (0.3, 0.26, 0.1)),
+            _block(p, (0, 0, -0.78), (0.3, 0.26, 0.12)),
             _rod(p, (0, 0, -0.7), (0, 0, -0.45), 0.15),
             _ball(p, (0, 0.02, -0.3), (0.52, 0.27, 0.28)),
             _rod(p, (0, 0.02, -0.2), (0, -0.03, 0.2), 0.14),
@@ -89,7 +89,7 @@ def _knot(p: np.ndarray) -> np.ndarray:
         [np.sin(t) + 2 * np.sin(2 * t), -np.sin(3 * t), np.cos(t) - 2 * np.cos(2 * t)], axis=-1
     ) + (0.0, 0.0, 0.12)
     rods = np.stack([_rod(p, tuple(a), tuple(b), 0.13) for a, b in zip(curve[:-1:2], curve[2::2])])
-    return _joined([rods.min(0), _block(p, (0, 0, -0.68), (0.4, 0.4, 0.12))])
+    return _joined([rods.min(0), _block(p, (0, 0, -0.73), (0.4, 0.4, 0.17))])
 
 
 def _hound(p: np.ndarray) -> np.ndarray:
@@ -99,7 +99,7 @@ def _hound(p: np.ndarray) -> np.ndarray:
     ears = [_rod(p, (x, -0.16, 0.62), (1.3 * x, -0.1, 0.8), 0.05) for x in (-0.13, 0.13)]
     return _joined(
         [
-            _block(p, (0, 0, -0.82), (0.36, 0.45, 0.06)),
+            _block(p, (0, 0, -0.82), (0.36, 0.45, 0.08)),
             _rod(p, (0, 0.22, -0.5), (0, -0.18, 0.12), 0.24),
             *legs,
             *thighs,

@@ -202,7 +202,7 @@ _DAYS = (
         "white-balance",
         "automatic white balance that turns warm and cold",
         _PLAIN,
-        effects=fx.Effects(white_balance=fx.WhiteBalance()),
+        effects=fx.Effects(white_balance=fx.WhiteBalance(warmth=0.9, tint=0.15)),
         designed=designed("neither", "appearance"),
     ),
     CaptureSpec(

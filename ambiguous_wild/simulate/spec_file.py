@@ -123,7 +123,7 @@ def _lists(data: dict[Any, Any]) -> None:
 def _effects(named: Any) -> Effects:
     if not isinstance(named, Mapping):
         raise AwError(f"effects: one 'effect: {{}}' a line, got {named!r}")
-    values = {}
+    values: dict[str, Any] = {}
     for name, settings in named.items():
         if name not in KINDS:
             raise unknown("effect", str(name), KINDS, "docs/simulation.md lists them")

@@ -140,7 +140,8 @@ def _draw(
             continue
         if distractor.path == "walk":
             place = _on_its_way(which, distractor, len(earlier) / max(spec.train_views - 1, 1))
-            if _free(place, world, []):
+            away = np.hypot(*(camera.center[:2] - (place.x_m, place.y_m)))
+            if away >= distractor.distance_m[0] and _free(place, world, []):
                 layout.append(place)
             continue
         for _ in range(12):

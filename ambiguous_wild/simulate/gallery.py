@@ -62,6 +62,7 @@ def _placard(name: str, texture: str, ambiguity: str, **more: object) -> Distrac
 
 
 _PLAIN = (RED, BLUE, PARCEL)
+_WALKER = replace(RED, path="walk", distance_m=(1.3, 4.5))
 _WALK = ((-3.0, -1.5), (3.0, -1.0))
 
 _WORLDS = (
@@ -127,15 +128,12 @@ _WORLDS = (
         "walkers",
         "three visitors who walk to and fro through the whole capture",
         (
+            replace(_WALKER, name="visitor in blue", tint=AZURE, waypoints=_WALK, laps=2.5, presence=0.95),
+            replace(_WALKER, waypoints=((2.6, -0.5), (-2.6, -2.0)), laps=3.5, presence=0.8),
             replace(
-                RED, name="visitor in blue", tint=AZURE, path="walk", waypoints=_WALK, laps=2.5, presence=0.95
-            ),
-            replace(RED, path="walk", waypoints=((2.6, -0.5), (-2.6, -2.0)), laps=3.5, presence=0.8),
-            replace(
-                RED,
+                _WALKER,
                 name="visitor in yellow",
                 tint=YELLOW,
-                path="walk",
                 waypoints=((-3.4, 0.4), (-1.0, -1.2), (1.2, -0.9), (3.0, 0.0)),
                 laps=1.5,
                 presence=0.7,

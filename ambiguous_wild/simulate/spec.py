@@ -47,7 +47,7 @@ class Distractor:
     ambiguity: Ambiguity  # why it is hard: the background's colour, the statue's shape, or not at all
     head: str = ""  # a visitor's head and hands, where they are not of the same sheet
     presence: float = 0.85  # duty cycle: share of the train photos in which it is put
-    distance_m: tuple[float, float] = (1.9, 4.5)  # from the camera
+    distance_m: tuple[float, float] = (1.9, 4.5)  # from the camera; of a walker the smallest alone counts
     size: float = 1.0  # times its natural size: figures 1.75 m, ball 0.8 m, pole 2 m, statues 1.6 m
     lift_m: float = 0.0  # how far above the ground it may fly
     tint: Colour = (1.0, 1.0, 1.0)  # the texture is multiplied by it, in linear light

@@ -98,6 +98,7 @@ def test_a_walker_keeps_to_its_way_and_speed() -> None:
         "cloth",
         "none",
         presence=1.0,
+        distance_m=(0.3, 4.5),
         path="walk",
         waypoints=((-3.0, -2.0), (3.0, -2.0)),
         laps=1.0,
@@ -114,8 +115,13 @@ def test_a_walker_keeps_to_its_way_and_speed() -> None:
         {round(s.placements[0].yaw_deg) % 360 for s in shots[5:8]},
     )
     assert yaws == ({90}, {270})
+    shy = replace(spec, distractors=(replace(walker, distance_m=(3.0, 4.5)),))
+    cameras = [s.camera for s in shots[:9]]
+    there = lay_out(shy, cameras, world, np.random.default_rng(0))
+    away = [np.hypot(*(c.center[:2] - (at, -2.0))) for c, at in zip(cameras, x)]
+    assert [bool(p) for p in there] == [d >= 3.0 for d in away] and 0 < sum(map(bool, there)) < 9
     rare = replace(spec, distractors=(replace(walker, presence=0.3),))
-    placed = lay_out(rare, [s.camera for s in shots[:9]], world, np.random.default_rng(0))
+    placed = lay_out(rare, cameras, world, np.random.default_rng(0))
     assert 0 < sum(bool(p) for p in placed) < 9
 
 

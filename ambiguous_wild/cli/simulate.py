@@ -1,4 +1,4 @@
-"""`aw simulate`: a capture with exact truth."""
+"""`aw simulate`: a capture with exact truth, from a preset or a YAML spec."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 import click
 
 if TYPE_CHECKING:
-    from ambiguous_wild.simulate.presets import CaptureSpec
+    from ambiguous_wild.simulate.spec import CaptureSpec
 
 
 @click.command("simulate")
-@click.argument("name", required=False)
+@click.argument("name", metavar="NAME|SPEC.yaml", required=False)
 @click.option("-o", "--out", type=click.Path(path_type=Path, file_okay=False), help="Folder to write.")
 @click.option(
     "--seed", type=click.IntRange(0), default=0, show_default=True, help="World, walk and distractors."
@@ -24,6 +24,10 @@ if TYPE_CHECKING:
 @click.option("--width", type=int, help="Width of a photo in px, 16:9.")
 @click.option("--depth", is_flag=True, help="Also write depth maps of the static scene.")
 @click.option("--overwrite", is_flag=True, help="Replace an earlier capture in this folder.")
+@click.option(
+    "--sheet/--no-sheet", default=True, show_default=True, help="Write truth/sheet.jpg, a contact sheet."
+)
+@click.option("--print-spec", is_flag=True, help="Print the capture as YAML, ready to be changed, and stop.")
 @click.option("--list", "listing", is_flag=True, help="List the captures there are.")
 @click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
 def command(
@@ -34,19 +38,29 @@ def command(
     width: int | None,
     depth: bool,
     overwrite: bool,
+    sheet: bool,
+    print_spec: bool,
     listing: bool,
     as_json: bool,
 ) -> None:
-    """Make the capture NAME: photos with distractors, clean test photos, and the exact truth."""
+    """Make a capture: photos with distractors, clean test photos, and the exact truth.
+
+    NAME is one of --list; SPEC.yaml says world, walk, distractors and effects (docs/simulation.md). What it
+    leaves out is as in the courtyard.
+    """
     from ambiguous_wild.core.errors import AwError
     from ambiguous_wild.simulate.presets import PRESETS, preset, resized
+    from ambiguous_wild.simulate.spec_file import dump_spec, is_spec_file, plain_spec, read_spec
 
     if listing:
         _print_list(PRESETS.values(), as_json)
         return
     if name is None:
         raise AwError("name a capture: " + ", ".join(PRESETS) + " ('aw simulate --list' describes them)")
-    spec = resized(preset(name), views, width)
+    spec = resized(read_spec(name) if is_spec_file(name) else preset(name), views, width)
+    if print_spec:
+        click.echo(dump_spec(spec), nl=False)
+        return
     if out is None:
         raise AwError(f"say where to write: aw simulate {name} -o raw")
 
@@ -57,31 +71,46 @@ def command(
     from ambiguous_wild.simulate.capture import simulate
 
     def bar(shots: list) -> tqdm:
-        return tqdm(shots, unit="photo", desc=f"simulate {name}", disable=as_json or None)
+        return tqdm(shots, unit="photo", desc=f"simulate {spec.name}", disable=as_json or None)
 
     check_output(out)
     with folder_lock(out, f"aw simulate {name}"):
         sweep_siblings(out)  # of a call that was killed
         facts = simulate(spec, out, seed, depth, overwrite, bar)
+        if sheet and not (facts["reused"] and (out / "truth" / "sheet.jpg").is_file()):
+            from ambiguous_wild.harness.capture_sheet import write_capture_sheet
+
+            write_capture_sheet(out)
     if as_json:
         click.echo(json.dumps({k: v for k, v in facts.items() if k not in ("files", "photos")}, indent=2))
         return
     share = facts["occlusion"]
     state = "already there, unchanged" if facts["reused"] else "wrote"
+    who = (
+        f"{len(spec.distractors)} distractors cover {100 * share['min']:.0f} to {100 * share['max']:.0f} % "
+        f"(mean {100 * share['mean']:.1f} %) of a train photo"
+    )
     click.echo(
         f"{state}: {out}: {spec.train_views} train and {spec.test_views} test photos of "
-        f"{spec.width}x{spec.height}; {len(spec.distractors)} distractors cover "
-        f"{100 * share['min']:.0f} to {100 * share['max']:.0f} % (mean {100 * share['mean']:.1f} %) of a train photo"
+        f"{spec.width}x{spec.height}; {who if spec.distractors else 'nobody there'}"
     )
+    effects = list(plain_spec(spec)["effects"])
+    if effects:
+        click.echo(f"effects: {', '.join(effects)}")
+    if sheet:
+        click.echo(f"look at: {out / 'truth' / 'sheet.jpg'}")
     scene = out.parent / f"{out.name}-scene"
     click.echo(f"next: aw build-scene {shlex.quote(str(out))} -o {shlex.quote(str(scene))}")
 
 
 def _print_list(specs: Iterable[CaptureSpec], as_json: bool) -> None:
-    rows = [(s.name, f"{s.train_views}+{s.test_views}", f"{s.width}x{s.height}", s.summary) for s in specs]
+    rows = [
+        (s.name, f"{s.train_views}+{s.test_views}", f"{s.width}x{s.height}", s.designed.ambiguity, s.summary)
+        for s in specs
+    ]
     if as_json:
-        keys = ("name", "views", "size", "summary")
+        keys = ("name", "views", "size", "designed", "summary")
         click.echo(json.dumps([dict(zip(keys, row)) for row in rows], indent=2))
         return
-    for name, count, size, summary in rows:
-        click.echo(f"{name:18s} {count:>6s}  {size:9s} {summary}")
+    for name, count, size, ambiguity, summary in rows:
+        click.echo(f"{name:18s} {count:>6s}  {size:9s} {ambiguity:9s} {summary}")

@@ -3,10 +3,12 @@
 RAW/train/IMG_0001.jpg ...        with distractors
 RAW/test/IMG_0101.jpg ...         other viewpoints, nobody there
 RAW/truth/cameras.json            name -> size, fx, fy, cx, cy, cam_from_world (OpenCV axes, metres)
-RAW/truth/distractor/<stem>.png   255 where any sample of the pixel hit a distractor, else 0
-RAW/truth/clean/<stem>.png        the train photo with nobody there, before JPEG
+RAW/truth/distractor/<stem>.png   255 where any part of the pixel shows a distractor, else 0
+RAW/truth/clean/<stem>.png        the train photo with nobody there, same effects, before JPEG
+RAW/truth/shadow/<stem>.png       with moving shadows: 255 where one darkens the static scene
 RAW/truth/depth/<stem>.png        optional: z of the static surface, 16 bit, millimetres
-RAW/truth/capture.json            spec, seed, versions, occlusion per photo, who stands where, sha256
+RAW/truth/capture.json            spec, seed, versions, what it was designed as; per photo occlusion, who
+                                  stands where, what the effects drew; sha256 of every file
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -27,88 +29,22 @@ from ambiguous_wild.core.config import config_hash, to_plain
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.atomic import atomic_dir, write_json
 from ambiguous_wild.io.hashing import sha256_file
-from ambiguous_wild.simulate.atlas import linear_to_srgb
-from ambiguous_wild.simulate.distractors import Placement, lay_out, movers
-from ambiguous_wild.simulate.presets import CaptureSpec
-from ambiguous_wild.simulate.tracer import trace
+from ambiguous_wild.simulate.develop import Developed, Shot, depth_m, develop
+from ambiguous_wild.simulate.distractors import lay_out
+from ambiguous_wild.simulate.effects.moment import Moment
+from ambiguous_wild.simulate.phone import write_photo, write_png
+from ambiguous_wild.simulate.spec import CaptureSpec
+from ambiguous_wild.simulate.spec_file import plain_spec
+from ambiguous_wild.simulate.walk import plan_cameras
 from ambiguous_wild.simulate.world import World, courtyard
 
-_FULL_FRAME_DIAGONAL_MM = 43.2666  # of 36 x 24 mm
-_LENS_MM = 4.2  # what the simulated phone states as its focal length
-_DATE = "2025:06:14 15:{:02d}:{:02d}"
-
-
-@dataclass(frozen=True)
-class Shot:
-    """One photo to take."""
-
-    name: str  # IMG_0001.jpg
-    split: str  # train or test
-    camera: Camera
-    placements: tuple[Placement, ...]
-
-
 Progress = Callable[[list[Shot]], Iterable[Shot]]
-
-
-def focal_px(spec: CaptureSpec) -> float:
-    """Focal length in px of the stated 35 mm equivalent: the same angle over the diagonal (CIPA)."""
-    return spec.focal_35mm / _FULL_FRAME_DIAGONAL_MM * float(np.hypot(spec.width, spec.height))
-
-
-def look_at(eye: np.ndarray, target: np.ndarray, roll_deg: float) -> np.ndarray:
-    """cam_from_world [4, 4] of a camera at `eye` that looks at `target`; z is up in the world."""
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(forward, (0.0, 0.0, 1.0))
-    right /= np.linalg.norm(right)
-    down = np.cross(forward, right)
-    c, s = np.cos(np.deg2rad(roll_deg)), np.sin(np.deg2rad(roll_deg))
-    rotation = np.stack([c * right + s * down, c * down - s * right, forward])
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ eye
-    return pose
-
-
-def plan_cameras(
-    spec: CaptureSpec, world: World, rng: np.random.Generator
-) -> tuple[list[Camera], list[Camera]]:
-    """The walk: train cameras along an arc that sways near and far, high and low; test cameras inside it.
-
-    Test viewpoints lie at other angles than any train photo, between the near and the far, the high and
-    the low of the walk, so that they are new but not beyond what was seen.
-    """
-    half = np.deg2rad(spec.arc_deg / 2)
-    phase = rng.uniform(0, 2 * np.pi, 2)
-
-    def camera(azimuth: float, sway: float, rise: float, shake: float) -> Camera:
-        radius = np.interp(sway, (-1, 1), spec.radius_m)
-        height = np.interp(rise, (-1, 1), spec.eye_m)
-        center = np.array([world.statue[0], world.statue[1] - 0.3])
-        eye = np.array([*(center + radius * np.array([np.sin(azimuth), -np.cos(azimuth)])), height])
-        target = np.array([*center, 1.25]) + rng.normal(0, 0.16, 3) * shake
-        f = focal_px(spec)
-        pose = look_at(eye, target, float(rng.normal(0, 1.2)) * shake)
-        return Camera(spec.width, spec.height, f, f, spec.width / 2, spec.height / 2, pose)
-
-    step = 2 * half / (spec.train_views - 1)
-    train = []
-    for k in range(spec.train_views):
-        azimuth = -half + step * (k + (rng.uniform(-0.25, 0.25) if 0 < k < spec.train_views - 1 else 0))
-        turn = 2 * np.pi * 3 * k / spec.train_views
-        sway, rise = np.sin(turn + phase[0]), np.sin(1.7 * turn + phase[1])
-        train.append(camera(azimuth, float(sway), float(rise), 1.0))
-    test = []
-    for k in range(spec.test_views):
-        gap = round((k + 0.5) / spec.test_views * (spec.train_views - 1) - 0.5)
-        azimuth = -half + step * (gap + rng.uniform(0.35, 0.65))
-        test.append(camera(azimuth, rng.uniform(-0.6, 0.6), rng.uniform(-0.6, 0.6), 0.7))
-    return train, test
 
 
 def plan(spec: CaptureSpec, seed: int) -> tuple[World, list[Shot]]:
     """Build the world and decide every shot; world, walk and layout draw from independent streams."""
     paint, walk, stand = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(3))
-    world = courtyard(paint, spec.detail_px_per_m, spec.samples)
+    world = courtyard(paint, spec.detail_px_per_m, spec.samples, spec.world)
     train, test = plan_cameras(spec, world, walk)
     layouts = lay_out(spec, train, world, stand)
     first_test = 100 * (spec.train_views // 100 + 1) + 1
@@ -144,10 +80,12 @@ def simulate(
         return {**earlier, "reused": True}
     world, shots = plan(spec, seed)
     with atomic_dir(out) as folder:
-        for part in ("train", "test", "truth/distractor", "truth/clean", *(["truth/depth"] if depth else [])):
+        shadow = ["truth/shadow"] if spec.effects.moving_shadow is not None else []
+        optional = [*shadow, *(["truth/depth"] if depth else [])]
+        for part in ("train", "test", "truth/distractor", "truth/clean", *optional):
             (folder / part).mkdir(parents=True)
-        photos = _render(spec, world, shots, folder, depth, progress)
-        write_json(folder / "truth" / "cameras.json", {s.name: _camera_json(s.camera) for s in shots})
+        photos = _render(spec, world, shots, seed, folder, depth, progress)
+        write_json(folder / "truth" / "cameras.json", {s.name: _camera_json(spec, s.camera) for s in shots})
         files = sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
         facts = _facts(spec, seed, identity, photos)
         facts["files"] = {name: sha256_file(folder / name) for name in files}
@@ -156,26 +94,30 @@ def simulate(
 
 
 def _render(
-    spec: CaptureSpec, world: World, shots: list[Shot], folder: Path, depth: bool, progress: Progress
+    spec: CaptureSpec,
+    world: World,
+    shots: list[Shot],
+    seed: int,
+    folder: Path,
+    depth: bool,
+    progress: Progress,
 ) -> dict[str, Any]:
-    static = world.table()
     photos: dict[str, Any] = {}
     pending: list[Future[None]] = []
     with ThreadPoolExecutor(2) as writers:  # encoders leave the interpreter free: they run beside the rays
         for number, shot in enumerate(progress(shots)):
-            seen = trace(shot.camera, static, movers(spec, shot.placements, world), world.atlas, world.light)
-            photo = _to_uint8(seen.distracted)
-            pending.append(writers.submit(_write_photo, folder / shot.split / shot.name, photo, spec, number))
-            truth, stem = folder / "truth", Path(shot.name).stem
+            moment = Moment(seed, number, number / max(spec.train_views - 1, 1))
+            made = develop(spec, world, shot, moment)
+            path, truth = folder / shot.split / shot.name, folder / "truth"
+            pending.append(
+                writers.submit(write_photo, path, made.photo, spec, shot.camera, number, made.effects)
+            )
+            for part, pixels in _truth(world, shot, made, depth):
+                pending.append(
+                    writers.submit(write_png, truth / part / f"{Path(shot.name).stem}.png", pixels)
+                )
             if shot.split == "train":
-                mask = np.where(seen.owner > 0, 255, 0).astype(np.uint8)
-                pending.append(writers.submit(_write_png, truth / "distractor" / f"{stem}.png", mask))
-                clean = _to_uint8(seen.clean)
-                pending.append(writers.submit(_write_png, truth / "clean" / f"{stem}.png", clean))
-                photos[shot.name] = _photo_facts(spec, shot, seen.owner)
-            if depth:
-                millimetres = np.clip(np.round(1000 * seen.depth_m), 0, 65535).astype(np.uint16)
-                pending.append(writers.submit(_write_png, truth / "depth" / f"{stem}.png", millimetres))
+                photos[shot.name] = _photo_facts(spec, shot, made)
             while len(pending) > 12:
                 pending.pop(0).result()
         for task in pending:
@@ -183,13 +125,30 @@ def _render(
     return photos
 
 
-def _photo_facts(spec: CaptureSpec, shot: Shot, owner: np.ndarray) -> dict[str, Any]:
-    shares = np.bincount(owner.ravel(), minlength=len(spec.distractors) + 1) / owner.size
+def _truth(world: World, shot: Shot, made: Developed, depth: bool) -> Iterable[tuple[str, np.ndarray]]:
+    """The folder and the pixels of every truth picture of the shot."""
+    if shot.split == "train":
+        yield "distractor", np.where(made.owner > 0, 255, 0).astype(np.uint8)
+        yield "clean", made.clean
+        if made.shadow is not None:
+            yield "shadow", np.where(made.shadow, 255, 0).astype(np.uint8)
+    if depth:
+        millimetres = np.round(1000 * depth_m(world, shot.camera))
+        yield "depth", np.clip(millimetres, 0, 65535).astype(np.uint16)
+
+
+def _photo_facts(spec: CaptureSpec, shot: Shot, made: Developed) -> dict[str, Any]:
+    shares = np.bincount(made.owner.ravel(), minlength=len(spec.distractors) + 1) / made.owner.size
     standing = []
     for place in shot.placements:
         what, share = spec.distractors[place.which], round(float(shares[place.which + 1]), 6)
         standing.append({"distractor": what.name, "occlusion": share, **asdict(place)})
-    return {"occlusion": round(float(shares[1:].sum()), 6), "distractors": standing}
+    facts = {"occlusion": round(float(shares[1:].sum()), 6), "distractors": standing}
+    if made.shadow is not None:
+        facts["shadow"] = round(float(made.shadow.mean()), 6)
+    if made.effects:
+        facts["effects"] = made.effects
+    return facts
 
 
 def _facts(spec: CaptureSpec, seed: int, identity: str, photos: dict[str, Any]) -> dict[str, Any]:
@@ -200,8 +159,11 @@ def _facts(spec: CaptureSpec, seed: int, identity: str, photos: dict[str, Any]) 
         "seed": seed,
         "identity": identity,
         "version": {"ambiguous_wild": __version__, "scikit-image": version("scikit-image")},
-        "spec": to_plain(spec),
-        "mask": "255 where any sample of a pixel hit a distractor; distractors throw no shadow on the scene",
+        "spec": plain_spec(spec),
+        "designed": to_plain(spec.designed),
+        "mask": "255 where any part of a pixel shows a distractor; distractors throw no shadow on the scene",
+        "clean": "same camera, same effects, nobody there nor anybody's shadow, before JPEG",
+        "test": "nobody there; of the effects only specular and lens_distortion",
         "occlusion": {"mean": float(np.mean(shares)), "min": min(shares), "max": max(shares)},
         "photos": photos,
         "licence": "CC0; textures from photographs in scikit-image that are CC0 or in the public domain",
@@ -210,13 +172,16 @@ def _facts(spec: CaptureSpec, seed: int, identity: str, photos: dict[str, Any]) 
 
 def _code_hash() -> str:
     """What the simulator is, so that a capture of an older one is not taken for this one's."""
-    sources = sorted(Path(__file__).parent.glob("*.py"))
+    here = Path(__file__).parent
+    sources = sorted([*here.glob("*.py"), *here.glob("effects/*.py")])
     return config_hash([__version__, *(sha256_file(p) for p in sources)])
 
 
-def _camera_json(camera: Camera) -> dict[str, Any]:
+def _camera_json(spec: CaptureSpec, camera: Camera) -> dict[str, Any]:
     keys = ("width", "height", "fx", "fy", "cx", "cy")
-    return {**{k: getattr(camera, k) for k in keys}, "cam_from_world": camera.cam_from_world.tolist()}
+    facts = {**{k: getattr(camera, k) for k in keys}, "cam_from_world": camera.cam_from_world.tolist()}
+    lens = spec.effects.lens_distortion
+    return facts if lens is None else {**facts, "distortion": {"k1": lens.k1, "k2": lens.k2}}
 
 
 def _earlier(out: Path, identity: str, overwrite: bool) -> dict[str, Any] | None:
@@ -239,45 +204,3 @@ def _earlier(out: Path, identity: str, overwrite: bool) -> dict[str, Any] | None
         return None
     why = "with files changed since" if same else "of other settings or another version"
     raise AwError(f"{out} holds a capture ({made}) {why}; add --overwrite to replace it or choose another -o")
-
-
-def _to_uint8(linear: np.ndarray) -> np.ndarray:
-    return np.round(255.0 * linear_to_srgb(linear)).astype(np.uint8)
-
-
-def _write_png(path: Path, pixels: np.ndarray) -> None:
-    from PIL import Image
-
-    Image.fromarray(pixels).save(path, compress_level=3)
-
-
-def _write_photo(path: Path, pixels: np.ndarray, spec: CaptureSpec, number: int) -> None:
-    """JPEG at quality 95 without chroma subsampling, with the EXIF of a phone whose settings are locked."""
-    from PIL import Image
-
-    Image.fromarray(pixels).save(path, quality=95, subsampling=0, exif=_exif(spec, number))
-
-
-def _exif(spec: CaptureSpec, number: int) -> Any:
-    from PIL import Image, TiffImagePlugin
-
-    def rational(value: float) -> Any:
-        return TiffImagePlugin.IFDRational(round(value * 10000), 10000)
-
-    taken = _DATE.format(number * 4 // 60 % 60, number * 4 % 60)
-    exif = Image.Exif()
-    exif[0x010F], exif[0x0110] = "ambiguous_wild", "simulated phone"
-    exif[0x0131], exif[0x0132] = f"ambiguous_wild {__version__}", taken
-    camera = exif.get_ifd(0x8769)
-    camera[0x829A] = TiffImagePlugin.IFDRational(1, 250)  # ExposureTime, s
-    camera[0x829D] = rational(1.6)  # FNumber
-    camera[0x8827] = 64  # ISO
-    camera[0x9003] = camera[0x9004] = taken
-    camera[0x920A] = rational(_LENS_MM)
-    camera[0xA402] = camera[0xA403] = 1  # exposure and white balance: manual
-    camera[0xA002], camera[0xA003] = spec.width, spec.height
-    per_inch = 25.4 * focal_px(spec) / _LENS_MM
-    camera[0xA20E] = camera[0xA20F] = rational(per_inch)  # FocalPlaneX/YResolution
-    camera[0xA210] = 2  # in inches
-    camera[0xA405] = round(spec.focal_35mm)  # FocalLengthIn35mmFilm
-    return exif

@@ -12,11 +12,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ambiguous_wild.core.camera import Camera
+from ambiguous_wild.simulate.effects import specular
+from ambiguous_wild.simulate.ground_plan import BACK_M, FRONT_M, HALF_WIDTH_M
 from ambiguous_wild.simulate.kernels import BOX, ELLIPSOID
-from ambiguous_wild.simulate.presets import CaptureSpec, Distractor
 from ambiguous_wild.simulate.shapes import Shape, banner, barrier, figure, placed, pole, shape_table
+from ambiguous_wild.simulate.spec import STATUES, CaptureSpec, Distractor
+from ambiguous_wild.simulate.things import placard, statue
 from ambiguous_wild.simulate.tracer import ShapeTable, trace
-from ambiguous_wild.simulate.world import BACK_M, FRONT_M, HALF_WIDTH_M, World
+from ambiguous_wild.simulate.world import World
 
 _TRIES = 80  # layouts drawn for a photo before the best of them is taken
 _SAME_PLACE_M = 0.6  # closer than this is the same place
@@ -63,6 +66,10 @@ def _parts(distractor: Distractor, pose: float) -> list[Shape]:
             return barrier(texture)
         case "banner":
             return banner(texture)
+        case "placard":
+            return placard(texture)
+    if distractor.kind in STATUES:
+        return [statue(distractor.kind, texture, 1.6)]
     return [Shape(ELLIPSOID, (0, 0, 0.4), (0.4, 0.4, 0.4), texture)]
 
 
@@ -77,6 +84,9 @@ def _tinted(shape: Shape, distractor: Distractor) -> Shape:
 def movers(spec: CaptureSpec, placements: tuple[Placement, ...], world: World) -> ShapeTable:
     """All distractors of one photo as a table for the ray caster."""
     shapes = [s for p in placements for s in shapes_of(spec.distractors[p.which], p)]
+    polish = spec.effects.specular
+    if polish is not None:
+        shapes = specular.specular(shapes, polish.textures, polish.strength, polish.sharpness)
     return shape_table(shapes, world.atlas)
 
 
@@ -93,6 +103,8 @@ def lay_out(
     static = world.table()
     light = replace(world.light, sun=np.ascontiguousarray(world.light.sun[:1]))  # one sample a pixel
     low, high = spec.occlusion
+    # Where all walk there is nothing to choose, and choosing who is there would bend the duty cycles.
+    tries = 1 if all(d.path == "walk" for d in spec.distractors) else _TRIES
     for camera in cameras:
         if not spec.distractors:
             chosen.append(())
@@ -101,11 +113,11 @@ def lay_out(
         best: tuple[Placement, ...] = ()
         best_gap = np.inf
         aim = rng.uniform(low, high)  # so that the shares spread over the whole band
-        for attempt in range(_TRIES):
+        for attempt in range(tries):
             layout = _draw(spec, camera, world, chosen, rng)
             seen = trace(small, static, movers(spec, layout, world), world.atlas, light)
             share = float(np.mean(seen.owner > 0))
-            tolerance = (high - low) * (0.1 + 0.4 * attempt / _TRIES)
+            tolerance = (high - low) * (0.1 + 0.4 * attempt / tries)
             gap = max(abs(share - aim) - tolerance, 0.0) + 10 * max(low - share, share - high, 0.0)
             if gap < best_gap:
                 best, best_gap = layout, gap
@@ -126,6 +138,12 @@ def _draw(
     for which, distractor in enumerate(spec.distractors):
         if rng.random() > distractor.presence:
             continue
+        if distractor.path == "walk":
+            place = _on_its_way(which, distractor, len(earlier) / max(spec.train_views - 1, 1))
+            away = np.hypot(*(camera.center[:2] - (place.x_m, place.y_m)))
+            if away >= distractor.distance_m[0] and _free(place, world, []):
+                layout.append(place)
+            continue
         for _ in range(12):
             place = _place(which, distractor, camera, rng)
             if _free(place, world, layout) and _fresh(place, earlier, spec.train_views):
@@ -141,6 +159,22 @@ def _place(which: int, distractor: Distractor, camera: Camera, rng: np.random.Ge
     flat = direction[:2] / np.linalg.norm(direction[:2])
     x, y = camera.center[:2] + rng.uniform(*distractor.distance_m) * flat
     return Placement(which, float(x), float(y), float(rng.uniform(-180, 180)), float(rng.random()))
+
+
+def _on_its_way(which: int, distractor: Distractor, progress: float) -> Placement:
+    """Where a walker is at `progress` (0 to 1) of the capture; it turns at the ends and looks ahead."""
+    corners = np.array(distractor.waypoints)
+    legs = np.linalg.norm(np.diff(corners, axis=0), axis=1)
+    along = (2 * distractor.laps * progress) % 2.0  # 0 to 1 there, 1 to 2 back
+    there = along <= 1.0
+    gone = (along if there else 2.0 - along) * legs.sum()
+    leg = min(int(np.searchsorted(np.cumsum(legs), gone)), len(legs) - 1)
+    share = (gone - legs[:leg].sum()) / max(legs[leg], 1e-9)
+    x, y = corners[leg] + share * (corners[leg + 1] - corners[leg])
+    ahead = (corners[leg + 1] - corners[leg]) * (1 if there else -1)
+    yaw = np.rad2deg(np.arctan2(ahead[1], ahead[0])) + 90.0  # figures face -y
+    stride = 0.5 + 0.5 * np.sin(2 * np.pi * 0.35 * 2 * distractor.laps * progress * legs.sum())
+    return Placement(which, float(x), float(y), float(yaw), float(stride))
 
 
 def _free(place: Placement, world: World, others: list[Placement]) -> bool:

@@ -10,7 +10,9 @@ import math
 
 import numba
 
-QUAD, BOX, ELLIPSOID, CAPSULE, CYLINDER = range(5)
+from ambiguous_wild.simulate.marching import march, slope
+
+QUAD, BOX, ELLIPSOID, CAPSULE, CYLINDER, VOLUME = range(6)
 PLANAR, BY_FACE, DOME = range(3)  # how a surface point becomes a texture coordinate
 FAR = 1e30
 
@@ -111,7 +113,10 @@ def nearest(table, which, count, o, d, far):
             continue
         h = (half[s, 0], half[s, 1], half[s, 2])
         lo, ld = _local(table, s, o[0], o[1], o[2], True), _local(table, s, d[0], d[1], d[2], False)
-        t = _intersect(kind[s], lo, ld, h, best)
+        if kind[s] == VOLUME:
+            t = march(table[13][table[12][s]], lo, ld, h[0], best)
+        else:
+            t = _intersect(kind[s], lo, ld, h, best)
         if t < best:
             best, hit = t, s
     return best, hit
@@ -129,7 +134,10 @@ def _shadowed(table, o, d):
             continue
         h = (half[s, 0], half[s, 1], half[s, 2])
         lo, ld = _local(table, s, o[0], o[1], o[2], True), _local(table, s, d[0], d[1], d[2], False)
-        if _intersect(kind[s], lo, ld, h, FAR) < FAR:
+        if kind[s] == VOLUME:
+            if march(table[13][table[12][s]], lo, ld, h[0], FAR) < FAR:
+                return True
+        elif _intersect(kind[s], lo, ld, h, FAR) < FAR:
             return True
     return False
 
@@ -203,13 +211,32 @@ def _sample(atlas, t, u, v, lod):
 
 
 @numba.njit(cache=True, error_model="numpy", inline="never")
+def _gloss(strength, sharpness, n, d, sun, sunlit, light):
+    """What a polished surface adds: the sun's highlight (Blinn) and the sheen of the sky (Schlick)."""
+    facing = -(n[0] * d[0] + n[1] * d[1] + n[2] * d[2])
+    lobe = 0.0
+    if sunlit:
+        hx, hy, hz = sun[0] - d[0], sun[1] - d[1], sun[2] - d[2]
+        cosine = (n[0] * hx + n[1] * hy + n[2] * hz) / math.sqrt(max(hx * hx + hy * hy + hz * hz, 1e-12))
+        lobe = strength * max(cosine, 0.0) ** sharpness
+    mirrored_up = 0.5 + 0.5 * (d[2] + 2.0 * facing * n[2])
+    sheen = min(strength, 1.0) * (0.04 + 0.96 * (1.0 - min(max(facing, 0.0), 1.0)) ** 5)
+    sun_colour, sky, ground = light[1], light[2], light[3]
+    return (
+        lobe * sun_colour[0] + sheen * (mirrored_up * sky[0] + (1 - mirrored_up) * ground[0]),
+        lobe * sun_colour[1] + sheen * (mirrored_up * sky[1] + (1 - mirrored_up) * ground[1]),
+        lobe * sun_colour[2] + sheen * (mirrored_up * sky[2] + (1 - mirrored_up) * ground[2]),
+    )
+
+
+@numba.njit(cache=True, error_model="numpy", inline="never")
 def shade(table, s, t, o, d, spread, atlas, light, sun, blockers, others, use_others):
     """Colour of shape s at distance t: texture, sun with shadow, sky light from above and below."""
     kind, half, mapping, uv, tint = table[0][s], table[3], table[6][s], table[7], table[8]
     lo, ld = _local(table, s, o[0], o[1], o[2], True), _local(table, s, d[0], d[1], d[2], False)
     p = (lo[0] + t * ld[0], lo[1] + t * ld[1], lo[2] + t * ld[2])
     h = (half[s, 0], half[s, 1], half[s, 2])
-    n = _normal(kind, p, h, ld)
+    n = slope(table[13][table[12][s]], p, h[0], ld) if kind == VOLUME else _normal(kind, p, h, ld)
     cosine = -(n[0] * ld[0] + n[1] * ld[1] + n[2] * ld[2])
     texture = table[5][s]
     if mapping == DOME:
@@ -244,8 +271,12 @@ def shade(table, s, t, o, d, spread, atlas, light, sun, blockers, others, use_ot
     else:
         lit = 0.0
     sun_colour, sky, ground = light[1], light[2], light[3]
+    if table[11][s, 0] > 0.0:
+        gr, gg, gb = _gloss(table[11][s, 0], table[11][s, 1], (wx, wy, wz), d, sun, lit > 0.0, light)
+    else:
+        gr, gg, gb = 0.0, 0.0, 0.0
     return (
-        r * tint[s, 0] * (lit * sun_colour[0] + up * sky[0] + (1 - up) * ground[0]),
-        g * tint[s, 1] * (lit * sun_colour[1] + up * sky[1] + (1 - up) * ground[1]),
-        b * tint[s, 2] * (lit * sun_colour[2] + up * sky[2] + (1 - up) * ground[2]),
+        gr + r * tint[s, 0] * (lit * sun_colour[0] + up * sky[0] + (1 - up) * ground[0]),
+        gg + g * tint[s, 1] * (lit * sun_colour[1] + up * sky[1] + (1 - up) * ground[1]),
+        gb + b * tint[s, 2] * (lit * sun_colour[2] + up * sky[2] + (1 - up) * ground[2]),
     )

@@ -12,7 +12,9 @@ import numpy as np
 from ambiguous_wild.simulate.atlas import Atlas
 from ambiguous_wild.simulate.kernels import BOX, BY_FACE, CAPSULE, CYLINDER, ELLIPSOID, QUAD
 from ambiguous_wild.simulate.tracer import ShapeTable
+from ambiguous_wild.simulate.volumes import grids
 
+UNSEEN = -1  # owner of what throws a shadow and is not in the picture
 SHEET_M = 2.0  # side of the square that an object's texture covers before it mirrors
 
 Vector = tuple[float, float, float]
@@ -33,7 +35,9 @@ class Shape:
     offset: tuple[float, float] = (0.5, 0.5)  # the sheet's middle, far from where it mirrors
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
     casts: bool = True
-    owner: int = 0
+    owner: int = 0  # 0: the static world, k: the k-th distractor, UNSEEN
+    gloss: tuple[float, float] = (0.0, 0.0)  # strength and sharpness of the highlight
+    volume: str = ""  # the statue that a VOLUME is
 
 
 def bounding_radius(kind: int, half: Sequence[float]) -> float:
@@ -53,6 +57,7 @@ def shape_table(shapes: Iterable[Shape], atlas: Atlas) -> ShapeTable:
     """Shapes as the columns that the ray caster reads; an empty list gives an empty table."""
     listed = list(shapes)
     count = len(listed)
+    names = sorted({s.volume for s in listed if s.volume})
     return ShapeTable(
         kind=np.array([s.kind for s in listed], np.int32),
         rotation=np.array([s.axes for s in listed], np.float64).reshape(count, 3, 3),
@@ -65,6 +70,9 @@ def shape_table(shapes: Iterable[Shape], atlas: Atlas) -> ShapeTable:
         tint=np.array([s.tint for s in listed], np.float64).reshape(count, 3),
         casts=np.array([s.casts for s in listed], np.bool_),
         owner=np.array([s.owner for s in listed], np.int32),
+        gloss=np.array([s.gloss for s in listed], np.float64).reshape(count, 2),
+        volume=np.array([names.index(s.volume) if s.volume else 0 for s in listed], np.int32),
+        grids=grids(names),
     )
 
 

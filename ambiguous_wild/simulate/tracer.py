@@ -34,7 +34,10 @@ class ShapeTable:
     uv: np.ndarray  # [S, 4] float64: scale u, scale v (texture sizes a metre), offset u, offset v
     tint: np.ndarray  # [S, 3] float64, linear light
     casts: np.ndarray  # [S] bool, whether the shape throws shadows
-    owner: np.ndarray  # [S] int32, 0 = static, k = the k-th distractor of the photo
+    owner: np.ndarray  # [S] int32, 0 = static, k = the k-th distractor of the photo, -1 = only a shadow
+    gloss: np.ndarray  # [S, 2] float64: strength and sharpness of the highlight, strength 0 = dull
+    volume: np.ndarray  # [S] int32, which of `grids` a volume is
+    grids: np.ndarray  # [V, N, N, N] float32, signed distances
 
     def columns(self) -> tuple[np.ndarray, ...]:
         """The arrays in the order in which the kernel takes them."""
@@ -50,6 +53,9 @@ class ShapeTable:
             self.tint,
             self.casts,
             self.owner,
+            self.gloss,
+            self.volume,
+            self.grids,
         )
 
 
@@ -107,6 +113,8 @@ def _cull(table, o, axis, spread, keep):
     center, radius = table[2], table[4]
     count = 0
     for s in range(len(radius)):
+        if table[10][s] < 0:
+            continue
         qx, qy, qz = center[s, 0] - o[0], center[s, 1] - o[1], center[s, 2] - o[2]
         distance = math.sqrt(qx * qx + qy * qy + qz * qz)
         if distance > radius[s]:

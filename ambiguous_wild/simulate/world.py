@@ -14,14 +14,12 @@ import numpy as np
 
 from ambiguous_wild.simulate import textures as tx
 from ambiguous_wild.simulate.atlas import Atlas, build_atlas
+from ambiguous_wild.simulate.ground_plan import BACK_M, FRONT_M, GROUND_M, HALF_WIDTH_M, WALL_HEIGHT_M
 from ambiguous_wild.simulate.kernels import BOX, CYLINDER, DOME, ELLIPSOID, PLANAR, QUAD
 from ambiguous_wild.simulate.shapes import SHEET_M, Axes, Shape, between, figure, placed, shape_table, vector
+from ambiguous_wild.simulate.spec import WorldSpec
+from ambiguous_wild.simulate.things import circle_of, shapes_of_thing
 from ambiguous_wild.simulate.tracer import Light, ShapeTable
-
-GROUND_M = (16.0, 14.0)
-WALL_HEIGHT_M = 3.4
-HALF_WIDTH_M, BACK_M, FRONT_M = 5.6, 4.2, -6.0  # side walls at x = +-5.6, back wall at y = 4.2
-
 
 POSTERS = ("coffee", "rocket", "chelsea", "hubble", "coins", "camera", "retina")
 
@@ -156,19 +154,29 @@ def _ambient_occlusion(ground: np.ndarray, circles: Iterable[Sequence[float]], p
     ground *= (1 - 0.45 * np.exp(-np.maximum(gap, 0) / 0.25))[..., None]
 
 
-def courtyard(rng: np.random.Generator, detail_px_per_m: float, samples: int = 4) -> World:
+def courtyard(
+    rng: np.random.Generator, detail_px_per_m: float, samples: int = 4, what: WorldSpec | None = None
+) -> World:
     """Build the courtyard; the generator moves and repaints it moderately.
+
+    What is left out is drawn all the same, so that the rest stays as it is with it.
 
     Args:
         rng: where the seed enters.
         detail_px_per_m: resolution of the textures, px a metre.
         samples: rays a pixel, a square number.
+        what: what stands in it; None: furniture and statue.
     """
+    what = WorldSpec() if what is None else what
     d = detail_px_per_m
     depth = BACK_M - FRONT_M
     statue = (float(rng.uniform(-0.15, 0.35)), float(rng.uniform(1.2, 1.5)), 0.95)
     furniture, circles = _furniture(rng)
-    circles.append((statue[0], statue[1], 0.65))
+    if not what.furniture:
+        furniture, circles = [], []
+    if what.statue:
+        circles.append((statue[0], statue[1], 0.65))
+    circles += [circle_of(thing) for thing in what.things]
     plinth = [
         Shape(BOX, (0, 0, 0.08), (0.55, 0.55, 0.08), "stone"),
         Shape(BOX, (0, 0, 0.52), (0.4, 0.4, 0.36), "stone", offset=(0.4, 0.2)),
@@ -192,10 +200,12 @@ def courtyard(rng: np.random.Generator, detail_px_per_m: float, samples: int = 4
         Shape(ELLIPSOID, (0, 0, -0.5), (26.0, 26.0, 26.0), "sky", mapping=DOME, casts=False),
         *_walls(rng),
         *furniture,
-        *placed(plinth, (statue[0], statue[1], 0), yaw),
-        *placed(figure("stone", "stone", 0.07, 0.8), statue, yaw),
     ]
-    keep_out = np.array(circles)
+    if what.statue:
+        shapes += placed(plinth, (statue[0], statue[1], 0), yaw)
+        shapes += placed(figure("stone", "stone", 0.07, 0.8), statue, yaw)
+    shapes += [s for thing in what.things for s in shapes_of_thing(thing)]
+    keep_out = np.array(circles, float).reshape(-1, 3)
     return World(tuple(shapes), build_atlas(textures), _light(rng, samples), keep_out, statue)
 
 

@@ -16,7 +16,9 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.simulate import capture
 from ambiguous_wild.simulate import world as world_module
+from ambiguous_wild.simulate.check import PICTURES
 from ambiguous_wild.simulate.distractors import Placement, movers, shapes_of
+from ambiguous_wild.simulate.ground_plan import SURFACES
 from ambiguous_wild.simulate.presets import PRESETS, TWIN, preset, resized
 from ambiguous_wild.simulate.tracer import trace
 
@@ -200,7 +202,10 @@ def test_presets_name_what_they_use() -> None:
     from ambiguous_wild.simulate.world import SHEETS
 
     for spec in PRESETS.values():
-        assert all(d.texture in SHEETS and (not d.head or d.head in SHEETS) for d in spec.distractors)
+        flat = (*SURFACES, *PICTURES)
+        for d in spec.distractors:
+            assert d.texture in SHEETS or (d.kind == "placard" and d.texture in flat)
+            assert not d.head or d.head in SHEETS
     assert not PRESETS["courtyard-clean"].distractors
     assert {d.ambiguity for d in PRESETS["courtyard"].distractors} == {"colour", "semantic", "none"}
     assert {d.ambiguity for d in PRESETS["courtyard-plain"].distractors} == {"none"}

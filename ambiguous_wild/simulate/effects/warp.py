@@ -1,0 +1,74 @@
+"""Effects that move pixels, in one resampling: lens, rolling shutter and motion blur.
+
+The pinhole picture is traced larger than the photo and finer by a whole factor; each fine pixel of the
+photo looks up where its ray meets that picture. All weights are non-negative, so the support of a mask
+under the same weights is exactly the set of pixels that the masked ones reach.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ambiguous_wild.core.camera import Camera
+
+
+def fine_points(camera: Camera, fine: int) -> np.ndarray:
+    """Normalised coordinates [H fine, W fine, 2] of the photo's fine pixels on the sensor."""
+    u = ((np.arange(camera.width * fine) + 0.5) / fine - camera.cx) / camera.fx
+    v = ((np.arange(camera.height * fine) + 0.5) / fine - camera.cy) / camera.fy
+    return np.stack(np.meshgrid(u, v), axis=-1)
+
+
+def turned(points: np.ndarray, turns: np.ndarray) -> np.ndarray:
+    """Where the rays of the points go in the unturned camera.
+
+    Args:
+        points: [H, W, 2] normalised, of the turned camera.
+        turns: [H, 3] the turn of each row as a rotation vector, camera axes.
+
+    Returns:
+        [H, W, 2] normalised.
+    """
+    rays = np.concatenate([points, np.ones((*points.shape[:2], 1))], axis=-1)
+    rays = rays @ Rotation.from_rotvec(turns).as_matrix().transpose(0, 2, 1)
+    return rays[..., :2] / rays[..., 2:]
+
+
+def in_pixels(points: np.ndarray, camera: Camera) -> np.ndarray:
+    """[..., 2] px of the pinhole camera."""
+    return points * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+
+
+def enlarged(camera: Camera, sources: list[np.ndarray], fine: int) -> tuple[Camera, int]:
+    """A finer camera that sees all that the sources ask for, and its border in coarse px."""
+    low = min(float(s.min()) for s in sources)
+    high = max(float((s - (camera.width, camera.height)).max()) for s in sources)
+    border = int(np.ceil(max(-low, high, 0.0))) + 1
+    width, height = camera.width + 2 * border, camera.height + 2 * border
+    shifted = replace(camera, width=width, height=height, cx=camera.cx + border, cy=camera.cy + border)
+    return shifted.resized(width * fine, height * fine), border
+
+
+def resample(image: np.ndarray, sources: list[np.ndarray], border: int, fine: int) -> np.ndarray:
+    """The photo: the mean over the sources and over the fine pixels of each pixel.
+
+    Args:
+        image: [H', W'] or [H', W', 3] float32 of the enlarged camera.
+        sources: [H fine, W fine, 2] px of the pinhole camera, each an instant of the exposure.
+        border: of the enlarged camera, coarse px.
+        fine: fine pixels a side of a pixel.
+    """
+    total: np.ndarray = np.zeros((), np.float32)
+    for source in sources:
+        index = ((source + border) * fine - 0.5).astype(np.float32)
+        total = total + cv2.remap(
+            image, index[..., 0], index[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+    mean = total / np.float32(len(sources))
+    height, width = mean.shape[0] // fine, mean.shape[1] // fine
+    blocks = mean.reshape(height, fine, width, fine, *mean.shape[2:])
+    return np.asarray(blocks.mean((1, 3)), np.float32)

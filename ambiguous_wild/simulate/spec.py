@@ -1,0 +1,101 @@
+"""What a capture is: frozen dataclasses that a YAML spec fills. Nothing heavy is imported here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from ambiguous_wild.simulate.effects.settings import Effects
+
+Kind = Literal[
+    "visitor",
+    "twin",
+    "parcel",
+    "ball",
+    "pole",
+    "barrier",
+    "banner",
+    "placard",
+    "bust",
+    "knot",
+    "hound",
+    "spire",
+]
+ThingKind = Literal["box", "ball", "column", "board", "figure", "bust", "knot", "hound", "spire"]
+Ambiguity = Literal["colour", "semantic", "none"]
+Colour = tuple[float, float, float]  # linear light
+STATUES = ("bust", "knot", "hound", "spire")  # signed-distance shapes, in the world and as distractors
+
+
+@dataclass(frozen=True)
+class Designed:
+    """What a capture was made to show: the answer that a measurement of it should give."""
+
+    ambiguity: Literal["colour", "semantic", "both", "neither", "unstated"] = "unstated"
+    effects: tuple[
+        Literal["masks", "local", "global", "entropy", "appearance", "antialiasing", "sh", "pose"], ...
+    ] = ()  # the trainer's effects that it calls for
+
+
+@dataclass(frozen=True)
+class Distractor:
+    """Something that stands elsewhere in every photo, or walks through the capture."""
+
+    name: str
+    kind: Kind
+    texture: str  # a sheet of the world (stone, foliage, brick, ...), or for a placard any texture of it
+    ambiguity: Ambiguity  # why it is hard: the background's colour, the statue's shape, or not at all
+    head: str = ""  # a visitor's head and hands, where they are not of the same sheet
+    presence: float = 0.85  # duty cycle: share of the train photos in which it is put
+    distance_m: tuple[float, float] = (1.9, 4.5)  # from the camera; of a walker the smallest alone counts
+    size: float = 1.0  # times its natural size: figures 1.75 m, ball 0.8 m, pole 2 m, statues 1.6 m
+    lift_m: float = 0.0  # how far above the ground it may fly
+    tint: Colour = (1.0, 1.0, 1.0)  # the texture is multiplied by it, in linear light
+    path: Literal["elsewhere", "walk"] = "elsewhere"  # a new place for every photo, or on along `waypoints`
+    waypoints: tuple[tuple[float, float], ...] = ()  # m: x and y of the corners of its walk
+    laps: float = 1.0  # how often it walks there and back during the capture
+
+
+@dataclass(frozen=True)
+class Thing:
+    """Something that stands still in the courtyard, beside what is there anyway."""
+
+    kind: ThingKind
+    texture: str
+    at_m: tuple[float, float, float]  # middle of its foot: x to the right, y away from the walk, z up
+    size_m: tuple[float, float, float] = (1.0, 1.0, 1.0)  # width, depth, height; statues take the height
+    yaw_deg: float = 0.0
+    tint: Colour = (1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True)
+class WorldSpec:
+    """The courtyard: ground, three walls with posters and a sky, and what stands in it."""
+
+    furniture: bool = True  # planters, crates, bench, stone ball
+    statue: bool = True  # the figure on its plinth
+    things: tuple[Thing, ...] = ()
+
+
+@dataclass(frozen=True)
+class CaptureSpec:
+    """A capture to make. The same spec and seed give the same bytes."""
+
+    name: str
+    summary: str
+    distractors: tuple[Distractor, ...] = ()
+    occlusion: tuple[float, float] = (0.10, 0.25)  # share of a train photo's pixels, between which it is kept
+    train_views: int = 30
+    test_views: int = 8
+    width: int = 960  # px; a factor of 4 gives 240 x 135
+    height: int = 540  # px
+    samples: int = 4  # rays a pixel, a square number
+    detail_px_per_m: float = 110.0  # resolution of the textures
+    focal_35mm: float = 26.0  # mm, the equivalent that phones state (CIPA: same diagonal angle)
+    arc_deg: float = 104.0  # how far around the statue the walk goes
+    radius_m: tuple[float, float] = (4.2, 5.3)  # distance from the statue during the walk
+    eye_m: tuple[float, float] = (1.3, 1.8)  # height of the phone
+    zoom: tuple[float, float] = (1.0, 1.0)  # the focal length varies between these times `focal_35mm`
+    world: WorldSpec = field(default_factory=WorldSpec)
+    effects: Effects = field(default_factory=Effects)
+    designed: Designed = field(default_factory=Designed)

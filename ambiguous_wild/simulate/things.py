@@ -1,0 +1,73 @@
+"""What a spec puts into the world beside the courtyard's own: boxes, balls, columns, boards, statues."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from ambiguous_wild.simulate.ground_plan import SURFACES
+from ambiguous_wild.simulate.kernels import BOX, BY_FACE, CYLINDER, ELLIPSOID, VOLUME
+from ambiguous_wild.simulate.shapes import SHEET_M, Shape, between, figure, placed
+from ambiguous_wild.simulate.spec import STATUES, Thing
+
+
+def statue(name: str, texture: str, height_m: float) -> Shape:
+    """A signed-distance statue that stands at the origin."""
+    half = height_m / 1.8  # its foot is at -0.9 of the half size
+    return Shape(VOLUME, (0, 0, 0.9 * half), (half, half, half), texture, mapping=BY_FACE, volume=name)
+
+
+def board(texture: str, width_m: float, height_m: float, thick_m: float, lift_m: float = 0.0) -> Shape:
+    """An upright board that faces -y: a picture covers it once, of anything else it shows a piece.
+
+    Of a wall the piece is one that is as high up as the board: what it covers looks like that.
+    """
+    half = (width_m / 2, thick_m / 2, height_m / 2)
+    middle = (0.0, 0.0, lift_m + height_m / 2)
+    if texture.startswith("poster_"):
+        return Shape(BOX, middle, half, texture, scale=(1.0 / width_m, 1.0 / height_m))
+    across, up = SURFACES.get(texture, (SHEET_M, SHEET_M))
+    level = middle[2] / up if texture.startswith("wall_") else 0.5
+    return Shape(BOX, middle, half, texture, scale=(1.0 / across, 1.0 / up), offset=(0.5, level))
+
+
+def placard(texture: str) -> list[Shape]:
+    """A board of 1.1 x 0.85 m on two sticks, 0.75 m above the ground."""
+    sticks = [between((x, 0.03, 0.02), (x, 0.03, 1.5), 0.018, "timber") for x in (-0.45, 0.45)]
+    return [board(texture, 1.1, 0.85, 0.03, 0.75), *sticks]
+
+
+def shapes_of_thing(thing: Thing) -> list[Shape]:
+    """The thing's shapes in the world."""
+    width, depth, height = thing.size_m
+    half = (width / 2, depth / 2, height / 2)
+    middle = (0.0, 0.0, height / 2)
+    if thing.kind in STATUES:
+        parts = [statue(thing.kind, thing.texture, height)]
+    elif thing.kind == "figure":
+        parts = placed(figure(thing.texture, thing.texture, 0.07, 0.8), (0, 0, 0), 0.0, height / 1.75)
+    elif thing.kind == "board":
+        parts = [board(thing.texture, width, height, depth)]
+    elif thing.kind == "column":
+        parts = [between((0, 0, 0), (0, 0, height), width / 2, thing.texture, CYLINDER)]
+    else:
+        parts = [Shape(ELLIPSOID if thing.kind == "ball" else BOX, middle, half, thing.texture)]
+    tint = thing.tint
+    # Each thing shows another part of its sheet, or all of one stone would look alike.
+    shift = (0.37 * thing.at_m[0], 0.29 * thing.at_m[1])
+    parts = [
+        replace(
+            s,
+            tint=(s.tint[0] * tint[0], s.tint[1] * tint[1], s.tint[2] * tint[2]),
+            offset=s.offset if thing.kind == "board" else (s.offset[0] + shift[0], s.offset[1] + shift[1]),
+        )
+        for s in parts
+    ]
+    return placed(parts, thing.at_m, thing.yaw_deg)
+
+
+def circle_of(thing: Thing) -> tuple[float, float, float]:
+    """x, y and radius on the ground of what nobody can walk through, m."""
+    width, depth, height = thing.size_m
+    if thing.kind in STATUES or thing.kind == "figure":
+        return (thing.at_m[0], thing.at_m[1], 0.3 * height)
+    return (thing.at_m[0], thing.at_m[1], 0.5 * max(width, depth))

@@ -1,0 +1,139 @@
+"""What stands, walks and zooms: statues from distance grids, things of a spec, walkers, focal lengths."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from ambiguous_wild.core.camera import Camera
+from ambiguous_wild.simulate import capture, volumes
+from ambiguous_wild.simulate.atlas import build_atlas
+from ambiguous_wild.simulate.distractors import lay_out
+from ambiguous_wild.simulate.kernels import QUAD, VOLUME
+from ambiguous_wild.simulate.presets import preset, resized
+from ambiguous_wild.simulate.shapes import UNSEEN, Shape, shape_table
+from ambiguous_wild.simulate.spec import STATUES, Distractor, Thing
+from ambiguous_wild.simulate.things import circle_of, shapes_of_thing
+from ambiguous_wild.simulate.tracer import Light, trace
+from ambiguous_wild.simulate.walk import look_at
+
+ATLAS = build_atlas({"stone": np.full((4, 4, 3), 0.5, np.float32)})
+LIGHT = Light(np.array([[0.0, -0.6, 0.8]]), np.ones(3), np.full(3, 0.3), np.full(3, 0.3))
+EYE = np.array([0.0, -6.0, 0.0])
+CAMERA = Camera(120, 120, 240.0, 240.0, 60.0, 60.0, look_at(EYE, np.zeros(3), 0.0))
+
+
+def test_a_ball_of_distances_is_seen_where_the_ball_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(volumes.STATUES, "test ball", lambda p: np.linalg.norm(p, axis=-1) - 0.7)
+    shape = Shape(VOLUME, (0.1, 0.0, -0.2), (1.5, 1.5, 1.5), "stone", volume="test ball")
+    wall = Shape(QUAD, (0, 3, 0), (9, 9, 0), "stone", ((1, 0, 0), (0, 0, 1), (0, -1, 0)))
+    seen = trace(
+        CAMERA, shape_table([wall], ATLAS), shape_table([replace(shape, owner=1)], ATLAS), ATLAS, LIGHT
+    )
+    rows, columns = np.mgrid[0:120, 0:120] + 0.5
+    rays = np.stack([(columns - 60) / 240, np.ones_like(rows), (60 - rows) / 240], -1)
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    to = np.array(shape.center) - EYE
+    off = np.sqrt(to @ to - (rays @ to) ** 2)
+    assert ((seen.owner > 0) == (off < 1.05))[np.abs(off - 1.05) > 0.02].all()
+    alone = trace(CAMERA, shape_table([shape], ATLAS), shape_table([], ATLAS), ATLAS, LIGHT)
+    along = rays @ to - np.sqrt(np.maximum(1.05**2 - off**2, 0))
+    inside = off < 0.9
+    assert alone.depth_m[inside] == pytest.approx((along * rays[..., 1])[inside], abs=0.02)
+
+
+@pytest.mark.parametrize("name", STATUES)
+def test_a_statue_is_one_solid_on_its_foot_inside_its_sphere(name: str) -> None:
+    from scipy import ndimage
+
+    values = volumes.grid(name)
+    solid = values < 0
+    assert 0.02 < solid.mean() < 0.35 and ndimage.label(solid)[1] == 1
+    axis = np.linspace(-1, 1, volumes.SIZE)
+    z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
+    assert max(np.abs(a[solid]).max() for a in (x, y, z)) < 0.95
+    assert z[solid].min() == pytest.approx(-0.9, abs=0.035)
+    for a in range(3):  # outside, a ray that advances by 0.8 of the distance does not step through a wall
+        low, high = np.moveaxis(values, a, 0)[:-1], np.moveaxis(values, a, 0)[1:]
+        outside = (low > 0) & (high > 0)
+        assert np.abs(high - low)[outside].max() / (axis[1] - axis[0]) < 1.25
+
+
+def test_statues_throw_shadows_and_the_unseen_is_not_seen() -> None:
+    ground = Shape(QUAD, (0, 0, -1.0), (9, 9, 0), "stone", casts=False)
+    above = Camera(80, 80, 60.0, 60.0, 40.0, 40.0, look_at(np.array([0, -0.1, 9.0]), np.zeros(3), 0.0))
+    bust = Shape(VOLUME, (0, 0, 0.5), (1.5, 1.5, 1.5), "stone", volume="bust")
+    nobody = shape_table([], ATLAS)
+    free = trace(above, shape_table([ground], ATLAS), nobody, ATLAS, LIGHT)
+    unseen = trace(above, shape_table([ground, replace(bust, owner=UNSEEN)], ATLAS), nobody, ATLAS, LIGHT)
+    assert np.array_equal(free.depth_m, unseen.depth_m)
+    dark = unseen.clean[..., 0] < 0.6 * free.clean[..., 0]
+    assert 0.003 < dark.mean() < 0.1 and np.array_equal(unseen.clean[~dark], free.clean[~dark])
+    seen = trace(above, shape_table([ground, bust], ATLAS), nobody, ATLAS, LIGHT)
+    assert (seen.depth_m < free.depth_m - 0.5).mean() > 0.003
+
+
+@pytest.mark.parametrize("kind", ["box", "ball", "column", "board", "figure", *STATUES])
+def test_a_thing_stands_on_the_ground_at_its_place(kind: str) -> None:
+    thing = Thing(kind, "stone", (0.5, -1.0, 0.0), (0.8, 0.4, 1.6), 30.0)  # type: ignore[arg-type]
+    camera = Camera(
+        90, 150, 150.0, 150.0, 45.0, 75.0, look_at(np.array([0.5, -7.0, 0.8]), np.array([0.5, -1, 0.8]), 0.0)
+    )
+    things = shape_table([replace(s, owner=1) for s in shapes_of_thing(thing)], ATLAS)
+    rows, columns = np.nonzero(trace(camera, shape_table([], ATLAS), things, ATLAS, LIGHT).owner)
+    scale = 150.0 / 6.0
+    top, foot = (75 - rows.min()) / scale + 0.8, (74 - rows.max()) / scale + 0.8
+    assert foot == pytest.approx(0.0, abs=0.12) and 1.3 < top < 1.75
+    assert (columns.min() + columns.max()) / 2 == pytest.approx(45, abs=5)
+    assert circle_of(thing)[:2] == (0.5, -1.0)
+
+
+def test_a_walker_keeps_to_its_way_and_speed() -> None:
+    walker = Distractor(
+        "w",
+        "visitor",
+        "cloth",
+        "none",
+        presence=1.0,
+        distance_m=(0.3, 4.5),
+        path="walk",
+        waypoints=((-3.0, -2.0), (3.0, -2.0)),
+        laps=1.0,
+    )
+    spec = replace(
+        resized(preset("walkers"), views=9, width=64), distractors=(walker,), detail_px_per_m=6.0, samples=1
+    )
+    world, shots = capture.plan(spec, 0)
+    x = [s.placements[0].x_m for s in shots[:9]]
+    assert x == pytest.approx([-3, -1.5, 0, 1.5, 3, 1.5, 0, -1.5, -3], abs=1e-9)
+    assert {round(s.placements[0].y_m, 6) for s in shots[:9]} == {-2.0}
+    yaws = (
+        {round(s.placements[0].yaw_deg) % 360 for s in shots[1:4]},
+        {round(s.placements[0].yaw_deg) % 360 for s in shots[5:8]},
+    )
+    assert yaws == ({90}, {270})
+    shy = replace(spec, distractors=(replace(walker, distance_m=(3.0, 4.5)),))
+    cameras = [s.camera for s in shots[:9]]
+    there = lay_out(shy, cameras, world, np.random.default_rng(0))
+    away = [np.hypot(*(c.center[:2] - (at, -2.0))) for c, at in zip(cameras, x)]
+    assert [bool(p) for p in there] == [d >= 3.0 for d in away] and 0 < sum(map(bool, there)) < 9
+    rare = replace(spec, distractors=(replace(walker, presence=0.3),))
+    placed = lay_out(rare, cameras, world, np.random.default_rng(0))
+    assert 0 < sum(bool(p) for p in placed) < 9
+
+
+def test_zoom_varies_the_focal_length_in_photo_truth_and_exif(tmp_path) -> None:
+    spec = replace(resized(preset("zoom"), views=6, width=64), detail_px_per_m=6.0, samples=1, distractors=())
+    spec = replace(spec, occlusion=(0.0, 0.0))
+    capture.simulate(spec, tmp_path / "raw")
+    _, shots = capture.plan(spec, 0)
+    base = capture.plan(replace(spec, zoom=(1.0, 1.0)), 0)[1]
+    factors = [s.camera.fx / b.camera.fx for s, b in zip(shots, base)]
+    assert min(factors) < 1.0 and max(factors) > 1.6 and all(0.85 <= f <= 1.9 for f in factors)
+    for shot in shots:
+        fields = Image.open(tmp_path / "raw" / shot.split / shot.name).getexif().get_ifd(0x8769)
+        stated = float(fields[0x920A]) * float(fields[0xA20E]) / 25.4
+        assert stated == pytest.approx(shot.camera.fx, rel=1e-4)

@@ -71,16 +71,16 @@ def to_markdown(table: Table) -> str:
     """GitHub tables, one a block; the best of a column is bold, the three best are numbered."""
     parts = []
     for block in table.blocks:
-        parts += [f"**{_markdown(heading(table, block))}**", ""]
+        parts += [f"**{markdown_text(heading(table, block))}**", ""]
         parts.append(
             _markdown_row(["method", *(f"{c.label} {ARROWS[c.better]}".strip() for c in table.columns)])
         )
         parts.append("|---|" + "---:|" * len(table.columns))
         for row in block.rows:
             cells = [_bold(number(c, cell), cell) for c, cell in zip(table.columns, row.cells)]
-            parts.append(_markdown_row([_markdown(row.method), *cells]))
+            parts.append(_markdown_row([markdown_text(row.method), *cells]))
         parts.append("")
-    return "\n".join([*parts, *(f"- {_markdown(line)}" for line in _below(table))]) + "\n"
+    return "\n".join([*parts, *(f"- {markdown_text(line)}" for line in _below(table))]) + "\n"
 
 
 def to_csv(table: Table) -> str:
@@ -95,10 +95,10 @@ def to_csv(table: Table) -> str:
         head += [f"{column.key}_low", f"{column.key}_high"] if column.per_image else []
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow([_csv_text(name) for name in head])
+    writer.writerow([csv_text(name) for name in head])
     for block in table.blocks:
         for row in block.rows:
-            cells = [_csv_text(block.scene or ""), _csv_text(row.method), _status(row), str(row.runs)]
+            cells = [csv_text(block.scene or ""), csv_text(row.method), _status(row), str(row.runs)]
             for column, cell in zip(table.columns, row.cells):
                 values = [cell.value, cell.spread, *([cell.low, cell.high] if column.per_image else [])]
                 cells += [_csv_number(v) for v in values]
@@ -172,7 +172,7 @@ def _aligned(line: Sequence[str], widths: Sequence[int], ranks: Sequence[int | N
     return "  ".join(cells).rstrip()
 
 
-def _markdown(text: str) -> str:
+def markdown_text(text: str) -> str:
     """Escaped for a GitHub table: neither HTML, nor a link, nor a new column."""
     text = plain(text).replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
     text = re.sub(r"([\\`*_\[\]|~#$])", r"\\\1", text)
@@ -191,7 +191,7 @@ def _bold(text: str, cell: Cell) -> str:
     return f"**{value}** ({mark}"
 
 
-def _csv_text(text: str) -> str:
+def csv_text(text: str) -> str:
     """A cell that a spreadsheet takes for text: a leading formula character gets an apostrophe."""
     text = plain(text) if not str(text).startswith("\t") else "'" + plain(text)
     return "'" + text if text.lstrip()[:1] in ("=", "+", "-", "@") else text

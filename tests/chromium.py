@@ -15,7 +15,9 @@ from typing import Any
 import pytest
 
 PROGRAM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-needs_chromium = pytest.mark.skipif(PROGRAM is None, reason="no chromium in PATH (Debian: apt install chromium)")
+needs_chromium = pytest.mark.skipif(
+    PROGRAM is None, reason="no chromium in PATH (Debian: apt install chromium)"
+)
 PATIENCE_S = 120.0  # a loaded machine is no failure
 
 

@@ -116,7 +116,7 @@ function ask() {
       choice(right, "B", "\u2192", "is better", chosen));
   } else {
     $("question").textContent = TEXTS.ambiguity;
-    $("pictures").append(picture(q.images.photo, "photo"));
+    $("pictures").append(picture(q.images.photo, "photo", "only"));
     for (const [value, key, small] of SCALE) $("choices").append(choice(value, key, key, small, chosen));
   }
   const count = answered();

@@ -1,0 +1,131 @@
+"""SSIM and LPIPS out of place: impossible, exchanged, or unlike everything around them."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator
+
+import numpy as np
+
+from ambiguous_wild.harness.audit.finding import Finding, finding, place_name
+from ambiguous_wild.harness.audit.table import Number
+
+# metric family -> what a value can be; LPIPS has no upper limit, but none above 1.5 was ever printed rightly
+LIMITS = {"psnr": (2.0, 100.0), "ssim": (-1.0, 1.0), "lpips": (0.0, 1.5)}
+MARGIN = 0.5  # of the others' range: how far from them is still among them
+OTHERS = 4  # methods a scene needs besides, before one is called unlike them
+FAR = 9.0  # robust deviations of a residual; in normal noise once in 10^18
+Entry = dict[str, Number]  # family -> number
+
+
+def out_of_place(numbers: list[Number]) -> list[Finding]:
+    """Values outside what the metric allows."""
+    found = []
+    for n in numbers:
+        low, high = LIMITS.get(_family(n), (-np.inf, np.inf))
+        if not low <= n.value <= high:
+            text = f"{n.method} on {place_name(n)}: {n.metric} {n.text} cannot be ({low:g} to {high:g})"
+            found.append(finding("out of place", text, [n]))
+    return found
+
+
+def exchanged(numbers: list[Number]) -> list[Finding]:
+    """SSIM and LPIPS exchanged: for one method, or for a whole scene of a table."""
+    scenes = _scenes(numbers)
+    columns = list(_columns(scenes))
+    done = {n for f in columns for n in f.where}
+    return columns + [f for entries in scenes.values() for f in _cells(entries) if f.where[0] not in done]
+
+
+def _cells(entries: dict[str, Entry]) -> Iterator[Finding]:
+    for method, entry in entries.items():
+        others = [e for m, e in entries.items() if m != method]
+        if len(others) < OTHERS:
+            continue
+        psnr, ssim, lpips = (np.array([e[f].value for e in others]) for f in ("psnr", "ssim", "lpips"))
+        s, d = entry["ssim"].value, entry["lpips"].value
+        printed = _among(s, ssim) or _among(d, lpips)
+        # A method that failed here has a bad PSNR too: then both may be outside rightly.
+        if not printed and _among(d, ssim) and _among(s, lpips) and _among(entry["psnr"].value, psnr):
+            text = (
+                f"{method} on {place_name(entry['ssim'])}: SSIM {entry['ssim'].text} and LPIPS "
+                f"{entry['lpips'].text} look exchanged (others: SSIM {ssim.min():g} to {ssim.max():g}, LPIPS "
+                f"{lpips.min():g} to {lpips.max():g})"
+            )
+            yield finding("swapped", text, (entry["ssim"], entry["lpips"]))
+
+
+def _columns(scenes: dict[tuple[str, str, str], dict[str, Entry]]) -> Iterator[Finding]:
+    from scipy.stats import spearmanr
+
+    for place, entries in scenes.items():
+        if len(entries) < OTHERS:
+            continue
+        votes = []
+        for method, entry in entries.items():
+            rest = [e[method] for p, e in scenes.items() if p != place and method in e]
+            if rest:
+                usual = {f: float(np.median([e[f].value for e in rest])) for f in ("ssim", "lpips")}
+                s, d = entry["ssim"].value, entry["lpips"].value
+                kept = abs(s - usual["ssim"]) + abs(d - usual["lpips"])
+                votes.append(kept > abs(d - usual["ssim"]) + abs(s - usual["lpips"]))
+        if len(votes) < OTHERS or not all(votes):
+            continue
+        psnr, ssim, lpips = ([e[f].value for e in entries.values()] for f in ("psnr", "ssim", "lpips"))
+        if len(set(psnr)) > 1 and spearmanr(psnr, ssim)[0] < 0 < spearmanr(psnr, lpips)[0]:
+            involved = [e[f] for e in entries.values() for f in ("ssim", "lpips")]
+            text = f"SSIM and LPIPS of {place_name(involved[0])} in {place[0]} look exchanged for all methods"
+            yield finding("swapped", text, involved)
+
+
+def unlike(numbers: list[Number]) -> list[Finding]:
+    """SSIM or LPIPS far from what method and scene together let expect."""
+    known = {n for f in exchanged(numbers) for n in f.where}
+    grids: dict[tuple[str, str], dict[tuple[str, str], Number]] = defaultdict(dict)
+    for (_, dataset, scene), entries in _scenes(numbers).items():
+        for method, entry in entries.items():
+            for family in ("ssim", "lpips"):
+                grids[dataset, family].setdefault((method, scene), entry[family])
+    found = []
+    for (_, family), grid in grids.items():
+        for n, expected in _residuals(grid):
+            if n.where not in known:
+                text = f"{n.method} on {place_name(n)}: {family.upper()} {n.text}, where about {expected:.2f} fits"
+                found.append(finding("out of place", text, [n]))
+    return found
+
+
+def _residuals(grid: dict[tuple[str, str], Number]) -> Iterator[tuple[Number, float]]:
+    methods, scenes = (sorted({key[i] for key in grid}) for i in (0, 1))
+    table = np.full((len(methods), len(scenes)), np.nan)
+    for (method, scene), n in grid.items():
+        table[methods.index(method), scenes.index(scene)] = n.value
+    if min(table.shape) < 3 or np.isnan(table).mean() > 0.5:
+        return
+    fit = np.zeros_like(table)
+    for _ in range(10):  # Tukey's median polish
+        fit += np.nanmedian(table - fit, axis=1, keepdims=True)
+        fit += np.nanmedian(table - fit, axis=0, keepdims=True)
+    rest = table - fit
+    # The mean, not the median, of a polished table: its median is nearly zero by construction.
+    typical = 1.2533 * np.nanmean(np.sort(np.abs(rest[~np.isnan(rest)]))[:-1])
+    for i, j in np.argwhere(np.abs(rest) > FAR * typical):
+        yield grid[methods[i], scenes[j]], float(fit[i, j])
+
+
+def _scenes(numbers: list[Number]) -> dict[tuple[str, str, str], dict[str, Entry]]:
+    """(table, dataset, scene) -> method -> its PSNR, SSIM and LPIPS, where all three are."""
+    found: dict[tuple[str, str, str], dict[str, Entry]] = defaultdict(lambda: defaultdict(dict))
+    for n in numbers:
+        if n.known and not n.setting and _family(n) in LIMITS:
+            found[n.table, n.dataset, n.scene][n.method].setdefault(_family(n), n)
+    return {k: {m: e for m, e in v.items() if len(e) == len(LIMITS)} for k, v in found.items()}
+
+
+def _family(n: Number) -> str:
+    return n.metric.partition("_")[0]
+
+
+def _among(value: float, others: np.ndarray) -> bool:
+    low, high = others.min(), others.max()
+    return bool(low - MARGIN * (high - low) <= value <= high + MARGIN * (high - low))

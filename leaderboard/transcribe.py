@@ -3,7 +3,7 @@
     python leaderboard/transcribe.py paper.tex -o leaderboard/reported
 
 Numbers are copied, never corrected. What the table itself does not say (which scene an ablation is on, which
-variant of a metric) comes from the text around it, or is "unknown". The columns are described in docs/audit.md.
+variant of a metric) comes from the text around it, or is "unknown". docs/audit.md describes the columns.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from pathlib import Path
 COLUMNS = ("table", "method", "setting", "dataset", "scene", "metric", "variant", "value", "mark", "printed")
 PAPER = "RefineSplat, WACV 2027 submission 938"
 METHODS = {
-    "3D-GS": "3DGS", "HA-NeRF": "Ha-NeRF", "WildGaussian": "WildGaussians", "RefineSplat(Ours)": "RefineSplat",
-    "RefineSplat (Ours)": "RefineSplat", "Baseline": "RobustSplat", "Baselines": "RobustSplat",
+    "3D-GS": "3DGS", "HA-NeRF": "Ha-NeRF", "WildGaussian": "WildGaussians",
+    "RefineSplat(Ours)": "RefineSplat", "RefineSplat (Ours)": "RefineSplat", "Baseline": "RobustSplat", "Baselines": "RobustSplat",
 }  # fmt: skip
 AW, OTG, PT, DI = "Ambiguous wild", "NeRF On-the-go", "Photo Tourism", "Drone Imagery"
 QUALITY = ("psnr", "ssim", "lpips")
@@ -69,13 +69,16 @@ LAYOUTS = {
                                scenes=("unknown",), rows=ours("PUP", "UAD", "")),
     "tab:treshold_glb_mask": Layout("ablation-global-threshold", OTG, ("Patio",), lead=2,
                                     rows=ours("T_hard", "T_glb")),
-    "main_tab:sensitive_cr": Layout("sensitivity-alpha1", scenes=("unknown",), rows=ours("alpha_1 0.1", "", "alpha_1 0.3")),
+    "main_tab:sensitive_cr": Layout("sensitivity-alpha1", scenes=("unknown",),
+                                      rows=ours("alpha_1 0.1", "", "alpha_1 0.3")),
     "tab:impact_of_module": Layout("ablation-modules", scenes=("mean", "mean"), datasets=(AW, OTG), lead=4,
                                    rows=(_ROBUST, *ours("EAM", "EAM + CR", "EAM + EDC", ""))),
     "tab:dino_patch_size": Layout("sensitivity-patch", OTG, ("Patio",), rows=ours("", "patch 16")),
     "tab:dino_variant": Layout("sensitivity-dino", OTG, ("Patio",), rows=ours("DINOv1", "")),
-    "tab:dilated_filter": Layout("sensitivity-dilation", scenes=("unknown",), rows=ours("dilation 3", "", "dilation 7")),
-    "rebuttal_tab:treshold": Layout("sensitivity-merge-colour", scenes=("unknown",), rows=ours("colour 0.10", "", "colour 0.20")),
+    "tab:dilated_filter": Layout("sensitivity-dilation", scenes=("unknown",),
+                                      rows=ours("dilation 3", "", "dilation 7")),
+    "rebuttal_tab:treshold": Layout("sensitivity-merge-colour", scenes=("unknown",),
+                                      rows=ours("colour 0.10", "", "colour 0.20")),
     "sub_tab:ambi_quan_1": Layout("ambiguous-wild-1", AW, _AMB1, lead=2, speed=True),
     "sub_tab:ambi_quan_2": Layout("ambiguous-wild-2", AW, _AMB2, lead=2, speed=True),
     "sub_tab:onthego_quan": Layout("on-the-go", OTG, _OTG, lead=2, speed=True),
@@ -100,7 +103,11 @@ def plain(cell: str) -> tuple[str, str]:
     """(text without markup, rank it is coloured as) of a cell."""
     mark = re.search(r"\\metrictable(first|second|third)\{", cell)
     text = re.sub(r"\\cite\{[^}]*\}", "", cell)
-    text = re.sub(r"\\multirow\{[^}]*\}\{[^}]*\}|\\multicolumn\{[^}]*\}\{(?:[^{}]|\{[^}]*\})*\}|\\raisebox\{[^}]*\}", "", text)
+    text = re.sub(
+        r"\\multirow\{[^}]*\}\{[^}]*\}|\\multicolumn\{[^}]*\}\{(?:[^{}]|\{[^}]*\})*\}|\\raisebox\{[^}]*\}",
+        "",
+        text,
+    )
     text = re.sub(r"\\shortstack\{([^{}]*)\}", r"\1", text).replace(r"\\", " ")
     text = re.sub(r"\\[a-zA-Z]+|\\[;,!]|[{}$~]", " ", text)
     text = re.sub(r"\s+", " ", text).strip()
@@ -110,7 +117,9 @@ def plain(cell: str) -> tuple[str, str]:
 
 def bodies(source: str) -> Iterator[tuple[str, list[list[str]]]]:
     """(label, rows of raw cells below the head) of every tabular."""
-    for found in re.finditer(r"\\begin\{tabular\*?\}(.*?)\\end\{tabular\*?\}(.*?)\\label\{([^}]*)\}", source, re.S):
+    for found in re.finditer(
+        r"\\begin\{tabular\*?\}(.*?)\\end\{tabular\*?\}(.*?)\\label\{([^}]*)\}", source, re.S
+    ):
         body = re.sub(r"(?<!\\)%.*", "", found[1])
         body = body.split(r"\midrule", 1)[-1]
         body = re.sub(r"\\(midrule|bottomrule|hline|toprule)", "", body)
@@ -138,7 +147,18 @@ def records(label: str, layout: Layout, rows: list[list[str]]) -> Iterator[tuple
         if layout.speed:
             hours, fps = (part.strip() for part in plain(row[1])[0].split("/"))
             covered = "+".join(layout.scenes)
-            yield (label, method, setting, layout.dataset, covered, "gpu_hours", "unknown", number(hours), "", hours)
+            yield (
+                label,
+                method,
+                setting,
+                layout.dataset,
+                covered,
+                "gpu_hours",
+                "unknown",
+                number(hours),
+                "",
+                hours,
+            )
             yield (label, method, setting, layout.dataset, covered, "fps", "unknown", number(fps), "", fps)
         cells = iter(row[lead:])
         for i, scene in enumerate(groups):
@@ -186,7 +206,9 @@ def main() -> None:
             writer = csv.writer(f, lineterminator="\n")
             writer.writerow(COLUMNS)
             writer.writerows(lines)
-    print(f"{PAPER}: {len(written)} files, {sum(map(len, written.values()))} numbers; left out: {', '.join(lost)}")
+    print(
+        f"{PAPER}: {len(written)} files, {sum(map(len, written.values()))} numbers; left out: {', '.join(lost)}"
+    )
     absent = sorted(set(LAYOUTS) - {label for label, _ in bodies(source)})
     if absent:
         raise SystemExit(f"not found: {', '.join(absent)}")

@@ -136,7 +136,8 @@ class Browser:
     @property
     def requests(self) -> list[str]:
         """Addresses asked for since `open`, pictures inside the page (data:, blob:) left out."""
-        urls = [e["params"]["request"]["url"] for e in self.events if e.get("method") == "Network.requestWillBeSent"]  # fmt: skip
+        sent = [e["params"] for e in self.events if e.get("method") == "Network.requestWillBeSent"]
+        urls = [params["request"]["url"] for params in sent]
         return [u for u in urls if not u.startswith(("data:", "blob:"))]
 
     @property

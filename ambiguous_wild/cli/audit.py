@@ -12,8 +12,16 @@ import click
 
 @click.command("audit")
 @click.argument("tables", nargs=-1, type=click.Path(path_type=Path))
-@click.option("--format", "style", type=click.Choice(["text", "markdown", "csv", "json"]), default="text", show_default=True)
-@click.option("-o", "--output", type=click.Path(path_type=Path, dir_okay=False), help="Write to a file instead.")
+@click.option(
+    "--format",
+    "style",
+    type=click.Choice(["text", "markdown", "csv", "json"]),
+    default="text",
+    show_default=True,
+)
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path, dir_okay=False), help="Write to a file instead."
+)
 @click.option("--strict", is_flag=True, help="Exit with 1 where anything is found.")
 def command(tables: tuple[Path, ...], style: str, output: Path | None, strict: bool) -> None:
     """Check TABLES (CSV, or folders of them; default: the reported numbers in this checkout).

@@ -144,7 +144,7 @@ def draw(questions: Sequence[Question], limit: int, rng: np.random.Generator) ->
     for question in questions:
         groups.setdefault(question.group, []).append(question)
     for members in groups.values():
-        rng.shuffle(members)  # type: ignore[arg-type]
+        rng.shuffle(members)
     names = sorted(groups)
     rng.shuffle(names)
     chosen: list[Question] = []

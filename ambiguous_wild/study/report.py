@@ -67,14 +67,14 @@ def _preference(found: dict[str, Any]) -> list[str]:
         ]
         parts += _table(("rank", "method", "Bradley-Terry strength (log odds)", "possible ranks"), rows)
     parts += ["", found["ranking_note"].capitalize() + "."] if found["ranking_note"] else []
-    rows = [(m["method"], _share(m), m["n"], m["ties"]) for m in found["methods"]]
+    shares = [(m["method"], _share(m), m["n"], m["ties"]) for m in found["methods"]]
     parts += ["", "Preferred in what share of the decided answers:", ""]
-    parts += _table(("method", "share", "decided", "ties"), rows)
-    rows = [(p["method"], p["against"], _share(p), p["n"], p["ties"]) for p in found["pairs"]]
-    parts += ["", *_table(("method", "against", "share", "decided", "ties"), rows)]
+    parts += _table(("method", "share", "decided", "ties"), shares)
+    pairs = [(p["method"], p["against"], _share(p), p["n"], p["ties"]) for p in found["pairs"]]
+    parts += ["", *_table(("method", "against", "share", "decided", "ties"), pairs)]
     if len({s["scene"] for s in found["scenes"]}) > 1:
-        rows = [(s["scene"], s["method"], _share(s), s["n"], s["ties"]) for s in found["scenes"]]
-        parts += ["", *_table(("scene", "method", "share", "decided", "ties"), rows)]
+        by_scene = [(s["scene"], s["method"], _share(s), s["n"], s["ties"]) for s in found["scenes"]]
+        parts += ["", *_table(("scene", "method", "share", "decided", "ties"), by_scene)]
     parts += ["", f"Agreement: {_agreement(found['agreement'], 'nominal')}.",
               f"The left one was preferred in {_share(found['left'])} of the decided answers."]  # fmt: skip
     return parts

@@ -83,7 +83,7 @@ def test_intervals_cover_the_truth_as_often_as_they_say() -> None:
     index = {m: i for i, m in enumerate(METHODS)}
     truth = np.array([STRENGTHS[m] for m in METHODS])
     covered = total = 0
-    for _ in range(80):
+    for _ in range(60):
         wins = np.zeros((10, 3, 3))
         for r, data in enumerate(panel(key, STRENGTHS, 10, rng).values()):
             for a in data["answers"]:
@@ -94,8 +94,8 @@ def test_intervals_cover_the_truth_as_often_as_they_say() -> None:
         for s in bradley_terry(list(METHODS), wins)[0]:
             total += 1
             covered += s.low <= truth[index[s.method]] <= s.high
-    # 240 intervals of 95 %: two deviations below is 0.92; above 0.995 they would be needlessly wide.
-    assert 0.915 <= covered / total <= 0.995
+    # 180 intervals of 95 %: 0.91 is two and a half deviations below; above 0.995 they would be too wide.
+    assert 0.91 <= covered / total <= 0.995
 
 
 def test_strengths_are_those_of_maximum_likelihood() -> None:
@@ -140,13 +140,11 @@ def test_alpha_is_krippendorff_s() -> None:
 def test_without_the_libraries_the_command_that_brings_them(
     study: tuple[Path, Path, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for missing in ("choix", "nltk"):
+    for missing, package in (("choix", "choix"), ("nltk.metrics.agreement", "NLTK")):
         with monkeypatch.context() as m:
             m.setitem(sys.modules, missing, None)
-            m.setitem(
-                sys.modules, "nltk.metrics.agreement", None if missing == "nltk" else sys.modules.get("x")
-            )
-            assert "[study]" in error(study[1], "--key", study[0])
+            message = error(study[1], "--key", study[0])
+            assert f"needs {package}" in message and "[study]" in message
 
 
 def test_csv_and_json_answers_score_alike(study: tuple[Path, Path, Any], tmp_path: Path) -> None:

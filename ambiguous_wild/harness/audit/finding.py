@@ -43,6 +43,8 @@ def place_name(number: Number) -> str:
     """Where it was measured, for people."""
     if number.scene == "mean":
         return f"the mean of {number.dataset}"
+    if number.scene == "all":
+        return f"all of {number.dataset}"
     return number.scene if number.scene != "unknown" else "a scene not named"
 
 

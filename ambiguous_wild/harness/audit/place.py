@@ -16,6 +16,7 @@ MARGIN = 0.5  # of the others' range: how far from them is still among them
 OTHERS = 4  # methods a scene needs besides, before one is called unlike them
 FAR = 9.0  # robust deviations of a residual; in normal noise once in 10^18
 Entry = dict[str, Number]  # family -> number
+Scenes = dict[tuple[str, str, str], dict[str, Entry]]  # (table, dataset, scene) -> method -> entry
 
 
 def out_of_place(numbers: list[Number]) -> list[Finding]:
@@ -34,11 +35,14 @@ def exchanged(numbers: list[Number]) -> list[Finding]:
     scenes = _scenes(numbers)
     columns = list(_columns(scenes))
     done = {n for f in columns for n in f.where}
-    return columns + [f for entries in scenes.values() for f in _cells(entries) if f.where[0] not in done]
+    return columns + [f for place in scenes for f in _cells(scenes, place) if f.where[0] not in done]
 
 
-def _cells(entries: dict[str, Entry]) -> Iterator[Finding]:
+def _cells(scenes: Scenes, place: tuple[str, str, str]) -> Iterator[Finding]:
+    entries = scenes[place]
     for method, entry in entries.items():
+        if _unusual(scenes, place, method) is False:
+            continue  # as the method is elsewhere: weak, not exchanged
         others = [e for m, e in entries.items() if m != method]
         if len(others) < OTHERS:
             continue
@@ -55,20 +59,23 @@ def _cells(entries: dict[str, Entry]) -> Iterator[Finding]:
             yield finding("swapped", text, (entry["ssim"], entry["lpips"]))
 
 
-def _columns(scenes: dict[tuple[str, str, str], dict[str, Entry]]) -> Iterator[Finding]:
+def _unusual(scenes: Scenes, place: tuple[str, str, str], method: str) -> bool | None:
+    """Whether SSIM and LPIPS, exchanged, are nearer to the method's elsewhere; None: it is nowhere else."""
+    rest = [e[method] for p, e in scenes.items() if p != place and method in e]
+    if not rest:
+        return None
+    ssim, lpips = (float(np.median([e[f].value for e in rest])) for f in ("ssim", "lpips"))
+    s, d = (scenes[place][method][f].value for f in ("ssim", "lpips"))
+    return abs(s - ssim) + abs(d - lpips) > abs(d - ssim) + abs(s - lpips)
+
+
+def _columns(scenes: Scenes) -> Iterator[Finding]:
     from scipy.stats import spearmanr
 
     for place, entries in scenes.items():
         if len(entries) < OTHERS:
             continue
-        votes = []
-        for method, entry in entries.items():
-            rest = [e[method] for p, e in scenes.items() if p != place and method in e]
-            if rest:
-                usual = {f: float(np.median([e[f].value for e in rest])) for f in ("ssim", "lpips")}
-                s, d = entry["ssim"].value, entry["lpips"].value
-                kept = abs(s - usual["ssim"]) + abs(d - usual["lpips"])
-                votes.append(kept > abs(d - usual["ssim"]) + abs(s - usual["lpips"]))
+        votes = [v for m in entries if (v := _unusual(scenes, place, m)) is not None]
         if len(votes) < OTHERS or not all(votes):
             continue
         psnr, ssim, lpips = ([e[f].value for e in entries.values()] for f in ("psnr", "ssim", "lpips"))
@@ -90,7 +97,7 @@ def unlike(numbers: list[Number]) -> list[Finding]:
     for (_, family), grid in grids.items():
         for n, expected in _residuals(grid):
             if n.where not in known:
-                text = f"{n.method} on {place_name(n)}: {family.upper()} {n.text}, where about {expected:.2f} fits"
+                text = f"{n.method} on {place_name(n)}: {family.upper()} {n.text}, about {expected:.2f} would fit"
                 found.append(finding("out of place", text, [n]))
     return found
 
@@ -107,14 +114,15 @@ def _residuals(grid: dict[tuple[str, str], Number]) -> Iterator[tuple[Number, fl
         fit += np.nanmedian(table - fit, axis=1, keepdims=True)
         fit += np.nanmedian(table - fit, axis=0, keepdims=True)
     rest = table - fit
-    # The mean, not the median, of a polished table: its median is nearly zero by construction.
-    typical = 1.2533 * np.nanmean(np.sort(np.abs(rest[~np.isnan(rest)]))[:-1])
+    # The mean, not the median: many residuals of a polished table are zero by construction. The largest is
+    # left out, or it would hide itself.
+    typical = 1.2533 * np.mean(np.sort(np.abs(rest[~np.isnan(rest)]))[:-1])
     for i, j in np.argwhere(np.abs(rest) > FAR * typical):
         yield grid[methods[i], scenes[j]], float(fit[i, j])
 
 
-def _scenes(numbers: list[Number]) -> dict[tuple[str, str, str], dict[str, Entry]]:
-    """(table, dataset, scene) -> method -> its PSNR, SSIM and LPIPS, where all three are."""
+def _scenes(numbers: list[Number]) -> Scenes:
+    """PSNR, SSIM and LPIPS of every method on every scene, where all three are."""
     found: dict[tuple[str, str, str], dict[str, Entry]] = defaultdict(lambda: defaultdict(dict))
     for n in numbers:
         if n.known and not n.setting and _family(n) in LIMITS:

@@ -30,10 +30,16 @@ def repeated(numbers: list[Number]) -> list[Finding]:
             involved = [n for pair in pairs for n in pair]
             covered |= {frozenset((a.where, b.where)) for a, b in pairs}
             found.append(finding("repeated", _words(kind, pairs), involved))
-    return found + list(_entries(numbers, covered))
+    # A mean stands in several tables: what repeats it is said once.
+    said: dict[str, Finding] = {}
+    for f in _entries(numbers, covered):
+        said.setdefault(f.text, f)
+    return found + list(said.values())
 
 
-def _lines(numbers: list[Number], line: Callable[[Number], Key], cell: Callable[[Number], Key]) -> dict[Key, Line]:
+def _lines(
+    numbers: list[Number], line: Callable[[Number], Key], cell: Callable[[Number], Key]
+) -> dict[Key, Line]:
     lines: dict[Key, Line] = defaultdict(dict)
     for n in numbers:
         lines[line(n)].setdefault(cell(n), n)
@@ -68,7 +74,8 @@ def _words(kind: str, pairs: list[tuple[Number, Number]]) -> str:
     metrics = ", ".join(dict.fromkeys(p[0].metric for p in pairs))
     if kind == "scenes":
         methods = ", ".join(dict.fromkeys(method_name(p[0]) for p in pairs))
-        return f"{place_name(a)} ({a.dataset}) and {place_name(b)} ({b.dataset}): the same {metrics} for {methods}"
+        places = f"{place_name(a)} ({a.dataset}) and {place_name(b)} ({b.dataset})"
+        return f"{places}: the same {metrics} for {methods}"
     scenes = ", ".join(dict.fromkeys(place_name(p[0]) for p in pairs))
     return f"{method_name(a)} and {method_name(b)}: the same {metrics} on {scenes}"
 

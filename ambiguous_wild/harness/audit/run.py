@@ -49,5 +49,7 @@ def to_csv(findings: list[Finding]) -> str:
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(["kind", "finding", "tables", "where"])
     for f in findings:
-        writer.writerow([f.kind, csv_text(f.text), csv_text("; ".join(f.tables)), csv_text("; ".join(f.where))])
+        writer.writerow(
+            [f.kind, csv_text(f.text), csv_text("; ".join(f.tables)), csv_text("; ".join(f.where))]
+        )
     return out.getvalue()

@@ -86,8 +86,8 @@ def _read(path: Path) -> list[Number]:
             missing = [c for c in REQUIRED if c not in head]
             if missing:
                 raise AwError(
-                    f"{path} lacks the column {shortlist(missing)}; a table has {', '.join(REQUIRED)} and may "
-                    f"have {', '.join(OPTIONAL)}"
+                    f"{path} lacks the column {shortlist(missing)}; a table has {', '.join(REQUIRED)} "
+                    f"and may have {', '.join(OPTIONAL)}"
                 )
             return [n for row in reader if (n := _number(path, reader.line_num, row)) is not None]
     except UnicodeDecodeError:
@@ -109,7 +109,9 @@ def _number(path: Path, line: int, row: dict[str, str]) -> Number | None:
         if not cell[column]:
             raise AwError(f"{path} line {line} has no {column}")
     if not re.fullmatch(r"-?\d+(\.\d+)?([eE][+-]?\d+)?", cell["value"]) or math.isinf(float(cell["value"])):
-        raise AwError(f"{path} line {line}: {cell['value'][:40]!a} is no number; leave the cell empty where none is")  # fmt: skip
+        raise AwError(
+            f"{path} line {line}: {cell['value'][:40]!a} is no number; leave the cell empty where there is none"
+        )
     if cell["mark"] not in ("", "1", "2", "3"):
         raise AwError(f"{path} line {line}: mark {cell['mark'][:40]!a} is none of 1, 2, 3")
     return Number(

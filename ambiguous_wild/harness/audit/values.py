@@ -50,8 +50,8 @@ def _exchanged(
         alike = (a.place, a.metric, a.table, a2.table) == (b.place, b.metric, b.table, b2.table)
         if alike and a.method != b.method and a.value == b2.value and b.value == a2.value:
             text = (
-                f"{a.method} and {b.method} on {place_name(a)}: {a.metric} {a.text} and {b.text} in {a.table} "
-                f"are exchanged in {a2.table}"
+                f"{a.method} and {b.method} on {place_name(a)}: {a.metric} {a.text} and {b.text} in "
+                f"{a.table} are exchanged in {a2.table}"
             )
             found.append((finding("swapped", text, (a, b, a2, b2)), [(a, a2), (b, b2)]))
     return found
@@ -59,7 +59,7 @@ def _exchanged(
 
 def means(numbers: list[Number]) -> list[Finding]:
     """Means over scenes, and over datasets, that rounding does not explain."""
-    found = []
+    wrong: dict[tuple[str, ...], list[tuple[Number, float, list[Number]]]] = defaultdict(list)
     for n in numbers:
         if n.scene != MEAN or n.setting:
             continue
@@ -68,13 +68,18 @@ def means(numbers: list[Number]) -> list[Finding]:
             continue
         value = float(np.mean([p.value for p in parts]))
         if abs(value - n.value) > n.half + max(p.half for p in parts) + 1e-9:
-            what = "datasets" if n.dataset == ALL else f"scenes of {n.dataset}"
-            text = (
-                f"{n.method}: {n.metric} averages {value:.{n.digits + 1}f} over the {len(parts)} {what}, "
-                f"printed {n.text} ({n.table})"
-            )
-            found.append(finding("mean", text, [n, *parts]))
-    return found
+            wrong[n.table, n.method, n.dataset].append((n, value, parts))
+    return [_mean(cases) for cases in wrong.values()]
+
+
+def _mean(cases: list[tuple[Number, float, list[Number]]]) -> Finding:
+    first, _, parts = cases[0]
+    what = "datasets" if first.dataset == ALL else f"scenes of {first.dataset}"
+    words = ", ".join(
+        f"{n.metric} {n.text} where they give {value:.{n.digits + 1}f}" for n, value, _ in cases
+    )
+    text = f"{first.method}, mean over the {len(parts)} {what}: {words} ({first.table})"
+    return finding("mean", text, [m for n, _, parts in cases for m in (n, *parts)])
 
 
 def _of_datasets(mean: Number, numbers: list[Number]) -> list[Number]:

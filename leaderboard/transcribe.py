@@ -19,7 +19,8 @@ COLUMNS = ("table", "method", "setting", "dataset", "scene", "metric", "variant"
 PAPER = "RefineSplat, WACV 2027 submission 938"
 METHODS = {
     "3D-GS": "3DGS", "HA-NeRF": "Ha-NeRF", "WildGaussian": "WildGaussians",
-    "RefineSplat(Ours)": "RefineSplat", "RefineSplat (Ours)": "RefineSplat", "Baseline": "RobustSplat", "Baselines": "RobustSplat",
+    "RefineSplat(Ours)": "RefineSplat", "RefineSplat (Ours)": "RefineSplat",
+    "Baseline": "RobustSplat", "Baselines": "RobustSplat",
 }  # fmt: skip
 AW, OTG, PT, DI = "Ambiguous wild", "NeRF On-the-go", "Photo Tourism", "Drone Imagery"
 QUALITY = ("psnr", "ssim", "lpips")
@@ -178,8 +179,8 @@ def memory_main(rows: list[list[str]]) -> Iterator[tuple[str, ...]]:
         for side in (0, 1):
             scene, method, value = (plain(c)[0] for c in row[3 * side : 3 * side + 3])
             current[side] = scene or current[side]
-            yield (MEMORY_MAIN, METHODS.get(method, method), "", datasets[current[side]], current[side], "memory",
-                   "unknown", number(value), "", value)  # fmt: skip
+            what = (METHODS.get(method, method), "", datasets[current[side]], current[side])
+            yield (MEMORY_MAIN, *what, "memory", "unknown", number(value), "", value)
 
 
 def main() -> None:
@@ -206,9 +207,8 @@ def main() -> None:
             writer = csv.writer(f, lineterminator="\n")
             writer.writerow(COLUMNS)
             writer.writerows(lines)
-    print(
-        f"{PAPER}: {len(written)} files, {sum(map(len, written.values()))} numbers; left out: {', '.join(lost)}"
-    )
+    count = sum(map(len, written.values()))
+    print(f"{PAPER}: {len(written)} files, {count} numbers; left out: {', '.join(lost)}")
     absent = sorted(set(LAYOUTS) - {label for label, _ in bodies(source)})
     if absent:
         raise SystemExit(f"not found: {', '.join(absent)}")

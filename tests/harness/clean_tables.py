@@ -79,7 +79,9 @@ def _means(rows: list[Row], methods: list[str]) -> list[Row]:
             averages = {d: float(np.mean(v)) for d, v in of.items()}
             found += [_row("means", method, d, "mean", metric, v) for d, v in averages.items()]
             if len(averages) > 1:
-                found.append(_row("means", method, "all", "mean", metric, float(np.mean([*averages.values()]))))
+                found.append(
+                    _row("means", method, "all", "mean", metric, float(np.mean([*averages.values()])))
+                )
     return found
 
 

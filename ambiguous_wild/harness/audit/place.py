@@ -14,7 +14,11 @@ from ambiguous_wild.harness.audit.table import Number
 LIMITS = {"psnr": (2.0, 100.0), "ssim": (-1.0, 1.0), "lpips": (0.0, 1.5)}
 MARGIN = 0.5  # of the others' range: how far from them is still among them
 OTHERS = 4  # methods a scene needs besides, before one is called unlike them
-FAR = 9.0  # robust deviations of a residual; in normal noise once in 10^18
+CLEARLY = 3.0  # times nearer to the others when exchanged
+FAR = 8.0  # robust deviations of a residual; in normal noise once in 10^15
+USUAL = 4.0  # what the other two metrics may be off
+FINEST = 0.0125  # of a spread: nothing below FAR times it is called a misprint
+SMALLEST = 4  # methods and scenes a table needs to say what fits
 Entry = dict[str, Number]  # family -> number
 Scenes = dict[tuple[str, str, str], dict[str, Entry]]  # (table, dataset, scene) -> method -> entry
 
@@ -48,9 +52,12 @@ def _cells(scenes: Scenes, place: tuple[str, str, str]) -> Iterator[Finding]:
             continue
         psnr, ssim, lpips = (np.array([e[f].value for e in others]) for f in ("psnr", "ssim", "lpips"))
         s, d = entry["ssim"].value, entry["lpips"].value
-        printed = _among(s, ssim) or _among(d, lpips)
+        usual = float(np.median(ssim)), float(np.median(lpips))
+        printed = abs(s - usual[0]) + abs(d - usual[1])
+        turned = abs(d - usual[0]) + abs(s - usual[1])
+        among = _among(s, ssim) or _among(d, lpips)
         # A method that failed here has a bad PSNR too: then both may be outside rightly.
-        if not printed and _among(d, ssim) and _among(s, lpips) and _among(entry["psnr"].value, psnr):
+        if not among and CLEARLY * turned < printed and _among(entry["psnr"].value, psnr):
             text = (
                 f"{method} on {place_name(entry['ssim'])}: SSIM {entry['ssim'].text} and LPIPS "
                 f"{entry['lpips'].text} look exchanged (others: SSIM {ssim.min():g} to {ssim.max():g}, LPIPS "
@@ -79,36 +86,45 @@ def _columns(scenes: Scenes) -> Iterator[Finding]:
         if len(votes) < OTHERS or not all(votes):
             continue
         psnr, ssim, lpips = ([e[f].value for e in entries.values()] for f in ("psnr", "ssim", "lpips"))
-        if len(set(psnr)) > 1 and spearmanr(psnr, ssim)[0] < 0 < spearmanr(psnr, lpips)[0]:
+        if len(set(psnr)) > 1 and spearmanr(psnr, ssim)[0] < spearmanr(psnr, lpips)[0]:
             involved = [e[f] for e in entries.values() for f in ("ssim", "lpips")]
             text = f"SSIM and LPIPS of {place_name(involved[0])} in {place[0]} look exchanged for all methods"
             yield finding("swapped", text, involved)
 
 
 def unlike(numbers: list[Number]) -> list[Finding]:
-    """SSIM or LPIPS far from what method and scene together let expect."""
+    """SSIM or LPIPS far from what method and scene together let expect, where PSNR and the other are not.
+
+    A method that failed on a scene is bad in all three: that is a result, not a misprint.
+    """
     known = {n for f in exchanged(numbers) for n in f.where}
-    grids: dict[tuple[str, str], dict[tuple[str, str], Number]] = defaultdict(dict)
+    grids: dict[str, dict[tuple[str, str], Entry]] = defaultdict(dict)
     for (_, dataset, scene), entries in _scenes(numbers).items():
         for method, entry in entries.items():
-            for family in ("ssim", "lpips"):
-                grids[dataset, family].setdefault((method, scene), entry[family])
+            grids[dataset].setdefault((method, scene), entry)
     found = []
-    for (_, family), grid in grids.items():
-        for n, expected in _residuals(grid):
-            if n.where not in known:
-                text = f"{n.method} on {place_name(n)}: {family.upper()} {n.text}, about {expected:.2f} would fit"
-                found.append(finding("out of place", text, [n]))
+    for grid in grids.values():
+        rests = {family: _residuals(grid, family) for family in LIMITS}
+        for key, entry in grid.items():
+            far = {family: abs(rest[key][0]) for family, rest in rests.items() if key in rest}
+            for family in ("ssim", "lpips"):
+                others = [v for f, v in far.items() if f != family]
+                n = entry[family]
+                if far and far[family] > FAR and max(others) < USUAL and n.where not in known:
+                    fits = rests[family][key][1]
+                    text = f"{n.method} on {place_name(n)}: {family.upper()} {n.text}, {fits:.2f} would fit"
+                    found.append(finding("out of place", text, [n]))
     return found
 
 
-def _residuals(grid: dict[tuple[str, str], Number]) -> Iterator[tuple[Number, float]]:
+def _residuals(grid: dict[tuple[str, str], Entry], family: str) -> dict[tuple[str, str], tuple[float, float]]:
+    """(residual in robust deviations, expected value) by method and scene; empty for a small table."""
     methods, scenes = (sorted({key[i] for key in grid}) for i in (0, 1))
     table = np.full((len(methods), len(scenes)), np.nan)
-    for (method, scene), n in grid.items():
-        table[methods.index(method), scenes.index(scene)] = n.value
-    if min(table.shape) < 3 or np.isnan(table).mean() > 0.5:
-        return
+    for (method, scene), entry in grid.items():
+        table[methods.index(method), scenes.index(scene)] = entry[family].value
+    if min(table.shape) < SMALLEST or np.isnan(table).mean() > 0.5:
+        return {}
     fit = np.zeros_like(table)
     for _ in range(10):  # Tukey's median polish
         fit += np.nanmedian(table - fit, axis=1, keepdims=True)
@@ -116,9 +132,15 @@ def _residuals(grid: dict[tuple[str, str], Number]) -> Iterator[tuple[Number, fl
     rest = table - fit
     # The mean, not the median: many residuals of a polished table are zero by construction. The largest is
     # left out, or it would hide itself.
-    typical = 1.2533 * np.mean(np.sort(np.abs(rest[~np.isnan(rest)]))[:-1])
-    for i, j in np.argwhere(np.abs(rest) > FAR * typical):
-        yield grid[methods[i], scenes[j]], float(fit[i, j])
+    spread = 1.2533 * np.mean(np.sort(np.abs(rest[~np.isnan(rest)]))[:-1])
+    # What the fit takes up: a row and a column of freedom; and three digits are never known better than this.
+    typical = max(spread * np.sqrt(table.size / ((len(methods) - 1) * (len(scenes) - 1))), FINEST)
+    return {
+        (m, s): (float(rest[i, j] / typical), float(fit[i, j]))
+        for i, m in enumerate(methods)
+        for j, s in enumerate(scenes)
+        if not np.isnan(rest[i, j])
+    }
 
 
 def _scenes(numbers: list[Number]) -> Scenes:

@@ -10,6 +10,8 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from itertools import combinations
 
+import numpy as np
+
 from ambiguous_wild.harness.audit.finding import Finding, finding, method_name, place_name
 from ambiguous_wild.harness.audit.table import MEAN, UNKNOWN, Number
 
@@ -61,9 +63,12 @@ def _repeating(lines: dict[Key, Line]) -> Iterator[list[tuple[Number, Number]]]:
         equal = []
         for pairs in metrics:
             same = [(a, b) for a, b in pairs if a.value == b.value]
+            # Several methods at the same value (0.99 for all) are one coincidence, not several.
+            distinct = len({a.value for a, _ in same})
+            if distinct < 3:
+                continue
             near = sum(a.value != b.value and _near(a, b) for a, b in pairs)
-            odds = poisson.sf(len(same) - 1, (near + 1) / (2 * NEAR)) * tested
-            if len(same) >= 3 and odds < ODDS:
+            if poisson.sf(distinct - 1, (near + 1) / (2 * NEAR)) * tested < ODDS:
                 equal += same
         if equal:
             yield equal
@@ -87,20 +92,38 @@ def _entries(numbers: list[Number], covered: set[frozenset[str]]) -> Iterator[Fi
     wide = [e for e in entries.values() if len(e) >= 2]
     # By how they are related: chance is rarer where fewer pairs are looked at.
     families: dict[str, list[tuple[dict[str, Number], dict[str, Number]]]] = defaultdict(list)
-    for a, b in combinations(wide, 2):
+    for i, j in _near_pairs(wide):
+        a, b = wide[i], wide[j]
         first, second = next(iter(a.values())), next(iter(b.values()))
-        if len(a.keys() & b.keys()) >= 3 and not _may_be_one(first, second):
+        if not _may_be_one(first, second):
             related = first.method == second.method or (first.known and first.place == second.place)
             families["related" if related else "unrelated"].append((a, b))
     for pairs in families.values():
         equal = [(a, b) for a, b in pairs if _all(a, b, lambda x, y: x.value == y.value)]
-        near = sum(_all(a, b, _near) for a, b in pairs) - len(equal)
+        near = len(pairs) - len(equal)
         for a, b in equal:
             shared = sorted(a.keys() & b.keys())
             odds = (near + 3) / (2 * NEAR + 1) ** len(shared)
             known = all(frozenset((a[m].where, b[m].where)) in covered for m in shared)
             if odds < ODDS and not known:
                 yield _entry(a, b, shared)
+
+
+def _near_pairs(entries: list[dict[str, Number]]) -> list[tuple[int, int]]:
+    """Pairs that share three metrics or more and are near in all they share."""
+    metrics = sorted({m for e in entries for m in e})
+    value, unit = (np.full((len(entries), len(metrics)), np.nan) for _ in range(2))
+    for i, e in enumerate(entries):
+        for m, n in e.items():
+            value[i, metrics.index(m)], unit[i, metrics.index(m)] = n.value, 2 * n.half
+    pairs = []
+    for i in range(len(entries) - 1):
+        apart = np.abs(value[i + 1 :] - value[i])
+        shared = ~np.isnan(apart)
+        far = shared & (apart > NEAR * np.fmin(unit[i + 1 :], unit[i]) + 1e-12)
+        hits = np.flatnonzero((shared.sum(axis=1) >= 3) & ~far.any(axis=1))
+        pairs += [(i, i + 1 + int(j)) for j in hits]
+    return pairs
 
 
 def _entry(a: dict[str, Number], b: dict[str, Number], shared: list[str]) -> Finding:

@@ -110,7 +110,7 @@ def _number(path: Path, line: int, row: dict[str, str]) -> Number | None:
             raise AwError(f"{path} line {line} has no {column}")
     if not re.fullmatch(r"-?\d+(\.\d+)?([eE][+-]?\d+)?", cell["value"]) or math.isinf(float(cell["value"])):
         raise AwError(
-            f"{path} line {line}: {cell['value'][:40]!a} is no number; leave the cell empty where there is none"
+            f"{path} line {line}: {cell['value'][:40]!a} is no number; leave the cell empty for none"
         )
     if cell["mark"] not in ("", "1", "2", "3"):
         raise AwError(f"{path} line {line}: mark {cell['mark'][:40]!a} is none of 1, 2, 3")

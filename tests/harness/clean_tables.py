@@ -15,7 +15,7 @@ COLUMNS = ("table", "method", "setting", "dataset", "scene", "metric", "variant"
 
 
 def clean_tables(seed: int) -> list[Row]:
-    """Main tables, one of means, an ablation and one of memory; hard scenes and a method that fails included."""
+    """Main tables, one of means, an ablation and one of memory; here and there a method fails on a scene."""
     rng = np.random.default_rng(seed)
     methods = [f"method {i}" for i in range(rng.integers(4, 11))]
     rows: list[Row] = []

@@ -131,8 +131,10 @@ def no_unit(rows: list[Row]) -> str:
     return "unit"
 
 
-PLANTS = [copied_row, copied_method, copied_memory, other_value, exchanged_methods, exchanged_cell,
-          exchanged_columns, wrong_mean, impossible, slipped_point, wrong_rank, lost_digit, no_unit]  # fmt: skip
+PLANTS = [
+    copied_row, copied_method, copied_memory, other_value, exchanged_methods, exchanged_cell, exchanged_columns,
+    wrong_mean, impossible, slipped_point, wrong_rank, lost_digit, no_unit,
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("plant", PLANTS, ids=lambda p: p.__name__)
@@ -267,8 +269,8 @@ def test_chance_is_measured_not_assumed(tmp_path: Path) -> None:
             for metric, value in (("psnr", 20 + rng.integers(4) / 10), ("ssim", 0.7 + rng.integers(3) / 100),
                                   ("lpips", 0.2 + rng.integers(3) / 100)):  # fmt: skip
                 digits = 1 if metric == "psnr" else 2
-                rows.append({"table": "t", "method": f"m{method}", "dataset": "d", "scene": f"s{scene}",
-                             "metric": metric, "variant": "stated", "value": f"{value:.{digits}f}"})  # fmt: skip
+                what = {"table": "t", "method": f"m{method}", "dataset": "d", "scene": f"s{scene}"}
+                rows.append({**what, "metric": metric, "variant": "stated", "value": f"{value:.{digits}f}"})
     assert [f for f in findings(rows, tmp_path) if f.kind == "repeated"] == []
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from ambiguous_wild.harness.audit.finding import Finding, finding, method_name, place_name
 from ambiguous_wild.harness.audit.table import MEAN, UNKNOWN, Number
 
-NEAR = 25  # units of the last digit
+NEAR, CLOSE = 25, 5  # units of the last digit; the narrower where numbers lie in heaps
 ODDS = 0.005  # of an accident, over everything looked at; above it nothing is said
 Key = tuple[str, ...]
 Line = dict[Key, Number]
@@ -67,8 +67,11 @@ def _repeating(lines: dict[Key, Line]) -> Iterator[list[tuple[Number, Number]]]:
             distinct = len({a.value for a, _ in same})
             if distinct < 3:
                 continue
-            near = sum(a.value != b.value and _near(a, b) for a, b in pairs)
-            if poisson.sf(distinct - 1, (near + 1) / (2 * NEAR)) * tested < ODDS:
+            near, close = (
+                sum(a.value != b.value and _near(a, b, w) for a, b in pairs) for w in (NEAR, CLOSE)
+            )
+            expected = max((near + 1) / (2 * NEAR), close / (2 * CLOSE))
+            if poisson.sf(distinct - 1, expected) * tested < ODDS:
                 equal += same
         if equal:
             yield equal
@@ -101,9 +104,10 @@ def _entries(numbers: list[Number], covered: set[frozenset[str]]) -> Iterator[Fi
     for pairs in families.values():
         equal = [(a, b) for a, b in pairs if _all(a, b, lambda x, y: x.value == y.value)]
         near = len(pairs) - len(equal)
+        close = sum(_all(a, b, lambda x, y: _near(x, y, CLOSE)) for a, b in pairs) - len(equal)
         for a, b in equal:
             shared = sorted(a.keys() & b.keys())
-            odds = (near + 3) / (2 * NEAR + 1) ** len(shared)
+            odds = max((near + 3) / (2 * NEAR + 1) ** len(shared), close / (2 * CLOSE + 1) ** len(shared))
             known = all(frozenset((a[m].where, b[m].where)) in covered for m in shared)
             if odds < ODDS and not known:
                 yield _entry(a, b, shared)
@@ -149,5 +153,5 @@ def _all(a: dict[str, Number], b: dict[str, Number], holds: Callable[[Number, Nu
     return all(holds(a[m], b[m]) for m in a.keys() & b.keys())
 
 
-def _near(a: Number, b: Number) -> bool:
-    return abs(a.value - b.value) <= NEAR * 10.0 ** -max(a.digits, b.digits) + 1e-12
+def _near(a: Number, b: Number, units: int) -> bool:
+    return abs(a.value - b.value) <= units * 10.0 ** -max(a.digits, b.digits) + 1e-12

@@ -132,8 +132,8 @@ def no_unit(rows: list[Row]) -> str:
 
 
 PLANTS = [
-    copied_row, copied_method, copied_memory, other_value, exchanged_methods, exchanged_cell, exchanged_columns,
-    wrong_mean, impossible, slipped_point, wrong_rank, lost_digit, no_unit,
+    copied_row, copied_method, copied_memory, other_value, exchanged_methods, exchanged_cell,
+    exchanged_columns, wrong_mean, impossible, slipped_point, wrong_rank, lost_digit, no_unit,
 ]  # fmt: skip
 
 

@@ -25,7 +25,8 @@ ALLOWED: dict[str, set[str]] = {
     "splat": {"core", "io"},
     "methods": {"core", "io", "splat", "vision"},
     "harness": BELOW_HARNESS,
-    "cli": BELOW_HARNESS | {"harness"},
+    "study": {"core", "io", "metrics", "harness"},
+    "cli": BELOW_HARNESS | {"harness", "study"},
 }
 HEAVY = ("torch", "numba", "pycolmap", "cv2", "matplotlib", "transformers", "scipy", "pandas", "skimage")
 FILES = sorted(PACKAGE.rglob("*.py"))

@@ -71,16 +71,16 @@ def to_markdown(table: Table) -> str:
     """GitHub tables, one a block; the best of a column is bold, the three best are numbered."""
     parts = []
     for block in table.blocks:
-        parts += [f"**{_markdown(heading(table, block))}**", ""]
+        parts += [f"**{markdown_text(heading(table, block))}**", ""]
         parts.append(
             _markdown_row(["method", *(f"{c.label} {ARROWS[c.better]}".strip() for c in table.columns)])
         )
         parts.append("|---|" + "---:|" * len(table.columns))
         for row in block.rows:
             cells = [_bold(number(c, cell), cell) for c, cell in zip(table.columns, row.cells)]
-            parts.append(_markdown_row([_markdown(row.method), *cells]))
+            parts.append(_markdown_row([markdown_text(row.method), *cells]))
         parts.append("")
-    return "\n".join([*parts, *(f"- {_markdown(line)}" for line in _below(table))]) + "\n"
+    return "\n".join([*parts, *(f"- {markdown_text(line)}" for line in _below(table))]) + "\n"
 
 
 def to_csv(table: Table) -> str:
@@ -172,7 +172,7 @@ def _aligned(line: Sequence[str], widths: Sequence[int], ranks: Sequence[int | N
     return "  ".join(cells).rstrip()
 
 
-def _markdown(text: str) -> str:
+def markdown_text(text: str) -> str:
     """Escaped for a GitHub table: neither HTML, nor a link, nor a new column."""
     text = plain(text).replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
     text = re.sub(r"([\\`*_\[\]|~#$])", r"\\\1", text)

@@ -269,12 +269,12 @@ def test_hostile_names_stay_text_in_every_format(tmp_path: Path) -> None:
 
 @given(st.text(max_size=30))
 def test_latex_and_markdown_of_any_name_have_no_open_special(name: str) -> None:
-    from ambiguous_wild.harness.render_tables import _latex, _markdown
+    from ambiguous_wild.harness.render_tables import _latex, markdown_text
 
-    assert "\n" not in _latex(name) + _markdown(name)
+    assert "\n" not in _latex(name) + markdown_text(name)
     rest = re.sub(r"\\text\w+\{\}|\\[&%$#_{}]|\{(?:[\[*]|'')\}", "", _latex(name))
     assert not re.search(r"[\\&%$#_{}~^\[*]", rest)
-    assert not re.search(r"[<>]", _markdown(name))
+    assert not re.search(r"[<>]", markdown_text(name))
 
 
 def test_latex_needs_no_font_encoding(tmp_path: Path) -> None:

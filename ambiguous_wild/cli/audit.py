@@ -1,0 +1,56 @@
+"""`aw audit`: what cannot be right in a table of results."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+from pathlib import Path
+
+import click
+
+
+@click.command("audit")
+@click.argument("tables", nargs=-1, type=click.Path(path_type=Path))
+@click.option(
+    "--format",
+    "style",
+    type=click.Choice(["text", "markdown", "csv", "json"]),
+    default="text",
+    show_default=True,
+)
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path, dir_okay=False), help="Write to a file instead."
+)
+@click.option("--strict", is_flag=True, help="Exit with 1 where anything is found.")
+def command(tables: tuple[Path, ...], style: str, output: Path | None, strict: bool) -> None:
+    """Check TABLES (CSV, or folders of them; default: the reported numbers in this checkout).
+
+    Finds numbers equal to the digit where they must not be, contradictions between tables, exchanged numbers,
+    means that do not follow, SSIM and LPIPS out of place, wrong ranks. It knows no right answers: a finding
+    is a question to whoever printed the number.
+    """
+    from ambiguous_wild.core.errors import AwError
+    from ambiguous_wild.harness.audit.run import audit, to_csv, to_markdown, to_text
+    from ambiguous_wild.harness.audit.table import read_tables
+    from ambiguous_wild.io.atomic import write_text
+
+    if not tables:
+        reported = Path(__file__).resolve().parents[2] / "leaderboard" / "reported"
+        if not reported.is_dir():
+            raise AwError("no tables given, and no leaderboard/reported beside the program: name CSV files")
+        tables = (reported,)
+    numbers = read_tables(tables)
+    findings = audit(numbers)
+    if style == "json":
+        text = json.dumps([dataclasses.asdict(f) for f in findings], indent=2, ensure_ascii=False) + "\n"
+    else:
+        text = {"text": to_text, "markdown": to_markdown, "csv": to_csv}[style](findings)
+    if output is not None:
+        write_text(output, text)
+    else:
+        click.echo(text, nl=style == "text" and bool(findings))
+    count = len({n.table for n in numbers})
+    click.echo(f"{len(findings)} findings in {len(numbers)} numbers of {count} tables", err=True)
+    if strict and findings:
+        sys.exit(1)

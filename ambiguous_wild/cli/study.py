@@ -1,0 +1,169 @@
+"""`aw study`: ask people, blind, and score what they said."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+
+@click.group("study")
+def command() -> None:
+    """Ask people, blind: is the distractor hard to see, and which render is better?
+
+    \b
+    aw study make --runs runs --scene scene -o study.html    a page to send round, and study.key.json to keep
+    aw study score answers/ --key study.key.json             shares, ranking, agreement
+    """
+
+
+@command.command("make")
+@click.option(
+    "--scene",
+    "scenes",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    help="Ask about the train photos of this scene folder; repeatable.",
+)
+@click.option(
+    "--runs",
+    type=click.Path(path_type=Path),
+    help="Ask about the test renders below this folder of 'aw bench'.",
+)
+@click.option(
+    "-o",
+    "--out",
+    required=True,
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="The page, *.html; the key goes beside it.",
+)
+@click.option(
+    "--method", "methods", multiple=True, help="Compare only this method; repeatable.  [default: all]"
+)
+@click.option(
+    "--only-scene",
+    "only",
+    multiple=True,
+    help="Compare only on the scene of this name; repeatable.  [default: all]",
+)
+@click.option(
+    "--questions",
+    type=click.IntRange(1, 1000),
+    default=40,
+    show_default=True,
+    help="Of each kind, at most; spread evenly.",
+)
+@click.option(
+    "--truth/--no-truth", default=True, show_default=True, help="Show the test photo beside the two renders."
+)
+@click.option(
+    "--outline/--no-outline",
+    default=True,
+    show_default=True,
+    help="Let raters see what moved, where the scene has exact masks.",
+)
+@click.option(
+    "--side",
+    type=click.IntRange(64, 4000),
+    default=1000,
+    show_default=True,
+    help="Pixels of the longer side of a picture, at most.",
+)
+@click.option(
+    "--quality", type=click.IntRange(50, 100), default=92, show_default=True, help="Of the JPEG in the page."
+)
+@click.option("--title", default="Picture study", show_default=True, help="What raters read on top.")
+@click.option(
+    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Which questions are drawn."
+)
+@click.option(
+    "--force", is_flag=True, help="Replace a page and key that are there: answers to the old page are lost."
+)
+@click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
+def make_command(
+    scenes: tuple[Path, ...], runs: Path | None, out: Path, methods: tuple[str, ...], only: tuple[str, ...],
+    questions: int, truth: bool, outline: bool, side: int, quality: int, title: str, seed: int, force: bool,
+    as_json: bool,
+) -> None:  # fmt: skip
+    """Write one HTML file that asks, works from a file and on a phone, and requests nothing from anywhere.
+
+    The page holds no name of a method, scene or file. The key does: do not hand it to raters.
+    """
+    from tqdm import tqdm
+
+    from ambiguous_wild.core.errors import AwError
+    from ambiguous_wild.io.atomic import check_output
+    from ambiguous_wild.study.make import Settings, make
+    from ambiguous_wild.study.questions import Question, pairs_of_runs, photos_of_scene
+
+    if not scenes and runs is None:
+        raise AwError("nothing to ask about: give --scene SCENE (photos), --runs RUNS (renders), or both")
+    if (methods or only) and runs is None:
+        raise AwError("--method and --only-scene choose among runs: give --runs too")
+    if out.suffix.lower() not in (".html", ".htm"):
+        raise AwError(
+            f"the page must be called *.html, so that browsers open it: -o {out.with_suffix('.html')}"
+        )
+    key = out.with_suffix(".key.json")
+    check_output(out)
+    there = [str(p) for p in (out, key) if p.exists()]
+    if there and not force:
+        raise AwError(
+            f"{' and '.join(there)} exists: answers to another page cannot be scored; choose another -o or --force"
+        )
+    asked: list[Question] = [q for scene in scenes for q in photos_of_scene(scene, outline=outline)]
+    if runs is not None:
+        asked += pairs_of_runs(runs, methods=methods, scenes=only, truth=truth)
+    settings = Settings(title=title, limit=questions, side=side, quality=quality, seed=seed)
+    made = make(asked, out, key, settings, lambda q: tqdm(q, unit="question", disable=as_json or None))
+    if as_json:
+        facts = {k: str(v) if isinstance(v, Path) else v for k, v in vars(made).items()}
+        click.echo(json.dumps(facts, indent=2))
+        return
+    click.echo(
+        f"wrote {made.page} ({made.photos} questions about photos, {made.pairs} about renders, "
+        f"{made.pictures} pictures, {made.megabytes:.1f} MB)"
+    )
+    click.echo(f"wrote {made.key}: keep it, it says which method is which")
+
+
+@command.command("score")
+@click.argument("answers", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "--key",
+    required=True,
+    type=click.Path(path_type=Path),
+    help="What 'aw study make' wrote beside the page.",
+)
+@click.option(
+    "-o",
+    "--out",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Folder for scores.md, .csv and .json.  [default: KEY-scores]",
+)
+@click.option(
+    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the bootstrap over raters."
+)
+@click.option("--json", "as_json", is_flag=True, help="Print the scores as JSON.")
+def score_command(answers: tuple[Path, ...], key: Path, out: Path | None, seed: int, as_json: bool) -> None:
+    """Score ANSWERS: files (JSON or CSV) that raters saved, or folders of them."""
+    from ambiguous_wild.core.errors import AwError
+    from ambiguous_wild.io.atomic import check_output
+    from ambiguous_wild.study.answers import read_answers
+    from ambiguous_wild.study.key import read_key
+    from ambiguous_wild.study.report import to_markdown, write_scores
+    from ambiguous_wild.study.scores import score
+
+    known = read_key(key)
+    raters = read_answers(answers, known)
+    folder = out or key.with_name(key.name.removesuffix(".json").removesuffix(".key") + "-scores")
+    stray = [p.name for p in folder.iterdir() if not p.name.startswith("scores.")] if folder.is_dir() else []
+    if stray:
+        raise AwError(f"{folder} holds other files ({stray[0]}): choose another -o, it is written anew")
+    check_output(folder)
+    scores = score(known, raters, seed)
+    write_scores(scores, folder)
+    click.echo(json.dumps(scores, indent=2, ensure_ascii=False) if as_json else to_markdown(scores))
+    if not as_json:
+        click.echo(f"wrote {folder}/scores.md, scores.csv and scores.json")

@@ -1,0 +1,135 @@
+"""Tables of reported numbers: one number a line, in CSV."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.core.errors import shortlist
+
+REQUIRED = ("method", "scene", "metric", "value")
+OPTIONAL = ("table", "setting", "dataset", "variant", "mark", "printed")
+UNKNOWN = "unknown"
+MEAN, ALL = "mean", "all"  # of scenes, and of datasets
+LARGEST = 50_000_000  # bytes
+
+
+@dataclass(frozen=True)
+class Number:
+    """One number as printed."""
+
+    table: str  # which table it stands in
+    method: str
+    setting: str  # how it differs from the method as published; empty: as published
+    dataset: str
+    scene: str  # MEAN for a mean over the dataset's scenes, UNKNOWN where the table does not say
+    metric: str
+    variant: str  # of the metric, or its unit; UNKNOWN where the table does not say
+    value: float
+    digits: int  # behind the point
+    mark: int | None  # rank the table marks it as: 1, 2, 3
+    where: str  # file and line
+
+    @property
+    def identity(self) -> tuple[str, str, str, str]:
+        return (self.method, self.setting, self.dataset, self.scene)
+
+    @property
+    def place(self) -> tuple[str, str]:
+        return (self.dataset, self.scene)
+
+    @property
+    def half(self) -> float:
+        """Half a unit of the last printed digit."""
+        return 0.5 * 10.0**-self.digits
+
+    @property
+    def text(self) -> str:
+        return f"{self.value:.{self.digits}f}"
+
+    @property
+    def known(self) -> bool:
+        """Whether it is said what it was measured on."""
+        return UNKNOWN not in self.place
+
+
+def read_tables(paths: Sequence[Path]) -> list[Number]:
+    """Read CSV files; a folder stands for the *.csv in it. Cells without a value are left out.
+
+    Raises:
+        AwError: no file, or one that is unreadable, lacks a column or holds what is no number.
+    """
+    files: list[Path] = []
+    for path in paths:
+        inside = sorted(path.glob("*.csv")) if path.is_dir() else [path]
+        if not inside:
+            raise AwError(f"no *.csv in {path}: give tables as docs/audit.md describes them")
+        files += inside
+    found = [n for path in dict.fromkeys(files) for n in _read(path)]
+    if not found:
+        raise AwError(f"no number in {shortlist(map(str, files))}: nothing to audit")
+    return found
+
+
+def _read(path: Path) -> list[Number]:
+    try:
+        if path.stat().st_size > LARGEST:
+            raise AwError(f"{path} is larger than {LARGEST // 1_000_000} MB: no table of results")
+        with open(path, newline="", encoding="utf-8-sig") as f:
+            reader = csv.DictReader(f, strict=True)
+            head = list(reader.fieldnames or ())
+            missing = [c for c in REQUIRED if c not in head]
+            if missing:
+                raise AwError(
+                    f"{path} lacks the column {shortlist(missing)}; a table has {', '.join(REQUIRED)} "
+                    f"and may have {', '.join(OPTIONAL)}"
+                )
+            return [n for row in reader if (n := _number(path, reader.line_num, row)) is not None]
+    except UnicodeDecodeError:
+        raise AwError(f"{path} is no text in UTF-8: save it as CSV") from None
+    except csv.Error as error:
+        raise AwError(f"{path} is malformed CSV: {error}") from None
+    except OSError as error:
+        raise AwError(f"cannot read {path}: {error.strerror}") from None
+
+
+def _number(path: Path, line: int, row: dict[str, str]) -> Number | None:
+    where = f"{path.name}:{line}"
+    if None in row or None in row.values():
+        raise AwError(f"{path} line {line} has too few or too many cells")
+    cell = {k: row.get(k, "").strip() for k in (*REQUIRED, *OPTIONAL)}
+    if not cell["value"]:
+        return None
+    for column in ("method", "scene", "metric"):
+        if not cell[column]:
+            raise AwError(f"{path} line {line} has no {column}")
+    if not re.fullmatch(r"-?\d+(\.\d+)?([eE][+-]?\d+)?", cell["value"]) or math.isinf(float(cell["value"])):
+        raise AwError(
+            f"{path} line {line}: {cell['value'][:40]!a} is no number; leave the cell empty for none"
+        )
+    if cell["mark"] not in ("", "1", "2", "3"):
+        raise AwError(f"{path} line {line}: mark {cell['mark'][:40]!a} is none of 1, 2, 3")
+    return Number(
+        cell["table"] or path.stem,
+        cell["method"],
+        cell["setting"],
+        cell["dataset"] or UNKNOWN if "dataset" in row else path.stem,
+        cell["scene"],
+        cell["metric"],
+        cell["variant"] or UNKNOWN,
+        float(cell["value"]),
+        _digits(cell["value"]),
+        int(cell["mark"]) if cell["mark"] else None,
+        where,
+    )
+
+
+def _digits(text: str) -> int:
+    if "e" in text.lower():
+        return 6
+    return len(text.partition(".")[2])

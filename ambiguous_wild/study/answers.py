@@ -1,0 +1,180 @@
+"""Answer files: checked against the key, one file a rater, nothing believed that is not asked for."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.study.key import FORMAT as KEY_FORMAT
+from ambiguous_wild.study.key import KIND_PAIR, KIND_PHOTO, Key
+
+FORMAT, VERSION = "aw-study-answers", 1
+CHOICES = {KIND_PAIR: ("x", "y", "tie"), KIND_PHOTO: ("1", "2", "3", "4", "5", "none")}
+LARGEST = 5_000_000  # bytes; a study of a thousand questions is below a tenth of it
+LONGEST = 80  # characters of a rater's id or name, as the page has it
+_COLUMNS = ("study", "rater", "name", "question", "answer", "left", "ms")
+
+
+@dataclass(frozen=True)
+class Answer:
+    question: str  # token of the key
+    answer: str  # one of `CHOICES`
+    left: str  # "x" or "y": which render stood on the left; empty for photos
+    seconds: float  # from showing to answering
+
+
+@dataclass(frozen=True)
+class Rater:
+    rater: str  # random identity, made by the page
+    name: str  # as typed: anybody's text
+    path: Path
+    answers: tuple[Answer, ...]
+
+
+def read_answers(paths: Sequence[Path], key: Key) -> list[Rater]:
+    """Read the answer files (JSON or CSV; a folder stands for those in it), ordered by rater.
+
+    Raises:
+        AwError: no file, or one that is empty, malformed, of another study, twice of the same rater, or
+            that answers what was not asked; names the file.
+    """
+    raters: dict[str, Rater] = {}
+    for path in _files(paths):
+        rater = _read(path, key)
+        if rater.rater in raters:
+            raise AwError(
+                f"{raters[rater.rater].path} and {path} are both of rater {rater.rater!a}: leave one out "
+                "(the one saved last holds all answers)"
+            )
+        raters[rater.rater] = rater
+    return [raters[name] for name in sorted(raters)]
+
+
+def _files(paths: Sequence[Path]) -> list[Path]:
+    found: list[Path] = []
+    for path in paths:
+        if not path.is_dir():
+            found.append(path)
+            continue
+        # Keys and scores of our own may lie beside the answers.
+        inside = [
+            p
+            for p in sorted(path.iterdir())
+            if p.suffix.lower() in (".json", ".csv")
+            and not p.name.endswith(".key.json")
+            and not p.name.startswith(("scores.", "."))
+        ]
+        if not inside:
+            raise AwError(f"no answer file (*.json, *.csv) in {path}")
+        found += inside
+    twice = {p.resolve() for p in found if sum(p.resolve() == q.resolve() for q in found) > 1}
+    if twice:
+        raise AwError(f"given twice: {shortlist(sorted(map(str, twice)))}; name each answer file once")
+    if not found:
+        raise AwError("no answer files given: name the files raters handed in, or a folder of them")
+    return found
+
+
+def _read(path: Path, key: Key) -> Rater:
+    try:
+        if path.stat().st_size > LARGEST:
+            raise AwError(f"{path} is larger than {LARGEST // 1_000_000} MB: no answer file")
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise AwError(f"{path} is no text in UTF-8: no answer file of 'aw study make'") from None
+    except OSError as error:
+        raise AwError(f"cannot read {path}: {error.strerror}") from None
+    if not text.strip():
+        raise AwError(f"{path} is empty: ask the rater to save again")
+    # By content: mail programs and phones rename what they like.
+    data = _json(path, text) if text.lstrip()[:1] in ("{", "[") else _csv(path, text)
+    if data["study"] != key.study:
+        raise AwError(
+            f"{path} answers study {_short(data['study'])}, the key is of study {key.study}: another page, "
+            "or a page made again since"
+        )
+    rater, name = data["rater"], data["name"]
+    if not isinstance(rater, str) or not rater.strip() or len(rater) > LONGEST or not isinstance(name, str):
+        raise AwError(f"{path} has no fit rater ({_short(rater)}): it was changed by hand; save it again")
+    answers = tuple(_answer(path, row, key) for row in data["answers"])
+    if not answers:
+        raise AwError(f"{path} holds no answer: leave it out")
+    asked = [a.question for a in answers]
+    if len(set(asked)) < len(asked):
+        double = sorted({q for q in asked if asked.count(q) > 1})
+        raise AwError(f"{path} answers a question twice ({shortlist(double)}): it was changed by hand")
+    return Rater(rater, name[:LONGEST], path, answers)
+
+
+def _json(path: Path, text: str) -> dict[str, Any]:
+    try:
+        data = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise AwError(f"{path} is cut short or malformed ({error}): ask the rater to save again") from None
+    if isinstance(data, dict) and data.get("format") == KEY_FORMAT:
+        raise AwError(f"{path} is the key, not an answer file: give it with --key")
+    if (
+        not isinstance(data, dict)
+        or data.get("format") != FORMAT
+        or not isinstance(data.get("answers"), list)
+    ):
+        raise AwError(f"{path} is no answer file of a study page")
+    if data.get("version") != VERSION:
+        raise AwError(f"{path} has version {_short(data.get('version'))}, this program reads {VERSION}")
+    return {k: data.get(k, "") for k in ("study", "rater", "name", "answers")}
+
+
+def _csv(path: Path, text: str) -> dict[str, Any]:
+    try:
+        rows = list(csv.DictReader(io.StringIO(text, newline=""), strict=True))
+    except csv.Error as error:
+        raise AwError(f"{path} is malformed CSV ({error}): ask the rater to save again") from None
+    if not rows or tuple(rows[0]) != _COLUMNS:
+        raise AwError(
+            f"{path} is no answer file: its first line must be {','.join(_COLUMNS)}, and rows follow"
+        )
+    if any(None in row or None in row.values() for row in rows):
+        raise AwError(f"{path} has a row with too few or too many cells: ask the rater to save again")
+    for column in ("study", "rater", "name"):
+        if len({row[column] for row in rows}) > 1:
+            raise AwError(f"{path} holds more than one {column}: keep one file a rater")
+    # The page writes '=x for a name =x, so that no spreadsheet computes it.
+    name = rows[0]["name"]
+    name = name[1:] if name[:1] == "'" and name[1:].lstrip()[:1] in ("=", "+", "-", "@") else name
+    return {"study": rows[0]["study"], "rater": rows[0]["rater"], "name": name, "answers": rows}
+
+
+def _answer(path: Path, row: Any, key: Key) -> Answer:
+    if not isinstance(row, dict):
+        raise AwError(f"{path} is malformed: {_short(row)} is no answer")
+    question, answer = row.get("question"), row.get("answer")
+    entry = key.questions.get(question) if isinstance(question, str) else None
+    if entry is None:
+        raise AwError(f"{path} answers a question the study never asked: {_short(question)}")
+    choices = CHOICES[entry["kind"]]
+    if not isinstance(answer, str) or answer not in choices:
+        raise AwError(f"{path} answers {_short(answer)} to {question}; there is: {', '.join(choices)}")
+    left = row.get("left") or ""
+    if left not in (("x", "y") if entry["kind"] == KIND_PAIR else ("",)):
+        raise AwError(f"{path} says {_short(left)} stood on the left of {question}: it was changed by hand")
+    try:
+        seconds = float(row.get("ms")) / 1000  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        seconds = -1.0
+    if not 0 <= seconds < 1e7:
+        raise AwError(
+            f"{path} has no fit time for {question} ({_short(row.get('ms'))}): it was changed by hand"
+        )
+    return Answer(str(question), answer, left, seconds)
+
+
+def _short(value: Any) -> str:
+    text = ascii(value)
+    return text if len(text) <= 40 else text[:37] + "..."

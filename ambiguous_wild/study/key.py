@@ -1,0 +1,65 @@
+"""The key of a study: which method stood behind which picture."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ambiguous_wild.core import AwError
+
+FORMAT, VERSION = "aw-study-key", 1
+KIND_PHOTO, KIND_PAIR = "ambiguity", "preference"
+_FIELDS = {KIND_PHOTO: ("scene", "view"), KIND_PAIR: ("scene", "view", "x", "y")}
+
+
+@dataclass(frozen=True)
+class Key:
+    study: str  # identity of the study
+    title: str
+    questions: dict[str, dict[str, str]]  # token -> kind, scene, view and, for pairs, the methods x and y
+
+
+def study_id(*parts: Any) -> str:
+    """Sixteen hexadecimal digits that change with anything in `parts`."""
+    text = json.dumps(parts, sort_keys=True, ensure_ascii=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def read_key(path: Path) -> Key:
+    """Read and check a key.
+
+    Raises:
+        AwError: unreadable, no key, of a newer version, or damaged.
+    """
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise AwError(
+            f"cannot read the key {path}: {error.strerror}; 'aw study make' wrote it beside the page"
+        ) from None
+    except (ValueError, RecursionError) as error:
+        raise AwError(f"the key {path} is damaged ({error}); take the one 'aw study make' wrote") from None
+    if not isinstance(data, dict) or data.get("format") != FORMAT:
+        raise AwError(f"{path} is no key of a study; 'aw study make' wrote it beside the page (*.key.json)")
+    if data.get("version") != VERSION:
+        raise AwError(f"the key {path} has version {data.get('version')!r}, this program reads {VERSION}")
+    questions = data.get("questions")
+    whole = (
+        isinstance(data.get("study"), str)
+        and isinstance(data.get("title"), str)
+        and isinstance(questions, dict)
+        and bool(questions)
+        and all(_whole(entry) for entry in questions.values())
+    )
+    if not whole:
+        raise AwError(f"the key {path} is damaged (a field is absent); take the one 'aw study make' wrote")
+    return Key(data["study"], data["title"], data["questions"])
+
+
+def _whole(entry: Any) -> bool:
+    if not isinstance(entry, dict) or entry.get("kind") not in _FIELDS:
+        return False
+    return all(isinstance(entry.get(field), str) for field in _FIELDS[entry["kind"]])

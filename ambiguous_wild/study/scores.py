@@ -1,0 +1,186 @@
+"""From answers and key to scores: shares, ranking, ratings, agreement."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import asdict
+from itertools import combinations
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from ambiguous_wild.metrics.ambiguity import ratio_interval
+from ambiguous_wild.study.agreement import agreement
+from ambiguous_wild.study.answers import Answer, Rater
+from ambiguous_wild.study.key import KIND_PAIR, KIND_PHOTO, Key
+from ambiguous_wild.study.ranking import bradley_terry
+
+HARD = 4  # of 5: from here on a photo counts as hard
+Counts = np.ndarray  # [raters, 2]: how often, of how many
+
+
+def score(key: Key, raters: list[Rater], seed: int = 0) -> dict[str, Any]:
+    """All scores of a study as one JSON-ready dict; what is not defined is None.
+
+    Args:
+        key: of the study.
+        raters: at least one, from `read_answers`.
+        seed: of the bootstrap over raters.
+    """
+    return {
+        "study": key.study,
+        "title": key.title,
+        "seed": seed,
+        "raters": [_rater(r, key) for r in raters],
+        KIND_PAIR: _preference(key, raters, seed),
+        KIND_PHOTO: _ambiguity(key, raters, seed),
+    }
+
+
+def _rater(rater: Rater, key: Key) -> dict[str, Any]:
+    return {
+        "rater": rater.rater,
+        "name": rater.name,
+        "answers": len(rater.answers),
+        "asked": len(key.questions),
+        "median_s": round(median(a.seconds for a in rater.answers), 2),
+        "file": rater.path.name,
+    }
+
+
+def share(counts: Counts, seed: int) -> dict[str, Any]:
+    """A share with two 95 % intervals: Wilson's (answers independent) and a bootstrap over raters.
+
+    Args:
+        counts: per rater how often, of how many.
+        seed: of the bootstrap.
+    """
+    from scipy.stats import binomtest
+
+    part, whole = (int(n) for n in counts.sum(axis=0))
+    if not whole:
+        return {"share": None, "n": 0, "low": None, "high": None, "raters_low": None, "raters_high": None}
+    wilson = binomtest(part, whole).proportion_ci(method="wilson")
+    raters = ratio_interval(counts[:, 0], counts[:, 1], seed=seed)
+    return {
+        "share": part / whole,
+        "n": whole,
+        "low": float(wilson.low),
+        "high": float(wilson.high),
+        "raters_low": _number(raters.low),
+        "raters_high": _number(raters.high),
+    }
+
+
+def _preference(key: Key, raters: list[Rater], seed: int) -> dict[str, Any] | None:
+    entries = {q: e for q, e in key.questions.items() if e["kind"] == KIND_PAIR}
+    if not entries:
+        return None
+    mine = [[a for a in r.answers if a.question in entries] for r in raters]
+    methods = sorted({e[side] for e in entries.values() for side in ("x", "y")})
+    votes = [[_vote(entries[a.question], a) for a in answers] for answers in mine]
+    ranking, note = bradley_terry(methods, _matrix(methods, votes))
+    scenes = sorted({e["scene"] for e in entries.values()})
+    return {
+        "questions": len(entries),
+        "answers": sum(map(len, mine)),
+        "methods": [_method(m, votes, seed) for m in methods],
+        "scenes": [
+            {"scene": s, **_method(m, [[v for v in one if v[2] == s] for one in votes], seed)}
+            for s in scenes
+            for m in methods
+        ],
+        "pairs": [_pair(a, b, votes, seed) for a, b in combinations(methods, 2)],
+        "ranking": [{k: _number(v) for k, v in asdict(s).items()} for s in ranking],
+        "ranking_note": note,
+        "left": share(_counts(mine, lambda a: a.answer == a.left, lambda a: a.answer != "tie"), seed),
+        "agreement": asdict(
+            agreement(
+                ((r.rater, a.question, a.answer) for r, one in zip(raters, mine) for a in one), ordered=False
+            )
+        ),
+    }
+
+
+# (winner or first method, loser or second, scene, tie)
+Vote = tuple[str, str, str, bool]
+
+
+def _vote(entry: dict[str, str], answer: Answer) -> Vote:
+    other = {"x": "y", "y": "x"}
+    won = "x" if answer.answer == "tie" else answer.answer
+    return entry[won], entry[other[won]], entry["scene"], answer.answer == "tie"
+
+
+def _matrix(methods: list[str], votes: list[list[Vote]]) -> np.ndarray:
+    index = {m: i for i, m in enumerate(methods)}
+    wins = np.zeros((len(votes), len(methods), len(methods)))
+    for rater, cast in enumerate(votes):
+        for won, lost, _, tie in cast:
+            wins[rater, index[won], index[lost]] += 0.5 if tie else 1.0
+            wins[rater, index[lost], index[won]] += 0.5 if tie else 0.0
+    return wins
+
+
+def _method(method: str, votes: list[list[Vote]], seed: int) -> dict[str, Any]:
+    counts = _counts(votes, lambda v: v[0] == method, lambda v: method in v[:2] and not v[3])
+    return {"method": method, "ties": _ties(votes, {method}), **share(counts, seed)}
+
+
+def _pair(a: str, b: str, votes: list[list[Vote]], seed: int) -> dict[str, Any]:
+    counts = _counts(votes, lambda v: v[0] == a, lambda v: {a, b} == set(v[:2]) and not v[3])
+    return {"method": a, "against": b, "ties": _ties(votes, {a, b}), **share(counts, seed)}
+
+
+def _ties(votes: list[list[Vote]], methods: set[str]) -> int:
+    return sum(v[3] and methods <= set(v[:2]) for one in votes for v in one)
+
+
+def _ambiguity(key: Key, raters: list[Rater], seed: int) -> dict[str, Any] | None:
+    entries = {q: e for q, e in key.questions.items() if e["kind"] == KIND_PHOTO}
+    if not entries:
+        return None
+    mine = [[a for a in r.answers if a.question in entries] for r in raters]
+    rated = [[a for a in one if a.answer != "none"] for one in mine]
+    rows = ((r.rater, a.question, int(a.answer)) for r, one in zip(raters, rated) for a in one)
+    scenes = sorted({e["scene"] for e in entries.values()})
+    of_scene = {s: [[a for a in one if entries[a.question]["scene"] == s] for one in mine] for s in scenes}
+    return {
+        "questions": len(entries),
+        "answers": sum(map(len, mine)),
+        "scenes": [{"scene": s, **_ratings(of_scene[s], seed)} for s in scenes],
+        "photos": [
+            {"scene": e["scene"], "view": e["view"],
+             **_ratings([[a for a in one if a.question == q] for one in mine], seed)}
+            for q, e in sorted(entries.items(), key=lambda item: (item[1]["scene"], item[1]["view"]))
+        ],
+        "agreement": asdict(agreement(rows, ordered=True)),
+    }  # fmt: skip
+
+
+def _ratings(answers: list[list[Answer]], seed: int) -> dict[str, Any]:
+    rated = [[int(a.answer) for a in one if a.answer != "none"] for one in answers]
+    mean = ratio_interval([sum(one) for one in rated], [len(one) for one in rated], seed=seed)
+    hard = share(_counts(rated, lambda v: v >= HARD, lambda v: True), seed)
+    return {
+        "mean": _number(mean.mean),
+        "mean_low": _number(mean.low),
+        "mean_high": _number(mean.high),
+        "hard": hard.pop("share"),
+        **hard,
+        "none": sum(a.answer == "none" for one in answers for a in one),
+    }
+
+
+def _counts(groups: list[list[Any]], hit: Callable[[Any], bool], of: Callable[[Any], bool]) -> Counts:
+    def two(members: Iterable[Any]) -> tuple[int, int]:
+        valid = [m for m in members if of(m)]
+        return sum(map(hit, valid)), len(valid)
+
+    return np.array([two(one) for one in groups], dtype=int).reshape(-1, 2)
+
+
+def _number(value: Any) -> Any:
+    return None if isinstance(value, float) and math.isnan(value) else value

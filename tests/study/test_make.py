@@ -1,0 +1,180 @@
+"""`aw study make`: blind, bounded, repeatable, and refused in words where it cannot be."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from ambiguous_wild.cli.study import command
+from ambiguous_wild.core import AwError
+from ambiguous_wild.study.make import page_of
+from ambiguous_wild.study.questions import Pair, draw, pairs_of_runs
+from tests.study.studies import METHODS, write_runs
+from tests.tiny_scene import TEST, TRAIN
+
+
+@pytest.fixture
+def made(tmp_path: Path) -> tuple[Path, Path]:
+    return write_runs(tmp_path)
+
+
+def make(*words: object) -> dict:
+    done = CliRunner().invoke(command, ["make", *map(str, words), "--json"], catch_exceptions=False)
+    return json.loads(done.stdout)
+
+
+def error(*words: object) -> str:
+    raised = CliRunner().invoke(command, ["make", *map(str, words)]).exception
+    assert isinstance(raised, AwError), raised
+    return str(raised)
+
+
+def data_of(page: Path) -> dict:
+    text = re.search(r'<script id="data"[^>]*>(.*?)</script>', page.read_text(), re.S)
+    assert text
+    return json.loads(text[1])
+
+
+def pixels(uri: str) -> np.ndarray:
+    head, _, body = uri.partition(",")
+    assert head == "data:image/jpeg;base64"
+    return cv2.imdecode(np.frombuffer(base64.b64decode(body), np.uint8), cv2.IMREAD_COLOR)
+
+
+def test_page_and_key_fit_together(made: tuple[Path, Path], tmp_path: Path) -> None:
+    scene, runs = made
+    facts = make("--scene", scene, "--runs", runs, "-o", tmp_path / "s.html")
+    key = json.loads((tmp_path / "s.key.json").read_text())
+    data = data_of(tmp_path / "s.html")
+    assert facts["photos"] == len(TRAIN) and facts["pairs"] == 3 * len(TEST)
+    assert data["study"] == key["study"] == facts["study"]
+    assert {q["id"]: q["kind"] for q in data["questions"]} == {
+        t: e["kind"] for t, e in key["questions"].items()
+    }
+    # Behind x stands the method that the key names: its render is the picture on the page.
+    for q in data["questions"]:
+        entry = key["questions"][q["id"]]
+        if q["kind"] == "preference":
+            for side in ("x", "y"):
+                render = cv2.imread(
+                    str(runs / "yard" / entry[side] / f"seed0/renders/test/{entry['view']}.png")
+                )
+                assert np.abs(pixels(data["images"][q["images"][side]]).astype(int) - render).mean() < 3
+    sides = [e["x"] < e["y"] for e in key["questions"].values() if e["kind"] == "preference"]
+    assert len(set(sides)) == 2  # no method is always x
+
+
+def test_the_page_is_blind(made: tuple[Path, Path], tmp_path: Path) -> None:
+    scene, runs = made
+    make("--scene", scene, "--runs", runs, "-o", tmp_path / "s.html")
+    data = data_of(tmp_path / "s.html")
+    blank = dict.fromkeys(data["images"], "")
+    text = json.dumps({**data, "images": blank})
+    for leak in (*METHODS, "yard", str(tmp_path), "seed0", *TEST, *TRAIN, "train_", "test_0"):
+        assert leak not in text
+    for uri in data["images"].values():
+        body = base64.b64decode(uri.partition(",")[2])
+        assert b"Exif" not in body and b"3dgs" not in body and str(tmp_path).encode() not in body
+    # A render and its rivals are encoded alike: size and format say nothing.
+    shapes = {pixels(u).shape for u in data["images"].values()}
+    assert len(shapes) == 1
+
+
+def test_pictures_are_bounded_and_shared(made: tuple[Path, Path], tmp_path: Path) -> None:
+    facts = make("--runs", made[1], "-o", tmp_path / "s.html", "--side", 64)
+    data = data_of(tmp_path / "s.html")
+    assert all(max(pixels(u).shape) == 64 for u in data["images"].values())
+    assert facts["pictures"] == len(data["images"]) == len(TEST) * (len(METHODS) + 1)
+
+
+def test_the_same_seed_makes_the_same_files_and_another_another(
+    made: tuple[Path, Path], tmp_path: Path
+) -> None:
+    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+        make("--runs", made[1], "-o", tmp_path / f"{name}.html", "--seed", seed)
+    text = {n: (tmp_path / f"{n}.html").read_text() for n in "abc"}
+    assert text["a"] == text["b"] != text["c"]
+    assert (tmp_path / "a.key.json").read_text() == (tmp_path / "b.key.json").read_text()
+
+
+def test_drawing_is_even_over_pairs(tmp_path: Path) -> None:
+    pairs = [
+        Pair(s, str(v), m, (Path("a"), Path("b")), None)
+        for s in ("s", "t")
+        for v in range(20)
+        for m in (("a", "b"), ("a", "c"), ("b", "c"))
+    ]
+    chosen = draw(pairs, 12, np.random.default_rng(0))
+    assert len(set(map(id, chosen))) == 12
+    counts = [sum(q.group == g for q in chosen) for g in {p.group for p in pairs}]
+    assert counts == [2] * 6
+
+
+def test_outline_and_truth_can_be_left_out(made: tuple[Path, Path], tmp_path: Path) -> None:
+    scene, runs = made
+    make("--scene", scene, "--runs", runs, "-o", tmp_path / "s.html", "--no-outline", "--no-truth")
+    slots = {tuple(q["images"]) for q in data_of(tmp_path / "s.html")["questions"]}
+    assert slots == {("photo",), ("x", "y")}
+
+
+def test_photos_in_which_nothing_moves_are_not_asked_about(made: tuple[Path, Path], tmp_path: Path) -> None:
+    scene = made[0]
+    masks = scene / "truth/distractor"
+    cv2.imwrite(str(masks / TRAIN[0]), np.zeros((48, 64), np.uint8))
+    assert make("--scene", scene, "-o", tmp_path / "s.html")["photos"] == len(TRAIN) - 1
+    for name in TRAIN:
+        cv2.imwrite(str(masks / name), np.zeros((48, 64), np.uint8))
+    assert "nothing moves" in error("--scene", scene, "-o", tmp_path / "t.html")
+
+
+def test_what_cannot_be_is_said(made: tuple[Path, Path], tmp_path: Path) -> None:
+    scene, runs = made
+    out = tmp_path / "s.html"
+    assert "nothing to ask" in error("-o", out)
+    assert "*.html" in error("--scene", scene, "-o", tmp_path / "s.txt")
+    assert "unknown method 'refinesplit': did you mean 'refinesplat'" in error(
+        "--runs", runs, "-o", out, "--method", "refinesplit"
+    )
+    assert "two methods" in error("--runs", runs, "-o", out, "--method", "3dgs")
+    assert "give --runs" in error("--scene", scene, "-o", out, "--method", "3dgs")
+    wide = runs / "yard/3dgs/seed0/renders/test" / TEST[0]
+    cv2.imwrite(str(wide), np.zeros((48, 70, 3), np.uint8))
+    assert "differ in size" in error("--runs", runs, "-o", out)
+    shutil.rmtree(wide.parent)
+    assert "3dgs lacks renders/test" in error("--runs", runs, "-o", out)
+    shutil.rmtree(runs / "yard/3dgs")
+    shutil.rmtree(scene)
+    assert "--no-truth" in error("--runs", runs, "-o", out)
+    assert not out.exists() and not (tmp_path / "s.key.json").exists()
+
+
+def test_an_old_page_is_not_replaced_unasked(made: tuple[Path, Path], tmp_path: Path) -> None:
+    out = tmp_path / "s.html"
+    make("--scene", made[0], "-o", out)
+    before = out.read_text()
+    assert "--force" in error("--scene", made[0], "-o", out, "--seed", 1)
+    assert out.read_text() == before
+    make("--scene", made[0], "-o", out, "--seed", 1, "--force")
+    assert out.read_text() != before
+
+
+def test_data_cannot_leave_its_script_element() -> None:
+    page = page_of(
+        {"title": "</script><script>alert(1)</script>", "study": "x", "questions": [], "images": {}}
+    )
+    assert page.count("</script>") == 2 and "alert(1)</script>" not in page
+
+
+def test_a_method_of_any_name_stays_in_the_key(tmp_path: Path) -> None:
+    _, runs = write_runs(tmp_path, ("<b>a</b>", "=b"))
+    assert {m for p in pairs_of_runs(runs) for m in p.methods} == {"<b>a</b>", "=b"}
+    make("--runs", runs, "-o", tmp_path / "s.html")
+    assert "<b>a" not in (tmp_path / "s.html").read_text()

@@ -143,8 +143,9 @@ def main(words: Sequence[str] | None = None) -> int:
     book_path = args.results.with_name(args.results.name + "-runs.csv")
     book = read_book(book_path)
     failed = [] if args.report_only else run_all(cells, book, args)
-    runs = read_runs(args.out)
-    book = merged(book, book_of(runs))
+    # without a run folder the book may hold them all
+    runs = read_runs(args.out) if any(cell_folder(args.out, cell).is_dir() for cell in cells) else None
+    book = book if runs is None else merged(book, book_of(runs))
     write_text(book_path, book.to_csv(index=False, float_format="%.7g"))
     book = current(book, cells)
     scenes = {cell.scene.name: cell.scene for cell in cells}

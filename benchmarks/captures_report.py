@@ -127,11 +127,15 @@ def threads_of(book: pd.DataFrame) -> list[int]:
 
 
 def missing_runs(
-    book: pd.DataFrame, runs: Runs, scenes: Sequence[str], methods: Sequence[str], seeds: Sequence[int]
+    book: pd.DataFrame,
+    runs: Runs | None,
+    scenes: Sequence[str],
+    methods: Sequence[str],
+    seeds: Sequence[int],
 ) -> list[dict[str, Any]]:
     """Every run that is not in the book: capture, method, seed, and whether it failed or is not finished."""
     known = set(zip(book.capture, book.method, book.seed, strict=True))
-    tried = {(run.scene, run.method, run.seed) for run in runs.runs.itertuples()}
+    tried = set() if runs is None else {(r.scene, r.method, r.seed) for r in runs.runs.itertuples()}
     return [
         {
             "capture": scene,

@@ -207,6 +207,12 @@ class Trainer:
             antialias=self.parts.antialias,
         )
 
+    def neutral_model(self) -> Gaussians:
+        """The Gaussians for any viewer: what effects do to them for every camera is part of them."""
+        if self.effects is None:
+            return self.gaussians
+        return self.effects.model(self.gaussians, None, self.iteration)
+
     def render_fitted(self, camera: Camera, photo: Tensor, keep: Tensor) -> Tensor:
         """A test view after its colour effects were fitted to the part of its photo that `keep` shows."""
         self.optimiser.flush()

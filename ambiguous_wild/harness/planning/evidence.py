@@ -1,0 +1,165 @@
+"""Evidence that needs no training: what the sparse model and the photos at its points say.
+
+Every function returns a number, NaN where the scene cannot tell; `decide.py` holds the thresholds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ambiguous_wild.core import Scene
+from ambiguous_wild.splat.effects.tracks import TrackColours, grouped_median, log_gains, track_colours
+
+LEAST = 50  # observations below which nothing is said
+LEAST_VIEWS = 6  # of a point, to fit four numbers to its colour
+MOST = 20_000  # points whose view dependence is fitted; more do not change a median
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a scene shows, each in the unit of its threshold; NaN = it cannot be told."""
+
+    exposure: float  # spread of the photos' gains, share of a code value
+    appearance: float  # spread at a point that a gain per photo leaves, share of a code value
+    sampling: float  # ratio of the coarsest photo's pixel to the finest's, on the scene
+    view_dependence: float  # median amplitude of what follows the direction, code values in [0, 1]
+    reprojection_px: float  # median of points in the train photos, px of the loaded images
+    observations: int  # in train photos, usable for colour
+
+
+def measure(scene: Scene, photos: Sequence[np.ndarray]) -> Evidence:
+    """All of it.
+
+    Args:
+        scene: with tracks.
+        photos: of the train views, [H, W, 3] in [0, 1].
+    """
+    colours = track_colours(scene, photos)
+    gains = log_gains(colours, len(scene.train))
+    enough = len(colours.point) >= LEAST
+    return Evidence(
+        exposure=exposure_spread(gains) if enough else np.nan,
+        appearance=remaining_spread(colours, gains) if enough else np.nan,
+        sampling=sampling_ratio(scene),
+        view_dependence=view_dependence(scene, colours, gains) if enough else np.nan,
+        reprojection_px=reprojection(scene),
+        observations=len(colours.point),
+    )
+
+
+def has_tracks(scene: Scene) -> bool:
+    """Whether any point was seen at a known place of a photo; without, no photo need be read."""
+    return bool((scene.points.track_views >= 0).sum() >= LEAST)
+
+
+def exposure_spread(gains: np.ndarray) -> float:
+    """Standard deviation over photos of log gain, root mean square over channels.
+
+    Each photo's gain is a median already; over photos every one counts, since one dark photo is enough to
+    leave a dark floater.
+    """
+    return float(np.sqrt((gains.std(axis=0) ** 2).mean()))
+
+
+def remaining_spread(colours: TrackColours, gains: np.ndarray) -> float:
+    """What is left at a point between photos once each has its gain: median absolute deviation, as a sigma.
+
+    Counts points of three photos at least: of two the median is halfway between.
+    """
+    counts = np.bincount(colours.point)
+    rows = counts[colours.point] >= 3
+    if rows.sum() < LEAST:
+        return float("nan")
+    logs = np.log(colours.rgb[rows]) - gains[colours.view[rows]]
+    left = np.abs(logs - grouped_median(logs, colours.point[rows])).mean(axis=1)
+    # a deviation from the median of few is too small: n / (n - 1), as for a variance
+    n = counts[colours.point[rows]]
+    return float(1.4826 * np.median(left * np.sqrt(n / (n - 1))))
+
+
+def sampling_ratio(scene: Scene) -> float:
+    """Ratio of the 95th to the 5th percentile, over train photos, of a pixel's size on the points it sees.
+
+    A pixel covers depth / focal length; each photo counts with the median over its points.
+    """
+    sizes = []
+    for index, view in enumerate(scene.views):
+        if view.split != "train":
+            continue
+        xyz = scene.points.xyz[_points_of(scene, index)]
+        depth = (xyz @ view.camera.cam_from_world[:3, :3].T + view.camera.cam_from_world[:3, 3])[:, 2]
+        depth = depth[depth > 0]
+        if len(depth) >= 5:
+            sizes.append(float(np.median(depth)) / (0.5 * (view.camera.fx + view.camera.fy)))
+    if len(sizes) < 3:
+        return float("nan")
+    low, high = np.percentile(sizes, [5, 95])
+    return float(high / low)
+
+
+def reprojection(scene: Scene) -> float:
+    """Median distance between where a point was found and where it projects, px of the loaded photos."""
+    found = []
+    for index, view in enumerate(scene.views):
+        if view.split != "train":
+            continue
+        rows = np.flatnonzero(scene.points.track_views == index)
+        camera = view.camera
+        xyz = scene.points.xyz[_owner(scene)[rows]]
+        local = xyz @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+        front = local[:, 2] > 1e-6
+        local = local[front]
+        uv = local[:, :2] / local[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+        found.append(np.linalg.norm(uv - scene.points.track_xy[rows][front], axis=1))
+    errors = np.concatenate(found) if found else np.zeros(0)
+    return float(np.median(errors)) if len(errors) >= LEAST else float("nan")
+
+
+def view_dependence(scene: Scene, colours: TrackColours, gains: np.ndarray) -> float:
+    """Median over points of the amplitude of colour that is linear in the viewing direction.
+
+    A fit of four numbers explains noise too: what it explains by chance is subtracted (the adjusted
+    coefficient of determination). Points of six photos at least.
+    """
+    rgb = colours.rgb / np.exp(gains[colours.view])
+    order = np.argsort(colours.point, kind="stable")
+    point, view, grey = colours.point[order], colours.view[order], rgb[order].mean(axis=1)
+    starts = np.flatnonzero(np.r_[True, point[1:] != point[:-1]])
+    sizes = np.diff(np.r_[starts, len(point)])
+    chosen = np.flatnonzero(sizes >= LEAST_VIEWS)
+    if len(chosen) < 10:
+        return float("nan")
+    if len(chosen) > MOST:
+        chosen = np.random.default_rng(0).choice(chosen, MOST, replace=False)
+    centres = np.array([v.camera.center for v in scene.train])
+    amplitudes = []
+    for k in chosen:
+        rows = slice(starts[k], starts[k] + sizes[k])
+        direction = centres[view[rows]] - scene.points.xyz[point[starts[k]]]
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        amplitudes.append(_explained(direction, grey[rows]))
+    # signed squares: where nothing depends on the direction they scatter about zero
+    return float(np.sqrt(max(np.median(amplitudes), 0.0)))
+
+
+def _explained(direction: np.ndarray, grey: np.ndarray) -> float:
+    """Variance of `grey` [n] that its direction explains beyond chance; may be negative."""
+    n = len(grey)
+    design = np.column_stack([np.ones(n), direction])
+    coefficients, *_ = np.linalg.lstsq(design, grey, rcond=1e-3)
+    left = float(((grey - design @ coefficients) ** 2).sum())
+    used = int(np.linalg.matrix_rank(design, tol=1e-3 * np.sqrt(n)))
+    if n <= used:
+        return 0.0
+    return float(grey.var(ddof=1)) - left / (n - used)
+
+
+def _owner(scene: Scene) -> np.ndarray:
+    return np.repeat(np.arange(len(scene.points)), np.diff(scene.points.track_offsets))
+
+
+def _points_of(scene: Scene, index: int) -> np.ndarray:
+    return _owner(scene)[scene.points.track_views == index]

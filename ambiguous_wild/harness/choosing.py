@@ -75,7 +75,7 @@ def choose(
     if wanted not in ("auto", "default"):
         effects = ALL if wanted == "all" else named
         return {m.name: Chosen(effects, "" if wanted == "none" else wanted) for m in methods}
-    # a graft has parts of several papers: it is what its name says and nothing more
+    # of grafts none: they are what their names say and nothing more
     allowed = {m.name: None if wanted == "auto" else m.auto_effects for m in methods}
     if plan is None and any(names is None or names for names in allowed.values()):
         from ambiguous_wild.harness.planning.decide import plan_without_training

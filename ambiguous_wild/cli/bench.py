@@ -149,7 +149,9 @@ def command(
 
     check_wanted(effects)
     if plan_file is not None and len(scenes) > 1:
-        raise AwError(f"--plan {plan_file} is of one scene; bench {len(scenes)} scenes one by one, or without it")
+        raise AwError(
+            f"--plan {plan_file} is of one scene; bench {len(scenes)} scenes one by one, or without it"
+        )
 
     from ambiguous_wild.harness.grid import plan_cells, run_cells
     from ambiguous_wild.io.atomic import check_output

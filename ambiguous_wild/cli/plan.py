@@ -15,15 +15,21 @@ if TYPE_CHECKING:
 
 @click.command("plan")
 @click.argument("scene", type=click.Path(path_type=Path))
-@click.option("--factor", type=click.IntRange(1), help="Look at images_N.  [default: what the scene was built for]")
+@click.option(
+    "--factor", type=click.IntRange(1), help="Look at images_N.  [default: what the scene was built for]"
+)
 @click.option(
     "--probe/--no-probe",
     default=True,
     show_default=True,
     help="Train 3DGS shortly on small photos: masks need it, all others do not.",
 )
-@click.option("--costs/--no-costs", default=False, show_default=True, help="Time every effect on this machine.")
-@click.option("-o", "--out", type=click.Path(path_type=Path, dir_okay=False), help="Default: SCENE-plan.json.")
+@click.option(
+    "--costs/--no-costs", default=False, show_default=True, help="Time every effect on this machine."
+)
+@click.option(
+    "-o", "--out", type=click.Path(path_type=Path, dir_okay=False), help="Default: SCENE-plan.json."
+)
 @click.option("--json", "as_json", is_flag=True, help="Print the plan as JSON.")
 def command(
     scene: Path, factor: int | None, probe: bool, costs: bool, out: Path | None, as_json: bool

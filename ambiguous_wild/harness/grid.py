@@ -79,7 +79,9 @@ def plan_cells(
             resolved = with_options(entry.options(), options, f"option of {entry.name}")
             for seed in dict.fromkeys(seeds):
                 config = dataclasses.replace(train, seed=seed)
-                cells.append(Cell(entry, resolved, scene, identity, config, device, chosen[entry.name], protocol))
+                cells.append(
+                    Cell(entry, resolved, scene, identity, config, device, chosen[entry.name], protocol)
+                )
     return cells
 
 

@@ -270,7 +270,9 @@ def _train_and_measure(
         "per_image": per_image,
         "missing": missing,
         "masks": masks,
-        "facts": trainer.parts.mask.facts() | {"skipped_views": trainer.skipped_views} | _effect_facts(cell, trainer),
+        "facts": trainer.parts.mask.facts()
+        | {"skipped_views": trainer.skipped_views}
+        | _effect_facts(cell, trainer),
         "cost": cost
         | {
             "fps": evaluate.frames_per_second(trainer),

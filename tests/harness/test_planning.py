@@ -19,7 +19,7 @@ from ambiguous_wild.methods.registry import get_method
 from ambiguous_wild.splat.trainer import TrainConfig
 from tests.tiny_scene import write_tiny_scene
 
-VIEWS, POINTS, WIDTH, HEIGHT, FOCAL = 12, 250, 160, 90, 140.0
+VIEWS, POINTS, WIDTH, HEIGHT, FOCAL = 12, 150, 160, 90, 200.0
 
 
 def look_at(centre):
@@ -121,7 +121,12 @@ def test_a_plan_survives_its_file(tmp_path):
     assert again.plain() == plan.plain()
     assert again.effects() == ("antialias", "sh1")
     assert [d.cost_ms for d in again.decisions if d.effect == "antialiasing"] == [0.5]
-    for text in ("{half", "[]", '{"schema": 2}', json.dumps(plan.plain() | {"decisions": [{"decision": "on"}]})):
+    for text in (
+        "{half",
+        "[]",
+        '{"schema": 2}',
+        json.dumps(plan.plain() | {"decisions": [{"decision": "on"}]}),
+    ):
         (tmp_path / "bad.json").write_text(text)
         with pytest.raises(AwError, match="is no plan"):
             read_plan(tmp_path / "bad.json")

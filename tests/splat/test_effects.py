@@ -275,7 +275,9 @@ def test_the_cameras_gradient_against_finite_differences_of_the_reference(degree
     def loss(delta):
         pose = moved(cam.cam_from_world, delta[:3].numpy(), effect.depth * delta[3:].numpy())
         frozen = {name: tensor.detach() for name, tensor in parameters.items()}
-        return (render_reference(frozen, replace(cam, cam_from_world=pose), sh_degree=degree).image * weight).sum()
+        return (
+            render_reference(frozen, replace(cam, cam_from_world=pose), sh_degree=degree).image * weight
+        ).sum()
 
     expected = numeric(loss, effect.adam.values[0].clone(), step=1e-6)
     torch.testing.assert_close(effect._gradient, expected, rtol=1e-4, atol=1e-4)
@@ -302,7 +304,10 @@ GAINS = [0.8, 1.05, 0.9, 1.1, 0.75, 1.0]
 @pytest.mark.parametrize("name", ["exposure", "appearance"])
 def test_colour_effects_explain_drifting_exposure(scene, tmp_path, name):
     drift = lambda data: brightened(data, GAINS)  # noqa: E731
-    runs = {n: trainer_for(scene, tmp_path / (n or "none"), [n] if n else [], drift, iterations=300) for n in ("", name)}
+    runs = {
+        n: trainer_for(scene, tmp_path / (n or "none"), [n] if n else [], drift, iterations=300)
+        for n in ("", name)
+    }
     for run in runs.values():
         run.train()
     photos = runs[""].data.photos
@@ -333,7 +338,9 @@ def test_poses_return_when_they_were_disturbed(scene, tmp_path):
 
     def disturb(data):
         noise = rng.normal(size=(len(truth), 3)) * 0.012
-        cameras = [replace(c, cam_from_world=moved(c.cam_from_world, n, np.zeros(3))) for c, n in zip(truth, noise)]
+        cameras = [
+            replace(c, cam_from_world=moved(c.cam_from_world, n, np.zeros(3))) for c, n in zip(truth, noise)
+        ]
         return replace(data, cameras=cameras)
 
     trainer = trainer_for(scene, tmp_path, ("poses",), disturb, iterations=400)

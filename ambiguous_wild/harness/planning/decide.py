@@ -101,7 +101,7 @@ def decide(scene: str, found: Evidence) -> Plan:
     moved = answer(found.reprojection_px, REPROJECTION_PX)
     lines = (
         Decision(
-            "appearance embedding", "spread at a point once each photo has its gain", found.appearance,
+            "appearance embedding", "spread at a point after gain and shine", found.appearance,
             APPEARANCE, "of a code", local,
             "light differs by place, not by photo alone" if local == "on" else "no more than texture and noise",
             "--effects appearance",

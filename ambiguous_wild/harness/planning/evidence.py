@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ambiguous_wild.core import Scene
-from ambiguous_wild.splat.effects.tracks import TrackColours, grouped_median, log_gains, track_colours
+from ambiguous_wild.splat.effects.tracks import TrackColours, log_gains, track_colours
 
 LEAST = 50  # observations below which nothing is said
 LEAST_VIEWS = 6  # of a point, to fit four numbers to its colour
@@ -40,11 +40,13 @@ def measure(scene: Scene, photos: Sequence[np.ndarray]) -> Evidence:
     colours = track_colours(scene, photos)
     gains = log_gains(colours, len(scene.train))
     enough = len(colours.point) >= LEAST
+    grey = colours.rgb.mean(axis=1) / np.exp(gains[colours.view].mean(axis=1))
+    in_codes, in_logs = (_fit_points(scene, colours, v) for v in (grey, np.log(grey)))
     return Evidence(
         exposure=exposure_spread(gains) if enough else np.nan,
-        appearance=remaining_spread(colours, gains) if enough else np.nan,
+        appearance=remaining_spread(in_logs),
         sampling=sampling_ratio(scene),
-        view_dependence=view_dependence(scene, colours, gains) if enough else np.nan,
+        view_dependence=view_dependence(in_codes),
         reprojection_px=reprojection(scene),
         observations=len(colours.point),
     )
@@ -62,22 +64,6 @@ def exposure_spread(gains: np.ndarray) -> float:
     leave a dark floater.
     """
     return float(np.sqrt((gains.std(axis=0) ** 2).mean()))
-
-
-def remaining_spread(colours: TrackColours, gains: np.ndarray) -> float:
-    """What is left at a point between photos once each has its gain: median absolute deviation, as a sigma.
-
-    Counts points of three photos at least: of two the median is halfway between.
-    """
-    counts = np.bincount(colours.point)
-    rows = counts[colours.point] >= 3
-    if rows.sum() < LEAST:
-        return float("nan")
-    logs = np.log(colours.rgb[rows]) - gains[colours.view[rows]]
-    left = np.abs(logs - grouped_median(logs, colours.point[rows])).mean(axis=1)
-    # a deviation from the median of few is too small: n / (n - 1), as for a variance
-    n = counts[colours.point[rows]]
-    return float(1.4826 * np.median(left * np.sqrt(n / (n - 1))))
 
 
 def sampling_ratio(scene: Scene) -> float:
@@ -118,43 +104,60 @@ def reprojection(scene: Scene) -> float:
     return float(np.median(errors)) if len(errors) >= LEAST else float("nan")
 
 
-def view_dependence(scene: Scene, colours: TrackColours, gains: np.ndarray) -> float:
-    """Median over points of the amplitude of colour that is linear in the viewing direction.
+@dataclass(frozen=True)
+class _Fits:
+    """Of every point seen often enough, the variance of its colour that its viewing direction explains."""
 
-    A fit of four numbers explains noise too: what it explains by chance is subtracted (the adjusted
-    coefficient of determination). Points of six photos at least.
+    explained: np.ndarray  # [P] beyond chance; scatters about zero where there is nothing
+    left: np.ndarray  # [P] unbiased variance of what it does not
+
+
+def _fit_points(scene: Scene, colours: TrackColours, values: np.ndarray) -> _Fits:
+    """A constant and three numbers linear in the direction, by least squares, for points of six photos on.
+
+    A fit explains noise too: what it explains by chance is subtracted (the adjusted coefficient of
+    determination).
     """
-    rgb = colours.rgb / np.exp(gains[colours.view])
     order = np.argsort(colours.point, kind="stable")
-    point, view, grey = colours.point[order], colours.view[order], rgb[order].mean(axis=1)
+    point, view, values = colours.point[order], colours.view[order], values[order]
     starts = np.flatnonzero(np.r_[True, point[1:] != point[:-1]])
     sizes = np.diff(np.r_[starts, len(point)])
     chosen = np.flatnonzero(sizes >= LEAST_VIEWS)
-    if len(chosen) < 10:
-        return float("nan")
     if len(chosen) > MOST:
         chosen = np.random.default_rng(0).choice(chosen, MOST, replace=False)
     centres = np.array([v.camera.center for v in scene.train])
-    amplitudes = []
+    fits = []
     for k in chosen:
         rows = slice(starts[k], starts[k] + sizes[k])
         direction = centres[view[rows]] - scene.points.xyz[point[starts[k]]]
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-        amplitudes.append(_explained(direction, grey[rows]))
-    # signed squares: where nothing depends on the direction they scatter about zero
-    return float(np.sqrt(max(np.median(amplitudes), 0.0)))
+        fits.append(_fit(direction, values[rows]))
+    return _Fits(*np.array(fits).reshape(-1, 2).T)
 
 
-def _explained(direction: np.ndarray, grey: np.ndarray) -> float:
-    """Variance of `grey` [n] that its direction explains beyond chance; may be negative."""
-    n = len(grey)
-    design = np.column_stack([np.ones(n), direction])
-    coefficients, *_ = np.linalg.lstsq(design, grey, rcond=1e-3)
-    left = float(((grey - design @ coefficients) ** 2).sum())
-    used = int(np.linalg.matrix_rank(design, tol=1e-3 * np.sqrt(n)))
-    if n <= used:
-        return 0.0
-    return float(grey.var(ddof=1)) - left / (n - used)
+def _fit(direction: np.ndarray, values: np.ndarray) -> tuple[float, float]:
+    n = len(values)
+    # directions of a narrow arc are nearly one: what they cannot tell apart is left out of the fit
+    axes, spread, _ = np.linalg.svd(direction - direction.mean(axis=0), full_matrices=False)
+    rank = int((spread > 0.05 * np.sqrt(n)).sum())
+    centred = values - values.mean()
+    explained = axes[:, :rank] @ (axes[:, :rank].T @ centred)
+    variance = float(((centred - explained) ** 2).sum()) / (n - 1 - rank)
+    return float(centred @ centred) / (n - 1) - variance, variance
+
+
+def view_dependence(fits: _Fits) -> float:
+    """Median over points of the amplitude of colour that is linear in the viewing direction."""
+    if len(fits.explained) < 10:
+        return float("nan")
+    return float(np.sqrt(max(np.median(fits.explained), 0.0)))
+
+
+def remaining_spread(fits: _Fits) -> float:
+    """Median over points of what is left between photos once each has its gain and each point its shine."""
+    if len(fits.left) < 10:
+        return float("nan")
+    return float(np.sqrt(np.median(fits.left)))
 
 
 def _owner(scene: Scene) -> np.ndarray:

@@ -90,7 +90,11 @@ def summarise(patches: list[np.ndarray]) -> Occlusion:
 
 
 def occlusion(
-    scene: Scene, effects: tuple[str, ...] = (), *, iterations: int = ITERATIONS, tick: Callable[[], None] | None = None
+    scene: Scene,
+    effects: tuple[str, ...] = (),
+    *,
+    iterations: int = ITERATIONS,
+    tick: Callable[[], None] | None = None,
 ) -> Occlusion:
     """Train the probe and look at what it leaves.
 
@@ -143,7 +147,9 @@ def effect_costs(scene: Scene, *, rounds: int = 12, steps: int = 3) -> dict[str,
 def with_occlusion(plan: Plan, found: Occlusion) -> Plan:
     """The plan with the lines that the probe answers, first."""
 
-    def line(effect: str, evidence: str, value: float, threshold: float, on: str, off: str, how: str) -> Decision:
+    def line(
+        effect: str, evidence: str, value: float, threshold: float, on: str, off: str, how: str
+    ) -> Decision:
         decision = answer(value, threshold)
         why = on if decision == "on" else off
         return Decision(effect, evidence, value, threshold, "of the pixels", decision, why, how)

@@ -74,7 +74,9 @@ class Chain:
         for effect in self._rows:
             effect.rows_changed()
 
-    def fit_view(self, gaussians: Gaussians, camera: Camera, photo: Tensor, keep: Tensor, draw: Draw) -> Tensor:
+    def fit_view(
+        self, gaussians: Gaussians, camera: Camera, photo: Tensor, keep: Tensor, draw: Draw
+    ) -> Tensor:
         """Fit the colour effects, and nothing else, to a part of a photo; the picture under that fit.
 
         Args:

@@ -1,10 +1,10 @@
-"""What optional effects cost when off and when on, and what `aw plan` decides on scenes whose needs are known.
+"""What optional effects cost, off and on, and what `aw plan` decides on scenes whose needs are known.
 
     python benchmarks/effects.py --cost SCENE [--rounds N]
     python benchmarks/effects.py --scenes yard=exposure,masks street= [--no-probe] [--json PATH]
 
 --cost: ms an iteration of plain 3DGS, of the same code with an effect that does nothing, and of each effect;
-all take turns within every round, so that they meet the same machine, and the median of the differences counts.
+all take turns within every round, so that they meet the same machine; medians of the differences count.
 --scenes: FOLDER=EFFECTS, what each scene was made to call for; prints the confusion table per effect.
 """
 

@@ -20,8 +20,8 @@ from ambiguous_wild.core import AwError, Camera, Scene
 from ambiguous_wild.core.config import config_hash, to_plain
 from ambiguous_wild.harness import evaluate
 from ambiguous_wild.harness import pictures as run_pictures
-from ambiguous_wild.harness.environment import environment
 from ambiguous_wild.harness.choosing import Chosen
+from ambiguous_wild.harness.environment import environment
 from ambiguous_wild.harness.memory import peak_rss_mb, reset_peak
 from ambiguous_wild.harness.store import read_result, write_result
 from ambiguous_wild.io.atomic import sweep, write_json, write_text
@@ -53,7 +53,7 @@ class Cell:
     scene_id: str  # sha256 of what the scene was built from, see `scene_identity`
     train: TrainConfig
     device: str = "cpu"
-    chosen: Chosen = Chosen()  # optional effects, and why
+    chosen: Chosen = field(default_factory=Chosen)  # optional effects, and why
     protocol: Protocol = "full"  # "half": measured on the right half, colour effects fitted on the left
 
     @property

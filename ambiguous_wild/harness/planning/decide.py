@@ -51,7 +51,7 @@ class Plan:
     probed: bool = False
 
     def effects(self, among: Iterable[str] | None = None) -> tuple[str, ...]:
-        """Names for `--effects`: what was decided on, of those allowed. The SH degree's name counts as one."""
+        """Names for `--effects`: what was decided on, and the lower SH degree, of those allowed."""
         found = [d.how.removeprefix("--effects ") for d in self.decisions if _adds(d)]
         return tuple(name for name in found if among is None or name in tuple(among))
 
@@ -103,7 +103,7 @@ def decide(scene: str, found: Evidence) -> Plan:
         Decision(
             "appearance embedding", "spread at a point after gain and shine", found.appearance,
             APPEARANCE, "of a code", local,
-            "light differs by place, not by photo alone" if local == "on" else "no more than texture and noise",
+            "light differs by place" if local == "on" else "no more than texture and noise",
             "--effects appearance",
         ),
         Decision(

@@ -43,7 +43,7 @@ def measure(scene: Scene, photos: Sequence[np.ndarray]) -> Evidence:
     grey = colours.rgb.mean(axis=1) / np.exp(gains[colours.view].mean(axis=1))
     in_codes, in_logs = (_fit_points(scene, colours, v) for v in (grey, np.log(grey)))
     return Evidence(
-        exposure=exposure_spread(gains) if enough else np.nan,
+        exposure=exposure_spread(colours, gains) if enough else np.nan,
         appearance=remaining_spread(in_logs),
         sampling=sampling_ratio(scene),
         view_dependence=view_dependence(in_codes),
@@ -57,13 +57,20 @@ def has_tracks(scene: Scene) -> bool:
     return bool((scene.points.track_views >= 0).sum() >= LEAST)
 
 
-def exposure_spread(gains: np.ndarray) -> float:
-    """Standard deviation over photos of log gain, root mean square over channels.
+def exposure_spread(colours: TrackColours, gains: np.ndarray) -> float:
+    """Standard deviation of log gain between the photos that see a same point, rms over channels.
 
-    Each photo's gain is a median already; over photos every one counts, since one dark photo is enough to
-    leave a dark floater.
+    Not between all photos: along a strip of photos small errors add up from neighbour to neighbour, and
+    two photos that share nothing cannot disagree.
     """
-    return float(np.sqrt((gains.std(axis=0) ** 2).mean()))
+    counts = np.bincount(colours.point)
+    rows = counts[colours.point] >= 2
+    if not rows.any():
+        return float("nan")
+    point, values = colours.point[rows], gains[colours.view[rows]]
+    n = counts[point][:, None]
+    mean = np.stack([np.bincount(point, values[:, c], len(counts))[point] for c in range(3)], axis=1) / n
+    return float(np.sqrt(((values - mean) ** 2 * n / (n - 1)).mean()))
 
 
 def sampling_ratio(scene: Scene) -> float:

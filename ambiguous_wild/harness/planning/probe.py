@@ -71,8 +71,8 @@ def unexplained(photo: np.ndarray, render: np.ndarray, seen: np.ndarray) -> np.n
         seen: [H, W] bool, where the model has anything to say.
     """
     side = max(round(WINDOW * max(photo.shape[:2])), 3)
-    weight = uniform_filter(seen.astype(np.float64), side, mode="nearest")
-    signed = uniform_filter((photo - render) * seen[..., None], (side, side, 1), mode="nearest")
+    weight = uniform_filter(seen.astype(np.float64), side, mode="constant")
+    signed = uniform_filter((photo - render) * seen[..., None], (side, side, 1), mode="constant")
     mean = np.abs(signed / np.maximum(weight, 1e-6)[..., None]).max(axis=2)
     return (mean > STANDS_OUT) & seen & (weight > 0.25)
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 # name -> (module, class, what it is for), in the order in which they act on a render
 EFFECTS: dict[str, tuple[str, str, str]] = {
     "exposure": ("exposure", "AffineExposure", "an affine change of colour per photo"),
-    "appearance": ("appearance", "AppearanceEmbedding", "light that changes from photo to photo and place to place"),
+    "appearance": ("appearance", "AppearanceEmbedding", "light that changes by photo and place"),
     "antialias": ("smoothing", "SmoothingFilter", "Mip-Splatting's filters, for photos from near and far"),
     "poses": ("poses", "PoseRefinement", "a small correction of every camera's pose"),
     "sh0": ("", "", "colours that do not depend on the direction"),

@@ -50,7 +50,7 @@ class AppearanceEmbedding(Effect):
         self._graph: tuple[dict[str, Tensor], Tensor] | None = None
 
     def features(self, means: Tensor) -> Tensor:
-        """[N, 25] Fourier features of positions (WildGaussians' start of its per-Gaussian embedding), and 1."""
+        """[N, 25]: Fourier features of positions, as WildGaussians starts its embeddings from, and 1."""
         unit = ((means - self.centre) / self.spread).clamp(-1.5, 1.5)
         angles = torch.cat([unit * (torch.pi * 2.0**k / 2) for k in range(OCTAVES)], dim=1)
         return torch.cat([angles.sin(), angles.cos(), torch.ones_like(unit[:, :1])], dim=1)

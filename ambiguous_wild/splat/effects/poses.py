@@ -111,6 +111,8 @@ def left_gradient(gaussians: Gaussians, camera: Camera, gradients: Gradients, de
         degree: largest SH degree that the render may have used.
     """
     rows = torch.nonzero(gradients.means.abs().sum(dim=1) + gradients.quats.abs().sum(dim=1)).squeeze(1)
+    if not len(rows):  # nothing in the picture learns from it
+        return torch.zeros(6, dtype=torch.float64)
     pose = torch.as_tensor(camera.cam_from_world.copy(), device=gaussians.device)
     rotation, move = pose[:3, :3], pose[:3, 3]
     means = gaussians.means[rows].double()

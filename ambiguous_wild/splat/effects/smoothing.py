@@ -85,7 +85,7 @@ class SmoothingFilter(Effect):
 
 @torch.no_grad()
 def filter_sizes(means: Tensor, cameras: list[Camera]) -> Tensor:
-    """f [N] in world units: sqrt(0.2) z / F, z of the nearest camera that sees it, F the longest focal length.
+    """f [N] in world units: sqrt(0.2) z / F, z to the nearest camera that sees it, F the longest focal.
 
     Args:
         means: [N, 3] world.

@@ -21,9 +21,9 @@ from ambiguous_wild.splat.reference import harmonics
 from ambiguous_wild.splat.rendered import Gradients
 from ambiguous_wild.splat.step import TrainData
 
-RATE, RATE_FINAL = 5e-4, 5e-6  # radians, and shares of the scene's median depth
+RATE_PX, FINAL = 0.2, 0.01  # px a step of what a turn moves in the picture; decays to this share
 BEGIN = 0.05  # of the run: before it the render is no evidence of where a camera stood
-PULL = 1e-2  # of the regulariser, against a gradient of the loss divided by its running norm
+PULL = 1e-2  # a visit, towards the pose of the sparse model
 
 
 class PoseRefinement(Effect):
@@ -37,6 +37,7 @@ class PoseRefinement(Effect):
         distance = np.linalg.norm(data.scene.points.xyz - centres.mean(axis=0), axis=1)
         self.depth = float(np.median(distance)) if len(distance) else 1.0
         self.adam = RowAdam(torch.zeros(self.views, 6, dtype=torch.float64))
+        self.rate = RATE_PX / float(np.median([camera.fx for camera in data.cameras]))  # rad, and of depth
         self.degree = 3
         self._gradient: Tensor | None = None
 
@@ -59,9 +60,9 @@ class PoseRefinement(Effect):
         if gradient is None or progress < BEGIN:
             return
         row = self.adam.values[view]
-        rate = decayed(RATE, RATE_FINAL, progress)
-        self.adam.step(view, gradient, rate)
-        row *= 1 - PULL * rate / RATE  # decoupled from Adam's scaling, as weight decay is in AdamW
+        share = decayed(1.0, FINAL, progress)
+        self.adam.step(view, gradient, self.rate * share)
+        row *= 1 - PULL * share  # decoupled from Adam's scaling, as weight decay is in AdamW
 
     def facts(self) -> dict[str, Any]:
         angle = torch.rad2deg(self.adam.values[:, :3].norm(dim=1))

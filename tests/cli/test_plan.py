@@ -48,9 +48,9 @@ def test_a_plan_is_a_table_and_a_file_and_leaves_the_scene_alone(scene, tmp_path
     [
         (["plan", "SCENE", "-o", "SCENE/plan.json"], "would change the scene"),
         (["plan", "SCENE/nothing"], "there is no scene folder"),
-        (["bench", "--method", "3dgs", "--scene", "SCENE", "--effects", "exposur"], "did you mean 'exposure'"),
+        (["bench", "--method", "3dgs", "--scene", "SCENE", "--effects", "poss"], "did you mean 'poses'"),
         (["bench", "--method", "3dgs", "--scene", "SCENE", "--effects", "all,poses"], "stands alone"),
-        (["bench", "--method", "3dgs", "--scene", "SCENE", "--plan", "absent.json"], "there is no plan absent.json"),
+        (["bench", "--method", "3dgs", "--scene", "SCENE", "--plan", "gone"], "there is no plan gone"),
     ],
 )  # fmt: skip
 def test_mistakes_get_one_line_and_exit_code_2(scene, arguments, message):

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.ndimage import label, uniform_filter
+from scipy.ndimage import label, maximum_filter, uniform_filter
 
 from ambiguous_wild.core import Scene
 from ambiguous_wild.harness.planning.decide import Decision, Plan, answer
@@ -31,7 +31,9 @@ WINDOW = 1 / 20  # of the longest side: side of the window
 STANDS_OUT = 0.12  # code values of a window's mean residual, in the worst channel
 LARGE = 0.05  # of a photo: a patch above it is more than an instance
 
-OCCLUSION, LOCAL, GLOBAL, ENTROPY = 0.01, 0.005, 0.05, 0.03  # shares of the photos' pixels
+# Shares of the photos' pixels. On captures with exact truth the probe found 0.7 % where nobody stands, 2.1 % of
+# 6.8 (thin things), 3.6 of 5.4, 12 of 20 and 32 of 44.
+OCCLUSION, LOCAL, GLOBAL, ENTROPY = 0.012, 0.012, 0.05, 0.02
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,24 @@ def unexplained(photo: np.ndarray, render: np.ndarray, seen: np.ndarray) -> np.n
     return (mean > STANDS_OUT) & seen & (weight > 0.25)
 
 
+def supported(scene: Scene, index: int, size: tuple[int, int]) -> np.ndarray:
+    """[H, W] bool: within a window of an SfM point that three photos see, so what stands there stands still.
+
+    Args:
+        scene: with tracks.
+        index: of the view, into Scene.views.
+        size: (height, width) of the map.
+    """
+    points, view = scene.points, scene.views[index]
+    lengths = np.diff(points.track_offsets)
+    rows = (points.track_views == index) & np.repeat(lengths >= 3, lengths)
+    scale = np.array([size[1] / view.camera.width, size[0] / view.camera.height])
+    where = (points.track_xy[rows] * scale).astype(int)
+    found = np.zeros(size, bool)
+    found[where[:, 1].clip(0, size[0] - 1), where[:, 0].clip(0, size[1] - 1)] = True
+    return maximum_filter(found, max(round(WINDOW * max(size)), 3))
+
+
 def summarise(patches: list[np.ndarray]) -> Occlusion:
     """Shares of [H, W] bool maps, one a photo."""
     shares, compact = [], []
@@ -110,12 +130,14 @@ def occlusion(
         trainer = Trainer(data, with_effects(Parts(), effects), config, folder=Path(folder))
         trainer.train(tick=None if tick is None else lambda _: tick())
         patches = []
+        places = [i for i, v in enumerate(scene.views) if v.split == "train"]
         for view, photo in enumerate(data.photos):
             rendered = trainer.make_step(trainer.iteration, view, divisor=1).rendered
             seen = rendered.alpha.numpy() > 0.5
             keep = data.user_keep[view]
             seen &= True if keep is None else keep.numpy() > 0.5
-            patches.append(unexplained(photo.numpy(), np.clip(rendered.image.numpy(), 0, 1), seen))
+            patch = unexplained(photo.numpy(), np.clip(rendered.image.numpy(), 0, 1), seen)
+            patches.append(patch & ~supported(scene, places[view], patch.shape))
         return summarise(patches)
 
 

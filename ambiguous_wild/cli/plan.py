@@ -60,7 +60,7 @@ def command(
 
         colour = tuple(e for e in plan.effects(("exposure", "appearance")))
         with tqdm(total=ITERATIONS, unit="it", desc="probe", disable=as_json or None) as bar:
-            plan = with_occlusion(plan, occlusion(loaded, colour, tick=lambda: bar.update()))
+            plan = with_occlusion(plan, occlusion(loaded, colour, tick=bar.update))
     if costs:
         from ambiguous_wild.harness.planning.probe import effect_costs
 

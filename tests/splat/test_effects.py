@@ -131,7 +131,7 @@ def test_a_checkpoint_of_other_effects_is_refused(scene, tmp_path):
 
 
 def tiny_data(cameras, points=None):
-    xyz = np.random.default_rng(0).normal(size=(40, 3)) + [0, 0, 3] if points is None else points
+    xyz = np.random.default_rng(0).normal([0, 0, 3], 1.0, (40, 3)) if points is None else points
     empty = Points(xyz, np.zeros((len(xyz), 3), np.uint8), np.zeros(len(xyz)), np.zeros(len(xyz) + 1, int),
                    np.zeros(0, np.int32), np.zeros((0, 2), np.float32))  # fmt: skip
     views = tuple(View(f"{i}.png", None, c, "train") for i, c in enumerate(cameras))

@@ -67,7 +67,7 @@ class Plan:
 
     def with_costs(self, costs: dict[str, float]) -> Plan:
         """The same plan with ms an iteration of each effect, by the name that switches it."""
-        lines = (
+        lines: tuple[Decision, ...] = (
             replace(d, cost_ms=costs.get(d.how.removeprefix("--effects "), d.cost_ms)) for d in self.decisions
         )
         return replace(self, decisions=tuple(lines))

@@ -31,7 +31,7 @@ WINDOW = 1 / 20  # of the longest side: side of the window
 STANDS_OUT = 0.12  # code values of a window's mean residual, in the worst channel
 LARGE = 0.05  # of a photo: a patch above it is more than an instance
 
-# Shares of the photos' pixels. On captures with exact truth the probe found 0.7 % where nobody stands, 2.1 % of
+# Shares of the photos' pixels. On captures with exact truth the probe found 0.7 % where nobody is, 2.1 % of
 # 6.8 (thin things), 3.6 of 5.4, 12 of 20 and 32 of 44.
 OCCLUSION, LOCAL, GLOBAL, ENTROPY = 0.012, 0.012, 0.05, 0.02
 
@@ -114,7 +114,7 @@ def occlusion(
     effects: tuple[str, ...] = (),
     *,
     iterations: int = ITERATIONS,
-    tick: Callable[[], None] | None = None,
+    tick: Callable[[], object] | None = None,
 ) -> Occlusion:
     """Train the probe and look at what it leaves.
 

@@ -374,3 +374,6 @@ def test_gains_from_tracks_are_those_put_in():
     )  # fmt: skip
     scene = Scene(None, "s", tuple(View(f"{i}", None, cam, "train") for i in range(views)), tracks)
     np.testing.assert_allclose(photo_gains(scene, photos), gains, rtol=0.01)
+    # a probe's photos are smaller than those the tracks are in px of
+    halves = [photo[::2, ::2] for photo in photos]
+    np.testing.assert_allclose(photo_gains(scene, halves), gains, rtol=0.02)

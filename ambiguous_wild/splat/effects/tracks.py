@@ -28,7 +28,7 @@ def track_colours(scene: Scene, photos: Sequence[np.ndarray]) -> TrackColours:
 
     Args:
         scene: with tracks.
-        photos: of the train views, [H, W, 3] in [0, 1].
+        photos: of the train views, [H, W, 3] in [0, 1], of any size.
     """
     points = scene.points
     of_point = np.repeat(np.arange(len(points)), np.diff(points.track_offsets))
@@ -40,7 +40,10 @@ def track_colours(scene: Scene, photos: Sequence[np.ndarray]) -> TrackColours:
             continue
         photo = np.asarray(photos[k], np.float64)
         smooth = uniform_filter(photo, size=(3, 3, 1), mode="nearest")
-        where = points.track_xy[rows].T[::-1].astype(np.float64) - 0.5  # rows, columns; centres at +0.5
+        camera = scene.views[index].camera
+        scale = np.array([photo.shape[1] / camera.width, photo.shape[0] / camera.height])
+        # rows, columns; pixel centres at +0.5
+        where = (points.track_xy[rows].astype(np.float64) * scale).T[::-1] - 0.5
         rgb = np.stack(
             [map_coordinates(smooth[..., c], where, order=1, mode="nearest") for c in range(3)], axis=1
         )

@@ -79,6 +79,26 @@ def unexplained(photo: np.ndarray, render: np.ndarray, seen: np.ndarray) -> np.n
     return (mean > STANDS_OUT) & seen & (weight > 0.25)
 
 
+def founded(scene: Scene, index: int, size: tuple[int, int]) -> np.ndarray:
+    """[H, W] bool: near where a point that three photos see projects, whether or not this photo saw it.
+
+    Elsewhere (the rim of an aerial capture, sky) few photos look and a short run has learnt nothing. All of
+    it where the model has no tracks.
+    """
+    camera = scene.views[index].camera
+    well = np.diff(scene.points.track_offsets) >= 3
+    if not well.any():
+        return np.ones(size, bool)
+    local = scene.points.xyz[well] @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+    local = local[local[:, 2] > 1e-6]
+    uv = local[:, :2] / local[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    uv = uv * [size[1] / camera.width, size[0] / camera.height]
+    columns, rows = uv[((uv >= 0) & (uv < [size[1], size[0]])).all(axis=1)].astype(int).T
+    found = np.zeros(size, bool)
+    found[rows, columns] = True
+    return maximum_filter(found, max(round(WINDOW * max(size)), 3))
+
+
 def supported(scene: Scene, index: int, size: tuple[int, int]) -> np.ndarray:
     """[H, W] bool: within a window of an SfM point that three photos see, so what stands there stands still.
 
@@ -135,6 +155,7 @@ def occlusion(
             rendered = trainer.make_step(trainer.iteration, view, divisor=1).rendered
             seen = rendered.alpha.numpy() > 0.5
             keep = data.user_keep[view]
+            seen &= founded(scene, places[view], (photo.shape[0], photo.shape[1]))
             seen &= True if keep is None else keep.numpy() > 0.5
             patch = unexplained(photo.numpy(), np.clip(rendered.image.numpy(), 0, 1), seen)
             patches.append(patch & ~supported(scene, places[view], patch.shape))

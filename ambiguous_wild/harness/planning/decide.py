@@ -67,7 +67,7 @@ class Plan:
 
     def with_costs(self, costs: dict[str, float]) -> Plan:
         """The same plan with ms an iteration of each effect, by the name that switches it."""
-        lines: tuple[Decision, ...] = (
+        lines = (
             replace(d, cost_ms=costs.get(d.how.removeprefix("--effects "), d.cost_ms)) for d in self.decisions
         )
         return replace(self, decisions=tuple(lines))
@@ -99,7 +99,7 @@ def decide(scene: str, found: Evidence) -> Plan:
     smooth = answer(found.sampling, SAMPLING)
     bent = answer(found.view_dependence, VIEW_DEPENDENCE)
     moved = answer(found.reprojection_px, REPROJECTION_PX)
-    lines = (
+    lines: tuple[Decision, ...] = (
         Decision(
             "appearance embedding", "spread at a point after gain and shine", found.appearance,
             APPEARANCE, "of a code", local,

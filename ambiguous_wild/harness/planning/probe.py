@@ -148,7 +148,12 @@ def occlusion(
         data = small_data(scene, Path(folder))
         config = TrainConfig(iterations=iterations, probes=0, checkpoint_every_s=1e9)
         trainer = Trainer(data, with_effects(Parts(), effects), config, folder=Path(folder))
-        trainer.train(tick=None if tick is None else lambda _: tick())
+
+        def after(_: Trainer) -> None:
+            if tick is not None:
+                tick()
+
+        trainer.train(tick=after)
         patches = []
         places = [i for i, v in enumerate(scene.views) if v.split == "train"]
         for view, photo in enumerate(data.photos):

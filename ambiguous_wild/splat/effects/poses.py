@@ -142,15 +142,15 @@ def _through_direction(
     degree = min(degree, gaussians.sh_degree)
     if degree == 0:
         return torch.zeros(len(rows), 3, dtype=torch.float64, device=gaussians.device)
-    used = gradients.sh_rest[rows].double()
-    d_colour = gradients.sh0[rows].double() / SH_C0
-    rest = gaussians.sh_rest[rows].double()
+    used = gradients.sh_rest[rows]
+    d_colour = gradients.sh0[rows] / SH_C0
+    rest = gaussians.sh_rest[rows]
     # a coefficient that the render did not use has no gradient, whatever its value
     rest = torch.where(used.abs().amax(dim=(0, 2), keepdim=True) > 0, rest, torch.zeros_like(rest))
-    centre = torch.as_tensor(camera.center, device=gaussians.device)
+    centre = torch.as_tensor(camera.center).to(gaussians.means)
     with torch.enable_grad():
-        means = gaussians.means[rows].double().requires_grad_(True)
+        means = gaussians.means[rows].requires_grad_(True)
         direction = torch.nn.functional.normalize(means - centre, dim=1)
         count = (degree + 1) ** 2 - 1
         shade = torch.einsum("nk,nkc->nc", harmonics(direction, degree), rest[:, :count])
-        return torch.autograd.grad(shade, means, d_colour)[0]
+        return torch.autograd.grad(shade, means, d_colour)[0].double()

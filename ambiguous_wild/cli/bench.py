@@ -60,6 +60,25 @@ def parse_budget(text: str) -> float:
 @click.option(
     "--set", "settings", multiple=True, metavar="METHOD.KEY=VALUE", help="An option of a method; repeatable."
 )
+@click.option(
+    "--effects",
+    metavar="auto|none|all|LIST",
+    default="default",
+    help="Optional effects, see 'aw plan'; LIST: names with commas.  [default: auto where the method allows it, else none]",
+)
+@click.option(
+    "--plan",
+    "plan_file",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="A plan of 'aw plan' instead of a new one.",
+)
+@click.option(
+    "--protocol",
+    type=click.Choice(["full", "half"]),
+    default="full",
+    show_default=True,
+    help="half: colour effects see the left half of a test photo, the right one is measured (NeRF-W).",
+)
 @click.option("-o", "--output", type=click.Path(path_type=Path), default=Path("runs"), show_default=True)
 @click.option(
     "--checkpoint-every",
@@ -91,6 +110,9 @@ def command(
     regulariser: str | None,
     settings: tuple[str, ...],
     plugins: tuple[Path, ...],
+    effects: str,
+    plan_file: Path | None,
+    protocol: str,
     output: Path,
     overwrite: str,
     cache: Path | None,
@@ -123,6 +145,13 @@ def command(
     methods = tuple(graft_name(name, donors) for name in methods)
     for name in methods:
         get_method(name)  # a misspelt name is answered before torch is imported
+    from ambiguous_wild.harness.choosing import check_wanted
+
+    check_wanted(effects)
+    if plan_file is not None and len(scenes) > 1:
+        raise AwError(
+            f"--plan {plan_file} is of one scene; bench {len(scenes)} scenes one by one, or without it"
+        )
 
     from ambiguous_wild.harness.grid import plan_cells, run_cells
     from ambiguous_wild.io.atomic import check_output
@@ -136,7 +165,23 @@ def command(
         max_gaussians=max_gaussians,
         checkpoint_every_s=checkpoint_every,
     )
-    cells = plan_cells(methods, scenes, seeds, train, settings=settings, device=chosen, factor=factor)
+    from ambiguous_wild.harness.planning.file import read_plan
+
+    cells = plan_cells(
+        methods,
+        scenes,
+        seeds,
+        train,
+        settings=settings,
+        device=chosen,
+        factor=factor,
+        effects=effects,
+        plan=None if plan_file is None else read_plan(plan_file),
+        protocol=protocol,  # type: ignore[arg-type]
+    )
+    for cell in cells:
+        if cell.chosen.effects:
+            click.echo(f"{cell.method.name} on {cell.scene.name}: {', '.join(cell.chosen.effects)}", err=True)
     for scene in {cell.scene.name: cell.scene for cell in cells}.values():
         for warning in scene.info.get("warnings", ()):
             click.echo(f"warning: {scene.name}: {warning}", err=True)

@@ -20,6 +20,7 @@ COMMANDS = {
     "screen": ("screen", "Check a capture: exposure, white balance, focus, blur, overlap; what to do."),
     "build-scene": ("build_scene", "From a folder of photos to a scene: check, COLMAP, downsample, split."),
     "ambiguity-report": ("ambiguity_report", "How hard are this scene's distractors to tell apart?"),
+    "plan": ("plan", "Which optional effects does this scene call for, and what do they cost?"),
     "bench": ("bench", "Train methods on scenes and measure them."),
     "ablate": ("ablate", "What each part of a method brings, and what it costs."),
     "table": ("table", "Compare runs: Markdown, CSV, LaTeX."),

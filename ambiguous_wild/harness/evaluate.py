@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from ambiguous_wild.core import Camera, Scene, View
 from ambiguous_wild.io.atomic import atomic_dir
@@ -47,9 +48,16 @@ def mean_psnr(truth: list[TestPhoto], draw: Callable[[Camera], np.ndarray]) -> f
 
 
 def render_and_measure(
-    trainer: Trainer, truth: list[TestPhoto], folder: Path
+    trainer: Trainer, truth: list[TestPhoto], folder: Path, *, half: bool = False
 ) -> tuple[list[dict[str, Any]], dict[str, str]]:
     """Render the test views to PNG and measure what was written.
+
+    Args:
+        trainer: holds the model.
+        truth: the test photos.
+        folder: for the PNG files.
+        half: NeRF-W's protocol: colour effects are fitted on the left half of each test photo, columns
+            0 to ceil(W / 2), everything else stays, and the right half, from W // 2, is measured.
 
     Returns:
         Per-image metrics, and for each metric that is missing the reason.
@@ -65,13 +73,24 @@ def render_and_measure(
         for t in truth:
             path = temporary / Path(t.view.name).with_suffix(".png")
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_png(path, to_uint8(trainer.render(t.view.camera).image.cpu().numpy()))
-            drawn = read_png_rgb(path)
+            image = _fitted(trainer, t) if half else trainer.render(t.view.camera).image
+            write_png(path, to_uint8(image.cpu().numpy()))
+            drawn, photo = read_png_rgb(path), t.photo
+            if half:
+                right = slice(photo.shape[1] // 2, None)
+                drawn, photo = (np.ascontiguousarray(picture[:, right]) for picture in (drawn, photo))
             row: dict[str, Any] = {"name": t.view.name}
-            row |= {name: metric(drawn, t.photo) for name, metric in image_metrics.METRICS.items()}
-            row |= {name: network(drawn, t.photo) for name, network in networks.items()}
+            row |= {name: metric(drawn, photo) for name, metric in image_metrics.METRICS.items()}
+            row |= {name: network(drawn, photo) for name, network in networks.items()}
             rows.append(row)
     return rows, missing
+
+
+def _fitted(trainer: Trainer, test: TestPhoto) -> torch.Tensor:
+    photo = torch.from_numpy(test.photo.astype(np.float32) / 255.0).to(trainer.data.device)
+    keep = torch.zeros(photo.shape[:2], device=photo.device)
+    keep[:, : -(-photo.shape[1] // 2)] = 1.0
+    return trainer.render_fitted(test.view.camera, photo, keep)
 
 
 def write_masks(trainer: Trainer, folder: Path) -> dict[str, Any] | None:

@@ -10,10 +10,13 @@ from typing import Any
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import with_options
 from ambiguous_wild.core.errors import unknown
+from ambiguous_wild.harness.choosing import choose
+from ambiguous_wild.harness.planning.decide import Plan
 from ambiguous_wild.harness.run import (
     Cell,
     CellReport,
     Overwrite,
+    Protocol,
     error_line,
     refuse_other_config,
     refuse_strange_folder,
@@ -35,6 +38,9 @@ def plan_cells(
     settings: Iterable[str] = (),
     device: str = "cpu",
     factor: int | None = None,
+    effects: str = "none",
+    plan: Plan | None = None,
+    protocol: Protocol = "full",
 ) -> list[Cell]:
     """Every method on every scene with every seed; all names and options are checked before any training.
 
@@ -46,6 +52,9 @@ def plan_cells(
         settings: "method.key=value" strings.
         device: "cpu" or "cuda".
         factor: which images_N; None = what the scene was built for.
+        effects: "none", "all", "auto", "default" (auto where the method lets it), or names of effects.
+        plan: of the one scene, where it was made before; None = made where one is needed.
+        protocol: "full" measures whole test photos, "half" the right half.
 
     Raises:
         AwError: unknown method, option or scene; two scenes of the same name.
@@ -65,11 +74,14 @@ def plan_cells(
     cells = []
     for scene in loaded:
         identity = scene_identity(scene)
+        chosen = choose(effects, scene, [entry for entry, _ in entries], plan)
         for entry, options in entries:
             resolved = with_options(entry.options(), options, f"option of {entry.name}")
             for seed in dict.fromkeys(seeds):
                 config = dataclasses.replace(train, seed=seed)
-                cells.append(Cell(entry, resolved, scene, identity, config, device))
+                cells.append(
+                    Cell(entry, resolved, scene, identity, config, device, chosen[entry.name], protocol)
+                )
     return cells
 
 

@@ -20,6 +20,7 @@ from ambiguous_wild.core import AwError, Camera, Scene
 from ambiguous_wild.core.config import config_hash, to_plain
 from ambiguous_wild.harness import evaluate
 from ambiguous_wild.harness import pictures as run_pictures
+from ambiguous_wild.harness.choosing import Chosen
 from ambiguous_wild.harness.environment import environment
 from ambiguous_wild.harness.memory import peak_rss_mb, reset_peak
 from ambiguous_wild.harness.store import read_result, write_result
@@ -28,15 +29,18 @@ from ambiguous_wild.io.lock import folder_lock
 from ambiguous_wild.io.ply import write_splat_ply
 from ambiguous_wild.methods.registry import MethodEntry
 from ambiguous_wild.splat.data import load_train_data
+from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.trainer import TrainConfig, Trainer
 
 Overwrite = Literal["never", "missing", "always"]
+Protocol = Literal["full", "half"]
 Outcome = Literal["trained", "kept", "skipped", "failed"]
 RESULT = "metrics.json"
 FAILED = "failed.json"
 TRACEBACK = "traceback.txt"
+EFFECTS = "effects.json"
 # What a run leaves before anything worth keeping exists in its folder.
-_WORTHLESS = {"config.yaml", "env.json", FAILED, TRACEBACK}
+_WORTHLESS = {"config.yaml", "env.json", EFFECTS, FAILED, TRACEBACK}
 
 
 @dataclass(frozen=True)
@@ -49,12 +53,18 @@ class Cell:
     scene_id: str  # sha256 of what the scene was built from, see `scene_identity`
     train: TrainConfig
     device: str = "cpu"
+    chosen: Chosen = field(default_factory=Chosen)  # optional effects, and why
+    protocol: Protocol = "full"  # "half": measured on the right half, colour effects fitted on the left
 
     @property
     def config(self) -> dict[str, Any]:
         """The resolved configuration, as written to config.yaml."""
         train = to_plain(self.train)
-        return {
+        # keys that say nothing are left out: runs from before they existed keep their identity
+        more: dict[str, Any] = {"effects": list(self.chosen.effects)} if self.chosen.effects else {}
+        if self.protocol != "full":
+            more["protocol"] = self.protocol
+        return more | {
             "method": self.method.name,
             "source": self.method.source_hash,
             "options": to_plain(self.options),
@@ -129,6 +139,7 @@ def run_cell(
         config = cell.config | {"config_hash": cell.identity}
         write_text(folder / "config.yaml", yaml.safe_dump(config, sort_keys=False, allow_unicode=True))
         write_json(folder / "env.json", environment(cell.device))
+        cell.chosen.write(folder / EFFECTS)
         try:
             result = _train_and_measure(cell, folder, cache_dir, tick, pictures)
         except Exception as error:
@@ -217,7 +228,7 @@ def _train_and_measure(
     reset_peak()
     device = torch.device(cell.device)
     data = load_train_data(cell.scene, device=device, seed=cell.train.seed, cache_dir=cache_dir)
-    parts = cell.method.build(cell.options)
+    parts = with_effects(cell.method.build(cell.options), cell.chosen.effects)
     truth = evaluate.load_test_photos(cell.scene)
 
     def probe(draw: Callable[[Camera], torch.Tensor]) -> float:
@@ -239,8 +250,12 @@ def _train_and_measure(
     trainer.train(tick=after_iteration)
     cost = _cost(cell, trainer)  # now: what follows measures, and is no training
 
-    write_splat_ply(folder / "point_cloud.ply", {k: v.cpu().numpy() for k, v in trainer.gaussians.items()})
-    per_image, missing = evaluate.render_and_measure(trainer, truth, folder / "renders" / "test")
+    write_splat_ply(
+        folder / "point_cloud.ply", {k: v.cpu().numpy() for k, v in trainer.neutral_model().items()}
+    )
+    per_image, missing = evaluate.render_and_measure(
+        trainer, truth, folder / "renders" / "test", half=cell.protocol == "half"
+    )
     masks = evaluate.write_masks(trainer, folder / "masks")
     if recorder is not None:
         run_pictures.draw_all(trainer, recorder, folder)
@@ -255,7 +270,9 @@ def _train_and_measure(
         "per_image": per_image,
         "missing": missing,
         "masks": masks,
-        "facts": trainer.parts.mask.facts() | {"skipped_views": trainer.skipped_views},
+        "facts": trainer.parts.mask.facts()
+        | {"skipped_views": trainer.skipped_views}
+        | _effect_facts(cell, trainer),
         "cost": cost
         | {
             "fps": evaluate.frames_per_second(trainer),
@@ -265,6 +282,14 @@ def _train_and_measure(
         "scene_hash": cell.scene_id,
         "version": __version__,
     }
+
+
+def _effect_facts(cell: Cell, trainer: Trainer) -> dict[str, Any]:
+    """What was on and what it learnt; nothing where there is nothing to say."""
+    facts: dict[str, Any] = {} if cell.protocol == "full" else {"protocol": cell.protocol}
+    if cell.chosen.effects:
+        facts["effects"] = list(cell.chosen.effects)
+    return facts if trainer.effects is None else facts | {"effect_facts": trainer.effects.facts()}
 
 
 def _cost(cell: Cell, trainer: Trainer) -> dict[str, Any]:

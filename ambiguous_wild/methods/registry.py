@@ -44,6 +44,9 @@ class MethodEntry:
     ablations: str | tuple[Group, ...] = ()  # "module:ABLATIONS" or the groups, see methods/ablation.py
     source_hash: str = ""  # of a plugin's file: a changed plugin is another configuration
     places: tuple[tuple[str, str], ...] = ()  # of a graft: which field of its options is whose, see graft.py
+    # effects that `aw bench` may switch on by itself where a scene calls for them; a baseline has none, it
+    # stays what its paper defines
+    auto_effects: tuple[str, ...] = ()
 
     def options(self) -> Any:
         """The method's options at their defaults (a frozen dataclass instance)."""
@@ -84,6 +87,7 @@ BUILTIN = (
         config="ambiguous_wild.methods.refinesplat.recipe:Config",
         paper="Rectifying Mask via Entropy for Distractor-Free 3DGS in Ambiguous Scenarios",
         ablations="ambiguous_wild.methods.refinesplat.ablations:ABLATIONS",
+        auto_effects=("exposure", "appearance", "antialias", "poses"),
     ),
     MethodEntry(
         name="robustsplat",

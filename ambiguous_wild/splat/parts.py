@@ -15,6 +15,7 @@ import numpy as np
 from torch import Tensor
 
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
+from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.step import Step, TrainData
 
 State = dict[str, Any]  # nested dicts of tensors and plain values, see checkpoint.py
@@ -105,3 +106,4 @@ class Parts:
     start_opacity: float = 0.1
     # trains on something else than the capture's photos (references on clean ones); None = the capture
     train_data: Callable[[TrainData], TrainData] | None = None
+    effects: tuple[Effect, ...] = ()  # optional ones, see effects/; none = that code is never reached

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,6 +20,7 @@ from ambiguous_wild.core import AwError, Camera
 from ambiguous_wild.io.atomic import write_text
 from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.data import shrink, shrink_camera, shrink_keep
+from ambiguous_wild.splat.effects.chain import Chain
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.optim import SplatAdam
@@ -122,6 +124,7 @@ class Trainer:
         self.optimiser = SplatAdam(self.gaussians, self._learning_rates(0.0))
         self.density = parts.density(parts.density_config, self.extent, config.seed)
         parts.mask.setup(data)
+        self.effects = Chain(parts.effects, data) if parts.effects else None
 
     # -- schedule ---------------------------------------------------------------------------------
 
@@ -189,26 +192,46 @@ class Trainer:
             self._pyramid[key] = shrink(self.data.photos[view], divisor)
         return self._pyramid[key]
 
-    def render(self, camera: Camera, nominal: float | None = None) -> Rendered:
-        """The model as it stands, for one camera."""
+    def render(self, camera: Camera, nominal: float | None = None, view: int | None = None) -> Rendered:
+        """The model as it stands, for one camera; `view` says which train photo's effects apply."""
         nominal = self.progress(self.iteration) * NOMINAL_ITERATIONS if nominal is None else nominal
-        return render(
-            self.gaussians,
-            camera,
+        if self.effects is None:
+            return self._draw(nominal)(self.gaussians, camera)
+        return self.effects.render(self.gaussians, camera, view, self.iteration, self._draw(nominal))
+
+    def _draw(self, nominal: float) -> Callable[[Gaussians, Camera], Rendered]:
+        return partial(
+            render,
             sh_degree=min(int(nominal // self.parts.schedule.sh_every), self.parts.sh_degree),
             background=self.parts.background,
             antialias=self.parts.antialias,
         )
+
+    def neutral_model(self) -> Gaussians:
+        """The Gaussians for any viewer: what effects do to them for every camera is part of them."""
+        if self.effects is None:
+            return self.gaussians
+        return self.effects.model(self.gaussians, None, self.iteration)
+
+    def render_fitted(self, camera: Camera, photo: Tensor, keep: Tensor) -> Tensor:
+        """A test view after its colour effects were fitted to the part of its photo that `keep` shows."""
+        self.optimiser.flush()
+        if self.effects is None:
+            return self.render(camera).image
+        draw = self._draw(self.progress(self.iteration) * NOMINAL_ITERATIONS)
+        return self.effects.fit_view(self.gaussians, camera, photo, keep, draw)
 
     def make_step(self, iteration: int, view: int, divisor: int | None = None) -> Step:
         """Render a train view as the loop does; also used to predict masks afterwards."""
         progress = self.progress(iteration)
         divisor = divisor_at(self.levels, progress) if divisor is None else divisor
         camera = shrink_camera(self.data.cameras[view], divisor)
+        if self.effects is not None:
+            camera = self.effects.camera(view, camera)
         nominal = progress * NOMINAL_ITERATIONS
         with self.clock.part("render"):
             self.optimiser.prepare(camera)
-            rendered = self.render(camera, nominal)
+            rendered = self.render(camera, nominal, view)
         return Step(
             iteration=iteration,
             nominal=nominal,
@@ -263,6 +286,11 @@ class Trainer:
             self.density.observe(step, gradients)
             self.gaussians, events = self.density.refine(step, self.gaussians, self.optimiser)
             self.optimiser.bind(self.gaussians)
+        if self.effects is not None:
+            with part("effects"):
+                self.effects.step(step.view, self.progress(iteration))
+                if events:
+                    self.effects.rows_changed()
         if "reset" in events:
             self.parts.mask.on_opacity_reset(step)
         self.iteration = iteration
@@ -356,6 +384,7 @@ class Trainer:
             "optimiser": self.optimiser.state_dict(),
             "density": self.density.state_dict(),
             "mask": self.parts.mask.state_dict(),
+            **({} if self.effects is None else {"effects": self.effects.state_dict()}),
             "timeline": self.timeline,
             "loss": [self._loss_sum, self._loss_count],
             "skipped": sorted(self._skipped_views),
@@ -374,6 +403,8 @@ class Trainer:
             self.optimiser.load_state_dict(state["optimiser"])
             self.density.load_state_dict(state["density"])
             self.parts.mask.load_state_dict(state["mask"])
+            if self.effects is not None:
+                self.effects.load_state_dict(state["effects"])
             self.iteration = state["iteration"]
             self.setup_s = state["setup_s"]
             self.clock = Clock(state["elapsed_s"], dict(state["parts_s"]))

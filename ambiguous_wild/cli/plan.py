@@ -1,0 +1,90 @@
+"""`aw plan`: which optional effects a scene calls for."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+if TYPE_CHECKING:
+    from ambiguous_wild.harness.planning.decide import Decision, Plan
+
+
+@click.command("plan")
+@click.argument("scene", type=click.Path(path_type=Path))
+@click.option(
+    "--factor", type=click.IntRange(1), help="Look at images_N.  [default: what the scene was built for]"
+)
+@click.option(
+    "--probe/--no-probe",
+    default=True,
+    show_default=True,
+    help="Train 3DGS shortly on small photos: masks need it, all others do not.",
+)
+@click.option(
+    "--costs/--no-costs", default=False, show_default=True, help="Time every effect on this machine."
+)
+@click.option(
+    "-o", "--out", type=click.Path(path_type=Path, dir_okay=False), help="Default: SCENE-plan.json."
+)
+@click.option("--json", "as_json", is_flag=True, help="Print the plan as JSON.")
+def command(
+    scene: Path, factor: int | None, probe: bool, costs: bool, out: Path | None, as_json: bool
+) -> None:
+    """Measure what SCENE calls for: effect, evidence, threshold, decision, cost.
+
+    'aw bench --effects auto' makes the same decisions by itself, without the probe.
+    """
+    from ambiguous_wild.core.errors import AwError
+    from ambiguous_wild.harness.planning.decide import plan_without_training
+    from ambiguous_wild.io.atomic import check_output, write_json
+    from ambiguous_wild.io.scene_folder import load_scene
+
+    loaded = load_scene(scene, factor=factor)
+    path = out or scene.resolve().parent / f"{scene.resolve().name}-plan.json"
+    if path.resolve().is_relative_to(scene.resolve()):
+        raise AwError(f"{path} lies inside {scene}, and would change the scene; choose another -o")
+    check_output(path)
+    plan = plan_without_training(loaded)
+    if probe or costs:
+        from ambiguous_wild.cli.bench import prepare_cpu
+
+        prepare_cpu(None)
+    if probe:
+        from tqdm import tqdm
+
+        from ambiguous_wild.harness.planning.probe import ITERATIONS, occlusion, with_occlusion
+
+        colour = tuple(e for e in plan.effects(("exposure", "appearance")))
+        with tqdm(total=ITERATIONS, unit="it", desc="probe", disable=as_json or None) as bar:
+            plan = with_occlusion(plan, occlusion(loaded, colour, tick=bar.update))
+    if costs:
+        from ambiguous_wild.harness.planning.probe import effect_costs
+
+        plan = plan.with_costs(effect_costs(loaded))
+    write_json(path, plan.plain())
+    if as_json:
+        click.echo(json.dumps({**plan.plain(), "file": str(path)}, indent=2))
+        return
+    for line in table(plan):
+        click.echo(line)
+    click.echo(f"wrote {path}")
+
+
+def table(plan: Plan) -> list[str]:
+    """The plan as lines of a terminal."""
+    head = ("effect", "evidence", "found", "from", "decision", "ms/iteration", "why")
+    rows = [head, *(_row(d) for d in plan.decisions)]
+    widths = [max(len(row[k]) for row in rows) for k in range(len(head) - 1)]
+    lines = ["  ".join([*(cell.ljust(w) for cell, w in zip(row, widths)), row[-1]]).rstrip() for row in rows]
+    effects = ",".join(plan.effects()) or "none"
+    return [*lines, f"{plan.scene}: --effects {effects}"]
+
+
+def _row(d: Decision) -> tuple[str, ...]:
+    found = "—" if math.isnan(d.value) else f"{d.value:.3g} {d.unit}"
+    cost = "—" if d.cost_ms is None else f"{d.cost_ms:+.2f}"
+    return d.effect, d.evidence, found, f"{d.threshold:g}", d.decision, cost, d.why

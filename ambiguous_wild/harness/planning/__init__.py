@@ -1,0 +1,1 @@
+"""Which optional effects a scene calls for: evidence, threshold, decision, cost."""

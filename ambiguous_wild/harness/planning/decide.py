@@ -1,0 +1,148 @@
+"""Thresholds, and what follows from them: a plan says effect, evidence, threshold, decision, why and cost."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+from ambiguous_wild.core import Scene
+from ambiguous_wild.harness.planning.evidence import Evidence, has_tracks, measure
+
+Answer = Literal["on", "off", "unknown"]
+SCHEMA = 1
+
+# Set on tracks with the effect injected and without (tests/harness/test_planning.py) and on the captures of
+# docs/effects.md; between "on" and "off" there lies a factor of two at least.
+EXPOSURE = 0.05
+APPEARANCE = 0.15
+SAMPLING = 2.0
+VIEW_DEPENDENCE = 0.015
+REPROJECTION_PX = 1.0
+
+
+@dataclass(frozen=True)
+class Decision:
+    """One line of the plan."""
+
+    effect: str
+    evidence: str  # what was measured, in words
+    value: float  # NaN: it could not be
+    threshold: float
+    unit: str
+    decision: Answer
+    why: str
+    how: str  # what switches it
+    cost_ms: float | None = None  # an iteration more; None: not measured
+
+    def plain(self) -> dict[str, Any]:
+        """For JSON, which has no NaN."""
+        value = None if math.isnan(self.value) else self.value
+        return {**self.__dict__, "value": value}
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a scene calls for."""
+
+    scene: str
+    decisions: tuple[Decision, ...]
+    probed: bool = False
+
+    def effects(self, among: Iterable[str] | None = None) -> tuple[str, ...]:
+        """Names for `--effects`: what was decided on, and the lower SH degree, of those allowed."""
+        found = [d.how.removeprefix("--effects ") for d in self.decisions if _adds(d)]
+        return tuple(name for name in found if among is None or name in tuple(among))
+
+    def plain(self) -> dict[str, Any]:
+        """As it is written to files."""
+        return {
+            "schema": SCHEMA,
+            "scene": self.scene,
+            "probed": self.probed,
+            "effects": list(self.effects()),
+            "decisions": [d.plain() for d in self.decisions],
+        }
+
+    def with_costs(self, costs: dict[str, float]) -> Plan:
+        """The same plan with ms an iteration of each effect, by the name that switches it."""
+        lines = (
+            replace(d, cost_ms=costs.get(d.how.removeprefix("--effects "), d.cost_ms)) for d in self.decisions
+        )
+        return replace(self, decisions=tuple(lines))
+
+
+def _adds(decision: Decision) -> bool:
+    # the degree of the harmonics is lowered where the evidence is *off*
+    wanted = "off" if decision.effect == "SH degree" else "on"
+    return decision.how.startswith("--effects ") and decision.decision == wanted
+
+
+def answer(value: float, threshold: float) -> Answer:
+    """On from the threshold up."""
+    if math.isnan(value):
+        return "unknown"
+    return "on" if value >= threshold else "off"
+
+
+def decide(scene: str, found: Evidence) -> Plan:
+    """The lines that need no training."""
+    seen = f"{found.observations} observations of SfM points"
+    local = answer(found.appearance, APPEARANCE)
+    globally = answer(found.exposure, EXPOSURE)
+    by_gain = "a gain per photo explains it" if globally == "on" else "photos agree"
+    if local == "on":
+        globally_why = "the embedding covers it" if globally == "on" else by_gain
+    else:
+        globally_why = by_gain
+    smooth = answer(found.sampling, SAMPLING)
+    bent = answer(found.view_dependence, VIEW_DEPENDENCE)
+    moved = answer(found.reprojection_px, REPROJECTION_PX)
+    lines: tuple[Decision, ...] = (
+        Decision(
+            "appearance embedding", "spread at a point after gain and shine", found.appearance,
+            APPEARANCE, "of a code", local,
+            "light differs by place" if local == "on" else "no more than texture and noise",
+            "--effects appearance",
+        ),
+        Decision(
+            "affine exposure", "spread of the photos' gains at the same points", found.exposure, EXPOSURE,
+            "of a code", "off" if local == "on" and globally == "on" else globally, globally_why,
+            "--effects exposure",
+        ),
+        Decision(
+            "antialiasing", "pixel size on the scene, coarsest over finest photo", found.sampling, SAMPLING,
+            "times", smooth,
+            "seen from near and far" if smooth == "on" else "all photos resolve about the same",
+            "--effects antialias",
+        ),
+        Decision(
+            "SH degree", "colour that follows the viewing direction", found.view_dependence, VIEW_DEPENDENCE,
+            "code values", bent,
+            "degree 3 has work to do" if bent == "on" else "degree 1 is enough", "--effects sh1",
+        ),
+        Decision(
+            "pose refinement", "reprojection error of the sparse model", found.reprojection_px,
+            REPROJECTION_PX, "px", moved,
+            "poses are off by more than the photos can hide" if moved == "on" else "poses fit the photos",
+            "--effects poses",
+        ),
+    )  # fmt: skip
+    missing = f"cannot be told from {seen}"
+    lines = tuple(replace(d, why=missing) if d.decision == "unknown" else d for d in lines)
+    return Plan(scene, lines)
+
+
+def plan_without_training(scene: Scene) -> Plan:
+    """Read the train photos at the SfM points and decide; a scene without tracks reads nothing.
+
+    Raises:
+        AwError: a photo cannot be read.
+    """
+    nothing = Evidence(*(math.nan,) * 5, observations=0)
+    if not has_tracks(scene):
+        return decide(scene.name, nothing)
+    from ambiguous_wild.io.images import load_image_float
+
+    return decide(scene.name, measure(scene, [load_image_float(v.image_path) for v in scene.train]))

@@ -1,0 +1,175 @@
+"""Evidence that needs no training: what the sparse model and the photos at its points say.
+
+Every function returns a number, NaN where the scene cannot tell; `decide.py` holds the thresholds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ambiguous_wild.core import Scene
+from ambiguous_wild.splat.effects.tracks import TrackColours, log_gains, track_colours
+
+LEAST = 50  # observations below which nothing is said
+LEAST_VIEWS = 6  # of a point, to fit four numbers to its colour
+MOST = 20_000  # points whose view dependence is fitted; more do not change a median
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a scene shows, each in the unit of its threshold; NaN = it cannot be told."""
+
+    exposure: float  # spread of the photos' gains, share of a code value
+    appearance: float  # spread at a point that a gain per photo leaves, share of a code value
+    sampling: float  # ratio of the coarsest photo's pixel to the finest's, on the scene
+    view_dependence: float  # median amplitude of what follows the direction, code values in [0, 1]
+    reprojection_px: float  # median of points in the train photos, px of the loaded images
+    observations: int  # in train photos, usable for colour
+
+
+def measure(scene: Scene, photos: Sequence[np.ndarray]) -> Evidence:
+    """All of it.
+
+    Args:
+        scene: with tracks.
+        photos: of the train views, [H, W, 3] in [0, 1].
+    """
+    colours = track_colours(scene, photos)
+    gains = log_gains(colours, len(scene.train))
+    enough = len(colours.point) >= LEAST
+    grey = colours.rgb.mean(axis=1) / np.exp(gains[colours.view].mean(axis=1))
+    in_codes, in_logs = (_fit_points(scene, colours, v) for v in (grey, np.log(grey)))
+    return Evidence(
+        exposure=exposure_spread(colours, gains) if enough else np.nan,
+        appearance=remaining_spread(in_logs),
+        sampling=sampling_ratio(scene),
+        view_dependence=view_dependence(in_codes),
+        reprojection_px=reprojection(scene),
+        observations=len(colours.point),
+    )
+
+
+def has_tracks(scene: Scene) -> bool:
+    """Whether any point was seen at a known place of a photo; without, no photo need be read."""
+    return bool((scene.points.track_views >= 0).sum() >= LEAST)
+
+
+def exposure_spread(colours: TrackColours, gains: np.ndarray) -> float:
+    """Standard deviation of log gain between the photos that see a same point, rms over channels.
+
+    Not between all photos: along a strip of photos small errors add up from neighbour to neighbour, and
+    two photos that share nothing cannot disagree.
+    """
+    counts = np.bincount(colours.point)
+    rows = counts[colours.point] >= 2
+    if not rows.any():
+        return float("nan")
+    point, values = colours.point[rows], gains[colours.view[rows]]
+    n = counts[point][:, None]
+    mean = np.stack([np.bincount(point, values[:, c], len(counts))[point] for c in range(3)], axis=1) / n
+    return float(np.sqrt(((values - mean) ** 2 * n / (n - 1)).mean()))
+
+
+def sampling_ratio(scene: Scene) -> float:
+    """Ratio of the 95th to the 5th percentile, over train photos, of a pixel's size on the points it sees.
+
+    A pixel covers depth / focal length; each photo counts with the median over its points.
+    """
+    sizes = []
+    for index, view in enumerate(scene.views):
+        if view.split != "train":
+            continue
+        xyz = scene.points.xyz[_points_of(scene, index)]
+        depth = (xyz @ view.camera.cam_from_world[:3, :3].T + view.camera.cam_from_world[:3, 3])[:, 2]
+        depth = depth[depth > 0]
+        if len(depth) >= 5:
+            sizes.append(float(np.median(depth)) / (0.5 * (view.camera.fx + view.camera.fy)))
+    if len(sizes) < 3:
+        return float("nan")
+    low, high = np.percentile(sizes, [5, 95])
+    return float(high / low)
+
+
+def reprojection(scene: Scene) -> float:
+    """Median distance between where a point was found and where it projects, px of the loaded photos."""
+    found = []
+    for index, view in enumerate(scene.views):
+        if view.split != "train":
+            continue
+        rows = np.flatnonzero(scene.points.track_views == index)
+        camera = view.camera
+        xyz = scene.points.xyz[_owner(scene)[rows]]
+        local = xyz @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+        front = local[:, 2] > 1e-6
+        local = local[front]
+        uv = local[:, :2] / local[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+        found.append(np.linalg.norm(uv - scene.points.track_xy[rows][front], axis=1))
+    errors = np.concatenate(found) if found else np.zeros(0)
+    return float(np.median(errors)) if len(errors) >= LEAST else float("nan")
+
+
+@dataclass(frozen=True)
+class _Fits:
+    """Of every point seen often enough, the variance of its colour that its viewing direction explains."""
+
+    explained: np.ndarray  # [P] beyond chance; scatters about zero where there is nothing
+    left: np.ndarray  # [P] unbiased variance of what it does not
+
+
+def _fit_points(scene: Scene, colours: TrackColours, values: np.ndarray) -> _Fits:
+    """A constant and three numbers linear in the direction, by least squares, for points of six photos on.
+
+    A fit explains noise too: what it explains by chance is subtracted (the adjusted coefficient of
+    determination).
+    """
+    order = np.argsort(colours.point, kind="stable")
+    point, view, values = colours.point[order], colours.view[order], values[order]
+    starts = np.flatnonzero(np.r_[True, point[1:] != point[:-1]])
+    sizes = np.diff(np.r_[starts, len(point)])
+    chosen = np.flatnonzero(sizes >= LEAST_VIEWS)
+    if len(chosen) > MOST:
+        chosen = np.random.default_rng(0).choice(chosen, MOST, replace=False)
+    centres = np.array([v.camera.center for v in scene.train])
+    fits = []
+    for k in chosen:
+        rows = slice(starts[k], starts[k] + sizes[k])
+        direction = centres[view[rows]] - scene.points.xyz[point[starts[k]]]
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        fits.append(_fit(direction, values[rows]))
+    return _Fits(*np.array(fits).reshape(-1, 2).T)
+
+
+def _fit(direction: np.ndarray, values: np.ndarray) -> tuple[float, float]:
+    n = len(values)
+    # directions of a narrow arc are nearly one: what they cannot tell apart is left out of the fit
+    axes, spread, _ = np.linalg.svd(direction - direction.mean(axis=0), full_matrices=False)
+    rank = int((spread > 0.05 * np.sqrt(n)).sum())
+    centred = values - values.mean()
+    explained = axes[:, :rank] @ (axes[:, :rank].T @ centred)
+    variance = float(((centred - explained) ** 2).sum()) / (n - 1 - rank)
+    return float(centred @ centred) / (n - 1) - variance, variance
+
+
+def view_dependence(fits: _Fits) -> float:
+    """Median over points of the amplitude of colour that is linear in the viewing direction."""
+    if len(fits.explained) < 10:
+        return float("nan")
+    return float(np.sqrt(max(np.median(fits.explained), 0.0)))
+
+
+def remaining_spread(fits: _Fits) -> float:
+    """Median over points of what is left between photos once each has its gain and each point its shine."""
+    if len(fits.left) < 10:
+        return float("nan")
+    return float(np.sqrt(np.median(fits.left)))
+
+
+def _owner(scene: Scene) -> np.ndarray:
+    return np.repeat(np.arange(len(scene.points)), np.diff(scene.points.track_offsets))
+
+
+def _points_of(scene: Scene, index: int) -> np.ndarray:
+    return _owner(scene)[scene.points.track_views == index]

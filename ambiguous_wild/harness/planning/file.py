@@ -1,0 +1,45 @@
+"""Plans as JSON files."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import fields
+from pathlib import Path
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.planning.decide import SCHEMA, Decision, Plan
+
+_TEXTS = ("effect", "evidence", "unit", "why", "how")
+
+
+def read_plan(path: Path) -> Plan:
+    """A plan that `aw plan` wrote.
+
+    Raises:
+        AwError: no such file, or it is none.
+    """
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        if data["schema"] != SCHEMA:
+            raise ValueError(f"schema {data['schema']!r}, not {SCHEMA}")
+        lines = tuple(_decision(row) for row in data["decisions"])
+        if not isinstance(data["scene"], str):
+            raise ValueError("scene is no text")
+    except FileNotFoundError:
+        raise AwError(f"there is no plan {path}; 'aw plan SCENE' makes one") from None
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise AwError(f"{path} is no plan of 'aw plan' ({error}); make it again") from None
+    return Plan(data["scene"], lines, bool(data.get("probed")))
+
+
+def _decision(row: dict[str, object]) -> Decision:
+    values = {f.name: row.get(f.name) for f in fields(Decision)}
+    if row.get("decision") not in ("on", "off", "unknown"):
+        raise ValueError(f"decision {row.get('decision')!r}")
+    for name in _TEXTS:
+        if not isinstance(values[name], str):
+            raise ValueError(f"{name} is no text")
+    values["value"] = math.nan if values["value"] is None else float(values["value"])  # type: ignore[arg-type]
+    values["threshold"] = float(values["threshold"])  # type: ignore[arg-type]
+    return Decision(**values)  # type: ignore[arg-type]

@@ -1,0 +1,63 @@
+"""Optional effects of the trainer, by name. What is not asked for is not imported, built or called.
+
+Imports no torch: names are checked before anything heavy is loaded.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
+
+from ambiguous_wild.core.errors import AwError, unknown
+
+if TYPE_CHECKING:
+    from ambiguous_wild.splat.effects.base import Effect
+    from ambiguous_wild.splat.parts import Parts
+
+# name -> (module, class, what it is for), in the order in which they act on a render
+EFFECTS: dict[str, tuple[str, str, str]] = {
+    "exposure": ("exposure", "AffineExposure", "an affine change of colour per photo"),
+    "appearance": ("appearance", "AppearanceEmbedding", "light that changes by photo and place"),
+    "antialias": ("smoothing", "SmoothingFilter", "Mip-Splatting's filters, for photos from near and far"),
+    "poses": ("poses", "PoseRefinement", "a small correction of every camera's pose"),
+    "sh0": ("", "", "colours that do not depend on the direction"),
+    "sh1": ("", "", "spherical harmonics up to degree 1"),
+    "sh2": ("", "", "spherical harmonics up to degree 2"),
+}  # fmt: skip
+COLOUR = ("exposure", "appearance")  # what is fitted on half a test photo where the protocol says so
+ALL = ("exposure", "appearance", "antialias", "poses")
+DEGREES = {"sh0": 0, "sh1": 1, "sh2": 2}
+
+
+def check_effects(names: Iterable[str]) -> tuple[str, ...]:
+    """The effects in the order in which they act, each once.
+
+    Raises:
+        AwError: there is none of that name, or two SH degrees.
+    """
+    wanted = list(names)
+    for name in wanted:
+        if name not in EFFECTS:
+            raise unknown("effect", name, EFFECTS)
+    degrees = sorted(set(wanted) & DEGREES.keys())
+    if len(degrees) > 1:
+        raise AwError(f"effects {' and '.join(degrees)} exclude each other: name one degree")
+    return tuple(name for name in EFFECTS if name in wanted)
+
+
+def with_effects(parts: Parts, names: Sequence[str]) -> Parts:
+    """The method's parts with these effects on top; the same object where there are none."""
+    if not names:
+        return parts
+    built: list[Effect] = []
+    for name in check_effects(names):
+        if name in DEGREES:
+            parts = dataclasses.replace(parts, sh_degree=min(parts.sh_degree, DEGREES[name]))
+            continue
+        module, cls, _ = EFFECTS[name]
+        effect = getattr(importlib.import_module(f"{__name__}.{module}"), cls)()
+        parts = effect.change_parts(parts)
+        built.append(effect)
+    return dataclasses.replace(parts, effects=(*parts.effects, *built))

@@ -1,0 +1,114 @@
+"""Appearance embedding: a few numbers per photo change the colour of every Gaussian, by where it is.
+
+After WildGaussians (Kulhanek et al. 2024), smaller and with a neutral that is exact: the change is *linear*
+in the photo's embedding, and embeddings sum to zero over the train photos, so that an embedding of zero is
+both the unchanged model and the mean of all photos. Positions enter as Fourier features, which needs no
+state per Gaussian and so nothing of density control.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ambiguous_wild.splat.effects.base import Effect, RowAdam, State, decayed
+from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
+from ambiguous_wild.splat.rendered import Gradients
+from ambiguous_wild.splat.step import TrainData
+
+SIZE, HIDDEN, OCTAVES = 4, 32, 4  # of the embedding, of the net, of the Fourier features
+RATE_ROWS, RATE_NET, FINAL = 0.02, 2e-3, 0.1  # both decay to this share
+FIT_RATE = 0.1  # WildGaussians
+
+
+class AppearanceEmbedding(Effect):
+    """colour' = colour (1 + m) + o of the constant harmonic; (m, o) = e_v . B(position)."""
+
+    name = "appearance"
+
+    def setup(self, data: TrainData) -> None:
+        self.views = len(data.photos)
+        xyz = data.scene.points.xyz
+        self.centre = torch.tensor(np.median(xyz, axis=0), dtype=torch.float32, device=data.device)
+        spread = np.maximum(np.quantile(np.abs(xyz - np.median(xyz, axis=0)), 0.97, axis=0), 1e-6)
+        self.spread = torch.tensor(spread, dtype=torch.float32, device=data.device)
+        rng = np.random.default_rng([data.seed, 0xA9])
+
+        def weights(*shape: int) -> Tensor:
+            values = rng.normal(size=shape) / np.sqrt(shape[0])
+            return torch.tensor(values, dtype=torch.float32, device=data.device)
+
+        self.rows = RowAdam(torch.zeros(self.views + 1, SIZE, device=data.device))
+        inputs = 6 * OCTAVES + 1
+        self.net = {"first": weights(inputs, HIDDEN), "last": 0.3 * weights(HIDDEN + 1, SIZE * 6)}
+        self.moments = {name: RowAdam(values[None]) for name, values in self.net.items()}
+        self._pending: dict[str, Tensor] | None = None
+        self._graph: tuple[dict[str, Tensor], Tensor] | None = None
+
+    def features(self, means: Tensor) -> Tensor:
+        """[N, 25]: Fourier features of positions, as WildGaussians starts its embeddings from, and 1."""
+        unit = ((means - self.centre) / self.spread).clamp(-1.5, 1.5)
+        angles = torch.cat([unit * (torch.pi * 2.0**k / 2) for k in range(OCTAVES)], dim=1)
+        return torch.cat([angles.sin(), angles.cos(), torch.ones_like(unit[:, :1])], dim=1)
+
+    def change(self, features: Tensor, embedding: Tensor, net: dict[str, Tensor]) -> Tensor:
+        """[N, 6]: what is added to gain and offset."""
+        hidden = torch.relu(features @ net["first"])
+        hidden = torch.cat([hidden, torch.ones_like(hidden[:, :1])], dim=1)
+        # the embedding first: one [33, 6] matrix a view instead of SIZE of them a Gaussian
+        return hidden @ torch.einsum("hse,s->he", net["last"].reshape(-1, SIZE, 6), embedding)
+
+    def model(self, gaussians: Gaussians, view: int | None, iteration: int) -> Gaussians:
+        if view is None:
+            return replace(gaussians)
+        leaves = self.net | {"row": self.rows.values[view], "sh0": gaussians.sh0}
+        leaves = {name: tensor.detach().clone().requires_grad_(True) for name, tensor in leaves.items()}
+        with torch.enable_grad():
+            change = self.change(self.features(gaussians.means), leaves["row"], leaves)
+            colour = (SH_C0 * leaves["sh0"] + 0.5) * (1 + change[:, :3]) + change[:, 3:]
+            sh0 = (colour - 0.5) / SH_C0
+        self._graph = (leaves, sh0)
+        return replace(gaussians, sh0=sh0.detach())
+
+    def model_backward(self, gradients: Gradients, view: int | None) -> Gradients:
+        if view is None or self._graph is None:
+            return gradients
+        leaves, sh0 = self._graph
+        self._graph = None
+        found = torch.autograd.grad(sh0, list(leaves.values()), gradients.sh0.to(sh0))
+        self._pending = dict(zip(leaves, found))
+        return replace(gradients, sh0=self._pending.pop("sh0").contiguous())
+
+    def step(self, view: int, progress: float) -> None:
+        if self._pending is None:
+            return
+        share = decayed(1.0, FINAL, progress)
+        self.rows.step(view, self._pending["row"], RATE_ROWS * share)
+        for name, adam in self.moments.items():
+            adam.step(0, self._pending[name], RATE_NET * share)
+        self._pending = None
+        rows = self.rows.values[: self.views]
+        rows -= rows.mean(dim=0)
+
+    def begin_fit(self) -> None:
+        self.rows.reset(self.views)
+
+    def fit(self) -> None:
+        if self._pending is not None:
+            self.rows.step(self.views, self._pending["row"], FIT_RATE)
+            self._pending = None
+
+    def facts(self) -> dict[str, Any]:
+        return {"embedding_std": float(self.rows.values[: self.views].std(unbiased=False))}
+
+    def state_dict(self) -> State:
+        return {"rows": self.rows.state_dict()} | {name: m.state_dict() for name, m in self.moments.items()}
+
+    def load_state_dict(self, state: State) -> None:
+        self.rows.load_state_dict(state["rows"])
+        for name, adam in self.moments.items():
+            adam.load_state_dict(state[name])

@@ -1,0 +1,133 @@
+"""What an effect is: a change around the render call, with its own way back for gradients.
+
+    camera -> [poses] -> model -> [appearance] -> [3D filter] -> render -> image -> [exposure]
+
+Forward in that order, backward in reverse. The mask policy and the loss see the changed picture.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from ambiguous_wild.core import Camera
+from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.rendered import Gradients
+from ambiguous_wild.splat.step import TrainData
+
+if TYPE_CHECKING:
+    from ambiguous_wild.splat.parts import Parts
+
+State = dict[str, Any]
+
+
+class Effect:
+    """Does nothing. Override the hooks of the places it acts in; the others are never called.
+
+    `view` is the index of a train photo, `None` for any other camera (neutral), or the number of train
+    photos while a test photo's half is fitted.
+    """
+
+    name = ""
+
+    def change_parts(self, parts: Parts) -> Parts:
+        """The method's parts with what the effect needs of the renderer."""
+        return parts
+
+    def setup(self, data: TrainData) -> None:
+        """Called once before the first step, and again when a run resumes."""
+
+    def camera(self, view: int, camera: Camera) -> Camera:
+        """The camera of a train photo, at the resolution of the step."""
+        return camera
+
+    def model(self, gaussians: Gaussians, view: int | None, iteration: int) -> Gaussians:
+        """The Gaussians as they are drawn."""
+        return gaussians
+
+    def model_backward(self, gradients: Gradients, view: int | None) -> Gradients:
+        """Gradients of what `model` returned to those of what it was given; keeps those of its own.
+
+        Not in place: the tensors are the renderer's.
+        """
+        return gradients
+
+    def pose_backward(self, gaussians: Gaussians, camera: Camera, gradients: Gradients, view: int) -> None:
+        """Keep the gradient of the camera; `gaussians` and `gradients` are those of the render call."""
+
+    def image(self, image: Tensor, view: int | None) -> Tensor:
+        """[H, W, 3] to [H, W, 3]; not in place."""
+        return image
+
+    def image_backward(self, image: Tensor, d_image: Tensor, view: int | None, *, learn: bool) -> Tensor:
+        """dL/d(what `image` was given) from dL/d(what it returned); keeps its own gradient if `learn`."""
+        return d_image
+
+    def step(self, view: int, progress: float) -> None:
+        """Learn from the gradients kept since the last step.
+
+        Args:
+            view: whose they are.
+            progress: of the run, in [0, 1].
+        """
+
+    def rows_changed(self) -> None:
+        """Density control made, split, merged or dropped Gaussians."""
+
+    def begin_fit(self) -> None:
+        """A test photo is about to be fitted: its row starts neutral."""
+
+    def fit(self) -> None:
+        """One step of that row alone; nothing shared changes."""
+
+    def facts(self) -> dict[str, Any]:
+        """Plain values for the run's metrics."""
+        return {}
+
+    def state_dict(self) -> State:
+        return {}
+
+    def load_state_dict(self, state: State) -> None:
+        """Restore what `state_dict` returned; exact, so that a resumed run gives the same bits."""
+
+
+class RowAdam:
+    """Adam over the rows of a table [V, ...], each with moments and a count of its own.
+
+    A row moves only when its photo was seen: Adam's momentum would carry the others along for nothing.
+    """
+
+    def __init__(self, values: Tensor, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-15) -> None:
+        self.values, self.betas, self.eps = values, betas, eps
+        self.first, self.second = torch.zeros_like(values), torch.zeros_like(values)
+        self.steps = [0] * len(values)
+
+    def step(self, row: int, gradient: Tensor, rate: float | Tensor) -> None:
+        """One step of one row; `rate` broadcasts over it."""
+        self.steps[row] += 1
+        first, second = self.first[row], self.second[row]
+        first.lerp_(gradient, 1 - self.betas[0])
+        second.lerp_(gradient * gradient, 1 - self.betas[1])
+        bias1, bias2 = (1 - beta ** self.steps[row] for beta in self.betas)
+        self.values[row] -= rate / bias1 * first / ((second / bias2).sqrt() + self.eps)
+
+    def reset(self, row: int) -> None:
+        """That row at zero, as if it had never been seen."""
+        for tensor in (self.values, self.first, self.second):
+            tensor[row] = 0.0
+        self.steps[row] = 0
+
+    def state_dict(self) -> State:
+        return {"values": self.values, "first": self.first, "second": self.second, "steps": self.steps}
+
+    def load_state_dict(self, state: State) -> None:
+        for name in ("values", "first", "second"):
+            getattr(self, name).copy_(state[name])
+        self.steps = [int(n) for n in state["steps"]]
+
+
+def decayed(first: float, last: float, progress: float) -> float:
+    """Exponential decay from `first` to `last` over the run."""
+    return float(first * (last / first) ** progress)

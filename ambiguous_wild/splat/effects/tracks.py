@@ -1,0 +1,100 @@
+"""What the photos say of the same SfM points: colours along tracks, and exposure gains from them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import map_coordinates, uniform_filter
+
+from ambiguous_wild.core import Scene
+
+DARK, BRIGHT = 0.04, 0.96  # outside, a ratio of codes is noise or clipping
+ROUNDS = 12
+
+
+@dataclass(frozen=True)
+class TrackColours:
+    """Observations of SfM points in the train photos, those that are neither black nor clipped."""
+
+    point: np.ndarray  # [L] int64, index into Scene.points
+    view: np.ndarray  # [L] int64, index into Scene.train
+    rgb: np.ndarray  # [L, 3] float64 in (0, 1), sRGB, mean of 3x3 px
+
+
+def track_colours(scene: Scene, photos: Sequence[np.ndarray]) -> TrackColours:
+    """Read every train photo where its SfM points were found.
+
+    Args:
+        scene: with tracks.
+        photos: of the train views, [H, W, 3] in [0, 1], of any size.
+    """
+    points = scene.points
+    of_point = np.repeat(np.arange(len(points)), np.diff(points.track_offsets))
+    train = {index: k for k, index in enumerate(i for i, v in enumerate(scene.views) if v.split == "train")}
+    found = []
+    for index, k in train.items():
+        rows = np.flatnonzero(points.track_views == index)
+        if not len(rows):
+            continue
+        photo = np.asarray(photos[k], np.float64)
+        smooth = uniform_filter(photo, size=(3, 3, 1), mode="nearest")
+        camera = scene.views[index].camera
+        scale = np.array([photo.shape[1] / camera.width, photo.shape[0] / camera.height])
+        # rows, columns; pixel centres at +0.5
+        where = (points.track_xy[rows].astype(np.float64) * scale).T[::-1] - 0.5
+        rgb = np.stack(
+            [map_coordinates(smooth[..., c], where, order=1, mode="nearest") for c in range(3)], axis=1
+        )
+        usable = ((rgb > DARK) & (rgb < BRIGHT)).all(axis=1)
+        found.append((of_point[rows][usable], np.full(usable.sum(), k), rgb[usable]))
+    if not found:
+        return TrackColours(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)))
+    return TrackColours(*(np.concatenate(parts) for parts in zip(*found)))
+
+
+def log_gains(colours: TrackColours, views: int) -> np.ndarray:
+    """[views, 3] log gain of each photo and channel against the mean photo; 0 where nothing is known.
+
+    Alternates medians: of a point over its photos, then of a photo over its points. Medians, because a
+    distractor before a point is no exposure.
+    """
+    gains = np.zeros((views, 3))
+    counts = np.bincount(colours.point) if len(colours.point) else np.zeros(0, int)
+    shared = counts[colours.point] >= 2 if len(colours.point) else np.zeros(0, bool)
+    if shared.sum() < 10:
+        return gains
+    point, view, logs = colours.point[shared], colours.view[shared], np.log(colours.rgb[shared])
+    for _ in range(ROUNDS):
+        level = grouped_median(logs - gains[view], point)
+        gains = _by_view(logs - level, view, views)
+        gains -= gains.mean(axis=0)
+    return gains
+
+
+def _by_view(values: np.ndarray, view: np.ndarray, views: int) -> np.ndarray:
+    out = np.zeros((views, values.shape[1]))
+    for k in range(views):
+        rows = values[view == k]
+        if len(rows) >= 5:
+            out[k] = np.median(rows, axis=0)
+    return out
+
+
+def grouped_median(values: np.ndarray, group: np.ndarray) -> np.ndarray:
+    """Each row's group median, [L, C]: rows of one group get the same value."""
+    out = np.empty_like(values)
+    for c in range(values.shape[1]):
+        order = np.lexsort((values[:, c], group))
+        sorted_group, sorted_values = group[order], values[order, c]
+        starts = np.flatnonzero(np.r_[True, sorted_group[1:] != sorted_group[:-1]])
+        sizes = np.diff(np.r_[starts, len(order)])
+        median = 0.5 * (sorted_values[starts + (sizes - 1) // 2] + sorted_values[starts + sizes // 2])
+        out[order, c] = np.repeat(median, sizes)
+    return out
+
+
+def photo_gains(scene: Scene, photos: Sequence[np.ndarray]) -> np.ndarray:
+    """[V, 3] factor of each train photo's sRGB codes against the mean photo; 1 where nothing is known."""
+    return np.exp(log_gains(track_colours(scene, photos), len(photos)))

@@ -1,0 +1,60 @@
+"""`aw plan` and `aw bench --effects` as they are typed."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.tiny_scene import write_tiny_scene
+
+ROOT = Path(__file__).parents[2]
+
+
+def aw(*arguments) -> subprocess.CompletedProcess:
+    command = [sys.executable, "-m", "ambiguous_wild.cli.main", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
+
+
+def files(folder):
+    return {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_a_plan_is_a_table_and_a_file_and_leaves_the_scene_alone(scene, tmp_path):
+    before = files(scene)
+    done = aw("plan", scene, "-o", tmp_path / "plan.json", "--costs")
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert lines[0].split()[:2] == ["effect", "evidence"]
+    plan = json.loads((tmp_path / "plan.json").read_text())
+    assert plan["probed"] and plan["scene"] == "scene"
+    found = {d["effect"]: d for d in plan["decisions"]}
+    # a red square stands elsewhere in every photo; there are no tracks to say anything else
+    assert found["masks"]["decision"] == "on" and found["masks"]["value"] > 0.02
+    assert found["affine exposure"]["decision"] == "unknown" and found["affine exposure"]["value"] is None
+    assert isinstance(found["antialiasing"]["cost_ms"], float)
+    assert found["masks"]["cost_ms"] is None
+    assert files(scene) == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["plan", "SCENE", "-o", "SCENE/plan.json"], "would change the scene"),
+        (["plan", "SCENE/nothing"], "there is no scene folder"),
+        (["bench", "--method", "3dgs", "--scene", "SCENE", "--effects", "poss"], "did you mean 'poses'"),
+        (["bench", "--method", "3dgs", "--scene", "SCENE", "--effects", "all,poses"], "stands alone"),
+        (["bench", "--method", "3dgs", "--scene", "SCENE", "--plan", "gone"], "there is no plan gone"),
+    ],
+)  # fmt: skip
+def test_mistakes_get_one_line_and_exit_code_2(scene, arguments, message):
+    done = aw(*(a.replace("SCENE", str(scene)) for a in arguments))
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1

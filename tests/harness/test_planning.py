@@ -1,0 +1,206 @@
+"""Evidence on small tracks with an effect injected and without; what `--effects` makes of it."""
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+
+from ambiguous_wild.core import AwError, Camera, Points, Scene, View
+from ambiguous_wild.harness.choosing import check_wanted, choose
+from ambiguous_wild.harness.grid import cell_folder, plan_cells, run_cells
+from ambiguous_wild.harness.planning.decide import Plan, decide, plan_without_training
+from ambiguous_wild.harness.planning.evidence import measure
+from ambiguous_wild.harness.planning.file import read_plan
+from ambiguous_wild.harness.planning.probe import Occlusion, summarise, unexplained, with_occlusion
+from ambiguous_wild.io.atomic import write_json
+from ambiguous_wild.methods.registry import get_method
+from ambiguous_wild.splat.trainer import TrainConfig
+from tests.tiny_scene import write_tiny_scene
+
+VIEWS, POINTS, WIDTH, HEIGHT, FOCAL = 12, 150, 160, 90, 200.0
+
+
+def look_at(centre):
+    z = -centre / np.linalg.norm(centre)
+    x = np.cross([0, 1.0, 0], z)
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([x, np.cross(z, x), z])
+    pose[:3, 3] = -pose[:3, :3] @ centre
+    return pose
+
+
+def synthetic(*, exposure=0.0, place=0.0, zoom=1.0, noise_px=0.0, shine=0.0, seed=0):
+    """A cloud of coloured dots from an arc of cameras; each keyword injects one effect."""
+    rng = np.random.default_rng(seed)
+    xyz, rgb = rng.uniform(-1, 1, (POINTS, 3)), rng.uniform(0.25, 0.6, (POINTS, 3))
+    normal = rng.normal(size=(POINTS, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    views, photos, xy, seen = [], [], [], []
+    for k in range(VIEWS):
+        angle = np.radians(-40 + 80 * k / (VIEWS - 1))
+        centre = 5.0 * np.array([np.sin(angle), 0.2 * np.sin(3 * angle), -np.cos(angle)])
+        focal = FOCAL * zoom ** (k / (VIEWS - 1))
+        camera = Camera(WIDTH, HEIGHT, focal, focal, WIDTH / 2, HEIGHT / 2, look_at(centre))
+        local = xyz @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+        uv = local[:, :2] / local[:, 2:] * focal + [WIDTH / 2, HEIGHT / 2]
+        uv += rng.normal(size=uv.shape) * noise_px
+        inside = ((uv > 3) & (uv < [WIDTH - 3, HEIGHT - 3])).all(axis=1)
+        direction = (centre - xyz) / np.linalg.norm(centre - xyz, axis=1, keepdims=True)
+        colour = rgb + shine * (normal * direction).sum(axis=1, keepdims=True)
+        colour = colour * np.exp(exposure * rng.normal(size=3)) * np.exp(place * rng.normal(size=(POINTS, 1)))
+        photo = np.full((HEIGHT, WIDTH, 3), 0.4) + rng.normal(size=(HEIGHT, WIDTH, 3)) * 0.01
+        for i in np.argsort(-local[:, 2]):  # near ones last
+            if inside[i]:
+                c, r = np.floor(uv[i]).astype(int)
+                photo[r - 2 : r + 3, c - 2 : c + 3] = colour[i]
+        views.append(View(f"{k}.png", None, camera, "train"))
+        photos.append(np.clip(photo + rng.normal(size=photo.shape) * 0.01, 0, 1))
+        xy.append(uv)
+        seen.append(inside)
+    seen, xy = np.stack(seen, 1), np.stack(xy, 1)  # [POINTS, VIEWS]
+    offsets = np.concatenate([[0], np.cumsum(seen.sum(axis=1))])
+    points = Points(
+        xyz, (rgb * 255).astype(np.uint8), np.zeros(POINTS), offsets,
+        np.nonzero(seen)[1].astype(np.int32), xy[seen].astype(np.float32),
+    )  # fmt: skip
+    return Scene(None, "dots", tuple(views), points), photos
+
+
+def decisions(**kw):
+    scene, photos = synthetic(**kw)
+    return {d.effect: d for d in decide("dots", measure(scene, photos)).decisions}
+
+
+INJECTED = {
+    "affine exposure": {"exposure": 0.15},
+    "appearance embedding": {"place": 0.4},
+    "antialiasing": {"zoom": 3.0},
+    "pose refinement": {"noise_px": 2.5},
+    "SH degree": {"shine": 0.25},
+}
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_nothing_is_called_for_where_nothing_was_put_in(seed):
+    found = decisions(seed=seed)
+    assert {name: d.decision for name, d in found.items()} == dict.fromkeys(INJECTED, "off")
+
+
+@pytest.mark.parametrize("effect", INJECTED)
+def test_what_was_put_in_is_called_for_and_nothing_else(effect):
+    answers = {name: d.decision for name, d in decisions(**INJECTED[effect]).items()}
+    others = {name for name, a in answers.items() if a == "on"} - {effect}
+    assert answers[effect] == "on"
+    # a colour that follows the direction or the place leaves its mark on what is read as the other
+    assert others <= {"SH degree"} if effect in ("appearance embedding", "pose refinement") else not others
+
+
+def test_the_numbers_are_what_was_put_in():
+    assert measure(*synthetic(exposure=0.15)).exposure == pytest.approx(0.15, rel=0.35)
+    assert measure(*synthetic(zoom=3.0)).sampling == pytest.approx(3.0 ** (0.9), rel=0.1)
+    # the median length of a 2D normal deviate is 1.18 sigma
+    assert measure(*synthetic(noise_px=2.0)).reprojection_px == pytest.approx(2 * 1.1774, rel=0.1)
+
+
+def test_a_scene_without_tracks_reads_no_photo_and_says_unknown(tmp_path):
+    scene, _ = synthetic()
+    empty = dataclasses.replace(scene.points, track_views=np.full_like(scene.points.track_views, -1))
+    plan = plan_without_training(dataclasses.replace(scene, points=empty))
+    assert {d.decision for d in plan.decisions} == {"unknown"}
+    assert plan.effects() == ()
+
+
+def test_a_plan_survives_its_file(tmp_path):
+    plan = with_occlusion(decide("dots", measure(*synthetic(zoom=3.0))), Occlusion(0.1, 0.02, 0.3))
+    plan = plan.with_costs({"antialias": 0.5})
+    write_json(tmp_path / "plan.json", plan.plain())
+    again = read_plan(tmp_path / "plan.json")
+    assert again.plain() == plan.plain()
+    assert again.effects() == ("antialias", "sh1")
+    assert [d.cost_ms for d in again.decisions if d.effect == "antialiasing"] == [0.5]
+    for text in (
+        "{half",
+        "[]",
+        '{"schema": 2}',
+        json.dumps(plan.plain() | {"decisions": [{"decision": "on"}]}),
+    ):
+        (tmp_path / "bad.json").write_text(text)
+        with pytest.raises(AwError, match="is no plan"):
+            read_plan(tmp_path / "bad.json")
+
+
+def test_what_a_probe_leaves():
+    rng = np.random.default_rng(0)
+    render = rng.uniform(0.2, 0.8, (90, 160, 3))
+    everywhere = np.ones((90, 160), bool)
+    photo = np.clip(render + rng.normal(size=render.shape) * 0.1, 0, 1)  # detail that was not learnt
+    assert not unexplained(photo, render, everywhere).any()
+    photo[30:60, 40:80] = render[30:60, 40:80] + 0.3
+    patch = unexplained(photo, render, everywhere)
+    truth = np.zeros_like(patch)
+    truth[30:60, 40:80] = True
+    assert (patch & truth).sum() > 0.9 * truth.sum() and (patch & ~truth).sum() < 0.35 * truth.sum()
+    assert not unexplained(photo, render, ~truth)[truth].any()
+    found = summarise([patch] + [np.zeros_like(patch)] * 9)
+    assert found.share == pytest.approx(patch.mean() / 10) and found.worst == pytest.approx(patch.mean())
+    assert found.compact == 0.0  # larger than a twentieth of the photo
+
+
+# -- --effects ------------------------------------------------------------------------------------
+
+
+def test_words_and_lists():
+    assert check_wanted("auto") == check_wanted("none") == ()
+    assert check_wanted("poses, exposure") == ("exposure", "poses")
+    for wrong, message in (("auto,poses", "stands alone"), (" , ", "is empty"), ("exposur", "did you mean")):
+        with pytest.raises(AwError, match=message):
+            check_wanted(wrong)
+
+
+def test_a_baseline_stays_what_its_paper_defines_unless_asked():
+    scene, photos = synthetic(zoom=3.0, exposure=0.15)
+    plan = decide("dots", measure(scene, photos))
+    methods = [get_method(name) for name in ("3dgs", "refinesplat", "refinesplat@mask=truth")]
+    by_default = choose("default", scene, methods, plan)
+    assert by_default["3dgs"].effects == by_default["refinesplat@mask=truth"].effects == ()
+    assert not by_default["3dgs"].asked  # and its folder says nothing
+    assert by_default["refinesplat"].effects == ("exposure", "antialias")  # sh1 is none of its own
+    assert choose("auto", scene, methods, plan)["3dgs"].effects == ("exposure", "antialias", "sh1")
+    assert choose("none", scene, methods, plan)["refinesplat"].effects == ()
+    with pytest.raises(AwError, match="of scene dots, not of other"):
+        choose("auto", dataclasses.replace(scene, name="other"), methods, plan)
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory):
+    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
+
+
+SHORT = TrainConfig(iterations=40, probes=0)
+
+
+def test_a_scene_that_calls_for_nothing_keeps_the_identity_of_its_runs(tiny):
+    (none,) = plan_cells(["refinesplat"], [tiny], [0], SHORT)
+    (default,) = plan_cells(["refinesplat"], [tiny], [0], SHORT, effects="default")
+    (listed,) = plan_cells(["refinesplat"], [tiny], [0], SHORT, effects="poses")
+    assert none.identity == default.identity != listed.identity
+    assert none.config == default.config
+
+
+def test_a_run_says_what_was_on_and_why_and_ships_the_filtered_model(tiny, tmp_path):
+    plan = Plan("scene", decide("scene", measure(*synthetic(zoom=3.0))).decisions)
+    cells = plan_cells(["3dgs"], [tiny], [0], SHORT, effects="auto", plan=plan, protocol="half")
+    (report,) = run_cells(cells, tmp_path, pictures=False)
+    assert report.outcome == "trained", report.error
+    said = json.loads((cell_folder(tmp_path, cells[0]) / "effects.json").read_text())
+    assert said["asked"] == "auto" and said["effects"] == ["antialias", "sh1"]
+    assert {d["effect"] for d in said["plan"]["decisions"]} == set(INJECTED)
+    facts = report.result["facts"]
+    assert facts["effects"] == ["antialias", "sh1"] and facts["protocol"] == "half"
+    assert facts["effect_facts"]["antialias"]["filter_size_median"] > 0
+    assert not any(math.isnan(row["psnr"]) for row in report.result["per_image"])
+    with pytest.raises(AwError, match="effects was"):
+        run_cells(plan_cells(["3dgs"], [tiny], [0], SHORT, protocol="half"), tmp_path)

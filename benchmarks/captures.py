@@ -67,7 +67,7 @@ def command(cell: Cell, args: argparse.Namespace) -> list[str]:
     """The `aw bench` of one cell."""
     words = ["bench", "--method", cell.method.name, "--scene", str(cell.scene.root)]
     words += ["--seed", str(cell.train.seed), "--iterations", str(cell.train.iterations)]
-    words += ["--device", "cpu", "--threads", "1", "--no-pictures", "-o", str(args.out)]
+    words += ["--device", "cpu", "--threads", "1", "--no-pictures", "--effects", "none", "-o", str(args.out)]
     for setting in args.settings:
         method, _, key = setting.partition("=")[0].partition(".")
         if cell.method.option_keys(method, key):

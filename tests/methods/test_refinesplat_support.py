@@ -21,8 +21,8 @@ VISIBLE = torch.tensor([True, True, True, False])
 LEFT_MASKED = torch.cat([torch.zeros(8, 4), torch.ones(8, 4)], dim=1)
 
 
-def looked(looks, keep=LEFT_MASKED, config=SupportConfig()):
-    support = Support(config)
+def looked(looks, keep=LEFT_MASKED):
+    support = Support(SupportConfig())
     support.match(4, torch.device("cpu"))
     for _ in range(looks):
         support.look(MEANS, VISIBLE, CAMERA, keep)

@@ -35,7 +35,7 @@ class EntropyDensityConfig(DensityConfig):
     merge_every: float = 1000.0  # nominal iterations between merges; 0 = never
     merge_grad: float = 5e-5  # tau_e: only Gaussians whose mean statistic is below it may merge
     merge: MergeConfig = field(default_factory=MergeConfig)
-    support: SupportConfig = field(default_factory=SupportConfig)  # who is removed because masks hide it always
+    support: SupportConfig = field(default_factory=SupportConfig)  # what masks hide in every photo goes
 
 
 class EntropyAwareDensity(DensityControl):

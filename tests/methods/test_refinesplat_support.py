@@ -118,3 +118,28 @@ def test_the_counts_survive_a_stop():
     assert torch.equal(other.support.looked, control.support.looked)
     assert torch.equal(other.support.kept, control.support.kept)
     assert control.support.looked.sum() > 0
+
+
+def test_growth_goes_first_and_the_judgement_follows():
+    config = EntropyDensityConfig(start=0.0, grow_grad=1e-9, grow_scale=1e9, min_every=50)
+    control = EntropyAwareDensity(config, 1.0, 0)
+    gaussians = Gaussians.from_points(MEANS.double().numpy(), np.full((4, 3), 99, np.uint8))
+    optimiser = SplatAdam(gaussians, RATES)
+    seen = []
+    for iteration in range(1, 56):
+        step = SimpleNamespace(
+            iteration=iteration,
+            nominal=100.0 * iteration,
+            ceiling=100,
+            gaussians=gaussians,
+            camera=CAMERA,
+            rendered=SimpleNamespace(visible=torch.ones(len(gaussians), dtype=torch.bool)),
+        )
+        zeros = {name: torch.zeros_like(tensor) for name, tensor in gaussians.items()}
+        screen = torch.full((len(gaussians), 2), 1.0)
+        control.observe(step, Gradients(**zeros, screen=screen), LEFT_MASKED)
+        gaussians, events = control.refine(step, gaussians, optimiser)
+        optimiser.bind(gaussians)
+        seen += [(iteration, event) for event in events]
+    assert seen == [(50, "grow"), (51, "prune")]
+    assert len(gaussians) == 7  # four, each cloned; the hidden one's copy has not been looked at often enough

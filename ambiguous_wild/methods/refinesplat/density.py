@@ -79,8 +79,9 @@ class EntropyAwareDensity(DensityControl):
     def refine(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> tuple[Gaussians, list[str]]:
         """As 3DGS, and every `min_every` iterations to the end, what no kept pixel vouches for goes."""
         gaussians, events = super().refine(step, gaussians, optimiser)
-        if self.config.support.least_share <= 0 or step.iteration - self.last_judged < self.config.min_every:
-            return gaussians, events
+        due = step.iteration - self.last_judged >= self.config.min_every
+        if events or not due or self.config.support.least_share <= 0:
+            return gaussians, events  # one change of rows an iteration
         self.last_judged = step.iteration
         self._match(gaussians)
         drop = self.support.judge()

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ambiguous_wild.core import AwError
@@ -161,6 +161,7 @@ def test_under_a_budget_both_take_as_long_and_no_rate_is_given(tmp_path: Path) -
     assert "same time" in to_text(cost_report(read(tmp_path)))
 
 
+@settings(max_examples=50, deadline=None)
 @given(st.lists(st.tuples(st.integers(1, 6), st.integers(1, 6)), min_size=1, max_size=12))
 def test_the_front_is_what_no_other_dominates(at: list[tuple[int, int]]) -> None:
     made = [
@@ -198,6 +199,7 @@ def test_a_mean_timeline_exists_only_where_every_run_has_one(tmp_path: Path) -> 
     assert math.isnan(summary(Curve("a", "a", curve.length, ()), ("yard",), lambda run: run.psnr).mean)
 
 
+@settings(max_examples=50, deadline=None)
 @given(st.lists(st.floats(0, 10), max_size=8), st.floats(0.1, 2))
 def test_labels_keep_their_order_and_distance(heights: list[float], gap: float) -> None:
     placed = spread_out(heights, gap)

@@ -233,6 +233,23 @@ def test_files_hold_what_is_printed_and_hostile_names_stay_text(tmp_path: Path) 
     assert "\x1b" not in to_text(report)
 
 
+def test_only_an_earlier_report_is_taken_away(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    for name in ("changes.csv", "notes.txt"):
+        (out / name).write_text("mine")
+    cost_run(tmp_path / "runs", "a")
+    report = cost_report(read(tmp_path / "runs", tmp_path / "runs" / "yard"))  # a folder in a folder: one run
+    assert [p.runs for p in report.points] == [1]
+    write_report(report, out)
+    assert (out / "changes.csv").read_text() == "mine"  # nothing here was a report of ours
+    (out / "changes.csv").unlink()
+    (out / "budgets.png").write_text("of a report")
+    write_report(report, out)
+    assert sorted(p.name for p in out.iterdir()) == ["cost.csv", "cost.json", "notes.txt", "time-to-psnr.csv",
+                                                     "timelines.csv"]  # fmt: skip
+
+
 def test_errors_say_what_to_do(tmp_path: Path) -> None:
     with pytest.raises(AwError, match="no folder of runs"):
         read(tmp_path / "absent")

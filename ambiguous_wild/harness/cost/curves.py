@@ -30,6 +30,11 @@ class Curve:
     def scenes(self) -> tuple[str, ...]:
         return tuple(sorted({run.scene for run in self.runs}))
 
+    @property
+    def trained_s(self) -> float:
+        """Seconds of the longest training; 0 where none is known."""
+        return max((run.train_s for run in self.runs if math.isfinite(run.train_s)), default=0.0)
+
     def on(self, scene: str) -> list[CostRun]:
         return sorted((run for run in self.runs if run.scene == scene), key=lambda run: run.seed)
 
@@ -43,13 +48,13 @@ class Summary:
 
 
 def curves_of(runs: Sequence[CostRun]) -> list[Curve]:
-    """Runs gathered into curves, in the order of their names and lengths."""
+    """Runs gathered into curves, by name, the shortest training first."""
     names = _names(runs)
     groups: dict[tuple[str, Length], list[CostRun]] = {}
     for run, name in zip(runs, names):
         groups.setdefault((name, run.length), []).append(run)
-    return [Curve(name, group[0].method, length, tuple(group))
-            for (name, length), group in sorted(groups.items())]  # fmt: skip
+    curves = [Curve(name, runs[0].method, length, tuple(runs)) for (name, length), runs in groups.items()]
+    return sorted(curves, key=lambda curve: (curve.name, curve.trained_s, curve.length))
 
 
 def scenes_of(curves: Iterable[Curve]) -> tuple[str, ...]:

@@ -21,7 +21,7 @@ from ambiguous_wild.harness.cost.plot_style import (
     text,
     ticks_of_time,
 )
-from ambiguous_wild.harness.cost.report import Report
+from ambiguous_wild.harness.cost.report import PLOTS, Report
 from ambiguous_wild.harness.cost.text import Unit, per_minute, time_unit
 from ambiguous_wild.harness.render_tables import plain
 from ambiguous_wild.io.palette import CATEGORIES, plot_colour
@@ -37,14 +37,9 @@ KINDS = {"effect": 0, "interval": 1, "option": 2}
 def draw_all(report: Report, folder: Path) -> list[Path]:
     """Every plot that the runs give something to draw for, as SVG and PNG; returns what was written."""
     written = []
-    for name, draw in (("timelines", draw_timelines), ("budgets", draw_budgets), ("front", draw_front),
-                       ("changes", draw_changes)):  # fmt: skip
+    for name, draw in zip(PLOTS, (draw_timelines, draw_budgets, draw_front, draw_changes)):
         figure = draw(report)
-        if figure is None:  # an earlier report's must not stand beside this one
-            for suffix in (".svg", ".png"):
-                (folder / f"{name}{suffix}").unlink(missing_ok=True)
-        else:
-            written += save(figure, folder / name)
+        written += [] if figure is None else save(figure, folder / name)
     return written
 
 

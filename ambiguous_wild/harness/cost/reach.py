@@ -76,7 +76,7 @@ def _soonest(rows: Sequence[Reach]) -> Reach:
     there = [row for row in rows if math.isfinite(row.minutes.mean)]
     if there:
         return min(there, key=lambda row: row.minutes.mean)
-    return max(reversed(rows), key=lambda row: row.reached / max(row.runs, 1))
+    return max(reversed(rows), key=lambda row: (row.runs > 0, row.reached / max(row.runs, 1)))
 
 
 def first_time(run: CostRun, psnr: float) -> tuple[float, bool]:

@@ -89,18 +89,15 @@ def read_cost_runs(folders: Sequence[Path], *, scenes: Sequence[str] = ()) -> Fo
     """
     runs: list[CostRun] = []
     notes: list[str] = []
-    for root in dict.fromkeys(Path(f).resolve() for f in folders):
-        if not root.is_dir():
-            raise AwError(f"no folder of runs {root}: give the folder that 'aw bench -o' wrote")
-        for folder in run_folders(root):
-            path = next((folder / n for n in (RESULT, FAILED) if (folder / n).exists()), None)
-            if path is None:
-                notes.append(f"not finished, left out: {folder}")
-                continue
-            try:
-                runs.append(_run(folder, read_result(path)))
-            except AwError as error:
-                notes.append(f"left out: {error}")
+    for folder in _each_once(folders):
+        path = next((folder / n for n in (RESULT, FAILED) if (folder / n).exists()), None)
+        if path is None:
+            notes.append(f"not finished, left out: {folder}")
+            continue
+        try:
+            runs.append(_run(folder, read_result(path)))
+        except AwError as error:
+            notes.append(f"left out: {error}")
     known = sorted({run.scene for run in runs})
     for name in scenes:
         if name not in known:
@@ -119,10 +116,20 @@ def read_cost_runs(folders: Sequence[Path], *, scenes: Sequence[str] = ()) -> Fo
     return Found(tuple(runs), tuple(notes))
 
 
+def _each_once(folders: Sequence[Path]) -> list[Path]:
+    """The run folders below; one folder may lie in another that is given too."""
+    found: dict[Path, Path] = {}
+    for root in folders:
+        if not root.is_dir():
+            raise AwError(f"no folder of runs {root}: give the folder that 'aw bench -o' wrote")
+        for folder in run_folders(root):
+            found.setdefault(folder.resolve(), folder)
+    return list(found.values())
+
+
 def _run(folder: Path, result: dict[str, Any]) -> CostRun:
     config = read_config(folder)
-    train = config.get("train") if isinstance(config.get("train"), dict) else {}
-    scene = config.get("scene") if isinstance(config.get("scene"), dict) else {}
+    train, scene = _mapping(config.get("train")), _mapping(config.get("scene"))
     cost = result["cost"]
     images = {row["name"]: _number(row.get("psnr")) for row in result["per_image"]}
     psnr, train_s = stats.mean(list(images.values())), _number(cost.get("train_s"))
@@ -200,6 +207,10 @@ def _refuse_twice(runs: Iterable[CostRun]) -> None:
                 f"{seen[key]} and {run.folder}; leave one of them out"
             )
         seen[key] = run.folder
+
+
+def _mapping(value: Any) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}
 
 
 def _number(value: Any) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -17,6 +18,10 @@ from ambiguous_wild.harness.cost.reach import Reach, times_to_reach
 from ambiguous_wild.harness.cost.read import Found
 from ambiguous_wild.harness.render_tables import csv_text
 from ambiguous_wild.io.atomic import write_json, write_text
+
+PLOTS = ("timelines", "budgets", "front", "changes")
+FILES = ("cost.csv", "time-to-psnr.csv", "changes.csv", "timelines.csv", "cost.json",
+         *(f"{plot}{suffix}" for plot in PLOTS for suffix in (".svg", ".png")))  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -78,6 +83,7 @@ def _gaps(curves: Sequence[Curve], scenes: Sequence[str]) -> list[str]:
 
 def write_report(report: Report, folder: Path) -> list[Path]:
     """cost.json, cost.csv, time-to-psnr.csv, changes.csv and timelines.csv; returns what was written."""
+    _remove_earlier(folder)
     tables = {
         "cost.csv": [_point_row(p) for p in report.points],
         "time-to-psnr.csv": [_reach_row(r) for r in report.reach],
@@ -87,13 +93,21 @@ def write_report(report: Report, folder: Path) -> list[Path]:
     written = [folder / "cost.json"]
     write_json(written[0], plain_data(report))
     for name, rows in tables.items():
-        path = folder / name
         if rows:
-            write_text(path, _csv(rows))
-            written.append(path)
-        else:  # of an earlier report, when there was something to say
-            path.unlink(missing_ok=True)
+            write_text(folder / name, _csv(rows))
+            written.append(folder / name)
     return written
+
+
+def _remove_earlier(folder: Path) -> None:
+    """Take away what an earlier report left, and nothing else: its plots must not stand beside our tables."""
+    try:
+        ours = "time_to_psnr" in json.loads((folder / "cost.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError, TypeError, RecursionError):
+        return
+    if ours:
+        for name in FILES:
+            (folder / name).unlink(missing_ok=True)
 
 
 def plain_data(report: Report) -> dict[str, Any]:

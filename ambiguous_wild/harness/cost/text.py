@@ -114,6 +114,8 @@ def _when(row: Reach, unit: Unit, several: bool) -> str:
         return "no run"
     if row.reached < row.runs:
         return "never" if not row.reached else f"{row.reached} of {row.runs} runs"
+    if math.isnan(row.minutes.mean):  # a scene without a run
+        return MISSING
     text = ("≤ " if row.bound else "") + number(unit.of(row.minutes), unit.digits)
     return f"{text} (in {row.length})" if several else text
 

@@ -18,7 +18,7 @@ def grouped(planned: Mapping[str, Sequence[Cell]], budgets_s: Sequence[float] = 
         budgets_s: seconds of training; empty = as the cells have it.
     """
     cells = []
-    lengths = sorted(set(budgets_s))
+    lengths: list[float | None] = [*sorted(set(budgets_s))]
     for seconds in lengths or [None]:
         for effects, members in planned.items():
             group = [f"budget-{seconds:g}s"] if len(lengths) > 1 else []

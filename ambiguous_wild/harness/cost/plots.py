@@ -45,7 +45,7 @@ def draw_all(report: Report, folder: Path) -> list[Path]:
 
 def _panels(report: Report) -> list[tuple[str, tuple[str, ...]]]:
     """(title, scenes) of each panel: the mean first where there are several."""
-    panels = [(scene, (scene,)) for scene in report.scenes]
+    panels: list[tuple[str, tuple[str, ...]]] = [(scene, (scene,)) for scene in report.scenes]
     return [(f"mean over {len(panels)} scenes", report.scenes), *panels] if len(panels) > 1 else panels
 
 

@@ -61,7 +61,8 @@ def means(
     datasets: Mapping[str, Sequence[str]] | None = None,
 ) -> list[Layout]:
     """One table: the mean over each dataset's scenes side by side; arguments as for `paper`."""
-    ties, parts = Ties(runs), []
+    ties = Ties(runs)
+    parts: list[Layout] = []
     notes: dict[str, None] = {}
     for name, members in divided(runs, scenes, datasets or {}).items():
         table = comparison(runs, metrics=metrics or quality_columns(runs), scenes=members)

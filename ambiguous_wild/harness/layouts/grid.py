@@ -11,8 +11,7 @@ from ambiguous_wild.harness.tables import Cell
 
 Kind = Literal["measured", "reported"]
 State = Literal["ok", "missing", "failed", "absent", "blank"]
-BLANK = "blank"  # nothing belongs there
-SHOWN = {"missing": "—", "failed": "failed", "absent": "no run", "blank": ""}
+SHOWN = {"missing": "—", "failed": "failed", "absent": "no run", "blank": ""}  # blank: nothing belongs there
 ARROWS = {"higher": "↑", "lower": "↓", None: ""}
 TIE = "≈"
 

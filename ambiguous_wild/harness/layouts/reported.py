@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.audit.table import MEAN, Number, read_tables
-from ambiguous_wild.harness.layouts.grid import BLANK, Column, Entry, Layout, Line
+from ambiguous_wild.harness.layouts.grid import Column, Entry, Layout, Line
 
 FOLDER = Path(__file__).resolve().parents[3] / "leaderboard" / "reported"
 FAMILIES = ("psnr", "ssim", "lpips")
@@ -73,7 +73,7 @@ def _entry(
         found = by_dataset.get(column.dataset, [])
     else:  # a scene is told by its name alone, a mean is not
         found = [text for of in by_dataset.values() for text in of] if column.scene else []
-    return Entry(printed=" / ".join(dict.fromkeys(found))) if found else Entry(state=BLANK)
+    return Entry(printed=" / ".join(dict.fromkeys(found))) if found else Entry(state="blank")
 
 
 def _plain(name: str) -> str:

@@ -55,6 +55,7 @@ class Cell:
     device: str = "cpu"
     chosen: Chosen = field(default_factory=Chosen)  # optional effects, and why
     protocol: Protocol = "full"  # "half": measured on the right half, colour effects fitted on the left
+    group: str = ""  # folder below the output, where one output takes several lengths or effects
 
     @property
     def config(self) -> dict[str, Any]:

@@ -25,6 +25,7 @@ COMMANDS = {
     "ablate": ("ablate", "What each part of a method brings, and what it costs."),
     "table": ("table", "Compare runs: Markdown, CSV, LaTeX."),
     "audit": ("audit", "What cannot be right in a table of results."),
+    "leaderboard": ("leaderboard", "Take checked runs into CSVs, and publish them as a page."),
     "study": ("study", "Ask people, blind: what is hard to see, which render is better."),
     "methods": ("methods", "List the methods there are."),
 }

@@ -1,0 +1,129 @@
+"""`aw leaderboard`: take runs in, publish the page, check what is there."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    from ambiguous_wild.harness.leaderboard.add import Report
+
+_board = click.option(
+    "--board",
+    type=click.Path(path_type=Path, file_okay=False),
+    default=Path("leaderboard"),
+    show_default=True,
+    help="Folder of the leaderboard.",
+)
+_json = click.option("--json", "as_json", is_flag=True, help="Print the same facts as JSON.")
+
+
+@click.group("leaderboard")
+def command() -> None:
+    """Numbers that others can trust, as CSVs and a page.
+
+    \b
+    aw leaderboard add runs                 check finished runs and take them in
+    aw leaderboard publish -o site          CSVs and a page that opens from a file
+    aw leaderboard check                    what is wrong with what is there
+    """
+
+
+@command.command("add")
+@click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path))
+@_board
+@click.option(
+    "--dataset", help="Of these runs.  [default: what their scene says; of 'aw simulate': simulated]"
+)
+@click.option(
+    "--scenes",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Where the scenes lie (a scene, or a folder of them).  [default: where the runs say]",
+)
+@click.option(
+    "--images",
+    type=click.IntRange(0, 20),
+    default=1,
+    show_default=True,
+    help="Test images a scene of which small copies are kept for the page.",
+)
+@click.option("--replace", is_flag=True, help="A run with other numbers replaces the one on the board.")
+@click.option("--quick", is_flag=True, help="Recompute PSNR alone, not every metric.")
+@click.option("--dry-run", is_flag=True, help="Check, and write nothing.")
+@_json
+def add_command(
+    runs: tuple[Path, ...],
+    board: Path,
+    dataset: str | None,
+    scenes: Path | None,
+    images: int,
+    replace: bool,
+    quick: bool,
+    dry_run: bool,
+    as_json: bool,
+) -> None:
+    """Check RUNS (run folders, or folders of them) and add those that pass.
+
+    Changed, partial, failed and foreign runs are refused, one line each; runs that are not finished are left
+    for later. Whoever adds a run twice changes nothing.
+    """
+    from ambiguous_wild.core import AwError
+    from ambiguous_wild.harness.leaderboard.add import add
+
+    with _bar() as tick:
+        reports = add(
+            board,
+            runs,
+            dataset=dataset,
+            scenes=scenes,
+            images=images,
+            replace_other=replace,
+            quick=quick,
+            dry=dry_run,
+            tick=tick,
+        )
+    _print_reports(reports, as_json)
+    counts = Counter(r.outcome for r in reports)
+    told = ", ".join(f"{n} {outcome}" for outcome, n in counts.items())
+    dry_note = " (nothing written)" if dry_run else ""
+    click.echo(
+        f"{len(reports)} run{'' if len(reports) == 1 else 's'}: {told}{dry_note}; board {board}", err=True
+    )
+    if counts["refused"]:
+        sys.exit(AwError.exit_code)
+
+
+def _print_reports(reports: list[Report], as_json: bool) -> None:
+    if as_json:
+        rows = [{"run": str(r.run), "outcome": r.outcome, "error": r.error or None} for r in reports]
+        click.echo(json.dumps(rows, indent=2))
+        return
+    for r in reports:
+        if r.error:
+            click.secho(
+                f"{r.outcome}: {' '.join(r.error.split())}", fg="red" if r.outcome == "refused" else None
+            )
+
+
+class _bar:
+    """A bar over the runs, where somebody looks."""
+
+    def __enter__(self) -> Any:
+        self.bar: Any = None
+        return self.tick
+
+    def tick(self, done: int, total: int) -> None:
+        from tqdm import tqdm
+
+        if self.bar is None:
+            self.bar = tqdm(total=total, unit="run", disable=not sys.stderr.isatty(), file=sys.stderr)
+        self.bar.update(done - self.bar.n)
+
+    def __exit__(self, *_: object) -> None:
+        if self.bar is not None:
+            self.bar.close()

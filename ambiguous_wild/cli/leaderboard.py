@@ -127,3 +127,55 @@ class _bar:
     def __exit__(self, *_: object) -> None:
         if self.bar is not None:
             self.bar.close()
+
+
+@command.command("publish")
+@_board
+@click.option("-o", "--out", required=True, type=click.Path(path_type=Path), help="Folder of the page.")
+@click.option("--reported", is_flag=True, help="Show what papers print beside the measured numbers, marked.")
+@click.option("--title", default="Leaderboard", show_default=True, help="Of the page.")
+@_json
+def publish_command(board: Path, out: Path, reported: bool, title: str, as_json: bool) -> None:
+    """Write CSVs and a page that works from a file, from the board's CSVs alone.
+
+    OUT holds index.html, data/ and images/ afterwards; an earlier page there is replaced.
+    """
+    import dataclasses
+
+    from ambiguous_wild.harness.leaderboard.publish import publish
+
+    done = publish(board, out, reported=reported, title=title)
+    if as_json:
+        click.echo(json.dumps(dataclasses.asdict(done), indent=2))
+    told = f"{done.runs} runs of {done.datasets} datasets, {done.images} pictures, {done.reported} reported numbers"
+    click.echo(f"wrote {out / 'index.html'}: {told}", err=True)
+
+
+@command.command("check")
+@_board
+@click.option("--strict", is_flag=True, help="Exit with 1 where the audit asks anything.")
+@_json
+def check_command(board: Path, strict: bool, as_json: bool) -> None:
+    """Read the board again: hashes, duplicates, files that do not follow; then audit its numbers.
+
+    What is wrong ends with exit code 2. What the audit finds are questions, as with 'aw audit'.
+    """
+    import dataclasses
+
+    from ambiguous_wild.core import AwError
+    from ambiguous_wild.harness.audit.run import to_text
+    from ambiguous_wild.harness.leaderboard.check import check
+
+    found = check(board)
+    if as_json:
+        click.echo(json.dumps(dataclasses.asdict(found), indent=2, ensure_ascii=False))
+    else:
+        for problem in found.problems:
+            click.secho(f"wrong: {problem}", fg="red")
+        click.echo(to_text(list(found.findings)), nl=bool(found.findings))
+    counts = f"{len(found.problems)} problems, {len(found.findings)} findings of the audit"
+    click.echo(f"{found.runs} runs: {counts}; board {board}", err=True)
+    if found.problems:
+        sys.exit(AwError.exit_code)
+    if strict and found.findings:
+        sys.exit(1)

@@ -132,7 +132,10 @@ def _other_numbers(new: Verified, old: Entry) -> str:
         if key
         else "only its cost differs"
     )
-    return f"{new.run}: {old.name} is on the board with another result ({shown}); leave it out, or pass --replace"
+    return (
+        f"{new.run}: {old.name} is on the board with another result ({shown}); leave it out, or pass "
+        "--replace"
+    )
 
 
 def _conflicts(board: Path, there: list[Entry], passed: list[Verified]) -> list[tuple[str, Verified]]:
@@ -157,10 +160,11 @@ def _conflicts(board: Path, there: list[Entry], passed: list[Verified]) -> list[
                 f"{v.run}: dataset {e.dataset!a} is also spelt {min(names - {e.dataset})!a}; spell it alike"
             )
         elif len(hashes[e.dataset, e.scene]) > 1 and e.scene_hash != known:
+            other = min(hashes[e.dataset, e.scene] - {e.scene_hash})
             reason = (
                 f"{v.run}: scene {e.scene!a} has hash {e.scene_hash[:12]}, another run's of that name has "
-                f"{min(hashes[e.dataset, e.scene] - {e.scene_hash})[:12]}: other photos, split or size, so their "
-                "numbers do not compare; put it under another --dataset"
+                f"{other[:12]}: other photos, split or size, so their numbers do not compare; put it under "
+                "another --dataset"
             )
         elif others:
             reason = f"{v.run} and {others[0].run} are the same cell with other numbers; give one of them"

@@ -13,13 +13,13 @@ from ambiguous_wild.harness.measures import MEASURES
 
 FIRST = ("dataset", "scene", "method", "setting", "options", "seed", "images")
 LAST = (
-    "missing", "device", "hardware", "version", "source", "config_hash", "scene_hash", "result_hash", "checked",
-    "reproduce",
+    "missing", "device", "hardware", "version", "source", "config_hash", "scene_hash", "result_hash",
+    "checked", "reproduce",
 )  # fmt: skip
 COST = "cost_"  # begins the column of a cost; every other column of numbers is a quality
 TIDY = (
-    "dataset", "scene", "method", "setting", "options", "seed", "kind", "metric", "value", "device", "version",
-    "source", "config_hash", "scene_hash", "checked",
+    "dataset", "scene", "method", "setting", "options", "seed", "kind", "metric", "value", "device",
+    "version", "source", "config_hash", "scene_hash", "checked",
 )  # fmt: skip
 Checked = Literal["photos", "files"]  # what the numbers were compared with: the scene's photos, or nothing
 CHECKED: tuple[Checked, ...] = ("files", "photos")  # the stronger last

@@ -171,7 +171,7 @@ def _check_files(run: Path, result: dict[str, Any]) -> dict[str, Path]:
         raise AwError(f"{run} is partial, it lacks {shortlist(lacking)}: restore what is gone, or {ANEW}")
     if not renders:
         raise AwError(f"{run} measured no test image: a scene without test views has no place on a board")
-    there = {p for p in (run / RENDERS).rglob("*.png")}
+    there = set((run / RENDERS).rglob("*.png"))
     unlisted = sorted(str(p.relative_to(run / RENDERS)) for p in there - set(renders.values()))
     if unlisted or len(set(renders.values())) < len(renders):
         what = f"{shortlist(unlisted)} was rendered" if unlisted else "two images share a render"

@@ -35,7 +35,7 @@ def write_run(
     *,
     noise: float = 12.0,
     train_s: float = 60.0,
-    size_b: int = 5000,
+    size_b: int = 500_000,
     iterations: int = 100,
     options: dict[str, Any] | None = None,
     cpu: str = "Test CPU",

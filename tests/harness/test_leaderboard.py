@@ -20,7 +20,7 @@ from ambiguous_wild.harness.leaderboard.sheet import guard, read_csv, to_csv, un
 from ambiguous_wild.io.images import read_png_rgb, write_png
 from tests.harness.board_runs import write_run, write_scene
 
-HOSTILE = "=HYPERLINK(\"x\")</script><img src=x onerror=alert(1)>/../../etc"
+HOSTILE = '=HYPERLINK("x")</script><img src=x onerror=alert(1)>/../../etc'
 
 
 def aw(*words: object) -> Result:
@@ -258,7 +258,11 @@ def test_check_finds_what_was_changed_by_hand(runs: Path, tmp_path: Path) -> Non
     path.write_text("".join([*lines, copy]))
     found = aw("check", "--board", tmp_path)
     assert found.exit_code == 2
-    for part in ("same numbers in all digits", "same configuration hash", "all.csv is not what its runs give"):
+    for part in (
+        "same numbers in all digits",
+        "same configuration hash",
+        "all.csv is not what its runs give",
+    ):
         assert part in found.stdout
     path.write_text(good)
     next(tmp_path.rglob("*.jpg")).write_bytes(b"x")

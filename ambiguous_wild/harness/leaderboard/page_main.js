@@ -101,6 +101,7 @@ function recall() {
   for (const key of ["dataset", "scene", "metric", "method"]) state[key] = words.get(key) ?? "";
   state.reported = words.get("reported") !== "no";
   const sort = words.get("sort");
+  delete state.sort.table;
   if (sort) state.sort.table = { key: sort.replace(/^-/, ""), down: sort.startsWith("-") };
   $("method").value = state.method;
   $("reported").checked = state.reported;
@@ -120,6 +121,7 @@ function start() {
   for (const key of ["dataset", "scene", "metric"]) $(key).addEventListener("change", () => { state[key] = $(key).value; draw(); });
   $("method").addEventListener("input", () => { state.method = $("method").value; draw(); });
   $("reported").addEventListener("change", () => { state.reported = $("reported").checked; draw(); });
+  window.addEventListener("hashchange", () => { recall(); draw(); });
   $("filters").addEventListener("submit", (event) => event.preventDefault());
   for (const key of ["plot-x", "plot-y"]) $(key).addEventListener("change", drawPlot);
   $("image").addEventListener("change", fillSides);

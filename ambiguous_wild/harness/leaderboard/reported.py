@@ -11,7 +11,18 @@ from ambiguous_wild.harness.audit.table import read_tables
 from ambiguous_wild.harness.leaderboard.sheet import to_csv
 
 SOURCE = "reported"
-COLUMNS = ("source", "method", "setting", "dataset", "scene", "metric", "variant", "value", "table")
+COLUMNS = (
+    "source",
+    "method",
+    "setting",
+    "dataset",
+    "scene",
+    "metric",
+    "variant",
+    "value",
+    "printed",
+    "table",
+)
 
 
 @dataclass(frozen=True)
@@ -52,9 +63,9 @@ def read_reported(board: Path) -> list[Printed]:
 
 
 def reported_csv(numbers: Sequence[Printed]) -> str:
-    """One number a row, each marked as reported; the value as printed."""
+    """One number a row, each marked as reported; beside the value how it is printed."""
     rows = (
-        [SOURCE, n.method, n.setting, n.dataset, n.scene, n.metric, n.variant, n.value, n.table]
+        [SOURCE, n.method, n.setting, n.dataset, n.scene, n.metric, n.variant, n.value, n.printed, n.table]
         for n in numbers
     )
     return to_csv(COLUMNS, rows)

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from ambiguous_wild.cli.leaderboard import command
 from ambiguous_wild.harness.identity import config_identity
 from ambiguous_wild.harness.leaderboard.board import read_board
+from ambiguous_wild.harness.leaderboard.check import check
 from ambiguous_wild.harness.leaderboard.sheet import guard, read_csv, to_csv, unguard, unique_slug
 from ambiguous_wild.io.images import read_png_rgb, write_png
 from tests.harness.board_runs import write_run, write_scene
@@ -117,6 +118,10 @@ def easy_images(result: dict) -> None:
     del result["per_image"][1]
 
 
+def fewer_iterations(config: dict) -> None:
+    config["train"]["iterations"] = 9
+
+
 def outside(result: dict) -> None:
     result["per_image"][0]["name"] = "../../../../etc/passwd"
 
@@ -157,7 +162,7 @@ SPOILT: dict[str, tuple[Callable[[Path], object], str]] = {
     "render damaged": (lambda r: (r / "renders/test/test_0.png").write_bytes(b"x"), "test_0.png"),
     "model": (lambda r: (r / "point_cloud.ply").write_bytes(b"p"), "point_cloud.ply is not of the size"),
     "no environment": (lambda r: (r / "env.json").unlink(), "it lacks env.json"),
-    "config": (lambda r: change_config(r, lambda c: c["train"].update(iterations=9), hashed=False), "hashes to"),
+    "config": (lambda r: change_config(r, fewer_iterations, hashed=False), "hashes to"),
     "seed": (lambda r: change_config(r, lambda c: c["train"].update(seed=4), hashed=True), "seed is '4'"),
     "no config": (lambda r: (r / "config.yaml").unlink(), "config.yaml is absent"),
     "code": (anonymous, "has no hash of its code"),
@@ -281,3 +286,8 @@ def test_guarded_cells_read_back_and_never_calculate(texts: list[str]) -> None:
 def test_numbers_in_csv_stay_numbers(tmp_path: Path) -> None:
     (tmp_path / "t.csv").write_text(to_csv(["a", "b", "c", "d"], [[-0.5, 3.0, None, float("inf")]]))
     assert read_csv(tmp_path / "t.csv", ("a",))[1] == [{"a": "-0.5", "b": "3", "c": "", "d": "inf"}]
+
+
+def test_the_board_of_this_checkout_passes_its_own_check() -> None:
+    board = Path(__file__).resolve().parents[2] / "leaderboard"
+    assert check(board).problems == ()

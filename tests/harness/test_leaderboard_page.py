@@ -111,7 +111,8 @@ def names(page: Browser, table: str = "table") -> list[str]:
 
 def column(page: Browser, at: int) -> list[str]:
     return page.run(
-        f"[...document.querySelectorAll('#table tbody tr')].map((r) => r.children[{at}].firstChild.textContent)"
+        "[...document.querySelectorAll('#table tbody tr')]"
+        f".map((r) => r.children[{at}].firstChild.textContent)"
     )
 
 
@@ -301,7 +302,7 @@ def on_a_phone(page: Browser, site: str) -> None:
     page.click("#table tbody tr:first-child .open")
     assert page.run("document.documentElement.scrollWidth") == 390
     small = page.run(
-        "[...document.querySelectorAll('select, input[type=search], thead button')].filter((e) => e.offsetHeight"
-        " && e.offsetHeight < 36).length"
+        "[...document.querySelectorAll('select, input[type=search], thead button')]"
+        ".filter((e) => e.offsetHeight && e.offsetHeight < 36).length"
     )
     assert small == 0 and page.errors == []

@@ -10,11 +10,12 @@ from typing import Literal
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.leaderboard import pictures
-from ambiguous_wild.harness.leaderboard.board import dataset_file, read_board, write_board
+from ambiguous_wild.harness.leaderboard.board import dataset_file, measured, read_board, write_board
 from ambiguous_wild.harness.leaderboard.entry import CHECKED, Entry, Key
 from ambiguous_wild.harness.leaderboard.scenes import Scenes
 from ambiguous_wild.harness.leaderboard.verify import Unfinished, Verified, verify
 from ambiguous_wild.harness.store import run_folders
+from ambiguous_wild.io.atomic import sweep
 from ambiguous_wild.io.lock import folder_lock
 
 Outcome = Literal["added", "there already", "replaced", "refused", "unfinished"]
@@ -63,6 +64,8 @@ def add(
     """
     runs = _find(paths)
     with folder_lock(board, "aw leaderboard add"):
+        if not dry:
+            sweep(measured(board))
         there = read_board(board)
         finder = Scenes(scenes, dataset, there)
         reports: dict[Path, Report] = {}
@@ -79,9 +82,9 @@ def add(
         merged = _merge(board, there, passed, replace_other, reports)
         if not dry:
             taken = [v for v in passed if reports[v.run].outcome != "refused"]
-            pictures.keep(board, taken, images)
             if taken:
                 write_board(board, merged)
+                pictures.keep(board, taken, images)  # after its run: no picture without one
     return [reports[run] for run in sorted(runs)]
 
 

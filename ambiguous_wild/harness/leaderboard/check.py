@@ -75,7 +75,7 @@ def _hashes(entries: Iterable[Entry]) -> Iterator[str]:
             yield f"{e.name} and {first.name} have the same configuration hash: one is the other's copy"
         other = by_scene.setdefault((e.dataset, e.scene), e)
         if other.scene_hash != e.scene_hash:
-            yield f"{e.name} was measured on another scene of that name than {other.name}: they do not compare"
+            yield f"{e.name} is of another scene of that name than {other.name}: they do not compare"
 
 
 def _copies(entries: Iterable[Entry]) -> Iterator[str]:

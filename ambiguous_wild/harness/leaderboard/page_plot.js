@@ -74,7 +74,7 @@ function drawPlot() {
   points.forEach((p, i) => root.append(label(p, px(p.x.value), py(p.y.value), taken, [left, right, top, bottom])));
   $("plot").replaceChildren(root);
   const many = points.some((p) => p.y.seeds.length > 1);
-  $("plot-said").textContent = `${measure(ky).label} against ${measure(kx).label}. Not beaten in both: ${front.map((p) => p.group.method).join(", ")} (dashed).`
+  $("plot-said").textContent = `${measure(ky).label} against ${measure(kx).label}. Not beaten in both: ${front.map((p) => p.group.method).join(", ")}${front.length > 1 ? " (dashed)" : ""}.`
     + (many ? " Bars: sample deviation over seeds; faint dots: the seeds." : "");
 }
 

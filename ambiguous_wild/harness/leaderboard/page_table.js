@@ -165,7 +165,9 @@ function drawReported() {
     if (!lines.has(key)) lines.set(key, { title: `${n.method} ${n.setting} ${n.scene}`, first: n, cells: {} });
     lines.get(key).cells[metricOf(n)] = n;
   }
-  const metrics = unique(fits.map(metricOf));
+  const usual = ["psnr", "ssim", "lpips"];
+  const rank = (key) => (usual.includes(JSON.parse(key)[0]) ? usual.indexOf(JSON.parse(key)[0]) : usual.length);
+  const metrics = unique(fits.map(metricOf)).sort((a, b) => rank(a) - rank(b) || byName(a, b));
   const columns = [
     { key: "method", label: "Method", name: true, sort: (row) => `${row.first.method} ${row.first.setting}` },
     { key: "scene", label: "Scene", sort: (row) => row.first.scene },

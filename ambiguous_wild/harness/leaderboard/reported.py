@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from ambiguous_wild.harness.audit.table import read_tables
-from ambiguous_wild.harness.leaderboard.sheet import to_csv
+from ambiguous_wild.harness.leaderboard.sheet import Cell, to_csv
 
 SOURCE = "reported"
 COLUMNS = (
@@ -64,7 +64,7 @@ def read_reported(board: Path) -> list[Printed]:
 
 def reported_csv(numbers: Sequence[Printed]) -> str:
     """One number a row, each marked as reported; beside the value how it is printed."""
-    rows = (
+    rows: Iterator[list[Cell]] = (
         [SOURCE, n.method, n.setting, n.dataset, n.scene, n.metric, n.variant, n.value, n.printed, n.table]
         for n in numbers
     )

@@ -201,7 +201,7 @@ def _qualities(run: Path, result: dict[str, Any]) -> tuple[dict[str, float], tup
             or name.startswith(COST)
         ):
             raise AwError(f"{run}: {name[:60]!a} cannot name a metric: lower case, digits, '_' and '.'")
-    means = {name: stats.mean([row.get(name) for row in result["per_image"]]) for name in names}  # type: ignore[misc]
+    means = {name: stats.mean([row.get(name) for row in result["per_image"]]) for name in names}
     masks = result["masks"] or {}
     means |= {f"mask_{k}": float(masks[k]) for k in MASK_SCORES if masks.get(k) is not None}
     missing = tuple(sorted(k for k, v in means.items() if math.isnan(v)))

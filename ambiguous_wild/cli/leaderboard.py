@@ -29,6 +29,7 @@ def command() -> None:
 
     \b
     aw leaderboard add runs                 check finished runs and take them in
+    aw leaderboard remove --method NAME     take runs down again
     aw leaderboard publish -o site          CSVs and a page that opens from a file
     aw leaderboard check                    what is wrong with what is there
     """
@@ -127,6 +128,32 @@ class _bar:
     def __exit__(self, *_: object) -> None:
         if self.bar is not None:
             self.bar.close()
+
+
+@command.command("remove")
+@_board
+@click.option("--method", required=True, help="Whose runs.")
+@click.option("--dataset", help="Only these.")
+@click.option("--scene", help="Only these.")
+@click.option("--setting", help="Only these, as the board has it.")
+@click.option("--seed", type=click.IntRange(0), help="Only these.")
+@click.option("--dry-run", is_flag=True, help="Say what would go, and change nothing.")
+def remove_command(
+    board: Path,
+    method: str,
+    dataset: str | None,
+    scene: str | None,
+    setting: str | None,
+    seed: int | None,
+    dry_run: bool,
+) -> None:
+    """Take runs down, with their pictures; the board is then as if they had never been there."""
+    from ambiguous_wild.harness.leaderboard.remove import remove
+
+    gone = remove(board, method=method, dataset=dataset, scene=scene, setting=setting, seed=seed, dry=dry_run)
+    for entry in gone:
+        click.echo(f"{'would remove' if dry_run else 'removed'}: {entry.name}")
+    click.echo(f"{len(gone)} run{'' if len(gone) == 1 else 's'}; board {board}", err=True)
 
 
 @command.command("publish")

@@ -10,8 +10,12 @@ import numpy as np
 from ambiguous_wild.core import Scene
 from ambiguous_wild.core.config import config_hash
 
-# Keys of config.yaml that do not decide the result: how often it is saved and probed, where the scene lies.
-IGNORED: dict[str, tuple[str, ...]] = {"train": ("checkpoint_every_s", "probes"), "scene": ("path",)}
+# Keys of config.yaml that do not decide the result: how often it is saved and probed, what is done about
+# values that are not finite (the result says so where there were any), where the scene lies.
+IGNORED: dict[str, tuple[str, ...]] = {
+    "train": ("checkpoint_every_s", "probes", "on_nonfinite"),
+    "scene": ("path",),
+}
 
 
 def config_identity(config: Mapping[str, Any]) -> str:

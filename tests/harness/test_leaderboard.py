@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ambiguous_wild.cli.leaderboard import command
+from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.identity import config_identity
 from ambiguous_wild.harness.leaderboard.board import read_board
 from ambiguous_wild.harness.leaderboard.check import check
@@ -118,6 +119,10 @@ def easy_images(result: dict) -> None:
     del result["per_image"][1]
 
 
+def value_gone(result: dict) -> None:
+    del result["per_image"][1]["psnr"]
+
+
 def fewer_iterations(config: dict) -> None:
     config["train"]["iterations"] = 9
 
@@ -155,6 +160,7 @@ def anonymous(run: Path) -> None:
 SPOILT: dict[str, tuple[Callable[[Path], object], str]] = {
     "number": (lambda r: change_result(r, better), "was changed: psnr of test_1.png"),
     "ssim": (lambda r: change_result(r, better_ssim), "was changed: ssim of test_0.png"),
+    "value gone": (lambda r: change_result(r, value_gone), "no psnr of test_1.png"),
     "render": (repaint, "was changed: psnr of test_0.png"),
     "render gone": (lambda r: (r / "renders/test/test_0.png").unlink(), "is partial, it lacks renders"),
     "image unlisted": (lambda r: change_result(r, easy_images), "is partial: test_1.png was rendered"),
@@ -246,6 +252,37 @@ def test_settings_and_options_are_cells_of_their_own(one: Path, tmp_path: Path) 
     entries = read_board(tmp_path / "board")
     assert len(entries) == 4 and len({e.options for e in entries if e.method == "mine"}) == 2
     assert "100 iterations, effects exposure+poses" in {e.setting for e in entries}
+
+
+def test_what_newer_results_say_is_taken_without_the_paths_of_a_machine(one: Path, tmp_path: Path) -> None:
+    def newer(result: dict) -> None:
+        result["reproduce"] = "aw bench --method 3dgs --scene /home/ann/wall --plugin '/home/ann/my m.py'"
+        result["code_hash"] = "ab" * 32
+        result["per_image"][0]["psnr_covered"] = 12.5  # nothing is covered in the other picture
+
+    change_result(one, newer)
+    add(tmp_path / "board", one)
+    (entry,) = read_board(tmp_path / "board")
+    assert entry.reproduce == "aw bench --method 3dgs --scene wall --plugin 'my m.py'"
+    assert entry.code_hash == "ab" * 32 and entry.quality["psnr_covered"] == 12.5
+
+
+def test_what_is_removed_was_never_there(runs: Path, tmp_path: Path) -> None:
+    mine = [p.parent for p in runs.rglob("metrics.json") if json.loads(p.read_text())["method"] == "3dgs"]
+    add(tmp_path / "few", *mine)
+    add(tmp_path / "all", runs)
+    before = content(tmp_path / "all")
+    for method in ("refinesplat", HOSTILE):
+        words = ("remove", "--board", tmp_path / "all", "--method", method)
+        there = content(tmp_path / "all")
+        assert "would remove" in aw(*words, "--dry-run").stdout and content(tmp_path / "all") == there
+        assert "1 run;" in aw(*words).stderr
+    assert content(tmp_path / "all") == content(tmp_path / "few") != before
+    aw("remove", "--board", tmp_path / "all", "--method", "3dgs")
+    assert read_board(tmp_path / "all") == [] and not list(tmp_path.glob("all/**/*.jpg"))
+    assert aw("check", "--board", tmp_path / "all").exit_code == 0
+    with pytest.raises(AwError, match="unknown method"):
+        aw("remove", "--board", tmp_path / "few", "--method", "4dgs")
 
 
 def test_check_finds_what_was_changed_by_hand(runs: Path, tmp_path: Path) -> None:

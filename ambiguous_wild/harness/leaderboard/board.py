@@ -82,6 +82,10 @@ def files_of(board: Path, entries: Sequence[Entry]) -> dict[Path, str]:
 
 def write_board(board: Path, entries: Sequence[Entry]) -> None:
     """Write what changed; all.csv last, because it can be made again from the others."""
-    for path, text in files_of(board, entries).items():
+    files = files_of(board, entries)
+    for path in dataset_files(board):
+        if path not in files:
+            path.unlink()  # of a dataset whose last run was taken down
+    for path, text in files.items():
         if not path.is_file() or path.read_bytes() != text.encode():
             write_text(path, text)

@@ -68,8 +68,9 @@ def _hashes(entries: Iterable[Entry]) -> Iterator[str]:
         for column in ("config_hash", "scene_hash", "result_hash"):
             if not HASH.fullmatch(getattr(e, column)):
                 yield f"{e.name}: {column} {getattr(e, column)[:20]!a} is no sha256: restore the file"
-        if e.source and not HASH.fullmatch(e.source):
-            yield f"{e.name}: source {e.source[:20]!a} is no sha256: restore the file"
+        for column in ("source", "code_hash"):
+            if getattr(e, column) and not HASH.fullmatch(getattr(e, column)):
+                yield f"{e.name}: {column} {getattr(e, column)[:20]!a} is no sha256: restore the file"
         first = by_config.setdefault(e.config_hash, e)
         if first is not e:
             yield f"{e.name} and {first.name} have the same configuration hash: one is the other's copy"

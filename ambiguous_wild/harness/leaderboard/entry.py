@@ -13,8 +13,8 @@ from ambiguous_wild.harness.measures import MEASURES
 
 FIRST = ("dataset", "scene", "method", "setting", "options", "seed", "images")
 LAST = (
-    "missing", "device", "hardware", "version", "source", "config_hash", "scene_hash", "result_hash",
-    "checked", "reproduce",
+    "missing", "device", "hardware", "version", "source", "code_hash", "config_hash", "scene_hash",
+    "result_hash", "checked", "reproduce",
 )  # fmt: skip
 COST = "cost_"  # begins the column of a cost; every other column of numbers is a quality
 TIDY = (
@@ -44,6 +44,7 @@ class Entry:
     hardware: str  # what times depend on
     version: str  # of this package
     source: str  # sha256 of the method's own file; empty for the methods of this package
+    code_hash: str  # sha256 over this package's files; empty in results of before it was kept
     config_hash: str
     scene_hash: str
     result_hash: str  # sha256 of metrics.json
@@ -76,7 +77,7 @@ def wide(entries: Sequence[Entry]) -> tuple[list[str], list[list[Cell]]]:
         row: list[Cell] = [*e.key, e.images]
         row += [e.quality.get(k) for k in quality]
         row += [e.cost.get(k) for k in cost]
-        row += [" ".join(e.missing), e.device, e.hardware, e.version, e.source]
+        row += [" ".join(e.missing), e.device, e.hardware, e.version, e.source, e.code_hash]
         rows.append([*row, e.config_hash, e.scene_hash, e.result_hash, e.checked, e.reproduce])
     return head, rows
 

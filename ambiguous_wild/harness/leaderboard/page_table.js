@@ -113,7 +113,7 @@ function oneRun(run) {
   const code = h("code", {}, run.reproduce);
   return h("div", { class: "run" },
     h("p", {}, h("strong", {}, `${run.scene}, seed ${run.seed}`), `: ${values.join(", ")}`),
-    h("p", { class: "small" }, `${run.images} test images; ${checked}; ${run.device}, ${run.hardware}; version ${run.version}; configuration ${run.config_hash.slice(0, 12)}, scene ${run.scene_hash.slice(0, 12)}, result ${run.result_hash.slice(0, 12)}${run.source ? `, code ${run.source.slice(0, 12)}` : ""}`),
+    h("p", { class: "small" }, `${run.images} test images; ${checked}; ${run.device}, ${run.hardware}; version ${run.version}; configuration ${run.config_hash.slice(0, 12)}, scene ${run.scene_hash.slice(0, 12)}, result ${run.result_hash.slice(0, 12)}${run.source ? `, its file ${run.source.slice(0, 12)}` : ""}${run.code_hash ? `, code ${run.code_hash.slice(0, 12)}` : ""}`),
     h("div", { class: "row" }, code, h("button", { type: "button", class: "copy", "aria-label": "Copy the command", onclick: (e) => copy(code, e.currentTarget) }, "Copy")));
 }
 

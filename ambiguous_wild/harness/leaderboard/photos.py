@@ -48,6 +48,10 @@ def check_photos(
             f"photos ({shortlist(odd)} in one of them only); a mean over a part is no result"
         )
     known = ("psnr",) if quick else tuple(image_metrics.METRICS)
+    for metric in known:
+        lacking = [row["name"] for row in rows if metric not in row]
+        if lacking and len(lacking) < len(rows):
+            raise AwError(f"{run} is partial: no {metric} of {shortlist(lacking)}, but of the other images")
     for row in rows:
         name = row["name"]
         render, photo = read_png_rgb(renders[name]), _photo(scene, views[name])

@@ -12,6 +12,7 @@ import numpy as np
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.leaderboard.board import measured
+from ambiguous_wild.harness.leaderboard.entry import Entry
 from ambiguous_wild.harness.leaderboard.sheet import (
     Cell,
     read_csv,
@@ -92,14 +93,38 @@ def keep(board: Path, runs: Iterable[Verified], count: int) -> int:
         for name in chosen(run.names, count):
             written += _keep_one(board, run, name, index)
     if index != before:
-        rows: list[list[Cell]] = []
-        for place in sorted(index, key=lambda p: p.file):
-            row = index[place]
-            seed = int(row["seed"]) if row["seed"] else None
-            psnr = to_number(row["psnr"], "psnr")
-            rows.append([*(row[k] for k in COLUMNS[:6]), seed, psnr, row["file"], row["sha256"]])
-        write_text(folder_of(board) / INDEX, to_csv(COLUMNS, rows))
+        _write_index(board, index.values())
     return written
+
+
+def drop(board: Path, runs: Iterable[Entry]) -> None:
+    """Remove the pictures of runs that are not among these, and photos beside which no render is left."""
+    cells = {(*e.key[:-1], str(e.seed)) for e in runs}
+    index = read_index(board)
+    keys = ("dataset", "scene", "method", "setting", "options", "seed")
+    renders = [row for row in index if row["method"] and tuple(row[k] for k in keys) in cells]
+    shown = {(row["dataset"], row["scene"], row["image"]) for row in renders}
+    left = [
+        row
+        for row in index
+        if row in renders or (not row["method"] and (row["dataset"], row["scene"], row["image"]) in shown)
+    ]
+    if left == index:
+        return
+    _write_index(board, left)
+    files = {row["file"] for row in left}
+    for row in index:
+        if row["file"] not in files:
+            (folder_of(board) / row["file"]).unlink(missing_ok=True)
+
+
+def _write_index(board: Path, index: Iterable[Row]) -> None:
+    rows: list[list[Cell]] = []
+    for row in sorted(index, key=lambda r: r["file"]):
+        seed = int(row["seed"]) if row["seed"] else None
+        psnr = to_number(row["psnr"], "psnr")
+        rows.append([*(row[k] for k in COLUMNS[:6]), seed, psnr, row["file"], row["sha256"]])
+    write_text(folder_of(board) / INDEX, to_csv(COLUMNS, rows))
 
 
 def chosen(names: tuple[str, ...], count: int) -> list[str]:

@@ -137,7 +137,7 @@ def _facts(
         measures.setdefault(n.metric, {"label": label, "better": measure(n.metric).better, "digits": 3})
     columns = (
         "dataset", "scene", "method", "setting", "options", "seed", "images", "missing", "device", "hardware",
-        "version", "source", "config_hash", "scene_hash", "result_hash", "checked", "reproduce",
+        "version", "source", "code_hash", "config_hash", "scene_hash", "result_hash", "checked", "reproduce",
     )  # fmt: skip
     return {
         "order": order,

@@ -50,7 +50,7 @@ def options_hash(config: Mapping[str, Any]) -> str:
 def command(result: Mapping[str, Any], config: Mapping[str, Any]) -> str:
     """The command that makes the run again, the scene by its name."""
     if isinstance(result.get("reproduce"), str):
-        return str(result["reproduce"])
+        return _without_paths(result["reproduce"])
     train, method = config["train"], config["method"]
     words = [
         "aw",
@@ -81,6 +81,18 @@ def command(result: Mapping[str, Any], config: Mapping[str, Any]) -> str:
         words += ["--set", f"{method.split('@')[0]}.{key}={value}"]
     words += ["--device", config.get("device", "cpu"), "-o", "runs"]
     return shlex.join(str(w) for w in words)
+
+
+def _without_paths(text: str) -> str:
+    """The command with scene and plugin by their names: where they lay is nobody else's business."""
+    try:
+        words = shlex.split(text)
+    except ValueError:
+        return text
+    for at, flag in enumerate(words[:-1]):
+        if flag in ("--scene", "--plugin"):
+            words[at + 1] = Path(words[at + 1]).name
+    return shlex.join(words)
 
 
 def _changed(config: Mapping[str, Any]) -> dict[str, str] | None:

@@ -25,6 +25,8 @@ from ambiguous_wild.metrics import stats
 PLY = "point_cloud.ply"
 ENVIRONMENT = "env.json"
 RENDERS = Path("renders") / "test"
+# Measured on part of a picture: one without such a pixel has no value, and is no gap in the mean.
+PARTIAL = ("psnr_valid", "psnr_covered", "psnr_uncovered")
 ANEW = "run it again with 'aw bench --overwrite always'"
 
 
@@ -57,7 +59,7 @@ def verify(run: Path, scenes: Scenes, *, quick: bool = False) -> Verified:
     """
     result, config = _result(run), _config(run)
     _check_identity(run, result, config)
-    renders = _check_files(run, result)
+    renders = _check_files(run, result, ours=not config["source"])
     scene = scenes.find(run, config)
     if scene is not None:
         check_photos(run, scene, result["per_image"], renders, half=_half(config), quick=quick)
@@ -79,6 +81,7 @@ def verify(run: Path, scenes: Scenes, *, quick: bool = False) -> Verified:
         hardware=hardware(run / ENVIRONMENT, result),
         version=result["version"],
         source=config["source"],
+        code_hash=str(result.get("code_hash", "")),
         config_hash=result["config_hash"],
         scene_hash=result["scene_hash"],
         result_hash=sha256_file(run / RESULT),
@@ -162,9 +165,12 @@ def _check_source(run: Path, config: dict[str, Any]) -> None:
         )
 
 
-def _check_files(run: Path, result: dict[str, Any]) -> dict[str, Path]:
+def _check_files(run: Path, result: dict[str, Any], *, ours: bool) -> dict[str, Path]:
     """Image name -> render; everything a result rests on is there."""
-    lacking = [name for name in (PLY, ENVIRONMENT) if not (run / name).is_file()]
+    # A program of others may have no splats; then its result says no size either.
+    size = result["cost"].get("model_mb")
+    needed = (ENVIRONMENT,) if size is None and not ours else (PLY, ENVIRONMENT)
+    lacking = [name for name in needed if not (run / name).is_file()]
     renders = {row["name"]: run / RENDERS / _inside(run, row["name"]) for row in result["per_image"]}
     lacking += [str(path.relative_to(run)) for path in renders.values() if not path.is_file()]
     if lacking:
@@ -176,8 +182,9 @@ def _check_files(run: Path, result: dict[str, Any]) -> dict[str, Path]:
     if unlisted or len(set(renders.values())) < len(renders):
         what = f"{shortlist(unlisted)} was rendered" if unlisted else "two images share a render"
         raise AwError(f"{run} is partial: {what} and {RESULT} does not list it; {ANEW}")
-    size = result["cost"].get("model_mb")
-    if size is None or not math.isclose(size, (run / PLY).stat().st_size / 1e6, abs_tol=1e-6):
+    if PLY in needed and (
+        size is None or not math.isclose(size, (run / PLY).stat().st_size / 1e6, abs_tol=1e-6)
+    ):
         raise AwError(f"{run} was changed: {PLY} is not of the size that {RESULT} says; {ANEW}")
     for path in renders.values():
         read_png_rgb(path)
@@ -201,7 +208,11 @@ def _qualities(run: Path, result: dict[str, Any]) -> tuple[dict[str, float], tup
             or name.startswith(COST)
         ):
             raise AwError(f"{run}: {name[:60]!a} cannot name a metric: lower case, digits, '_' and '.'")
-    means = {name: stats.mean([row.get(name) for row in result["per_image"]]) for name in names}
+    rows = result["per_image"]
+    means = {
+        name: stats.mean([row.get(name) for row in rows if name in row or name not in PARTIAL])
+        for name in names
+    }
     masks = result["masks"] or {}
     means |= {f"mask_{k}": float(masks[k]) for k in MASK_SCORES if masks.get(k) is not None}
     missing = tuple(sorted(k for k, v in means.items() if math.isnan(v)))

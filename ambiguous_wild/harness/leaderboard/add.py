@@ -118,7 +118,7 @@ def _merge(
             reports[v.run] = Report(v.run, "there already")
             # Whatever was checked once against the photos stays so.
             better = max(old.checked, v.entry.checked, key=CHECKED.index)
-            entries[v.entry.key] = replace(v.entry, checked=better)
+            entries[v.entry.key] = replace(old, checked=better)
         elif replace_other:
             reports[v.run] = Report(v.run, "replaced")
             entries[v.entry.key] = v.entry

@@ -12,11 +12,13 @@ from typing import Any
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash, to_plain
 
-SHOWN = 4  # options in words, at most
-
 
 def setting(config: Mapping[str, Any]) -> str:
-    """Length, effects, protocol and whatever else is not as usual: "2000 iterations, effects exposure"."""
+    """Length, effects, protocol, limits: "2000 iterations, effects exposure".
+
+    Only what the run itself says, for it is part of a cell: a method's defaults, which later versions change,
+    have no say in it. Options have a hash of their own.
+    """
     train = config["train"]
     words = [_length(train)]
     if config.get("effects"):
@@ -27,11 +29,6 @@ def setting(config: Mapping[str, Any]) -> str:
         words.append(f"resolution {train['resolution']}")
     if train.get("max_gaussians") is not None:
         words.append(f"at most {train['max_gaussians']} Gaussians")
-    changed = _changed(config)
-    if changed is not None:
-        words += (
-            [f"{k}={v}" for k, v in changed.items()] if len(changed) <= SHOWN else [f"{len(changed)} options"]
-        )
     return ", ".join(words)
 
 

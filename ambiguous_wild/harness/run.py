@@ -130,7 +130,7 @@ def run_cell(
                 shutil.rmtree(folder)
             else:
                 refuse_other_config(folder, cell)
-                if _finished(folder):
+                if is_finished(folder):
                     return CellReport(folder, "kept")
         folder.mkdir(parents=True, exist_ok=True)
         sweep(folder)
@@ -141,7 +141,12 @@ def run_cell(
         write_json(folder / "env.json", environment(cell.device))
         cell.chosen.write(folder / EFFECTS)
         try:
-            result = _train_and_measure(cell, folder, cache_dir, tick, pictures)
+            if cell.method.program is not None:
+                from ambiguous_wild.harness.external import run_program
+
+                result = run_program(cell, folder)
+            else:
+                result = _train_and_measure(cell, folder, cache_dir, tick, pictures)
         except Exception as error:
             _record_failure(cell, folder, error)
             raise
@@ -149,7 +154,7 @@ def run_cell(
     return CellReport(folder, "trained", result=result)
 
 
-def _finished(folder: Path) -> bool:
+def is_finished(folder: Path) -> bool:
     """Whether the folder has a result that can be read; a damaged one is made again."""
     if not (folder / RESULT).is_file():
         return False

@@ -31,7 +31,8 @@ SHORT = TrainConfig(iterations=7)
 BASE = {
     "name": "nearest",
     "prefix": [sys.executable, str(PROGRAM)],
-    "train": "train --scene {scene} --output {output} --images {images} --seed {seed} --iterations {iterations}",
+    "train": "train --scene {scene} --output {output} --images {images} "
+    "--seed {seed} --iterations {iterations}",
     "render": ["render", "--scene", "{scene}", "--output", "{output}"],
     "renders": "{output}/test/ours_*/renders/{index:05d}.png",
     "scene_files": {"sparse/0/test.txt": "{test_names}"},
@@ -69,7 +70,9 @@ def test_a_program_is_a_cell_like_any_other(scene, tmp_path):
     rng = np.random.default_rng(0)
     shapes = {"means": 3, "quats": 4, "log_scales": 3, "sh0": 3}
     arrays = {k: rng.normal(size=(5, n)).astype(np.float32) for k, n in shapes.items()}
-    write_splat_ply(splats, arrays | {"opacity_logits": np.zeros(5, np.float32), "sh_rest": np.zeros((5, 0, 3))})
+    write_splat_ply(
+        splats, arrays | {"opacity_logits": np.zeros(5, np.float32), "sh_rest": np.zeros((5, 0, 3))}
+    )
     before = files(scene)
     reference = describe(
         tmp_path,
@@ -78,7 +81,7 @@ def test_a_program_is_a_cell_like_any_other(scene, tmp_path):
         masks="{output}/masks/{stem}.png",
         ply="{output}/splats.ply",
     )
-    cell, report = run(reference, scene, tmp_path / "runs")
+    _, report = run(reference, scene, tmp_path / "runs")
     assert report.outcome == "trained", report.error
     assert report.folder == tmp_path / "runs" / "scene" / "nearest" / "seed3"
     result = read_result(report.folder / "metrics.json")
@@ -121,7 +124,7 @@ def test_what_changes_the_result_changes_the_identity_and_nothing_else_does(scen
 
 def test_a_failure_is_the_result_and_says_the_last_lines_of_its_log(scene, tmp_path):
     reference = describe(tmp_path, train=BASE["train"] + " --stop-after-start")
-    cell, report = run(reference, scene, tmp_path / "runs")
+    _, report = run(reference, scene, tmp_path / "runs")
     assert report.outcome == "failed"
     assert "train of nearest ended with exit code 3" in report.error
     assert "100% | out of luck" in report.error
@@ -162,10 +165,16 @@ def test_a_resume_command_takes_over_where_something_lies(scene, tmp_path):
         ({"renders": "{output}/*{index:.0s}"}, "cannot be filled in"),
         ({"renders": "{output}/test/ours_7/renders/0*{name:.0}.png"}, "2 files fit"),
         (
-            {"render": [*BASE["render"], "--suffix", ".jpg"], "renders": BASE["renders"].replace("png", "jpg")},
+            {
+                "render": [*BASE["render"], "--suffix", ".jpg"],
+                "renders": BASE["renders"].replace("png", "jpg"),
+            },
             "is no PNG",
         ),
-        ({"train": ["train", "--sleep", "60", *BASE["train"].split()[1:]], "timeout_h": 0.2 / 3600}, "took longer"),
+        (
+            {"train": ["train", "--sleep", "60", *BASE["train"].split()[1:]], "timeout_h": 0.2 / 3600},
+            "took longer",
+        ),
         ({"prefix": ["no-such-program"]}, "cannot start 'no-such-program'"),
     ],
 )
@@ -194,7 +203,7 @@ def test_what_a_program_leaves_wrong_is_one_clear_line(scene, tmp_path, changes,
     ],
 )
 def test_a_description_with_a_mistake_is_one_clear_line(tmp_path, changes, message):
-    with pytest.raises(AwError, match="(?s).*") as error:
+    with pytest.raises(AwError, match=r"(?s).*") as error:
         registry.get_method(describe(tmp_path, **changes))
     assert message in str(error.value)
     assert "\n" not in str(error.value)
@@ -220,7 +229,10 @@ def test_a_toml_file_says_the_same(scene, tmp_path):
     path = tmp_path / "nearest.toml"
     lines = [f"{key} = {json.dumps(BASE[key])}" for key in BASE if key != "scene_files"]
     path.write_text("\n".join([*lines, "[scene_files]", '"sparse/0/test.txt" = "{test_names}"']))
-    assert registry.get_method(f"external:{path}").source_hash == registry.get_method(describe(tmp_path)).source_hash
+    assert (
+        registry.get_method(f"external:{path}").source_hash
+        == registry.get_method(describe(tmp_path)).source_hash
+    )
 
 
 def test_effects_and_budgets_are_refused_where_they_cannot_be_kept(scene, tmp_path):

@@ -1,7 +1,7 @@
 """Somebody else's method, as a program: `train` remembers the photos, `render` draws the nearest one.
 
-It knows nothing of this project: it reads the COLMAP text model, the photos and its own split file, and writes
-pictures where it likes. The tests of the adapter run it for real.
+It knows nothing of this project: it reads the COLMAP text model, the photos and its own split
+file, and writes pictures where it likes. The tests of the adapter run it for real.
 """
 
 import argparse
@@ -50,7 +50,12 @@ def render(arguments: argparse.Namespace) -> None:
     here = positions(scene)
     for index, name in enumerate(sorted(test)):
         nearest = min(state["photos"], key=lambda n: (abs(state["photos"][n] - here[name]), n))
-        draw(Path(state["images"]) / nearest, folder / f"{index:05d}{arguments.suffix}", state["gain"], arguments)
+        draw(
+            Path(state["images"]) / nearest,
+            folder / f"{index:05d}{arguments.suffix}",
+            state["gain"],
+            arguments,
+        )
     if arguments.truth:  # keep maps: what another program thinks, here the answer itself
         (output / "masks").mkdir(exist_ok=True)
         for path in Path(arguments.truth).glob("*.png"):

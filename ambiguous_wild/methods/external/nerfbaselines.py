@@ -34,8 +34,8 @@ class Options:
     """What its command line takes; `--set nerfbaselines-METHOD.KEY=VALUE`."""
 
     backend: str = ""  # conda, docker, apptainer or python; empty = its own choice
-    presets: str = ""  # names with commas; empty = those it applies by itself
-    overrides: str = ""  # KEY=VALUE;KEY=VALUE of the method
+    presets: tuple[str, ...] = ()  # names with commas; none = those it applies by itself
+    overrides: tuple[str, ...] = ()  # KEY=VALUE,KEY=VALUE of the method
     iterations_key: str = ""  # the method's key for its length: gets --iterations; empty = its own length
     seed_key: str = ""  # the method's key for its seed; empty = it has none and is not told
     evaluate: bool = False  # run its own metrics too, which need torch in its environment
@@ -139,14 +139,14 @@ class NerfBaselines:
 
     def _train_command(self, task: Task) -> list[str]:
         options = task.options
-        pairs = [pair.strip() for pair in options.overrides.split(";") if pair.strip()]
+        pairs = list(options.overrides)
         pairs += [f"{options.iterations_key}={task.iterations}"] if options.iterations_key else []
         pairs += [f"{options.seed_key}={task.seed}"] if options.seed_key else []
         command = ["train", "--method", self.method, "--data", str(task.scene.root.resolve())]
         command += ["--output", str((task.work / "output").absolute()), "--logger", "none"]
         # Index 0 is never reached: nothing is evaluated while it trains.
         command += ["--eval-few-iters", "0", "--eval-all-iters", "0", "--disable-output-artifact"]
-        command += ["--presets", options.presets] if options.presets else []
+        command += ["--presets", ",".join(options.presets)] if options.presets else []
         command += [text for pair in pairs for text in ("--set", pair)]
         return [*command, *_backend(options)]
 

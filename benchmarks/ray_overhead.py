@@ -30,7 +30,7 @@ from tests.tiny_scene import write_tiny_scene
 
 COPY = (
     "import shutil, sys; from pathlib import Path; photos = sorted(Path(sys.argv[1]).iterdir()); "
-    "[shutil.copy(photos[-1], Path(sys.argv[2]) / f'{i}.png') for i in range(2)]"
+    "[shutil.copy(photos[-1], Path(sys.argv[2]) / (str(i) + '.png')) for i in range(2)]"
 )
 
 

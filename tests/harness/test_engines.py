@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,26 +24,19 @@ from tests.tiny_scene import write_tiny_scene
 
 SHORT = TrainConfig(iterations=40)
 HAS_RAY = importlib.util.find_spec("ray") is not None
-# Kills its own process in the middle of a training, as many times as the file beside it says.
+# Writes the renders of its seed, and in the middle kills whoever started it, as often as a file says.
 FRAIL = """
-import os, signal
+import os, shutil, signal, sys
 from pathlib import Path
-from ambiguous_wild.methods import MethodEntry, register
-from ambiguous_wild.splat.parts import MaskPolicy, Parts
 
-DEATHS = Path({deaths!r})
-
-class Mask(MaskPolicy):
-    def keep(self, step):
-        left = int(DEATHS.read_text())
-        if step.iteration == 20 and left:
-            DEATHS.write_text(str(left - 1))
-            os.kill(os.getpid(), signal.SIGKILL)
-        return None
-
-def frail():
-    "dies in the middle"
-    return Parts(mask=Mask())
+images, output, seed, deaths = Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]), Path(sys.argv[4])
+photos = sorted(images.glob("train*"))
+shutil.copy(photos[seed], output / "0.png")
+left = int(deaths.read_text())
+if left:
+    deaths.write_text(str(left - 1))
+    os.kill(os.getppid(), signal.SIGKILL)
+shutil.copy(photos[seed + 1], output / "1.png")
 """
 
 
@@ -58,18 +52,20 @@ def scene(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def frail(tmp_path_factory):
-    """A recipe's reference, and the file that says how often it dies."""
+    """A method's reference, and the file that says how often it kills its worker."""
     folder = tmp_path_factory.mktemp("method")
     deaths = folder / "deaths"
     deaths.write_text("0")
-    code = FRAIL.format(deaths=str(deaths))
-    (folder / "recipe.py").write_text(code)
-    return f"{folder / 'recipe.py'}:frail", deaths
+    (folder / "frail.py").write_text(FRAIL)
+    train = [sys.executable, "-S", "frail.py", "{scene}/{images}", "{output}", "{seed}", str(deaths)]
+    description = {"name": "frail", "train": train, "renders": "{output}/{index}.png"}
+    (folder / "frail.yaml").write_text(yaml.safe_dump(description))
+    return f"external:{folder / 'frail.yaml'}", deaths
 
 
 def aw_bench(output, scene, method, *words):
-    arguments = ["--method", method, "--scene", scene, "--seed", 0, "--seed", 1, "--iterations", 40]
-    arguments += ["--no-pictures", "--threads", 1, "-o", output, *words]
+    arguments = ["--method", method, "--scene", scene, "--seed", 0, "--seed", 1, "--seed", 2]
+    arguments += ["--iterations", 40, "-o", output, *words]
     return CliRunner().invoke(bench, [str(a) for a in arguments])
 
 
@@ -109,9 +105,9 @@ def test_processes_one_killed_in_the_middle_give_what_one_process_gives(scene, f
     assert done.exit_code == 0, done.output
     assert frail[1].read_text() == "0"
     assert results(tmp_path) == local
-    assert len([name for name in local if name.endswith("metrics.json")]) == 2
-    assert done.output.count("begins: frail on scene") == 3
-    assert "[2/2] frail on scene" in done.output and "2 runs: 2 trained" in done.output
+    assert len([name for name in local if name.endswith("metrics.json")]) == 3
+    assert done.output.count("begins: frail on scene") == 4
+    assert "[3/3] frail on scene" in done.output and "3 runs: 3 trained" in done.output
 
 
 @pytest.mark.skipif(not HAS_RAY, reason="Ray is not installed: extra [ray]")
@@ -121,7 +117,7 @@ def test_ray_one_worker_killed_in_the_middle_gives_what_one_process_gives(scene,
     assert done.exit_code == 0, done.output
     assert frail[1].read_text() == "0"
     assert results(tmp_path) == local
-    assert "Ray: 1 node, 2 CPU" in done.output and "2 runs: 2 trained" in done.output
+    assert "Ray: 1 node, 2 CPU" in done.output and "3 runs: 3 trained" in done.output
     assert list(tmp_path.glob(".aw-shared-*")) == []
 
 

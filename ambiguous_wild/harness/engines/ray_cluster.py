@@ -60,6 +60,8 @@ class RayCluster:
         """
         check_ray()
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is reported to anyone
+        # Ray's workers step back behind everything else (nice 15); a cell's time is measured, so ours do not.
+        os.environ.setdefault("RAY_worker_niceness", "0")
         os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # what Ray will do anyhow, unsaid
         import ray
 
@@ -142,12 +144,12 @@ class RayCluster:
 
     def _remote(self, function: Callable[..., Any]) -> Any:
         wanted = self.options
-        return self.ray.remote(
-            num_cpus=wanted.cpus,
-            num_gpus=wanted.gpus,
-            memory=int(wanted.memory_gb * 1e9) or None,
-            max_retries=wanted.retries,  # of workers and nodes that die; an error of the cell is its result
-        )(function)
+        # Of workers and nodes that die: an error of the cell itself is its result and comes once.
+        settings: dict[str, Any] = {"num_cpus": wanted.cpus, "num_gpus": wanted.gpus}
+        settings["max_retries"] = wanted.retries
+        if wanted.memory_gb:
+            settings["memory"] = wanted.memory_gb * 1e9
+        return self.ray.remote(**settings)(function)
 
     def _send(self, jobs: Sequence[Job]) -> Callable[[int], Any]:
         scenes = {job.scene: None for job in jobs}

@@ -38,7 +38,7 @@ def check(template: str, known: Iterable[str], where: str) -> set[str]:
     """
     names, choices = placeholders(template, where), set(known)
     for name in sorted(names - choices):
-        raise unknown(f"placeholder in {where}", name, choices)
+        raise unknown(f"placeholder in {where}", name, choices, "{{ is a brace that is meant")
     return names
 
 

@@ -21,7 +21,7 @@ from ambiguous_wild.harness.store import read_result, read_runs
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.io.ply import write_splat_ply
 from ambiguous_wild.methods import registry
-from ambiguous_wild.methods.external.process import run_logged
+from ambiguous_wild.methods.external.process import end_left_over
 from ambiguous_wild.metrics.image import psnr
 from ambiguous_wild.splat.trainer import TrainConfig
 from tests.tiny_scene import TEST, TRAIN, write_tiny_scene
@@ -243,9 +243,9 @@ def test_effects_and_budgets_are_refused_where_they_cannot_be_kept(scene, tmp_pa
 
 
 def test_what_was_started_ends_with_us(tmp_path):
-    """On Ctrl-C at once; after kill -9 when the same step is run again, so that no two work in one folder."""
+    """On Ctrl-C at once; after kill -9 when the run goes on, so that no two work in one folder."""
     code = (
-        "from pathlib import Path; from ambiguous_wild.methods.external.process import run_logged; "
+        "from pathlib import Path; from ambiguous_wild.methods.external.process import end_left_over; "
         f"run_logged('x', ['sh', '-c', 'sleep 60 & wait'], log=Path({str(tmp_path / 'x.log')!r}), "
         "cwd=Path('.'), environment={}, timeout_s=None)"
     )
@@ -259,7 +259,7 @@ def test_what_was_started_ends_with_us(tmp_path):
         os.kill(process.pid, sign)
         process.wait(30)
         assert _lives(group) == record.exists() == (sign == signal.SIGKILL)
-    run_logged("x", ["true"], log=tmp_path / "x.log", cwd=tmp_path, environment={}, timeout_s=None)
+    end_left_over(tmp_path)
     assert not _lives(group) and not record.exists()
 
 

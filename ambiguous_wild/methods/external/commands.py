@@ -16,7 +16,7 @@ from ambiguous_wild.core import AwError, View
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.io.atomic import write_json
 from ambiguous_wild.methods.external import templates
-from ambiguous_wild.methods.external.process import run_logged
+from ambiguous_wild.methods.external.process import end_left_over, run_logged
 from ambiguous_wild.methods.external.program import Produced, Task
 from ambiguous_wild.methods.external.staging import split_lists, stage
 
@@ -45,6 +45,7 @@ class CommandProgram:
             AwError: a command fails or does not leave what it should.
         """
         self._check_length(task)
+        end_left_over(task.logs)
         lists = split_lists(task.scene)
         files = {name: templates.fill(text, lists) for name, text in self.scene_files}
         staged = stage(task.scene, task.folder / ".scene", files)

@@ -20,7 +20,7 @@ from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.core.names import check_name
 from ambiguous_wild.io.archive import unpack
 from ambiguous_wild.io.atomic import atomic_dir, write_json
-from ambiguous_wild.methods.external.process import run_logged
+from ambiguous_wild.methods.external.process import end_left_over, run_logged
 from ambiguous_wild.methods.external.program import Produced, Task, no_parts
 from ambiguous_wild.methods.registry import MethodEntry
 
@@ -93,6 +93,7 @@ class NerfBaselines:
             AwError: a command fails, the scene is none that it loads as it is, or a render is missing.
         """
         self._check(task)
+        end_left_over(task.logs)
         steps = _Steps(self, task)
         checkpoint = _checkpoint(task.work / "output")
         if checkpoint is None:

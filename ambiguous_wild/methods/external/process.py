@@ -17,6 +17,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.io.atomic import write_json
 
 GRACE_S = 10.0  # between asking a program to end and ending it
+_RECORD = ".running.json"  # of a command that runs, beside its log
 _TAIL_BYTES, _TAIL_LINES = 8192, 4
 _ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]|[\x00-\x08\x0b-\x1f\x7f]")
 
@@ -47,8 +48,7 @@ def run_logged(
         AwError: no such program, a non-zero exit code (with the last lines of the log), or too late.
     """
     log.parent.mkdir(parents=True, exist_ok=True)
-    record = log.with_suffix(".running.json")
-    _end_left_over(record)
+    record = log.with_suffix(_RECORD)
     begin = time.perf_counter()
     with open(log, "ab") as out:
         out.write(f"$ {shlex.join(command)}\n".encode())
@@ -116,8 +116,13 @@ def _alive(group: int) -> bool:
     return stat is None or stat[0] != "Z"
 
 
-def _end_left_over(record: Path) -> None:
-    """End what a killed run of ours left working in the same folder: two would spoil each other's files."""
+def end_left_over(logs: Path) -> None:
+    """End what a killed run of ours left working for these logs: two would spoil each other's files."""
+    for record in sorted(logs.glob(f"*{_RECORD}")):
+        _end_recorded(record)
+
+
+def _end_recorded(record: Path) -> None:
     try:
         left = json.loads(record.read_text(encoding="utf-8"))
         group, host, start = int(left["group"]), left["host"], left["start"]

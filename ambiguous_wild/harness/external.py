@@ -21,11 +21,9 @@ from ambiguous_wild.harness.run import Cell
 from ambiguous_wild.io.atomic import atomic_dir, atomic_path
 from ambiguous_wild.io.images import image_size, read_gray, read_png_rgb, write_png
 from ambiguous_wild.io.ply import splat_count
-from ambiguous_wild.methods.external.program import Produced, Task
+from ambiguous_wild.methods.external.program import LOGS, WORK, Produced, Task
 from ambiguous_wild.metrics import masks as mask_metrics
 from ambiguous_wild.splat.trainer import Trainer
-
-WORK, LOGS = "external", "logs"
 
 
 def run_program(cell: Cell, folder: Path) -> dict[str, Any]:

@@ -27,6 +27,7 @@ from ambiguous_wild.harness.store import read_result, write_result
 from ambiguous_wild.io.atomic import sweep, write_json, write_text
 from ambiguous_wild.io.lock import folder_lock
 from ambiguous_wild.io.ply import write_splat_ply
+from ambiguous_wild.methods.external.program import DONE, LOGS, WORK
 from ambiguous_wild.methods.registry import MethodEntry
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.effects import with_effects
@@ -195,6 +196,8 @@ def refuse_other_config(folder: Path, cell: Cell) -> None:
     """Raise AwError if the folder was made by another configuration; names the keys that differ."""
     path = folder / "config.yaml"
     present = {p.name for p in folder.iterdir() if not p.name.startswith(".")}
+    if not (folder / WORK / DONE).exists():
+        present -= {WORK, LOGS}  # of an external program that has not finished training
     if not path.exists() or present <= _WORTHLESS:
         return  # it stopped before the first checkpoint: there is nothing to lose
     try:

@@ -149,6 +149,19 @@ def test_a_run_that_stopped_goes_on_with_what_is_done(scene, tmp_path):
     assert report.result["cost"]["train_s"] > 0
 
 
+def test_a_description_that_never_trained_may_be_mended(scene, tmp_path):
+    assert (
+        run(describe(tmp_path, prefix=["no-such-program"]), scene, tmp_path / "runs")[1].outcome == "failed"
+    )
+    registry._registered.clear()
+    cell, report = run(describe(tmp_path), scene, tmp_path / "runs")
+    assert report.outcome == "trained", report.error
+    registry._registered.clear()
+    with pytest.raises(AwError, match="another configuration"):  # now there is something to lose
+        run(describe(tmp_path, renders=BASE["renders"].replace("*", "7")), scene, tmp_path / "runs")
+    assert read_result(report.folder / "metrics.json")["config_hash"] == cell.identity
+
+
 def test_a_resume_command_takes_over_where_something_lies(scene, tmp_path):
     reference = describe(tmp_path, train=BASE["train"] + " --stop-after-start", resume=BASE["train"])
     assert run(reference, scene, tmp_path / "runs")[1].outcome == "failed"
@@ -245,7 +258,7 @@ def test_effects_and_budgets_are_refused_where_they_cannot_be_kept(scene, tmp_pa
 def test_what_was_started_ends_with_us(tmp_path):
     """On Ctrl-C at once; after kill -9 when the run goes on, so that no two work in one folder."""
     code = (
-        "from pathlib import Path; from ambiguous_wild.methods.external.process import end_left_over; "
+        "from pathlib import Path; from ambiguous_wild.methods.external.process import run_logged; "
         f"run_logged('x', ['sh', '-c', 'sleep 60 & wait'], log=Path({str(tmp_path / 'x.log')!r}), "
         "cwd=Path('.'), environment={}, timeout_s=None)"
     )

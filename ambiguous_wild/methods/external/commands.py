@@ -17,8 +17,10 @@ from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.io.atomic import write_json
 from ambiguous_wild.methods.external import templates
 from ambiguous_wild.methods.external.process import end_left_over, run_logged
-from ambiguous_wild.methods.external.program import Produced, Task
+from ambiguous_wild.methods.external.program import DONE, Produced, Task
 from ambiguous_wild.methods.external.staging import split_lists, stage
+
+BEGUN = "begun.json"  # in the folder of the program: what was begun, to tell whether it may go on
 
 
 @dataclass(frozen=True)
@@ -51,15 +53,16 @@ class CommandProgram:
         staged = stage(task.scene, task.folder / ".scene", files)
         try:
             values = self._values(task, staged)
-            state = task.work / "done.json"
+            state = task.work / DONE
             done: dict[str, float] = _read(state)
             output = Path(values["output"])
             if "train_s" not in done:
-                again = bool(self.resume) and output.is_dir() and any(output.iterdir())
+                again = self._goes_on(task, output)
                 if not again:
                     shutil.rmtree(output, ignore_errors=True)
                 output.mkdir(parents=True, exist_ok=True)
                 command = self.resume if again else self.train
+                write_json(task.work / BEGUN, list(self.train))
                 done["train_s"] = self._command("train", command, values, task)
                 write_json(state, done)
             if self.render and "render_s" not in done:
@@ -68,6 +71,15 @@ class CommandProgram:
             return self._collect(task, values, done)
         finally:
             shutil.rmtree(staged, ignore_errors=True)
+
+    def _goes_on(self, task: Task, output: Path) -> bool:
+        """Whether something lies there that `resume` may take over: left by the same command."""
+        try:
+            begun = json.loads((task.work / BEGUN).read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return False
+        same = begun == list(self.train)
+        return bool(self.resume) and same and output.is_dir() and any(output.iterdir())
 
     def _check_length(self, task: Task) -> None:
         if task.budget_s is not None and "budget_s" not in self._used():

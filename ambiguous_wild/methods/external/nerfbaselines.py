@@ -21,7 +21,7 @@ from ambiguous_wild.core.names import check_name
 from ambiguous_wild.io.archive import unpack
 from ambiguous_wild.io.atomic import atomic_dir, write_json
 from ambiguous_wild.methods.external.process import end_left_over, run_logged
-from ambiguous_wild.methods.external.program import Produced, Task, no_parts
+from ambiguous_wild.methods.external.program import DONE, Produced, Task, no_parts
 from ambiguous_wild.methods.registry import MethodEntry
 
 PROGRAM = "AW_NERFBASELINES"  # environment variable: where its command lies
@@ -174,7 +174,7 @@ class _Steps:
 
     def __init__(self, method: NerfBaselines, task: Task) -> None:
         self.method, self.task = method, task
-        self.state = task.work / "done.json"
+        self.state = task.work / DONE
         known = _json(self.state) if self.state.is_file() else {}
         self.seconds = {key: float(value) for key, value in known.items() if isinstance(value, (int, float))}
 

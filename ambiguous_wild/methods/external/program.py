@@ -9,6 +9,9 @@ from typing import Any, NoReturn, Protocol
 
 from ambiguous_wild.core import AwError, Scene
 
+WORK, LOGS = "external", "logs"  # folders of a run: what the program writes, and what it says
+DONE = "done.json"  # in WORK: the commands that ended, and the seconds they took
+
 
 @dataclass(frozen=True)
 class Task:

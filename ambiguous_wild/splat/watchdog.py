@@ -2,9 +2,10 @@
 
 Looking is cheap: a tensor with a NaN or an infinity in it has a sum that is not finite, so one sum of each
 tensor decides, and only where it is not finite (a large but sound sum may overflow too) are rows looked at.
-Harmonics above the constant are 45 of a Gaussian's 59 floats. Their gradient is the constant's times a
-polynomial of a unit vector, so that what breaks them breaks the constant too; they are looked at every
-`EVERY` iterations and before every checkpoint: no checkpoint holds a value that is not finite.
+Gradients are looked at in every step, before anything is changed; those of the higher harmonics
+(45 of a Gaussian's 59 floats) are the constant's times a polynomial of a unit vector: what breaks them
+breaks the constant too. Parameters are looked at every `EVERY` iterations, after growth and before every
+checkpoint: no checkpoint holds a value that is not finite.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 OnNonFinite = Literal["stop", "rollback"]
 FOLDER = "nonfinite"
 REPORT, GOOD, STEP = "report.json", "good.safetensors", "step.safetensors"
-EVERY = 50  # iterations between looks at the harmonics above the constant
+EVERY = 50  # iterations between looks at the parameters
 MOST_ROLLBACKS = 5  # a run that needs more is not worth saving
 _LARGE = "sh_rest"
 
@@ -48,7 +49,7 @@ class Finding:
     rows: tuple[int, ...]  # Gaussians, the first ten
     count: int  # of such Gaussians
     iteration: int
-    since: int  # the first iteration it may have come up at; differs from `iteration` for sh_rest alone
+    since: int  # the first iteration it may have come up at; earlier than `iteration` for parameters
     view: str  # file name of the photo
 
     def __str__(self) -> str:
@@ -89,46 +90,36 @@ class Watchdog:
         if not math.isfinite(loss.value):
             raise self._found("loss", step.iteration, step.view, {}, _seen(step, keep, loss))
 
-    def look_at_step(
-        self,
-        step: Step,
-        keep: Tensor | None,
-        loss: PhotometricLoss,
-        gradients: Gradients,
-        gaussians: Gaussians,
+    def look_at_gradients(
+        self, step: Step, keep: Tensor | None, loss: PhotometricLoss, gradients: Gradients
     ) -> None:
-        """Raise NonFinite if the optimiser left a parameter that is not finite, or names the gradient.
+        """Raise NonFinite if a gradient of this step is not finite: nothing has been changed yet.
 
-        Adam makes a NaN of every parameter whose gradient is none, in the same step: one look finds both.
+        Adam would not show it: its kernel takes a moment that is NaN for one too small to count.
         """
-        if _sums_are_finite(self._named(gaussians, step.iteration % self.every == 0)):
-            return
-        view, seen = step.view, _seen(step, keep, loss)
-        bad = _bad_rows({name: getattr(gradients, name) for name, _ in gaussians.items()})
-        if bad:
-            found = {f"d_{name}": getattr(gradients, name) for name in bad}
-            raise self._found("gradient", step.iteration, view, bad, seen | found)
-        bad = _bad_rows(dict(gaussians.items()))
-        if bad:
-            raise self._found("parameter", step.iteration, view, bad, seen)
+        named = {name: getattr(gradients, name) for name, _ in step.gaussians.items() if name != _LARGE}
+        if not _sums_are_finite(named):
+            bad = _bad_rows(named)
+            if bad:
+                found = {f"d_{name}": getattr(gradients, name) for name in bad}
+                raise self._found("gradient", step.iteration, step.view, bad, _seen(step, keep, loss) | found)
+
+    def due(self, iteration: int) -> bool:
+        """Whether parameters are looked at after this iteration, whatever happened in it."""
+        return iteration % self.every == 0
 
     def look_at_parameters(self, iteration: int, view: int, gaussians: Gaussians) -> None:
-        """Raise NonFinite if any parameter is not finite, after growth and before a checkpoint."""
+        """Raise NonFinite if a parameter is not finite: now and then, after growth, before a checkpoint."""
         if not _sums_are_finite(dict(gaussians.items())):
             bad = _bad_rows(dict(gaussians.items()))
             if bad:
                 raise self._found("parameter", iteration, view, bad, {"gaussians": dict(gaussians.items())})
 
-    @staticmethod
-    def _named(gaussians: Gaussians, everything: bool) -> dict[str, Tensor]:
-        return {name: tensor for name, tensor in gaussians.items() if everything or name != _LARGE}
-
     def _found(
         self, what: Any, iteration: int, view: int, bad: Mapping[str, Tensor], seen: Mapping[str, Any]
     ) -> NonFinite:
         rows = torch.stack(list(bad.values())).any(0).nonzero()[:, 0].tolist() if bad else []
-        late = set(bad) == {_LARGE} and self.every > 1
-        since = iteration - (iteration - 1) % self.every if late else iteration
+        since = iteration - (iteration - 1) % self.every if what == "parameter" else iteration
         finding = Finding(what, tuple(bad), tuple(rows[:10]), len(rows), iteration, since, self.photos[view])
         return NonFinite(finding, view, seen)
 

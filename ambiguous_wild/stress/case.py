@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import traceback
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
@@ -34,7 +35,7 @@ class Case:
 
     @property
     def key(self) -> str:
-        return f"{self.row:02d}-{self.name.replace(' ', '-')}"
+        return f"{self.row:02d}-{re.sub(r'[^a-z0-9.]+', '-', self.name.lower()).strip('-')}"
 
 
 @dataclass(frozen=True)

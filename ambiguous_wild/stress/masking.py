@@ -104,6 +104,7 @@ def planted_region(device: str) -> Measured:
     grown[9:17, 7:17] = True
     checks = {
         "finite": bool(np.isfinite(r).all()),
+        "H of 0 counts at most a hundred times": bool(r[20:, :30].max() < 100 * r[20:, 30:].max()),
         "the region is found": bool(found[11:15, 9:15].all()),
         "nothing else is": not bool((found & ~grown).any()),
         "U is at least 1": bool((masking.uncertainty(np.array([-1.0, 1.0, np.nan, np.inf])) >= 1).all()),
@@ -186,7 +187,7 @@ def consistency_saturated(device: str) -> Measured:
 def learnt_weight(device: str) -> Measured:
     checks = {}
     for name, residual in (("down", 1e6), ("up", 0.0)):
-        rng, weight = np.random.default_rng(0), LearntWeight()
+        rng, weight = np.random.default_rng(0), LearntWeight(rate=5.0)  # far beyond what is used
         for _ in range(300):
             weight.learn(rng.gamma(2.0, 1.0, 40), np.full(40, residual), np.ones(40), floor=0.5)
         single = float(torch.sigmoid(torch.tensor(weight.theta, dtype=torch.float32)))

@@ -48,7 +48,7 @@ def test_a_gradient_is_named_and_kept_for_replay(scene, tmp_path):
     ) as info:
         trainer.train()
     assert trainer.iteration == 16
-    assert not trainer.checkpoint_path.exists()
+    assert all(bool(torch.isfinite(t).all()) for _, t in trainer.gaussians.items())
     finding = info.value.finding
     assert {"means", "quats", "log_scales", "opacity_logits", "sh0"} <= set(finding.names)
     where = tmp_path / "run" / FOLDER / "000017"
@@ -75,7 +75,7 @@ def test_a_parameter_is_found_and_never_saved(scene, tmp_path, name):
     finding = info.value.finding
     assert finding.rows == (5,)
     assert finding.since <= 13 <= finding.iteration
-    assert (finding.since == finding.iteration) == (name == "means")
+    assert finding.iteration == 50  # nothing grew before, nothing was saved
     assert not trainer.checkpoint_path.exists()
 
 
@@ -117,7 +117,7 @@ def test_a_healthy_run_has_the_same_bits_without_it(scene, tmp_path, method, mon
     looked = trained(scene, tmp_path / "a", parts=parts_of(method), iterations=60)
     saved = checkpoint.load(tmp_path / "a" / "checkpoint" / "last.safetensors")
     assert "rollbacks" not in saved
-    for name in ("look_at_loss", "look_at_step", "look_at_parameters"):
+    for name in ("look_at_loss", "look_at_gradients", "look_at_parameters"):
         monkeypatch.setattr(Watchdog, name, lambda self, *args, **kw: None)
     assert bits(looked) == bits(trained(scene, tmp_path / "b", parts=parts_of(method), iterations=60))
 

@@ -93,7 +93,7 @@ def moments(device: str) -> Measured:
     # log-scales are stored with |log s| u, twice that of a variance; quaternions with u, twice in R S R^T
     bound = 2 * float(merged.log_scales.abs().max()) + 16
     return Measured(
-        worst, bound * UNIT, "2 |log s| + 16 roundings", "positive definite, the mixture's moments"
+        worst, bound * UNIT, "2 abs(log s) + 16 roundings", "positive definite, the mixture's moments"
     )
 
 

@@ -26,7 +26,8 @@ ALLOWED: dict[str, set[str]] = {
     "methods": {"core", "io", "splat", "vision"},
     "harness": BELOW_HARNESS,
     "study": {"core", "io", "metrics", "harness"},
-    "cli": BELOW_HARNESS | {"harness", "study"},
+    "stress": {"core", "metrics", "splat", "methods"},
+    "cli": BELOW_HARNESS | {"harness", "study", "stress"},
 }
 HEAVY = ("torch", "numba", "pycolmap", "cv2", "matplotlib", "transformers", "scipy", "pandas", "skimage")
 FILES = sorted(PACKAGE.rglob("*.py"))

@@ -109,6 +109,13 @@ def parse_budget(text: str) -> float:
     help="Seconds between checkpoints.",
 )
 @click.option(
+    "--on-nonfinite",
+    type=click.Choice(["stop", "rollback"]),
+    default="stop",
+    show_default=True,
+    help="A value that is no finite number: stop and say where, or go back and leave that photo out.",
+)
+@click.option(
     "--pictures/--no-pictures",
     default=True,
     show_default=True,
@@ -141,6 +148,7 @@ def command(
     overwrite: str,
     cache: Path | None,
     checkpoint_every: float,
+    on_nonfinite: str,
     pictures: bool,
     as_json: bool,
 ) -> None:
@@ -199,6 +207,7 @@ def command(
         resolution=resolution,  # type: ignore[arg-type]
         max_gaussians=max_gaussians,
         checkpoint_every_s=checkpoint_every,
+        on_nonfinite=on_nonfinite,  # type: ignore[arg-type]
     )
     from ambiguous_wild.harness.planning.file import read_plan
 

@@ -28,6 +28,7 @@ COMMANDS = {
     "audit": ("audit", "What cannot be right in a table of results."),
     "leaderboard": ("leaderboard", "Take checked runs into CSVs, and publish them as a page."),
     "study": ("study", "Ask people, blind: what is hard to see, which render is better."),
+    "stress": ("stress", "Numerically hard cases against float64; a training that met a NaN once more."),
     "methods": ("methods", "List the methods there are."),
 }
 

@@ -43,6 +43,7 @@ TRACEBACK = "traceback.txt"
 EFFECTS = "effects.json"
 # What a run leaves before anything worth keeping exists in its folder.
 _WORTHLESS = {"config.yaml", "env.json", EFFECTS, FAILED, TRACEBACK}
+_NOT_IDENTITY = ("checkpoint_every_s", "probes", "on_nonfinite")  # of a run's TrainConfig
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,11 @@ class Cell:
 
     @property
     def identity(self) -> str:
-        """Hash of what decides the result: not how often it is saved, nor where the scene lies."""
+        """Hash of what decides the result: not how often it is saved, nor where the scene lies.
+
+        What is done about values that are not finite is left out too: where there are none it does nothing,
+        and where there are the result's facts say so.
+        """
         return config_identity(self.config)
 
 
@@ -207,7 +212,7 @@ def refuse_other_config(folder: Path, cell: Cell) -> None:
         raise AwError(f"{path} is damaged ({error}); start anew with --overwrite always") from None
     if old.get("config_hash") == cell.identity:
         return
-    ignored = {"train.checkpoint_every_s", "train.probes", "scene.path", "config_hash"}
+    ignored = {f"train.{key}" for key in _NOT_IDENTITY} | {"scene.path", "config_hash"}
     before, now = _flat(old), _flat(cell.config)
     names = [
         k for k in sorted(before.keys() | now.keys()) if before.get(k) != now.get(k) and k not in ignored
@@ -279,6 +284,7 @@ def _train_and_measure(
         "masks": masks,
         "facts": trainer.parts.mask.facts()
         | {"skipped_views": trainer.skipped_views}
+        | trainer.watchdog.facts()
         | _effect_facts(cell, trainer),
         "cost": cost
         | {

@@ -26,6 +26,11 @@ _C3 = (
 )
 
 
+# Two layers at the alpha clamp leave (1 - 0.99)^2, which is 1e-4 to the digit and stops the pixel; float64
+# rounds it to just above, every float32 path to just below.
+_STOP = 1e-4 * (1 + 1e-12)
+
+
 @dataclass
 class Reference:
     """Pictures in float64, attached to the parameters' graph."""
@@ -144,7 +149,7 @@ def render_reference(
         alpha = torch.where(e > 0.99, torch.full_like(e, 0.99), e)
         alpha = torch.where(alpha < 1 / 255, torch.zeros_like(alpha), alpha)
         touched[i] = bool((alpha > 0).any())
-        stopped = stopped | (through * (1 - alpha) <= 1e-4)
+        stopped = stopped | (through * (1 - alpha) <= _STOP)
         alpha = torch.where(stopped, torch.zeros_like(alpha), alpha)
         weight = through * alpha
         image = image + weight[..., None] * colour[i]

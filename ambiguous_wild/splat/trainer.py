@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import csv
-import io
+import math
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -16,9 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ambiguous_wild.core import AwError, Camera
-from ambiguous_wild.io.atomic import write_text
-from ambiguous_wild.splat import checkpoint
+from ambiguous_wild.core import Camera
+from ambiguous_wild.splat import checkpoint, snapshot
+from ambiguous_wild.splat.clock import Clock
 from ambiguous_wild.splat.data import shrink, shrink_camera, shrink_keep
 from ambiguous_wild.splat.effects.chain import Chain
 from ambiguous_wild.splat.gaussians import Gaussians
@@ -29,6 +27,7 @@ from ambiguous_wild.splat.render import render
 from ambiguous_wild.splat.rendered import Rendered
 from ambiguous_wild.splat.resolution import FULL, Level, ceiling_at, coarse_to_fine, divisor_at
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData
+from ambiguous_wild.splat.watchdog import NonFinite, OnNonFinite, Watchdog
 
 COARSE_UNTIL = 0.4  # share of the run; measured on simulated captures, see docs/training.md
 TIMELINE_ROWS = 100
@@ -46,39 +45,9 @@ class TrainConfig:
     torch_threads: int = 1  # fixed, not the machine's: the split of a sum decides its last bits
     checkpoint_every_s: float = 60.0
     probes: int = 8  # times the test PSNR is probed; the clock stands still meanwhile
-
-
-@dataclass
-class Clock:
-    """Training time alone: reading photos, probing and saving do not count."""
-
-    elapsed_s: float = 0.0
-    parts_s: dict[str, float] = field(default_factory=dict)
-    _since: float | None = None
-
-    def start(self) -> None:
-        self._since = time.perf_counter()
-
-    def stop(self) -> None:
-        if self._since is not None:
-            self.elapsed_s += time.perf_counter() - self._since
-            self._since = None
-
-    def now(self) -> float:
-        running = 0.0 if self._since is None else time.perf_counter() - self._since
-        return self.elapsed_s + running
-
-    @contextmanager
-    def part(self, name: str) -> Iterator[None]:
-        begin = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.parts_s[name] = self.parts_s.get(name, 0.0) + time.perf_counter() - begin
-
-
-class NonFinite(AwError):
-    """The loss stopped being a number."""
+    on_nonfinite: OnNonFinite = (
+        "stop"  # or go back to the last checkpoint and leave the photo out, see watchdog.py
+    )
 
 
 class Trainer:
@@ -106,13 +75,15 @@ class Trainer:
             data = parts.train_data(data)
         self.data, self.parts, self.config, self.folder = data, parts, config, folder
         self.probe = probe
+        names = [view.name for view in data.scene.train]
+        self.watchdog = Watchdog(folder, config.on_nonfinite, config.seed, names)
         self.extent = data.scene.extent
         self.clock = Clock()
         self.setup_s = 0.0  # seconds before the first step, of the process that began the run
         self.iteration = 0
         self.timeline: list[dict[str, Any]] = []
-        self._loss_sum, self._loss_count = 0.0, 0
-        self._skipped_views: set[int] = set()
+        self.loss_sum, self.loss_count = 0.0, 0  # since the last row of the timeline
+        self.skipped: set[int] = set()  # views that were all masked at some step
         self._pyramid: dict[tuple[int, int], Tensor] = {}
 
         points = data.scene.points
@@ -121,7 +92,7 @@ class Trainer:
         ).to(data.device)
         self.start_count = len(self.gaussians)
         self.levels = self._levels()
-        self.optimiser = SplatAdam(self.gaussians, self._learning_rates(0.0))
+        self.optimiser = SplatAdam(self.gaussians, self.learning_rates(0.0))
         self.density = parts.density(parts.density_config, self.extent, config.seed)
         parts.mask.setup(data)
         self.effects = Chain(parts.effects, data) if parts.effects else None
@@ -164,7 +135,8 @@ class Trainer:
         sample = self.data.photos[:: max(len(self.data.photos) // 8, 1)]
         return coarse_to_fine([photo.cpu().numpy() for photo in sample], COARSE_UNTIL)
 
-    def _learning_rates(self, progress: float) -> dict[str, float]:
+    def learning_rates(self, progress: float) -> dict[str, float]:
+        """Of every tensor, at this share of the run."""
         s = self.parts.schedule
         last = s.lr_means_final_short if self._short() else s.lr_means_final
         return {
@@ -176,10 +148,14 @@ class Trainer:
             "sh_rest": s.lr_sh_rest,
         }
 
+    def epoch_of(self, iteration: int) -> int:
+        """Passes over all views that were complete before this iteration."""
+        return (iteration - 1) // len(self.data.photos)
+
     def _view_at(self, iteration: int) -> int:
         """Every view once an epoch in an order of its own; a function of the seed, so it has no state."""
         n = len(self.data.photos)
-        epoch, k = divmod(iteration - 1, n)
+        epoch, k = self.epoch_of(iteration), (iteration - 1) % n
         return int(np.random.default_rng([self.config.seed, 0x51, epoch]).permutation(n)[k])
 
     # -- one step ---------------------------------------------------------------------------------
@@ -253,10 +229,18 @@ class Trainer:
         return user if keep is None else keep * user
 
     def step(self) -> float:
-        """One iteration; returns the photometric loss."""
+        """One iteration; returns the photometric loss, NaN where the photo is left out after a rollback.
+
+        Raises:
+            NonFinite: names view, iteration and parameters.
+        """
         iteration = self.iteration + 1
         part = self.clock.part
-        step = self.make_step(iteration, self._view_at(iteration))
+        view = self._view_at(iteration)
+        if self.watchdog.skips(self.epoch_of(iteration), view):
+            self.iteration = iteration
+            return math.nan
+        step = self.make_step(iteration, view)
         with part("mask"):
             keep = self.combine_user_keep(step, self.parts.mask.keep(step))
         with part("loss"):
@@ -267,20 +251,21 @@ class Trainer:
                 lambda_dssim=self.parts.lambda_dssim,
                 weighting=self.parts.weighting,
             )
-        if not np.isfinite(loss.value):
-            raise self._non_finite(step, "loss")
+        self.watchdog.look_at_loss(step, keep, loss)
         with part("mask loss"):
             extra = self.parts.mask.cotangent(step, keep)
         if keep is not None and not bool(keep.any()):
             # Nothing to learn from: moving on Adam's momentum alone would drift away from the scene.
-            self._skipped_views.add(step.view)
+            self.skipped.add(step.view)
             self.iteration = iteration
             return loss.value
         with part("backward"):
             gradients = step.rendered.backward(loss.d_image, d_image_extra=extra)
+        with part("watchdog"):
+            self.watchdog.look_at_gradients(step, keep, loss, gradients)
         with part("optimiser"):
             self.optimiser.step(
-                gradients, step.rendered.visible, self._learning_rates(self.progress(iteration))
+                gradients, step.rendered.visible, self.learning_rates(self.progress(iteration))
             )
         with part("density"):
             self.density.observe(step, gradients, keep)
@@ -293,17 +278,11 @@ class Trainer:
                     self.effects.rows_changed()
         if "reset" in events:
             self.parts.mask.on_opacity_reset(step)
+        if events or self.watchdog.due(iteration):
+            with part("watchdog"):
+                self.watchdog.look_at_parameters(iteration, view, self.gaussians)
         self.iteration = iteration
         return loss.value
-
-    def _non_finite(self, step: Step, what: str) -> NonFinite:
-        bad = [name for name, tensor in self.gaussians.items() if not bool(torch.isfinite(tensor).all())]
-        where = self.data.scene.train[step.view].name
-        return NonFinite(
-            f"{what} is not finite at iteration {step.iteration}, view {where}"
-            + (f", parameters {', '.join(bad)}" if bad else "")
-            + f"; the last good state is in {self.folder / 'checkpoint'}"
-        )
 
     # -- the loop ---------------------------------------------------------------------------------
 
@@ -316,35 +295,60 @@ class Trainer:
         Raises:
             NonFinite: names view, iteration and parameters.
         """
+        if self.config.on_nonfinite == "rollback" and not self.checkpoint_path.exists():
+            self.save()  # something to go back to, from the first iteration on
         last_save = time.monotonic()
-        while not self.done:
-            before = self.progress(self.iteration)
-            self.clock.start()
-            loss = self.step()
-            self.clock.stop()
-            self._loss_sum, self._loss_count = self._loss_sum + loss, self._loss_count + 1
-            after = self.progress(self.iteration)
-            if int(after * TIMELINE_ROWS) > int(before * TIMELINE_ROWS):
-                probes = self.config.probes
-                self._log(probing=probes > 0 and int(after * probes) > int(before * probes))
-            if tick is not None:
-                tick(self)
+        while True:
+            if self.done:
+                if self._save_if_sound():
+                    return
+                continue  # rolled back: there is more to do
+            self._advance(tick)
             if time.monotonic() - last_save > self.config.checkpoint_every_s and not self.done:
-                self.save()
+                self._save_if_sound()
                 last_save = time.monotonic()
-        self.optimiser.flush()
+
+    def _advance(self, tick: Callable[[Trainer], None] | None) -> None:
+        """One iteration with its bookkeeping, or one step back."""
+        before = self.progress(self.iteration)
+        self.clock.start()
+        try:
+            loss = self.step()
+        except NonFinite as error:
+            self.clock.stop()
+            self.watchdog.handle(self, error)
+            return
+        self.clock.stop()
+        if not math.isnan(loss):
+            self.loss_sum, self.loss_count = self.loss_sum + loss, self.loss_count + 1
+        after = self.progress(self.iteration)
+        if int(after * TIMELINE_ROWS) > int(before * TIMELINE_ROWS):
+            probes = self.config.probes
+            self._log(probing=probes > 0 and int(after * probes) > int(before * probes))
+        if tick is not None:
+            tick(self)
+
+    def _save_if_sound(self) -> bool:
+        """Save, unless a parameter is not finite: then it is as if the last step had found that."""
+        try:
+            view = self._view_at(max(self.iteration, 1))
+            self.watchdog.look_at_parameters(self.iteration, view, self.gaussians)
+        except NonFinite as error:
+            self.watchdog.handle(self, error)
+            return False
         self.save()
+        return True
 
     def _log(self, probing: bool) -> None:
         n = max(self.iteration, 1)
         row: dict[str, Any] = {
             "wall_s": round(self.clock.now(), 3),
             "iteration": self.iteration,
-            "loss": self._loss_sum / max(self._loss_count, 1),
+            "loss": self.loss_sum / max(self.loss_count, 1),
             "gaussians": len(self.gaussians),
             "psnr_probe": None,
         }
-        self._loss_sum, self._loss_count = 0.0, 0
+        self.loss_sum, self.loss_count = 0.0, 0
         row |= {f"ms_{name.replace(' ', '_')}": 1e3 * s / n for name, s in self.clock.parts_s.items()}
         if probing and self.probe is not None:
             spent = dict(self.clock.parts_s)
@@ -365,7 +369,7 @@ class Trainer:
     @property
     def skipped_views(self) -> list[str]:
         """Train photos that were all masked at some step and taught nothing then."""
-        return sorted(self.data.scene.train[i].name for i in self._skipped_views)
+        return sorted(self.data.scene.train[i].name for i in self.skipped)
 
     # -- state ------------------------------------------------------------------------------------
 
@@ -375,54 +379,12 @@ class Trainer:
 
     def save(self) -> None:
         """Write the whole state and the timeline, each atomically."""
-        state = {
-            "iteration": self.iteration,
-            "elapsed_s": self.clock.now(),
-            "setup_s": self.setup_s,
-            "parts_s": self.clock.parts_s,
-            "gaussians": dict(self.gaussians.items()),
-            "optimiser": self.optimiser.state_dict(),
-            "density": self.density.state_dict(),
-            "mask": self.parts.mask.state_dict(),
-            **({} if self.effects is None else {"effects": self.effects.state_dict()}),
-            "timeline": self.timeline,
-            "loss": [self._loss_sum, self._loss_count],
-            "skipped": sorted(self._skipped_views),
-        }
-        checkpoint.save(self.checkpoint_path, state)
-        write_timeline(self.folder / "timeline.csv", self.timeline)
+        checkpoint.save(self.checkpoint_path, snapshot.take(self))
+        snapshot.write_timeline(self.folder / "timeline.csv", self.timeline)
 
     def resume(self) -> bool:
         """Go on from the last checkpoint, if there is one; returns whether there was."""
         if not self.checkpoint_path.exists():
             return False
-        state = checkpoint.load(self.checkpoint_path)
-        try:
-            self.gaussians = Gaussians(**state["gaussians"]).to(self.data.device)
-            self.optimiser = SplatAdam(self.gaussians, self._learning_rates(0.0))
-            self.optimiser.load_state_dict(state["optimiser"])
-            self.density.load_state_dict(state["density"])
-            self.parts.mask.load_state_dict(state["mask"])
-            if self.effects is not None:
-                self.effects.load_state_dict(state["effects"])
-            self.iteration = state["iteration"]
-            self.setup_s = state["setup_s"]
-            self.clock = Clock(state["elapsed_s"], dict(state["parts_s"]))
-            self.timeline = list(state["timeline"])
-            self._loss_sum, self._loss_count = state["loss"]
-            self._skipped_views = set(state["skipped"])
-        except (KeyError, TypeError) as error:
-            raise AwError(
-                f"checkpoint {self.checkpoint_path} lacks {error}; train again with --overwrite always"
-            ) from None
+        snapshot.restore(self, checkpoint.load(self.checkpoint_path), self.checkpoint_path)
         return True
-
-
-def write_timeline(path: Path, rows: list[dict[str, Any]]) -> None:
-    """timeline.csv: one line a hundredth of the run; empty cells where nothing was measured."""
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, names, lineterminator="\n", restval="")
-    writer.writeheader()
-    writer.writerows({k: "" if v is None else v for k, v in row.items()} for row in rows)
-    write_text(path, text.getvalue())

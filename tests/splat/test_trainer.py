@@ -160,7 +160,8 @@ class FakeTime:
 @pytest.fixture
 def fake_time(monkeypatch):
     clock = FakeTime()
-    monkeypatch.setattr("ambiguous_wild.splat.trainer.time", clock)
+    for module in ("trainer", "clock"):
+        monkeypatch.setattr(f"ambiguous_wild.splat.{module}.time", clock)
     return clock
 
 

@@ -31,6 +31,7 @@ EXTENT_X, EXTENT_Y, VARIANCE_Y, VARIANCE_X, HALF_WIDTH, OPACITY = range(10, 16)
 
 _LOG2E = 1.4426950408889634
 _HUGE = 1e30
+_SHORT = 1e-30  # norm of a quaternion: its gradient is divided by it, and float32 ends at 3e38
 
 
 @fused_kernel
@@ -99,7 +100,7 @@ def _project_chunk(first, means, quats, log_scales, opacity_logits, cam, antiali
         qy = np.float64(quats[i, 2])
         qz = np.float64(quats[i, 3])
         norm = math.sqrt(w_ * w_ + qx * qx + qy * qy + qz * qz)
-        if not (norm > 0.0 and norm < _HUGE):
+        if not (norm > _SHORT and norm < _HUGE):
             continue
         inv = 1.0 / norm
         s0 = math.exp(np.float64(log_scales[i, 0]))

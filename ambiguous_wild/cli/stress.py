@@ -1,0 +1,118 @@
+"""`aw stress`: the hard cases as a table, and a training that met a NaN once more."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import click
+
+
+@click.command("stress")
+@click.option("--only", multiple=True, metavar="CASE", help="A row (4), a name or a part of one; repeatable.")
+@click.option("--list", "listing", is_flag=True, help="Print the names of the cases and do nothing.")
+@click.option(
+    "--device",
+    type=click.Choice(["auto", "cpu", "cuda"]),
+    default="auto",
+    show_default=True,
+    help="auto: the CPU, and the GPU too where there is one.",
+)
+@click.option(
+    "--format",
+    "style",
+    type=click.Choice(["text", "markdown", "json"]),
+    default="text",
+    show_default=True,
+)
+@click.option("--json", "as_json", is_flag=True, help="Short for --format json.")
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path, dir_okay=False), help="Write to a file instead."
+)
+@click.option(
+    "--replay",
+    "run",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="A run folder whose training met a value that is not finite: run up to it again.",
+)
+def command(
+    only: tuple[str, ...],
+    listing: bool,
+    device: str,
+    style: str,
+    as_json: bool,
+    output: Path | None,
+    run: Path | None,
+) -> None:
+    """Numerically hard cases against float64: what comes out, how far off, how far it may be.
+
+    \b
+    aw stress                     every case
+    aw stress --only 4 --only needle
+    aw stress --replay runs/scene/3dgs/seed0
+
+    Exits with 1 where a case fails, or a replay finds something else. docs/numerics.md explains each case.
+    """
+    if run is not None:
+        _replay(run)
+        return
+    from ambiguous_wild.stress import table
+
+    cases = table.chosen(only)
+    if listing:
+        click.echo("\n".join(c.key for c in cases))
+        return
+    devices = _devices(device)
+    style = "json" if as_json else style
+    live = style == "text" and output is None
+    if live:
+        click.echo(table.HEADER)
+    outcomes = table.run_all(cases, devices, (lambda o: click.echo(table.to_line(o))) if live else None)
+    if style == "json":
+        plain = [{k: _plain(v) for k, v in o.plain().items()} for o in outcomes]
+        text = json.dumps(plain, indent=2, allow_nan=False) + "\n"
+    elif style == "markdown":
+        text = table.to_markdown(outcomes)
+    else:
+        text = "\n".join([table.HEADER, *map(table.to_line, outcomes)]) + "\n"
+    if output is not None:
+        from ambiguous_wild.io.atomic import write_text
+
+        write_text(output, text)
+    elif not live:
+        click.echo(text, nl=False)
+    failed = sum(not o.passed for o in outcomes)
+    click.echo(f"{len(outcomes) - failed} of {len(outcomes)} passed on {' and '.join(devices)}", err=True)
+    if failed:
+        sys.exit(1)
+
+
+def _plain(value: object) -> object:
+    """JSON has no NaN and no infinity: an error that is none is missing."""
+    import math
+
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _devices(wanted: str) -> list[str]:
+    from ambiguous_wild.cli.bench import choose_device, prepare_cpu
+
+    found = choose_device(wanted)  # names what is missing where a GPU was asked for
+    devices = ["cuda"] if wanted == "cuda" else ["cpu"] if found == "cpu" else ["cpu", "cuda"]
+    if "cpu" in devices:
+        prepare_cpu(None)
+    return devices
+
+
+def _replay(run: Path) -> None:
+    from ambiguous_wild.cli.bench import prepare_cpu
+    from ambiguous_wild.harness.replay import replay
+
+    prepare_cpu(None)
+    result = replay(run)
+    click.echo(f"reported: {result.reported}")
+    click.echo(f"again, from iteration {result.started_at}: {result.found or 'everything is finite'}")
+    if not result.same:
+        click.echo("not the same: was it another version, another machine, or a plugin?", err=True)
+        sys.exit(1)

@@ -1,0 +1,216 @@
+"""Finds the first value of a run that is not finite, keeps what reproduces it, and undoes it where asked.
+
+Looking is cheap: a tensor with a NaN or an infinity in it has a sum that is not finite, so one sum of each
+tensor decides, and only where it is not finite (a large but sound sum may overflow too) are rows looked at.
+Gradients are looked at in every step, before anything is changed; those of the higher harmonics
+(45 of a Gaussian's 59 floats) are the constant's times a polynomial of a unit vector: what breaks them
+breaks the constant too. Parameters are looked at every `EVERY` iterations, after growth and before every
+checkpoint: no checkpoint holds a value that is not finite.
+"""
+
+from __future__ import annotations
+
+import math
+import shlex
+import shutil
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import torch
+from torch import Tensor
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.io.atomic import atomic_path, write_json
+from ambiguous_wild.splat import checkpoint
+from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.losses import PhotometricLoss
+from ambiguous_wild.splat.rendered import Gradients
+from ambiguous_wild.splat.step import Step
+
+if TYPE_CHECKING:
+    from ambiguous_wild.splat.trainer import Trainer
+
+OnNonFinite = Literal["stop", "rollback"]
+FOLDER = "nonfinite"
+REPORT, GOOD, STEP = "report.json", "good.safetensors", "step.safetensors"
+EVERY = 50  # iterations between looks at the parameters
+MOST_ROLLBACKS = 5  # a run that needs more is not worth saving
+_LARGE = "sh_rest"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """The first value that is not finite, and where it came up."""
+
+    what: Literal["loss", "gradient", "parameter"]
+    names: tuple[str, ...]  # of the tensors it is in; empty for the loss
+    rows: tuple[int, ...]  # Gaussians, the first ten
+    count: int  # of such Gaussians
+    iteration: int
+    since: int  # the first iteration it may have come up at; earlier than `iteration` for parameters
+    view: str  # file name of the photo
+
+    def __str__(self) -> str:
+        which = f" of {', '.join(self.names)} in {self.count} Gaussians" if self.names else ""
+        when = f"iteration {self.iteration}"
+        if self.since < self.iteration:
+            when = f"one of the iterations {self.since} to {self.iteration}, the last"
+        return f"{self.what}{which} is not finite at {when}, view {self.view}"
+
+
+class NonFinite(AwError):
+    """Training met a value that is not a finite number."""
+
+    def __init__(self, finding: Finding, view: int, seen: Mapping[str, Any], message: str = "") -> None:
+        super().__init__(message or str(finding))
+        self.finding, self.view, self.seen = finding, view, seen
+
+
+class Watchdog:
+    """Looks at one training run. A healthy run has the same bits with and without it (a test compares)."""
+
+    def __init__(self, folder: Path, action: OnNonFinite, seed: int, photos: list[str]) -> None:
+        """
+        Args:
+            folder: the run's; findings go to its `nonfinite/`.
+            action: what to do about a finding.
+            seed: of the run, for the report.
+            photos: names of the train photos.
+        """
+        self.folder, self.action, self.seed, self.photos = folder, action, seed, photos
+        self.every = EVERY
+        self.rollbacks: list[dict[str, Any]] = []
+
+    # -- looking ----------------------------------------------------------------------------------
+
+    def look_at_loss(self, step: Step, keep: Tensor | None, loss: PhotometricLoss) -> None:
+        """Raise NonFinite if the loss of this step is not finite."""
+        if not math.isfinite(loss.value):
+            raise self._found("loss", step.iteration, step.view, {}, _seen(step, keep, loss))
+
+    def look_at_gradients(
+        self, step: Step, keep: Tensor | None, loss: PhotometricLoss, gradients: Gradients
+    ) -> None:
+        """Raise NonFinite if a gradient of this step is not finite: nothing has been changed yet.
+
+        Adam would not show it: its kernel takes a moment that is NaN for one too small to count.
+        """
+        named = {name: getattr(gradients, name) for name, _ in step.gaussians.items() if name != _LARGE}
+        if not _sums_are_finite(named):
+            bad = _bad_rows(named)
+            if bad:
+                found = {f"d_{name}": getattr(gradients, name) for name in bad}
+                raise self._found("gradient", step.iteration, step.view, bad, _seen(step, keep, loss) | found)
+
+    def due(self, iteration: int) -> bool:
+        """Whether parameters are looked at after this iteration, whatever happened in it."""
+        return iteration % self.every == 0
+
+    def look_at_parameters(self, iteration: int, view: int, gaussians: Gaussians) -> None:
+        """Raise NonFinite if a parameter is not finite: now and then, after growth, before a checkpoint."""
+        if not _sums_are_finite(dict(gaussians.items())):
+            bad = _bad_rows(dict(gaussians.items()))
+            if bad:
+                raise self._found("parameter", iteration, view, bad, {"gaussians": dict(gaussians.items())})
+
+    def _found(
+        self, what: Any, iteration: int, view: int, bad: Mapping[str, Tensor], seen: Mapping[str, Any]
+    ) -> NonFinite:
+        rows = torch.stack(list(bad.values())).any(0).nonzero()[:, 0].tolist() if bad else []
+        since = iteration - (iteration - 1) % self.every if what == "parameter" else iteration
+        finding = Finding(what, tuple(bad), tuple(rows[:10]), len(rows), iteration, since, self.photos[view])
+        return NonFinite(finding, view, seen)
+
+    # -- what is done about it --------------------------------------------------------------------
+
+    def skips(self, epoch: int, view: int) -> bool:
+        """Whether this photo is left out in this epoch: what it did there was undone."""
+        return any(r["epoch"] == epoch and r["view"] == view for r in self.rollbacks)
+
+    def handle(self, trainer: Trainer, error: NonFinite) -> None:
+        """Keep what reproduces the finding; then roll back, or raise it with where that lies.
+
+        Rolling back restores the last checkpoint and leaves the photo out for the rest of its epoch. The
+        seconds spent stay spent.
+        """
+        where = self._keep(trainer.checkpoint_path, error)
+        if self.action == "rollback" and len(self.rollbacks) < MOST_ROLLBACKS:
+            spent, rollbacks = trainer.clock, list(self.rollbacks)
+            trainer.resume()
+            back = {
+                "iteration": error.finding.iteration,
+                "epoch": trainer.epoch_of(error.finding.iteration),
+                "view": error.view,
+                "photo": error.finding.view,
+                "what": str(error),
+                "to": trainer.iteration,
+            }
+            trainer.clock, self.rollbacks, self.every = spent, [*rollbacks, back], 1
+            trainer.save()
+            return
+        tried = f" after {len(self.rollbacks)} rollbacks" if self.rollbacks else ""
+        run = shlex.quote(str(self.folder))
+        raise NonFinite(
+            error.finding,
+            error.view,
+            error.seen,
+            f"{error}{tried}; what the step saw is in {where}, and 'aw stress --replay {run}' runs up to it "
+            f"again from the last good state; --on-nonfinite rollback leaves such a photo out and goes on",
+        )
+
+    def _keep(self, good: Path, error: NonFinite) -> Path:
+        """Write report, last good checkpoint and what the step saw; returns the folder."""
+        where = self.folder / FOLDER / f"{error.finding.iteration:06d}"
+        where.mkdir(parents=True, exist_ok=True)
+        if good.exists():
+            with atomic_path(where / GOOD) as temporary:
+                shutil.copyfile(good, temporary)
+        else:
+            (where / GOOD).unlink(missing_ok=True)  # of an earlier run of this folder
+        checkpoint.save(where / STEP, error.seen)
+        report = asdict(error.finding) | {
+            "message": str(error),
+            "seed": self.seed,
+            "starts_from": GOOD if good.exists() else "the beginning",
+            "replay": f"aw stress --replay {shlex.quote(str(self.folder))}",
+        }
+        write_json(where / REPORT, report)
+        return where
+
+    # -- state ------------------------------------------------------------------------------------
+
+    def facts(self) -> dict[str, Any]:
+        """What was undone; nothing where nothing was."""
+        return {"rollbacks": self.rollbacks} if self.rollbacks else {}
+
+    def state_dict(self) -> list[dict[str, Any]]:
+        return self.rollbacks
+
+    def load_state_dict(self, rollbacks: list[dict[str, Any]]) -> None:
+        self.rollbacks = list(rollbacks)
+        self.every = 1 if rollbacks else EVERY
+
+
+def _sums_are_finite(tensors: Mapping[str, Tensor]) -> bool:
+    # torch's sum is several times as fast as isfinite().all(), which writes a tensor of its own
+    return all(math.isfinite(float(t.sum())) for t in tensors.values())
+
+
+def _bad_rows(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Rows [N] bool with a value that is not finite, of the tensors that have any."""
+    found = {name: ~torch.isfinite(t).reshape(len(t), -1).all(1) for name, t in tensors.items()}
+    return {name: rows for name, rows in found.items() if bool(rows.any())}
+
+
+def _seen(step: Step, keep: Tensor | None, loss: PhotometricLoss) -> dict[str, Any]:
+    """Tensors for whoever looks into it."""
+    rendered = step.rendered
+    return {
+        "gaussians": dict(step.gaussians.items()),
+        "photo": step.photo,
+        "keep": keep,
+        "render": {"image": rendered.image, "alpha": rendered.alpha, "depth": rendered.depth},
+        "d_image": loss.d_image,
+    }

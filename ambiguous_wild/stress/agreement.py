@@ -1,0 +1,119 @@
+"""A back end against the float64 judge, with a bound that follows from the problem's own condition.
+
+Rounding every raw parameter by one unit in float64 moves the result by `condition` units: no float32 path
+can be asked for less. A stable one adds a constant times the length of its chain (Higham, Accuracy and
+Stability of Numerical Algorithms, ch. 1): about 16 operations from parameters to a pixel's exponent, three a
+Gaussian that lies over it, and for gradients as many again backwards, plus the sums over a tile.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ambiguous_wild.core import Camera
+from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.reference import render_reference
+from ambiguous_wild.splat.render import render
+from ambiguous_wild.stress.case import UNIT, Measured
+
+_DRAWS = 2  # roundings tried; the largest change counts
+
+
+def picture_and_gradients(
+    g: Gaussians, camera: Camera, device: str, d_image: Tensor, **options: Any
+) -> dict[str, Tensor]:
+    """Image and gradient of every parameter as the back end of `device` gives them, float64 on the CPU."""
+    rendered = render(g.to(device), camera, **options)
+    grads = rendered.backward(d_image.to(device))
+    found = {f"d_{name}": getattr(grads, name) for name, _ in g.items()} | {"image": rendered.image}
+    return {name: tensor.detach().cpu().double() for name, tensor in found.items()}
+
+
+def judge(
+    parameters: dict[str, Tensor], camera: Camera, d_image: Tensor, **options: Any
+) -> dict[str, Tensor]:
+    """The same in float64 by autograd."""
+    leaves = {name: tensor.clone().requires_grad_(True) for name, tensor in parameters.items()}
+    truth = render_reference(leaves, camera, **options)
+    loss = (truth.image * d_image.double()).sum() + 0.0 * truth.screen.sum()
+    found = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True)
+    gradients = {
+        f"d_{name}": torch.zeros_like(leaf) if gradient is None else gradient
+        for (name, leaf), gradient in zip(leaves.items(), found)
+    }
+    return gradients | {"image": truth.image.detach()}
+
+
+def agree(
+    g: Gaussians,
+    camera: Camera,
+    device: str,
+    comes_out: str,
+    *,
+    layers: int | None = None,  # Gaussians that a pixel draws at most; None = all of them
+    **options: Any,  # of `render`
+) -> Measured:
+    """Worst error of image and gradients, each over its largest value, and what it may be."""
+    rng = np.random.default_rng(0)
+    d_image = torch.from_numpy(rng.normal(size=(camera.height, camera.width, 3)).astype(np.float32))
+    parameters = {name: tensor.double() for name, tensor in g.items()}
+    truth = judge(parameters, camera, d_image, **options)
+    condition = 1.0
+    for _ in range(_DRAWS):
+        moved = {
+            name: t * (1 + UNIT * torch.from_numpy(rng.choice([-1.0, 1.0], size=t.shape)))
+            for name, t in parameters.items()
+        }
+        condition = max(condition, _distance(judge(moved, camera, d_image, **options), truth) / UNIT)
+    error = _distance(picture_and_gradients(g, camera, device, d_image, **options), truth)
+    steps = 96 + 6 * (len(g) if layers is None else layers)
+    return Measured(error, steps * condition * UNIT, f"{steps} roundings x condition", comes_out, condition)
+
+
+def _distance(a: dict[str, Tensor], b: dict[str, Tensor]) -> float:
+    worst = 0.0
+    steepest = max(float(truth.abs().max()) for name, truth in b.items() if truth.numel() and name != "image")
+    for name, truth in b.items():
+        if truth.numel():
+            # a gradient that is 0 in exact arithmetic has no relative error: a millionth of the largest one
+            scale = max(float(truth.abs().max()), 1e-6 * steepest, 1e-30)
+            difference = float((a[name] - truth).abs().max()) / scale
+            worst = max(worst, difference if difference == difference else float("inf"))
+    return worst
+
+
+def front(n: int = 1, *, depth: float = 3.0, rest: int = 0) -> Gaussians:
+    """n Gaussians of scales 0.37, 0.3 and 0.22 near the axis of `camera`, a tenth of a unit apart."""
+    means = torch.zeros(n, 3)
+    means[:, 0], means[:, 1] = 0.05, -0.08
+    means[:, 2] = depth + 0.1 * torch.arange(n)
+    quats = torch.tensor([[0.8, 0.3, -0.4, 0.2]]).repeat(n, 1)
+    colours = torch.linspace(0.3, 1.2, 3 * n).reshape(n, 3)
+    log_scales = torch.tensor([[-1.0, -1.2, -1.5]]).repeat(n, 1)
+    return Gaussians(means, quats, log_scales, torch.full((n,), 0.5), colours, torch.zeros(n, rest, 3))
+
+
+def camera(width: int = 21, height: int = 17, focal: float = 30.0) -> Camera:
+    """At the origin, looking along z."""
+    return Camera(width, height, focal, 1.1 * focal, width / 2 + 0.3, height / 2 - 0.2, np.eye(4))
+
+
+def cloud(n: int, seed: int = 0, *, rest: int = 3) -> Gaussians:
+    """Random Gaussians: in view, outside it and behind, opaque and faint, colours on both sides of 0."""
+    rng = np.random.default_rng(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.from_numpy(rng.normal(size=shape).astype(np.float32))
+
+    return Gaussians(
+        means=normal(n, 3) * torch.tensor([1.5, 1.0, 1.0]) + torch.tensor([0.0, 0.0, 3.0]),
+        quats=normal(n, 4),
+        log_scales=normal(n, 3) * 0.7 - 1.5,
+        opacity_logits=normal(n) * 2,
+        sh0=normal(n, 3),
+        sh_rest=normal(n, rest, 3) * 0.2,
+    )

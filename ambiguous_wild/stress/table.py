@@ -1,0 +1,88 @@
+"""All cases, run and printed."""
+
+from __future__ import annotations
+
+import fnmatch
+from collections.abc import Callable, Iterable, Sequence
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.stress import masking, measuring, rendering, training
+from ambiguous_wild.stress.case import Case, Outcome, run
+
+CASES: tuple[Case, ...] = tuple(
+    sorted((*rendering.CASES, *training.CASES, *masking.CASES, *measuring.CASES), key=lambda c: c.row)
+)
+
+
+def chosen(only: Sequence[str]) -> list[Case]:
+    """The cases that match any of these: a row ("4"), a key, or a part of one with * and ?.
+
+    Raises:
+        AwError: one of them matches none.
+    """
+    if not only:
+        return list(CASES)
+    found: dict[str, Case] = {}
+    for wanted in only:
+        if wanted.isdigit():
+            hits = [c for c in CASES if c.row == int(wanted)]
+        else:
+            hits = [c for c in CASES if fnmatch.fnmatch(c.key, wanted) or wanted in c.key]
+        if not hits:
+            raise AwError(f"--only {wanted!r}: no such case; 'aw stress --list' shows them")
+        found |= {c.key: c for c in hits}
+    return [c for c in CASES if c.key in found]
+
+
+def run_all(
+    cases: Iterable[Case], devices: Sequence[str], each: Callable[[Outcome], None] | None = None
+) -> list[Outcome]:
+    """Every case on every device it says something on."""
+    outcomes = []
+    for one in cases:
+        for device in devices:
+            if device in one.devices:
+                outcomes.append(run(one, device))
+                if each is not None:
+                    each(outcomes[-1])
+    return outcomes
+
+
+def to_markdown(outcomes: Sequence[Outcome]) -> str:
+    """case | device | what comes out | error | tolerance and where it comes from | condition | verdict."""
+    lines = [
+        "| case | device | what comes out | worst error | tolerance | from | condition | verdict |",
+        "|---|---|---|---:|---:|---|---:|---|",
+    ]
+    for o in outcomes:
+        cells = (
+            o.key,
+            o.device,
+            o.comes_out,
+            _figure(o.error),
+            _figure(o.tolerance),
+            o.why,
+            "" if o.condition is None else f"{o.condition:.1e}",
+            "passed" if o.passed else "FAILED",
+        )
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def to_line(o: Outcome) -> str:
+    """One line for a terminal."""
+    condition = "" if o.condition is None else f"{o.condition:8.1e}"
+    verdict = "passed" if o.passed else "FAILED"
+    text = (
+        f"{verdict}  {o.device:4}  {_figure(o.error):>8}  {_figure(o.tolerance):>8}  {condition:>8}  {o.key}"
+    )
+    if not o.passed:
+        text += f"\n        {o.failure or o.why}".rstrip()
+    return text
+
+
+HEADER = f"{'verdict':7} {'on':4}  {'error':>9} {'allowed':>9} {'condition':>9}  case"
+
+
+def _figure(value: float) -> str:
+    return "0" if value == 0 else f"{value:.1e}"

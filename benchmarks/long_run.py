@@ -1,0 +1,280 @@
+"""30 000 iterations on a small scene full of hard content: does anything blow up, and what does it look like?
+
+    python benchmarks/long_run.py [--iterations N] [--method 3dgs --method refinesplat] [-o FOLDER]
+
+The scene (48x27 px, made on the spot from a seed): a wall, 40 needles of aspect 1000 before it, a sky
+brighter than white, distractors, two photos that are all masked, a camera behind the wall and one inside
+the needles. A run that was stopped goes on where it was. Prints what was checked; writes
+benchmarks/results/long-run.json and docs/images/long-run.png. Exits 1 where a check fails.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from ambiguous_wild.core import Camera
+from ambiguous_wild.harness import evaluate
+from ambiguous_wild.io.atomic import atomic_path, write_json
+from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.methods import get_method
+from ambiguous_wild.splat.cpu.render import render_cpu
+from ambiguous_wild.splat.cpu.warmup import warm_up
+from ambiguous_wild.splat.data import load_train_data
+from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
+from ambiguous_wild.splat.trainer import TrainConfig, Trainer
+
+ROOT = Path(__file__).resolve().parent.parent
+RESULTS = ROOT / "benchmarks" / "results" / "long-run.json"
+PICTURE = ROOT / "docs" / "images" / "long-run.png"
+WIDTH, HEIGHT, FOCAL = 48, 27, 41.0
+TRAIN, TEST, MASKED = 12, 3, (4, 9)  # views; which of them are all masked
+CAP = 600  # Gaussians at most
+ROWS = 100  # looks at the model over a run
+
+
+# -- the scene ----------------------------------------------------------------------------------------
+
+
+def world(seed: int = 7) -> Gaussians:
+    """Wall at z = 4, needles before it, sky behind it; what the photos are drawn from."""
+    rng = np.random.default_rng(seed)
+    wall, needles, sky = 300, 40, 60
+    n = wall + needles + sky
+    means, scales, colour = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3))
+    means[:wall] = np.column_stack(
+        [rng.uniform(-3, 3, wall), rng.uniform(-0.2, 1.6, wall), rng.normal(4, 0.02, wall)]
+    )
+    scales[:wall] = 0.12
+    colour[:wall] = 0.5 + 0.4 * np.sin(3 * means[:wall] + np.array([0.0, 1.0, 2.0]))
+    part = slice(wall, wall + needles)
+    means[part] = np.column_stack(
+        [rng.uniform(-2, 2, needles), rng.uniform(-0.8, 1.0, needles), rng.uniform(2.5, 3.5, needles)]
+    )
+    scales[part] = [0.4, 4e-4, 4e-4]  # aspect 1000
+    colour[part] = rng.uniform(0, 1, (needles, 3))
+    means[wall + needles :] = np.column_stack(
+        [rng.uniform(-60, 60, sky), rng.uniform(-40, 10, sky), rng.uniform(45, 60, sky)]
+    )
+    scales[wall + needles :] = 9.0
+    colour[wall + needles :] = 3.0  # white three times over: every photo is clipped there
+    return Gaussians(
+        means=_tensor(means),
+        quats=_tensor(rng.normal(size=(n, 4))),
+        log_scales=_tensor(np.log(scales)),
+        opacity_logits=torch.full((n,), 3.0),
+        sh0=_tensor((colour - 0.5) / SH_C0),
+        sh_rest=torch.zeros(n, 0, 3),
+    )
+
+
+def cameras() -> list[Camera]:
+    """TRAIN + TEST along a line; the last two of training look from behind and from among the needles."""
+    found = []
+    for i in range(TRAIN + TEST):
+        x = -1.2 + 2.4 * (i % TRAIN) / (TRAIN - 1) + (0.1 if i >= TRAIN else 0.0)
+        centre, turn = np.array([x, 0.0, 0.0]), -0.15 * x
+        if i == TRAIN - 2:
+            centre, turn = np.array([0.5, 0.2, 8.0]), math.pi
+        if i == TRAIN - 1:
+            centre = np.array([0.1, 0.0, 3.0])
+        pose = np.eye(4)
+        c, s = math.cos(turn), math.sin(turn)
+        pose[:3, :3] = [[c, 0, s], [0, 1, 0], [-s, 0, c]]
+        pose[:3, 3] = -pose[:3, :3] @ centre
+        found.append(Camera(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, pose))
+    return found
+
+
+def write_scene(root: Path, seed: int = 7) -> Path:
+    """The scene folder, as any COLMAP scene; returns `root`."""
+    if (root / "test_list.txt").exists():
+        return root
+    for folder in ("images", "masks/train", "sparse/0"):
+        (root / folder).mkdir(parents=True, exist_ok=True)
+    truth, rng = world(seed), np.random.default_rng(seed + 1)
+    names, poses = [], []
+    for i, camera in enumerate(cameras()):
+        name = f"train_{i:02d}.png" if i < TRAIN else f"test_{i - TRAIN}.png"
+        photo = render_cpu(truth, camera, sh_degree=0).image.clamp(0, 1).numpy()
+        if i < TRAIN and i % 3 == 0:  # a distractor, elsewhere in every third photo
+            x, y = rng.integers(4, WIDTH - 14), rng.integers(8, HEIGHT - 10)
+            photo[y : y + 8, x : x + 10] = rng.uniform(0, 1, 3)
+        cv2.imwrite(str(root / "images" / name), np.round(photo[:, :, ::-1] * 255).astype(np.uint8))
+        if i in MASKED:
+            cv2.imwrite(str(root / "masks" / "train" / name), np.zeros((HEIGHT, WIDTH), np.uint8))
+        names.append(name)
+        poses.append(f"{i + 1} {_quaternion(camera)} {_words(camera.cam_from_world[:3, 3])} 1 {name}\n\n")
+    pinhole = f"1 PINHOLE {WIDTH} {HEIGHT} {FOCAL} {FOCAL} {WIDTH / 2} {HEIGHT / 2}\n"
+    (root / "sparse/0/cameras.txt").write_text(pinhole)
+    (root / "sparse/0/images.txt").write_text("".join(poses))
+    (root / "sparse/0/points3D.txt").write_text("".join(_points(truth, rng)))
+    (root / "train_list.txt").write_text("\n".join(names[:TRAIN]) + "\n")
+    (root / "test_list.txt").write_text("\n".join(names[TRAIN:]) + "\n")
+    return root
+
+
+def _points(truth: Gaussians, rng: np.random.Generator) -> list[str]:
+    """Every other centre, moved a little; one in thirty far off, as SfM has them."""
+    xyz = truth.means.numpy()[::2] + rng.normal(0, 0.02, (len(truth.means[::2]), 3))
+    xyz[::30] += rng.normal(0, 30.0, xyz[::30].shape)
+    rgb = (np.clip(truth.sh0.numpy()[::2] * SH_C0 + 0.5, 0, 1) * 255).astype(int)
+    return [f"{i} {_words(p)} {_words(c)} 0.5\n" for i, (p, c) in enumerate(zip(xyz, rgb), 1)]
+
+
+def _quaternion(camera: Camera) -> str:
+    angle = math.atan2(camera.cam_from_world[0, 2], camera.cam_from_world[0, 0])
+    return _words([math.cos(angle / 2), 0.0, math.sin(angle / 2), 0.0])
+
+
+def _words(values: Any) -> str:
+    return " ".join(repr(float(v)) if isinstance(v, (float, np.floating)) else str(v) for v in values)
+
+
+def _tensor(array: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
+
+
+# -- the run ------------------------------------------------------------------------------------------
+
+
+def train(method: str, scene_root: Path, folder: Path, iterations: int) -> list[dict[str, Any]]:
+    """Train to the end, from where it stands; rows of what was seen, one a hundredth of the run."""
+    scene = load_scene(scene_root)
+    data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=folder.parent / ".cache")
+    truth = evaluate.load_test_photos(scene)
+    entry = get_method(method)
+    config = TrainConfig(iterations=iterations, max_gaussians=CAP, checkpoint_every_s=30.0, probes=30)
+
+    def probe(draw: Any) -> float:
+        return evaluate.mean_psnr(truth, lambda camera: draw(camera).numpy())
+
+    trainer = Trainer(data, entry.build(entry.options()), config, folder=folder, probe=probe)
+    trainer.resume()
+    looks = Looks(folder / "looks.json", trainer.iteration, max(iterations // ROWS, 1))
+    trainer.train(tick=looks)
+    return [look | row for look, row in zip(looks.rows, trainer.timeline)]
+
+
+class Looks:
+    """What the model looked like, every so many iterations; kept beside the checkpoint."""
+
+    def __init__(self, path: Path, iteration: int, every: int) -> None:
+        import json
+
+        old = json.loads(path.read_text()) if path.exists() and iteration else []
+        self.path, self.every = path, every
+        self.rows: list[dict[str, Any]] = [row for row in old if row["iteration"] <= iteration]
+
+    def __call__(self, trainer: Trainer) -> None:
+        if trainer.iteration % self.every:
+            return
+        g = trainer.gaussians
+        scales = g.log_scales.exp()
+        self.rows.append(
+            {
+                "iteration": trainer.iteration,
+                "largest_scale": float(scales.max()),
+                "largest_aspect": float((scales.amax(1) / scales.amin(1)).max()),
+                "largest_mean": float(g.means.abs().max()),
+                "largest_logit": float(g.opacity_logits.abs().max()),
+                "finite": all(bool(torch.isfinite(t).all()) for _, t in g.items()),
+            }
+        )
+        write_json(self.path, self.rows)
+
+
+def judge(rows: list[dict[str, Any]], trainer_folder: Path) -> dict[str, Any]:
+    """The checks, each with the figures it rests on."""
+    loss = np.array([row["loss"] for row in rows])
+    psnr = [row["psnr_probe"] for row in rows if row["psnr_probe"] is not None]
+    tenth = max(len(loss) // 10, 1)
+    windows = np.convolve(loss, np.ones(tenth) / tenth, "valid")
+    counts = [row["gaussians"] for row in rows]
+    facts = {
+        "iterations": rows[-1]["iteration"],
+        "finite": all(row["finite"] for row in rows) and bool(np.isfinite(loss).all()),
+        "most_gaussians": max(counts),
+        "last_gaussians": counts[-1],
+        "loss_first_tenth": float(loss[:tenth].mean()),
+        "loss_best_tenth": float(windows.min()),
+        "loss_last_tenth": float(loss[-tenth:].mean()),
+        "psnr_first": psnr[0] if psnr else None,
+        "psnr_best": max(psnr) if psnr else None,
+        "psnr_last": psnr[-1] if psnr else None,
+        "largest_scale": max(row["largest_scale"] for row in rows),
+        "largest_aspect": max(row["largest_aspect"] for row in rows),
+        "largest_logit": max(row["largest_logit"] for row in rows),
+        "nonfinite_found": (trainer_folder / "nonfinite").exists(),
+        "train_s": rows[-1]["wall_s"],
+    }
+    facts["passed"] = bool(
+        facts["finite"]
+        and not facts["nonfinite_found"]
+        and facts["most_gaussians"] <= CAP
+        and facts["loss_last_tenth"] <= 1.1 * facts["loss_best_tenth"]
+        and facts["loss_last_tenth"] < facts["loss_first_tenth"]
+    )
+    return facts
+
+
+def draw(runs: dict[str, list[dict[str, Any]]], path: Path) -> None:
+    """Loss, PSNR of the test views, number of Gaussians and largest scale over the iterations."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12, 7), layout="constrained", dpi=100)
+    FigureCanvasAgg(figure)
+    panels = [
+        ("loss", "loss, mean of a hundredth of the run", "log"),
+        ("psnr_probe", "PSNR of the test views [dB]", "linear"),
+        ("gaussians", f"Gaussians (at most {CAP})", "linear"),
+        ("largest_scale", "largest scale [world units]", "log"),
+    ]
+    for axes, (key, title, scale) in zip(figure.subplots(2, 2).ravel(), panels):
+        for colour, (method, rows) in zip(("#4477aa", "#ee6677"), runs.items()):
+            shown = [(row["iteration"], row[key]) for row in rows if row[key] is not None]
+            axes.plot(*zip(*shown), color=colour, label=method, lw=1.6)
+        axes.set_title(title, fontsize=11)
+        axes.set_yscale(scale)
+        axes.set_xlabel("iteration")
+        axes.grid(alpha=0.25)
+        axes.legend(frameon=False)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, format="png", metadata={"Software": None})
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--iterations", type=int, default=30_000)
+    parser.add_argument("--method", action="append", help="repeatable; default: 3dgs and refinesplat")
+    parser.add_argument("-o", "--output", type=Path, default=ROOT / "runs" / "long-run")
+    parser.add_argument("--json", type=Path, default=RESULTS, help="where the figures go")
+    parser.add_argument("--picture", type=Path, default=PICTURE, help="where the plot goes")
+    args = parser.parse_args()
+    warm_up(lambda text: print(text, file=sys.stderr))
+    scene = write_scene(args.output / "scene")
+    runs, facts = {}, {}
+    for method in args.method or ["3dgs", "refinesplat"]:
+        folder = args.output / f"{method}-{args.iterations}"
+        runs[method] = train(method, scene, folder, args.iterations)
+        facts[method] = judge(runs[method], folder)
+        print(method, *(f"{name} {value}" for name, value in facts[method].items()), sep="\n  ")
+        keys = ("iteration", "loss", "psnr_probe", "gaussians", "largest_scale")
+        over_time = {m: [{k: row[k] for k in keys} for row in rows] for m, rows in runs.items()}
+        write_json(args.json, {"width": WIDTH, "height": HEIGHT, "runs": facts, "over_time": over_time})
+        draw(runs, args.picture)
+    print(f"wrote {args.json} and {args.picture}")
+    return 0 if all(f["passed"] for f in facts.values()) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

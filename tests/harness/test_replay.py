@@ -1,0 +1,71 @@
+"""A run that met a NaN is run up to it again, from its own folder alone."""
+
+import math
+
+import pytest
+import torch
+from click.testing import CliRunner
+
+from ambiguous_wild.cli.main import cli
+from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.grid import cell_folder, plan_cells, run_cells
+from ambiguous_wild.harness.replay import replay
+from ambiguous_wild.harness.store import read_result
+from ambiguous_wild.methods import MethodEntry, register, registry
+from ambiguous_wild.splat.parts import MaskPolicy, Parts
+from ambiguous_wild.splat.trainer import TrainConfig
+from tests.tiny_scene import write_tiny_scene
+
+
+class Poison(MaskPolicy):
+    def cotangent(self, step, keep):
+        return torch.full_like(step.photo, math.nan) if step.iteration == 9 else None
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    monkeypatch.setattr(registry, "_registered", {})
+    register(MethodEntry("poison", "a NaN at iteration 9", lambda options: Parts(mask=Poison())))
+    scene = write_tiny_scene(tmp_path / "scene")
+
+    def go(action):
+        train = TrainConfig(iterations=12, probes=0, on_nonfinite=action)
+        (cell,) = plan_cells(["poison"], [scene], [0], train)
+        (report,) = run_cells([cell], tmp_path / "runs")
+        return cell_folder(tmp_path / "runs", cell), report
+
+    return go
+
+
+def test_the_same_value_is_found_again_and_the_run_is_left_alone(run):
+    folder, report = run("stop")
+    assert report.outcome == "failed"
+    assert "gradient of" in report.error
+    assert "aw stress --replay" in report.error
+    before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+    again = replay(folder)
+    assert again.same
+    assert again.started_at == 0
+    assert before == {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+    done = CliRunner().invoke(cli, ["stress", "--replay", str(folder)])
+    assert done.exit_code == 0
+    assert done.output.count("iteration 9") == 2
+
+
+def test_a_rollback_is_a_fact_of_the_result(run):
+    folder, report = run("rollback")
+    assert report.outcome == "trained", report.error
+    (fact,) = read_result(folder / "metrics.json")["facts"]["rollbacks"]
+    assert (fact["iteration"], fact["to"]) == (9, 0)
+
+
+def test_a_run_without_findings_is_named(tmp_path):
+    with pytest.raises(AwError, match="its watchdog found nothing"):
+        replay(tmp_path)
+
+
+def test_a_damaged_report_is_named(run):
+    folder, _ = run("stop")
+    (folder / "nonfinite" / "000009" / "report.json").write_text("[]")
+    with pytest.raises(AwError, match="is damaged"):
+        replay(folder)

@@ -29,7 +29,7 @@ class SupportConfig:
 
 
 class Support:
-    """Counts, a row a Gaussian, how often its centre was in the frame and how often it reached a kept pixel."""
+    """Per Gaussian, how often its centre was in the frame and how often it reached a kept pixel."""
 
     def __init__(self, config: SupportConfig) -> None:
         self.config = config

@@ -21,11 +21,18 @@ VISIBLE = torch.tensor([True, True, True, False])
 LEFT_MASKED = torch.cat([torch.zeros(8, 4), torch.ones(8, 4)], dim=1)
 
 
-def looked(looks, keep=LEFT_MASKED):
+def model(size=0.01):
+    """One Gaussian at each of MEANS, round."""
+    gaussians = Gaussians.from_points(MEANS.double().numpy(), np.full((4, 3), 99, np.uint8))
+    gaussians.log_scales[:] = float(np.log(size))
+    return gaussians
+
+
+def looked(looks, keep=LEFT_MASKED, size=0.01):
     support = Support(SupportConfig())
     support.match(4, torch.device("cpu"))
     for _ in range(looks):
-        support.look(MEANS, VISIBLE, CAMERA, keep)
+        support.look(model(size), VISIBLE, CAMERA, keep)
     return support
 
 
@@ -49,15 +56,21 @@ def test_without_a_mask_everyone_is_vouched_for():
 
 def test_one_kept_look_in_eight_is_enough():
     support = looked(7)
-    support.look(MEANS, VISIBLE, CAMERA, None)
+    support.look(model(), VISIBLE, CAMERA, None)
     assert not support.judge().any()
+
+
+def test_a_large_one_is_vouched_for_by_its_flanks():
+    # 0.25 left of the middle: a standard deviation of 0.3 reaches the kept half, one of 0.2 does not
+    assert looked(8, size=0.2).judge().tolist() == [True, False, False, False]
+    assert not looked(8, size=0.3).judge().any()
 
 
 def test_old_evidence_fades():
     support = looked(8, None)
     support.judge()
     for _ in range(80):
-        support.look(MEANS, VISIBLE, CAMERA, LEFT_MASKED)
+        support.look(model(), VISIBLE, CAMERA, LEFT_MASKED)
         gone = support.judge()
         if bool(gone[0]):
             break
@@ -89,7 +102,7 @@ def refined(control, gaussians, iterations, keep):
 def test_rows_of_everything_go_together(share, left):
     config = EntropyDensityConfig(support=SupportConfig(least_share=share))
     control = EntropyAwareDensity(config, 1.0, 0)
-    gaussians = Gaussians.from_points(MEANS.double().numpy(), np.full((4, 3), 99, np.uint8))
+    gaussians = model()
     after, events, optimiser = refined(control, gaussians, 60, LEFT_MASKED)
     assert len(after) == left
     assert events == (["prune"] if left == 3 else [])
@@ -102,7 +115,7 @@ def test_rows_of_everything_go_together(share, left):
 
 def test_it_never_removes_everything():
     control = EntropyAwareDensity(EntropyDensityConfig(), 1.0, 0)
-    gaussians = Gaussians.from_points(MEANS.double().numpy(), np.full((4, 3), 99, np.uint8))
+    gaussians = model()
     gaussians = gaussians.select(torch.arange(2))
     after, events, _ = refined(control, gaussians, 60, torch.zeros(8, 8))
     assert len(after) == 2
@@ -111,7 +124,7 @@ def test_it_never_removes_everything():
 
 def test_the_counts_survive_a_stop():
     control = EntropyAwareDensity(EntropyDensityConfig(), 1.0, 0)
-    gaussians = Gaussians.from_points(MEANS.double().numpy(), np.full((4, 3), 99, np.uint8))
+    gaussians = model()
     refined(control, gaussians, 30, LEFT_MASKED)
     other = EntropyAwareDensity(EntropyDensityConfig(), 1.0, 0)
     other.load_state_dict(control.state_dict())
@@ -123,7 +136,7 @@ def test_the_counts_survive_a_stop():
 def test_growth_goes_first_and_the_judgement_follows():
     config = EntropyDensityConfig(start=0.0, grow_grad=1e-9, grow_scale=1e9, min_every=50)
     control = EntropyAwareDensity(config, 1.0, 0)
-    gaussians = Gaussians.from_points(MEANS.double().numpy(), np.full((4, 3), 99, np.uint8))
+    gaussians = model()
     optimiser = SplatAdam(gaussians, RATES)
     seen = []
     for iteration in range(1, 56):

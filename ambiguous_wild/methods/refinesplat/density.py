@@ -73,7 +73,7 @@ class EntropyAwareDensity(DensityControl):
             self.downhill -= gradients.means
         if self.support.due(step.iteration):
             self.support.match(len(step.gaussians), step.gaussians.device)
-            self.support.look(step.gaussians.means, step.rendered.visible, step.camera, keep)
+            self.support.look(step.gaussians, step.rendered.visible, step.camera, keep)
 
     @torch.no_grad()
     def refine(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> tuple[Gaussians, list[str]]:

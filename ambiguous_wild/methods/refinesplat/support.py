@@ -15,19 +15,21 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import Camera
+from ambiguous_wild.splat.density import rotation_matrices
+from ambiguous_wild.splat.gaussians import Gaussians
 
 
 @dataclass(frozen=True)
 class SupportConfig:
     """When a Gaussian counts as vouched for by nobody."""
 
-    least_share: float = 0.1  # of the looks its centre must lie on a kept pixel; 0 = never removed (printed)
+    least_share: float = 0.1  # of the looks it must reach a kept pixel; 0 = never removed (printed)
     looks: int = 8  # with its centre in the frame before it is judged
     every: int = 4  # iterations between looks
 
 
 class Support:
-    """Counts, a row a Gaussian, how often its centre lay in the frame and how often on a kept pixel."""
+    """Per Gaussian, how often its centre was in the frame and how often it reached a kept pixel."""
 
     def __init__(self, config: SupportConfig) -> None:
         self.config = config
@@ -38,25 +40,26 @@ class Support:
         """Whether this iteration is looked at."""
         return self.config.least_share > 0 and iteration % self.config.every == 0
 
-    def look(self, means: Tensor, visible: Tensor, camera: Camera, keep: Tensor | None) -> None:
+    def look(self, gaussians: Gaussians, visible: Tensor, camera: Camera, keep: Tensor | None) -> None:
         """Add one view.
 
         Args:
-            means: [N, 3] in the world.
+            gaussians: N of them.
             visible: [N] bool, passed every cull of the render.
             camera: of the step.
             keep: [H, W] float32 at the camera's size, 1 = static; None = all of it.
         """
         rows = torch.nonzero(visible).squeeze(1)
-        pose = torch.tensor(camera.cam_from_world.tolist(), dtype=means.dtype, device=means.device)
-        local = means[rows] @ pose[:3, :3].T + pose[:3, 3]
-        z = local[:, 2].clamp(min=1e-6)
-        u = torch.floor(local[:, 0] / z * camera.fx + camera.cx).long()
-        v = torch.floor(local[:, 1] / z * camera.fy + camera.cy).long()
-        inside = (local[:, 2] > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-        rows, u, v = rows[inside], u[inside], v[inside]
-        self.looked[rows] += 1.0
-        self.kept[rows] += 1.0 if keep is None else (keep[v, u] > 0.5).to(self.kept.dtype)
+        inside, vouched = _on_kept(gaussians.means[rows], camera, keep)
+        self.looked[rows] += inside.to(self.looked.dtype)
+        hidden = rows[inside & ~vouched]
+        if len(hidden):
+            # a large one is vouched for by its flanks too: one standard deviation along every axis
+            axes = rotation_matrices(gaussians.quats[hidden]) * gaussians.log_scales[hidden].exp()[:, None, :]
+            ends = gaussians.means[hidden][:, None, :] + torch.cat([axes, -axes], dim=2).transpose(1, 2)
+            _, flanks = _on_kept(ends.reshape(-1, 3), camera, keep)
+            vouched[inside & ~vouched] = flanks.reshape(-1, 6).any(dim=1)
+        self.kept[rows] += (inside & vouched).to(self.kept.dtype)
 
     def judge(self) -> Tensor:
         """Who is to go, [N] bool; the evidence on those who were judged and stay counts half from now on."""
@@ -81,3 +84,17 @@ class Support:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.looked, self.kept = state["looked"], state["kept"]
+
+
+def _on_kept(points: Tensor, camera: Camera, keep: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Of points [N, 3] in the world: which the frame holds, and which lie on a kept pixel, [N] bool each."""
+    pose = torch.tensor(camera.cam_from_world.tolist(), dtype=points.dtype, device=points.device)
+    local = points @ pose[:3, :3].T + pose[:3, 3]
+    z = local[:, 2].clamp(min=1e-6)
+    u = torch.floor((local[:, 0] / z * camera.fx + camera.cx).clamp(-1.0, camera.width)).long()
+    v = torch.floor((local[:, 1] / z * camera.fy + camera.cy).clamp(-1.0, camera.height)).long()
+    inside = (local[:, 2] > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    if keep is None:
+        return inside, inside.clone()
+    kept = keep[v.clamp(0, camera.height - 1), u.clamp(0, camera.width - 1)] > 0.5
+    return inside, inside & kept

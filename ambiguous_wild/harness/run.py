@@ -21,7 +21,7 @@ from ambiguous_wild.harness import evaluate
 from ambiguous_wild.harness import pictures as run_pictures
 from ambiguous_wild.harness.choosing import Chosen
 from ambiguous_wild.harness.environment import environment
-from ambiguous_wild.harness.identity import config_identity
+from ambiguous_wild.harness.identity import IGNORED, config_identity
 from ambiguous_wild.harness.identity import scene_identity as scene_identity  # as it always was here
 from ambiguous_wild.harness.memory import peak_rss_mb, reset_peak
 from ambiguous_wild.harness.store import read_result, write_result
@@ -43,7 +43,6 @@ TRACEBACK = "traceback.txt"
 EFFECTS = "effects.json"
 # What a run leaves before anything worth keeping exists in its folder.
 _WORTHLESS = {"config.yaml", "env.json", EFFECTS, FAILED, TRACEBACK}
-_NOT_IDENTITY = ("checkpoint_every_s", "probes", "on_nonfinite")  # of a run's TrainConfig
 
 
 @dataclass(frozen=True)
@@ -212,7 +211,7 @@ def refuse_other_config(folder: Path, cell: Cell) -> None:
         raise AwError(f"{path} is damaged ({error}); start anew with --overwrite always") from None
     if old.get("config_hash") == cell.identity:
         return
-    ignored = {f"train.{key}" for key in _NOT_IDENTITY} | {"scene.path", "config_hash"}
+    ignored = {f"{part}.{key}" for part, keys in IGNORED.items() for key in keys} | {"config_hash"}
     before, now = _flat(old), _flat(cell.config)
     names = [
         k for k in sorted(before.keys() | now.keys()) if before.get(k) != now.get(k) and k not in ignored

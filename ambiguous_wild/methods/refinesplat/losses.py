@@ -62,8 +62,12 @@ def consistency_loss(logits: Tensor, one_hot: Tensor, variant: Variant = "sigmoi
     else:
         raise unknown("entropy variant", variant, ("sigmoid", "softmax"))
     total = logits.new_zeros(int(used.sum()))
+    of = one_hot[used].argmax(0)  # the instance of each cell; those of none weigh nothing
     for s, log_s in sides:
-        total = total + (weights @ (s * log_s)).sum(1) - ((weights @ s) * (weights @ log_s)).sum(1)
+        # mean[s l] - mean[s] mean[l] = mean[(s - mean s) (l - mean l)]: where the cells agree, the first form
+        # is a difference of numbers equal to seven digits
+        apart = (s - (weights @ s)[of]) * (log_s - (weights @ log_s)[of])
+        total = total + (weights @ apart).sum(1)
     return total.mean()
 
 

@@ -66,7 +66,9 @@ def overlap(
     scale = np.sqrt(np.maximum(np.einsum("nii->ni", total), 1e-300))
     normed = total / scale[:, :, None] / scale[:, None, :]
     d = delta / scale
-    squared = np.einsum("ni,ni->n", d, np.linalg.solve(normed, d[:, :, None])[:, :, 0])
+    # by eigenvalues, floored: two parallel needles of aspect 1e12 are singular in float64, and solve raises
+    values, vectors = np.linalg.eigh(normed)
+    squared = (np.einsum("nij,ni->nj", vectors, d) ** 2 / np.maximum(values, _EIGEN_FLOOR)).sum(1)
     log_total = _log_det(normed) + 2 * np.log(scale).sum(1)
     if form == "normalised":
         log_parts = 0.25 * (_log_det(cov_i) + _log_det(cov_j) + 6 * math.log(2.0))

@@ -58,9 +58,8 @@ def write_scene(root: Path, seed: int, *, views: int = 8, width: int = 96) -> Pa
             points += [(*xyz[i], *made.photo.reshape(-1, 3)[i]) for i in chosen]
         pose = camera.cam_from_world
         w, x, y, z = quaternion(pose[:3, :3])
-        cameras.append(
-            f"{number} PINHOLE {camera.width} {camera.height} {camera.fx} {camera.fy} {camera.cx} {camera.cy}\n"
-        )
+        numbers = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        cameras.append(f"{number} PINHOLE {' '.join(map(str, numbers))}\n")
         images.append(f"{number} {w} {x} {y} {z} {pose[0, 3]} {pose[1, 3]} {pose[2, 3]} {number} {name}\n\n")
     for side in ("train", "test"):
         names = [f"{Path(s.name).stem}.png\n" for s in shots if s.split == side]

@@ -5,13 +5,17 @@ from __future__ import annotations
 import shlex
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
+
+if TYPE_CHECKING:
+    from ambiguous_wild.harness.store import Runs
 
 
 @click.command(name="table")
 @click.argument("runs", type=click.Path(path_type=Path))
-@click.option("--format", "style", type=click.Choice(["text", "markdown", "csv", "latex"]), default="text",
+@click.option("--format", "style", type=click.Choice(["text", "markdown", "csv", "latex", "tidy"]), default="text",
               show_default=True)  # fmt: skip
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path, dir_okay=False), help="Write to a file instead."
@@ -41,6 +45,7 @@ def command(
     \b
     aw table runs
     aw table runs --format latex --metric psnr --metric ssim -o table.tex
+    aw table runs --format tidy -o results.csv    one row a method, scene, seed, image and metric
     """
     from ambiguous_wild.harness.render_tables import RENDERERS, plain, to_text
     from ambiguous_wild.harness.store import read_runs
@@ -48,6 +53,9 @@ def command(
     from ambiguous_wild.io.atomic import write_text
 
     found = read_runs(runs)
+    if style == "tidy":
+        _write_tidy(found, output, metrics, scenes)
+        return
     table = comparison(found, metrics=metrics, scenes=scenes)
     if sheet is not None:
         from ambiguous_wild.harness.sheet import write_sheet
@@ -73,6 +81,20 @@ def command(
     }
     told = ", ".join(f"{n} {what}{'' if n == 1 else 's'}" for what, n in counts.items())
     click.echo(f"wrote {output}: {told}", err=True)
+
+
+def _write_tidy(runs: Runs, output: Path | None, metrics: tuple[str, ...], scenes: tuple[str, ...]) -> None:
+    from ambiguous_wild.harness.table_frame import tidy, to_csv
+    from ambiguous_wild.io.atomic import write_text
+
+    frame = tidy(runs, metrics=metrics, scenes=scenes)
+    for run in runs.incomplete:
+        click.echo(f"incomplete: {run.folder}: {run.reason}", err=True)
+    if output is None:
+        click.echo(to_csv(frame), nl=False)
+        return
+    write_text(output, to_csv(frame))
+    click.echo(f"wrote {output}: {len(frame)} rows", err=True)
 
 
 def command_line(runs: Path, style: str, metrics: tuple[str, ...], scenes: tuple[str, ...]) -> str:

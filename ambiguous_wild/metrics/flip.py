@@ -59,9 +59,9 @@ def flip_map(
     """
     if not (math.isfinite(pixels_per_degree) and pixels_per_degree > 0):
         raise AwError(f"pixels per degree must be above zero, got {pixels_per_degree}")
-    opponents = [_opponent(_linear(picture)) for picture in checked_pair(a, b)]
-    colour = _colour_error(*(_as_seen(x, pixels_per_degree) for x in opponents))
-    feature = _feature_error(*((x[..., 0] + 16.0) / 116.0 for x in opponents), pixels_per_degree)
+    first, second = (_opponent(_linear(picture)) for picture in checked_pair(a, b))
+    colour = _colour_error(_as_seen(first, pixels_per_degree), _as_seen(second, pixels_per_degree))
+    feature = _feature_error(_luminance(first), _luminance(second), pixels_per_degree)
     return colour ** (1.0 - feature)  # equation 7
 
 
@@ -87,6 +87,11 @@ _YCC_FROM_RGB = _YCC_FROM_XYZ @ (_XYZ_FROM_RGB / _XYZ_WHITE[:, None])
 
 def _opponent(linear: np.ndarray) -> np.ndarray:
     return linear @ _YCC_FROM_RGB.T + _YCC_OFFSET
+
+
+def _luminance(opponent: np.ndarray) -> np.ndarray:
+    """Y of YCxCz brought to [0, 1], [H, W]."""
+    return (opponent[..., 0] + 16.0) / 116.0
 
 
 def _as_seen(opponent: np.ndarray, pixels_per_degree: float) -> np.ndarray:

@@ -37,6 +37,7 @@ from ambiguous_wild.splat.cpu.warmup import warm_up
 METHODS = ("3dgs", "robustsplat", "refinesplat")
 CLOCK = {"train_s", "setup_s", "ms_per_iteration", "ms_parts", "fps", "fps_low", "fps_high", "peak_rss_mb"}
 CLOCK |= {"elapsed_s", "parts_s", "wall_s"}
+CLOCK |= {"cores"}  # that the process may use: whoever shares the machine may change it between two starts
 POINTS_A_VIEW = 60
 
 

@@ -21,6 +21,7 @@ from ambiguous_wild.methods.ablation import Group
 )
 @click.option("--group", "groups", multiple=True, help="Only this group; repeatable.  [default: all]")
 @training_options
+@click.option("--budget", help="Training time instead: 90s, 10m, 1.5h. Schedules scale with it.")
 @click.option(
     "--set", "settings", multiple=True, metavar="KEY=VALUE", help="An option in every row; repeatable."
 )

@@ -48,6 +48,12 @@ def parse_budget(text: str) -> float:
 )
 @training_options
 @click.option(
+    "--budget",
+    "budgets",
+    multiple=True,
+    help="Training time instead: 90s, 10m, 1.5h. Schedules scale with it. Repeatable: every length, for 'aw cost'.",
+)
+@click.option(
     "--resolution",
     type=click.Choice(["auto", "full", "coarse-to-fine"]),
     default="auto",
@@ -63,8 +69,9 @@ def parse_budget(text: str) -> float:
 @click.option(
     "--effects",
     metavar="auto|none|all|LIST",
-    default="default",
-    help="Optional effects, see 'aw plan'; LIST: names with commas.  [default: auto where the method allows it, else none]",
+    multiple=True,
+    default=("default",),
+    help="Optional effects, see 'aw plan'; LIST: names with commas. Repeatable: every choice, for 'aw cost'.  [default: auto where the method allows it, else none]",
 )
 @click.option(
     "--plan",
@@ -80,6 +87,13 @@ def parse_budget(text: str) -> float:
     help="half: colour effects see the left half of a test photo, the right one is measured (NeRF-W).",
 )
 @click.option("-o", "--output", type=click.Path(path_type=Path), default=Path("runs"), show_default=True)
+@click.option(
+    "--probes",
+    type=click.IntRange(0, 100),
+    default=8,
+    show_default=True,
+    help="Times the test PSNR is measured on the way, the clock standing still; does not change the result.",
+)
 @click.option(
     "--checkpoint-every",
     type=click.FloatRange(min=0.0, min_open=True),
@@ -99,7 +113,7 @@ def command(
     scenes: tuple[Path, ...],
     seeds: tuple[int, ...],
     iterations: int | None,
-    budget: str | None,
+    budgets: tuple[str, ...],
     device: str,
     threads: int | None,
     factor: int | None,
@@ -110,10 +124,11 @@ def command(
     regulariser: str | None,
     settings: tuple[str, ...],
     plugins: tuple[Path, ...],
-    effects: str,
+    effects: tuple[str, ...],
     plan_file: Path | None,
     protocol: str,
     output: Path,
+    probes: int,
     overwrite: str,
     cache: Path | None,
     checkpoint_every: float,
@@ -125,14 +140,19 @@ def command(
     \b
     aw bench --method 3dgs --method refinesplat --scene scene -o runs
     aw bench --method refinesplat --scene scene --budget 10m --set refinesplat.lambda_cr=0.1
+    aw bench --method 3dgs --method refinesplat --scene scene --budget 1m --budget 3m --budget 10m -o runs
     aw bench --method 3dgs --method robustsplat --mask refinesplat --scene scene -o runs
 
     --mask, --density and --regulariser plug parts of one method into every METHOD: the runs are called
     3dgs@mask=refinesplat, which is also a METHOD.
+
+    Several --budget or --effects train every combination, each into a folder of its own:
+    runs/budget-60s/effects-exposure/SCENE/METHOD/seed0. 'aw cost runs' compares them all, 'aw table' those of
+    one folder.
     """
-    if iterations is not None and budget is not None:
+    if iterations is not None and budgets:
         raise AwError("--iterations and --budget exclude each other: a run is as long as one of them says")
-    seconds = None if budget is None else parse_budget(budget)
+    seconds = [parse_budget(budget) for budget in budgets]
     if math.isnan(checkpoint_every):
         raise AwError("--checkpoint-every nan: give a number of seconds")
 
@@ -147,41 +167,50 @@ def command(
         get_method(name)  # a misspelt name is answered before torch is imported
     from ambiguous_wild.harness.choosing import check_wanted
 
-    check_wanted(effects)
+    for wanted in effects:
+        check_wanted(wanted)
     if plan_file is not None and len(scenes) > 1:
         raise AwError(
             f"--plan {plan_file} is of one scene; bench {len(scenes)} scenes one by one, or without it"
         )
 
     from ambiguous_wild.harness.grid import plan_cells, run_cells
+    from ambiguous_wild.harness.several import grouped
     from ambiguous_wild.io.atomic import check_output
     from ambiguous_wild.splat.trainer import TrainConfig
 
     chosen = choose_device(device)
     train = TrainConfig(
         iterations=iterations or TrainConfig.iterations,
-        budget_s=seconds,
+        budget_s=seconds[0] if seconds else None,
+        probes=probes,
         resolution=resolution,  # type: ignore[arg-type]
         max_gaussians=max_gaussians,
         checkpoint_every_s=checkpoint_every,
     )
     from ambiguous_wild.harness.planning.file import read_plan
 
-    cells = plan_cells(
-        methods,
-        scenes,
-        seeds,
-        train,
-        settings=settings,
-        device=chosen,
-        factor=factor,
-        effects=effects,
-        plan=None if plan_file is None else read_plan(plan_file),
-        protocol=protocol,  # type: ignore[arg-type]
-    )
-    for cell in cells:
-        if cell.chosen.effects:
-            click.echo(f"{cell.method.name} on {cell.scene.name}: {', '.join(cell.chosen.effects)}", err=True)
+    plan = None if plan_file is None else read_plan(plan_file)
+    planned = {
+        wanted: plan_cells(
+            methods,
+            scenes,
+            seeds,
+            train,
+            settings=settings,
+            device=chosen,
+            factor=factor,
+            effects=wanted,
+            plan=plan,
+            protocol=protocol,  # type: ignore[arg-type]
+        )
+        for wanted in dict.fromkeys(effects)
+    }
+    cells = grouped(planned, seconds)
+    told = {(cell.method.name, cell.scene.name, cell.chosen.effects): None for cell in cells}
+    for method, name, on in told:
+        if on:
+            click.echo(f"{method} on {name}: {', '.join(on)}", err=True)
     for scene in {cell.scene.name: cell.scene for cell in cells}.values():
         for warning in scene.info.get("warnings", ()):
             click.echo(f"warning: {scene.name}: {warning}", err=True)
@@ -206,7 +235,7 @@ def command(
         on_start=progress.start,
         on_end=progress.end,
     )
-    _finish(reports, output, as_json)
+    _finish(reports, output, as_json, [str(output / group) for group in {cell.group: None for cell in cells}])
 
 
 def choose_device(device: str) -> str:
@@ -252,6 +281,7 @@ class Progress:
         self.index += 1
         self.title = (
             f"[{self.index}/{self.cells}] {cell.method.name} on {cell.scene.name}, seed {cell.train.seed}"
+            + (f", {cell.group}" if cell.group else "")
         )
         click.echo(f"{self.title} -> {folder}", err=True)
 
@@ -299,7 +329,7 @@ def _outcome_line(report: CellReport) -> str:
     )
 
 
-def _finish(reports: list[CellReport], output: Path, as_json: bool) -> None:
+def _finish(reports: list[CellReport], output: Path, as_json: bool, folders: list[str]) -> None:
     counts = Counter(report.outcome for report in reports)
     summary = ", ".join(f"{n} {name}" for name, n in counts.items())
     if as_json:
@@ -308,7 +338,9 @@ def _finish(reports: list[CellReport], output: Path, as_json: bool) -> None:
     failed = [report for report in reports if report.outcome == "failed"]
     if len(failed) == len(reports) == 1:
         raise AwError(failed[0].error)
-    compare = f"compare them with: aw table {shlex.quote(str(output))}"
+    compare = f"compare them with: aw {'cost' if len(folders) > 1 else 'table'} {shlex.quote(str(output))}"
+    if len(folders) > 1:
+        compare += f", or one folder with: aw table {shlex.quote(folders[0])}"
     click.echo(f"{len(reports)} run{'s' if len(reports) > 1 else ''}: {summary}; {compare}", err=True)
     if failed:
         raise AwError(f"{len(failed)} of {len(reports)} runs failed: " + failed[0].error)

@@ -24,7 +24,9 @@ COMMANDS = {
     "bench": ("bench", "Train methods on scenes and measure them."),
     "ablate": ("ablate", "What each part of a method brings, and what it costs."),
     "table": ("table", "Compare runs: Markdown, CSV, LaTeX."),
+    "cost": ("cost", "What accuracy costs in time: tables and plots."),
     "audit": ("audit", "What cannot be right in a table of results."),
+    "leaderboard": ("leaderboard", "Take checked runs into CSVs, and publish them as a page."),
     "study": ("study", "Ask people, blind: what is hard to see, which render is better."),
     "methods": ("methods", "List the methods there are."),
 }

@@ -19,7 +19,6 @@ _OPTIONS = (
         help="Repeatable.",
     ),
     click.option("--iterations", type=click.IntRange(1), help="Length of a training.  [default: 30000]"),
-    click.option("--budget", help="Training time instead: 90s, 10m, 1.5h. Schedules scale with it."),
     click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True),
     click.option("--threads", type=click.IntRange(1), help="CPU threads; the result does not depend on it."),
     click.option(
@@ -53,7 +52,7 @@ _OPTIONS = (
 
 
 def training_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add them to a click command, as seeds, iterations, budget, device, threads, factor, max_gaussians,
+    """Add them to a click command, as seeds, iterations, device, threads, factor, max_gaussians,
     plugins, overwrite and cache."""
     for option in reversed(_OPTIONS):
         command = option(command)

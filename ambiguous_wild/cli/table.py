@@ -4,19 +4,29 @@ from __future__ import annotations
 
 import shlex
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
+from ambiguous_wild.core.errors import AwError
+
 if TYPE_CHECKING:
+    from ambiguous_wild.harness.layouts.grid import Layout
     from ambiguous_wild.harness.store import Runs
+
+STYLES = ("text", "markdown", "csv", "latex", "html", "tidy")
+LAYOUTS = ("blocks", "paper", "means", "memory", "ablation")
 
 
 @click.command(name="table")
 @click.argument("runs", type=click.Path(path_type=Path))
-@click.option("--format", "style", type=click.Choice(["text", "markdown", "csv", "latex", "tidy"]), default="text",
-              show_default=True)  # fmt: skip
+@click.option("--format", "style", type=click.Choice(STYLES), default="text", show_default=True)
+@click.option(
+    "--layout", type=click.Choice(LAYOUTS), default="blocks", show_default=True,
+    help="blocks: a table a scene; paper: scenes side by side; means: over each dataset; memory: MB by scene; ablation: of 'aw ablate -o RUNS'.",
+)  # fmt: skip
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path, dir_okay=False), help="Write to a file instead."
 )
@@ -25,6 +35,15 @@ if TYPE_CHECKING:
 )
 @click.option("--scene", "scenes", multiple=True, help="Only this scene; repeatable.  [default: all]")
 @click.option(
+    "--dataset", "datasets", multiple=True, metavar="NAME=SCENE,SCENE",
+    help="Scenes that have tables and a mean of their own; repeatable.  [default: as the reported tables have them]",
+)  # fmt: skip
+@click.option("--reported", is_flag=True, help="Show what papers print below, in rows of their own.")
+@click.option(
+    "--reported-from", type=click.Path(path_type=Path, exists=True),
+    help="Their tables, as 'aw audit' reads them.  [default: leaderboard/reported]",
+)  # fmt: skip
+@click.option(
     "--sheet",
     type=click.Path(path_type=Path, dir_okay=False),
     help="Also write a PNG: test renders side by side, and what each method masks.",
@@ -32,9 +51,13 @@ if TYPE_CHECKING:
 def command(
     runs: Path,
     style: str,
+    layout: str,
     output: Path | None,
     metrics: tuple[str, ...],
     scenes: tuple[str, ...],
+    datasets: tuple[str, ...],
+    reported: bool,
+    reported_from: Path | None,
     sheet: Path | None,
 ) -> None:
     """Compare the runs below the folder RUNS: quality, cost and masks, method by method.
@@ -44,51 +67,62 @@ def command(
 
     \b
     aw table runs
-    aw table runs --format latex --metric psnr --metric ssim -o table.tex
+    aw table runs --layout paper --format latex -o table.tex
+    aw table runs --layout means --format html --reported -o means.html
     aw table runs --format tidy -o results.csv    one row a method, scene, seed, image and metric
     """
-    from ambiguous_wild.harness.render_tables import RENDERERS, plain, to_text
-    from ambiguous_wild.harness.store import read_runs
-    from ambiguous_wild.harness.tables import comparison
+    if style == "tidy":
+        if layout != "blocks" or datasets or reported or reported_from or sheet:
+            raise AwError(
+                "--format tidy goes with --metric, --scene and -o alone: it is every number there is"
+            )
+        _write_tidy(_read(runs), output, metrics, scenes)
+        return
+    if layout in ("blocks", "ablation"):
+        refused = {"--dataset": datasets, "--reported": reported or reported_from}
+        if layout == "ablation":
+            refused |= {"--scene": scenes, "--sheet": sheet}
+        for flag, value in refused.items():
+            if value:
+                raise AwError(
+                    f"{flag} does not go with --layout {layout}: give --layout paper, means or memory"
+                )
     from ambiguous_wild.io.atomic import write_text
 
-    found = read_runs(runs)
-    if style == "tidy":
-        _write_tidy(found, output, metrics, scenes)
-        return
-    table = comparison(found, metrics=metrics, scenes=scenes)
-    if sheet is not None:
+    found = None if layout == "ablation" else _read(runs)
+    if sheet is not None and found is not None:
         from ambiguous_wild.harness.sheet import write_sheet
 
         shown = write_sheet(found, sheet, scene=scenes[0] if scenes else None)
         click.echo(f"wrote {sheet}: {shown} methods side by side", err=True)
-    made_by = "made by: " + command_line(runs, style, metrics, scenes)
-    if style == "csv":
-        for note in (*table.notes, made_by):
-            click.echo(plain(note), err=True)
-    else:
-        table = table.with_note(made_by)
+    made_by = "made by: " + command_line(
+        runs, style, metrics, scenes, layout, datasets, reported, reported_from
+    )
     color = style == "text" and output is None and sys.stdout.isatty()
-    text = to_text(table, color=True) if color else RENDERERS[style](table)
+    if found is not None and layout == "blocks" and style != "html":
+        text, told = _blocks(found, style, metrics, scenes, made_by, color)
+    else:
+        made = _layouts(found, runs, layout, metrics, scenes, _named(datasets), reported, reported_from)
+        text, told = _laid_out(made, style, made_by, color)
     if output is None:
         click.echo(text, nl=False)
         return
     write_text(output, text)
-    counts = {
-        "method": len(table.blocks[0].rows),
-        "scene": len(table.scenes),
-        "column": len(table.columns),
-    }
-    told = ", ".join(f"{n} {what}{'' if n == 1 else 's'}" for what, n in counts.items())
     click.echo(f"wrote {output}: {told}", err=True)
 
 
-def _write_tidy(runs: Runs, output: Path | None, metrics: tuple[str, ...], scenes: tuple[str, ...]) -> None:
+def _read(runs: Path) -> Runs:
+    from ambiguous_wild.harness.store import read_runs
+
+    return read_runs(runs)
+
+
+def _write_tidy(found: Runs, output: Path | None, metrics: Sequence[str], scenes: Sequence[str]) -> None:
     from ambiguous_wild.harness.table_frame import tidy, to_csv
     from ambiguous_wild.io.atomic import write_text
 
-    frame = tidy(runs, metrics=metrics, scenes=scenes)
-    for run in runs.incomplete:
+    frame = tidy(found, metrics=metrics, scenes=scenes)
+    for run in found.incomplete:
         click.echo(f"incomplete: {run.folder}: {run.reason}", err=True)
     if output is None:
         click.echo(to_csv(frame), nl=False)
@@ -97,11 +131,106 @@ def _write_tidy(runs: Runs, output: Path | None, metrics: tuple[str, ...], scene
     click.echo(f"wrote {output}: {len(frame)} rows", err=True)
 
 
-def command_line(runs: Path, style: str, metrics: tuple[str, ...], scenes: tuple[str, ...]) -> str:
+def _blocks(
+    found: Runs, style: str, metrics: Sequence[str], scenes: Sequence[str], made_by: str, color: bool
+) -> tuple[str, str]:
+    from ambiguous_wild.harness.render_tables import RENDERERS, plain, to_text
+    from ambiguous_wild.harness.tables import comparison
+
+    table = comparison(found, metrics=metrics, scenes=scenes)
+    if style == "csv":
+        for note in (*table.notes, made_by):
+            click.echo(plain(note), err=True)
+    else:
+        table = table.with_note(made_by)
+    text = to_text(table, color=True) if color else RENDERERS[style](table)
+    counts = {"method": len(table.blocks[0].rows), "scene": len(table.scenes), "column": len(table.columns)}
+    return text, ", ".join(f"{n} {what}{'' if n == 1 else 's'}" for what, n in counts.items())
+
+
+def _layouts(
+    found: Runs | None,
+    runs: Path,
+    layout: str,
+    metrics: Sequence[str],
+    scenes: Sequence[str],
+    datasets: dict[str, list[str]],
+    reported: bool,
+    reported_from: Path | None,
+) -> list[Layout]:
+    from ambiguous_wild.harness.layouts import ablation, build
+    from ambiguous_wild.harness.layouts.reported import datasets_of, read_reported, with_reported
+
+    if found is None:
+        return ablation.ablation(runs, tuple(metrics))
+    if layout == "blocks":
+        return build.blocks(found, metrics=metrics, scenes=scenes)
+    numbers = read_reported(reported_from) if reported or reported_from else []
+    if not datasets:
+        datasets = datasets_of(numbers or _known(), sorted(set(found.runs["scene"])))
+    if layout == "memory":
+        metrics = metrics or build.MEMORY
+    if layout == "means":
+        made = build.means(found, metrics=metrics, scenes=scenes, datasets=datasets)
+    else:
+        subject = "memory" if layout == "memory" else ""
+        made = build.paper(found, metrics=metrics, scenes=scenes, datasets=datasets, subject=subject)
+    return [with_reported(one, numbers) for one in made] if numbers else made
+
+
+def _known() -> list:
+    """What the checkout's reported tables tell of datasets; nothing where there are none."""
+    from ambiguous_wild.harness.layouts.reported import FOLDER, read_reported
+
+    return read_reported() if FOLDER.is_dir() else []
+
+
+def _laid_out(made: list[Layout], style: str, made_by: str, color: bool) -> tuple[str, str]:
+    from ambiguous_wild.harness.layouts import plain_formats
+    from ambiguous_wild.harness.layouts.html_page import to_html
+    from ambiguous_wild.harness.layouts.latex import to_latex
+    from ambiguous_wild.harness.render_tables import plain
+
+    told = f"{len(made)} table{'' if len(made) == 1 else 's'}"
+    if style == "csv":
+        for note in dict.fromkeys([note for one in made for note in one.notes] + [made_by]):
+            click.echo(plain(note), err=True)
+        return plain_formats.to_csv(made), told
+    made = [one.with_notes(made_by) for one in made]
+    if style == "text":
+        return plain_formats.to_text(made, color=color), told
+    writers = {"markdown": plain_formats.to_markdown, "latex": to_latex, "html": to_html}
+    return writers[style](made), told
+
+
+def _named(datasets: Sequence[str]) -> dict[str, list[str]]:
+    named: dict[str, list[str]] = {}
+    for text in datasets:
+        name, equals, members = text.partition("=")
+        scenes = [scene.strip() for scene in members.split(",") if scene.strip()]
+        if not equals or not name.strip() or not scenes:
+            raise AwError(f"--dataset {text!r}: write NAME=SCENE,SCENE")
+        named.setdefault(name.strip(), []).extend(scenes)
+    return named
+
+
+def command_line(
+    runs: Path,
+    style: str,
+    metrics: Sequence[str],
+    scenes: Sequence[str],
+    layout: str = "blocks",
+    datasets: Sequence[str] = (),
+    reported: bool = False,
+    reported_from: Path | None = None,
+) -> str:
     """The command that makes this table again."""
     words = ["aw", "table", str(runs)]
     words += ["--format", style] if style != "text" else []
-    for flag, values in (("--metric", metrics), ("--scene", scenes)):
+    words += ["--layout", layout] if layout != "blocks" else []
+    for flag, values in (("--metric", metrics), ("--scene", scenes), ("--dataset", datasets)):
         for value in values:
             words += [flag, value]
+    words += ["--reported"] if reported else []
+    words += ["--reported-from", str(reported_from)] if reported_from else []
     return shlex.join(words)

@@ -104,8 +104,8 @@ def _settings_by_method(settings: Iterable[str], entries: Sequence[MethodEntry])
 
 
 def cell_folder(output: Path, cell: Cell) -> Path:
-    """OUTPUT/<scene>/<method>/seed<k>."""
-    return output / cell.scene.name / cell.method.name / f"seed{cell.train.seed}"
+    """OUTPUT/[<group>/]<scene>/<method>/seed<k>."""
+    return output / cell.group / cell.scene.name / cell.method.name / f"seed{cell.train.seed}"
 
 
 def run_cells(

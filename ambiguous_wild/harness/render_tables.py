@@ -56,7 +56,7 @@ def to_text(table: Table, *, color: bool = False) -> str:
             [plain(r.method), *(number(c, cell) for c, cell in zip(table.columns, r.cells))]
             for r in block.rows
         ]
-        widths = [max(_width(line[i]) for line in [head, *lines]) for i in range(len(head))]
+        widths = [max(display_width(line[i]) for line in [head, *lines]) for i in range(len(head))]
         parts.append(plain(heading(table, block)))
         parts.append(_aligned(head, widths))
         parts.append("  ".join("─" * w for w in widths))
@@ -123,7 +123,7 @@ def to_latex(table: Table) -> str:
     lines += ["\\resizebox{\\linewidth}{!}{%", f"\\begin{{tabular}}{{l{'r' * width}}}", "\\toprule"]
     top, rules, begin = [""], [], 2
     for title, _, chosen in groups:
-        top.append(f"\\multicolumn{{{len(chosen)}}}{{c}}{{{_latex(title)}}}")
+        top.append(f"\\multicolumn{{{len(chosen)}}}{{c}}{{{latex_text(title)}}}")
         rules.append(f"\\cmidrule(lr){{{begin}-{begin + len(chosen) - 1}}}")
         begin += len(chosen)
     lines += [" & ".join(top) + r" \\", " ".join(rules)]
@@ -131,7 +131,7 @@ def to_latex(table: Table) -> str:
     lines += [" & ".join(["Method", *head]) + r" \\", "\\midrule"]
     for k, row in enumerate(blocks[0].rows):
         cells = [_latex_cell(table.columns[i], b.rows[k].cells[i]) for _, b, chosen in groups for i in chosen]
-        lines.append(" & ".join([_latex(row.method), *cells]) + r" \\")
+        lines.append(" & ".join([latex_text(row.method), *cells]) + r" \\")
     lines += ["\\bottomrule", "\\end{tabular}}"]
     return "\n".join([*lines, *(f"% {plain(line)}" for line in _below(table, marks=False))]) + "\n"
 
@@ -154,7 +154,7 @@ def _below(table: Table, *, marks: bool = True) -> list[str]:
     ]
 
 
-def _width(text: str) -> int:
+def display_width(text: str) -> int:
     """Columns of a terminal: wide characters take two, combining ones none."""
     wide = sum(unicodedata.east_asian_width(c) in "WF" for c in text)
     return len(text) + wide - sum(unicodedata.combining(c) > 0 for c in text)
@@ -165,7 +165,7 @@ def _aligned(line: Sequence[str], widths: Sequence[int], ranks: Sequence[int | N
 
     cells = []
     for i, (text, width) in enumerate(zip(line, widths)):
-        gap = " " * (width - _width(text))
+        gap = " " * (width - display_width(text))
         if ranks and ranks[i]:
             text = click.style(text, fg=COLORS[ranks[i] or 1], bold=ranks[i] == 1)
         cells.append(text + gap if i == 0 else gap + text)
@@ -208,7 +208,8 @@ def _status(row: Row) -> str:
     return next((s for s in ("failed", "absent", "ok") if s in states), "missing")
 
 
-def _latex(text: str) -> str:
+def latex_text(text: str) -> str:
+    """Escaped for LaTeX: a name prints as it is, whatever it holds."""
     special = {
         "\\": r"\textbackslash{}",
         "~": r"\textasciitilde{}",
@@ -227,7 +228,7 @@ def _latex(text: str) -> str:
 
 def _latex_head(column: Measure) -> str:
     arrow = {"higher": r"$\uparrow$", "lower": r"$\downarrow$", None: ""}[column.better]
-    return _latex(column.label) + arrow
+    return latex_text(column.label) + arrow
 
 
 def _latex_cell(column: Measure, cell: Cell) -> str:

@@ -11,17 +11,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import torch
 import yaml
 
 from ambiguous_wild import __version__
 from ambiguous_wild.core import AwError, Camera, Scene
-from ambiguous_wild.core.config import config_hash, to_plain
+from ambiguous_wild.core.config import to_plain
 from ambiguous_wild.harness import evaluate
 from ambiguous_wild.harness import pictures as run_pictures
 from ambiguous_wild.harness.choosing import Chosen
 from ambiguous_wild.harness.environment import environment
+from ambiguous_wild.harness.identity import config_identity
+from ambiguous_wild.harness.identity import scene_identity as scene_identity  # as it always was here
 from ambiguous_wild.harness.memory import peak_memory, reset_peak
 from ambiguous_wild.harness.provenance import provenance
 from ambiguous_wild.harness.store import read_result, write_result
@@ -56,6 +57,7 @@ class Cell:
     device: str = "cpu"
     chosen: Chosen = field(default_factory=Chosen)  # optional effects, and why
     protocol: Protocol = "full"  # "half": measured on the right half, colour effects fitted on the left
+    group: str = ""  # folder below the output, where one output takes several lengths or effects
 
     @property
     def config(self) -> dict[str, Any]:
@@ -83,10 +85,7 @@ class Cell:
     @property
     def identity(self) -> str:
         """Hash of what decides the result: not how often it is saved, nor where the scene lies."""
-        config = self.config
-        scene = {k: v for k, v in config["scene"].items() if k != "path"}
-        train = {k: v for k, v in config["train"].items() if k not in ("checkpoint_every_s", "probes")}
-        return config_hash(config | {"train": train, "scene": scene})
+        return config_identity(self.config)
 
 
 @dataclass
@@ -312,18 +311,6 @@ def _threads() -> int:
     import numba
 
     return int(numba.get_num_threads())
-
-
-def scene_identity(scene: Scene) -> str:
-    """sha256 that stands for the scene: over its files' hashes, its split and the size it is loaded at."""
-    files = scene.info.get("files")
-    known = {name: entry["sha256"] for name, entry in files.items()} if isinstance(files, dict) else {}
-    split = [(v.name, v.split, v.camera.width, v.camera.height) for v in scene.views]
-    if not known:
-        # A plain COLMAP scene lists no hashes: cameras and points stand for it.
-        poses = np.concatenate([v.camera.cam_from_world.ravel() for v in scene.views])
-        known = {"poses": poses.round(9).tolist(), "points": len(scene.points)}
-    return config_hash({"files": known, "split": split})
 
 
 def failed_result(cell: Cell, error: str) -> dict[str, Any]:

@@ -131,7 +131,7 @@ def read_runs(folder: Path | str) -> Runs:
         raise AwError(f"no folder of runs {root}: give the folder that 'aw bench -o' wrote")
     results: list[tuple[Path, dict[str, Any]]] = []
     incomplete: list[Incomplete] = []
-    for run in _run_folders(root):
+    for run in run_folders(root):
         paths = [run / name for name in (RESULT, FAILED) if (run / name).exists()]
         try:
             if not paths:
@@ -155,7 +155,7 @@ def read_runs(folder: Path | str) -> Runs:
     )
 
 
-def _run_folders(root: Path) -> Iterator[Path]:
+def run_folders(root: Path) -> Iterator[Path]:
     """Folders that hold a result or the settings of a run, in the order of their paths.
 
     A name alone makes no run: a scene may be called seed1.
@@ -192,7 +192,7 @@ def _refuse_duplicates(results: list[tuple[Path, dict[str, Any]]]) -> None:
         if key in seen:
             raise AwError(
                 f"two results for method {key[1]!r} on scene {key[0]!r} with seed {key[2]}: {seen[key]} and "
-                f"{run}; move one of them elsewhere"
+                f"{run}; give one of their folders, or move one of them elsewhere ('aw cost' takes both)"
             )
         seen[key] = run
 

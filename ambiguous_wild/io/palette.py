@@ -15,6 +15,9 @@ GLOBAL = (150, 60, 200)
 ADDED = (31, 119, 180)
 MERGED = (214, 39, 40)
 NEUTRAL = (140, 140, 140)
+# Okabe and Ito's categories, for colour-blind eyes too; without their yellow, too light for a line on white
+CATEGORIES = ((0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167), (230, 159, 0), (86, 180, 233),
+              (0, 0, 0))  # fmt: skip
 
 
 def ramp(values: np.ndarray, low: float, high: float) -> np.ndarray:

@@ -66,8 +66,14 @@ class DensityControl:
         return False
 
     @torch.no_grad()
-    def observe(self, step: Step, gradients: Gradients) -> None:
-        """Add one view's statistic, scaled to half the image size so that it is resolution-free."""
+    def observe(self, step: Step, gradients: Gradients, keep: Tensor | None = None) -> None:
+        """Add one view's statistic, scaled to half the image size so that it is resolution-free.
+
+        Args:
+            step: the view's.
+            gradients: of the whole loss.
+            keep: [H, W] what weighed the loss, 1 = static; None = all of it. Not read here.
+        """
         if step.nominal > self.config.stop:
             return
         self._match(step.gaussians)

@@ -283,7 +283,7 @@ class Trainer:
                 gradients, step.rendered.visible, self._learning_rates(self.progress(iteration))
             )
         with part("density"):
-            self.density.observe(step, gradients)
+            self.density.observe(step, gradients, keep)
             self.gaussians, events = self.density.refine(step, self.gaussians, self.optimiser)
             self.optimiser.bind(self.gaussians)
         if self.effects is not None:

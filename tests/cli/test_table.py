@@ -57,3 +57,39 @@ def test_errors_say_what_to_do(tmp_path: Path) -> None:
     ):
         error = runner.invoke(command, words).exception
         assert isinstance(error, AwError) and expected in str(error)
+
+
+@pytest.mark.parametrize("style", ["text", "markdown", "latex", "html"])
+@pytest.mark.parametrize("layout", ["paper", "means", "memory", "blocks"])
+def test_the_command_stands_under_every_table(layout: str, style: str, tmp_path: Path) -> None:
+    runs = save(tmp_path, *(fake_result(m, s) for m in ("3dgs", "b") for s in ("one", "two")))
+    out, err = aw_table(runs, "--layout", layout, "--format", style, "--metric", "psnr")
+    words = f"aw table {runs}" + (f" --format {style}" if style != "text" else "")
+    words += f" --layout {layout}" if layout != "blocks" else ""
+    assert words.replace("_", "\\_") + " --metric psnr" in out or words + " --metric psnr" in out
+    assert err == ""
+
+
+def test_datasets_and_reported_numbers(tmp_path: Path) -> None:
+    runs = save(tmp_path / "runs", *(fake_result("3dgs", s) for s in ("one", "two", "Porter")))
+    tables = tmp_path / "t.csv"
+    tables.write_text(
+        "method,dataset,scene,metric,value\nFamous,D,one,psnr,30.10\nFamous,D,mean,psnr,31.00\n"
+    )
+    words = ["--layout", "paper", "--dataset", "D=one,two", "--metric", "psnr", "--reported-from", tables]
+    out, _ = aw_table(runs, *words)
+    first, second = out.split("Porter\n", 1)
+    assert "Famous" in first and "30.10" in first and "31.00" in first and "Famous" not in second
+    assert f"--dataset D=one,two --reported-from {tables}" in out
+
+
+def test_what_does_not_go_together_is_refused(tmp_path: Path) -> None:
+    save(tmp_path, fake_result("3dgs"))
+    for words, expected in (
+        (["--reported"], "--layout paper"),
+        (["--layout", "paper", "--dataset", "D"], "NAME=SCENE"),
+        (["--layout", "ablation", "--scene", "yard"], "--scene does not go"),
+        (["--layout", "ablation"], "aw ablate"),
+    ):
+        error = CliRunner().invoke(command, [str(tmp_path), *words]).exception
+        assert isinstance(error, AwError) and expected in str(error)

@@ -33,10 +33,9 @@ def typed(text: str) -> Cell:
         resolution=given["resolution"],
         max_gaussians=given["max_gaussians"],
     )
-    names = ("settings", "device", "factor", "effects", "protocol")
-    (cell,) = plan_cells(
-        given["methods"], given["scenes"], given["seeds"], train, **{name: given[name] for name in names}
-    )
+    more = {name: given[name] for name in ("settings", "device", "factor", "protocol")}
+    (effects,) = given["effects"]
+    (cell,) = plan_cells(given["methods"], given["scenes"], given["seeds"], train, effects=effects, **more)
     return cell
 
 

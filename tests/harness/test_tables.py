@@ -269,10 +269,10 @@ def test_hostile_names_stay_text_in_every_format(tmp_path: Path) -> None:
 
 @given(st.text(max_size=30))
 def test_latex_and_markdown_of_any_name_have_no_open_special(name: str) -> None:
-    from ambiguous_wild.harness.render_tables import _latex, markdown_text
+    from ambiguous_wild.harness.render_tables import latex_text, markdown_text
 
-    assert "\n" not in _latex(name) + markdown_text(name)
-    rest = re.sub(r"\\text\w+\{\}|\\[&%$#_{}]|\{(?:[\[*]|'')\}", "", _latex(name))
+    assert "\n" not in latex_text(name) + markdown_text(name)
+    rest = re.sub(r"\\text\w+\{\}|\\[&%$#_{}]|\{(?:[\[*]|'')\}", "", latex_text(name))
     assert not re.search(r"[\\&%$#_{}~^\[*]", rest)
     assert not re.search(r"[<>]", markdown_text(name))
 

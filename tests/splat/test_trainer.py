@@ -18,6 +18,7 @@ from ambiguous_wild.methods import get_method
 from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.cpu import set_threads
 from ambiguous_wild.splat.data import load_train_data, shrink, shrink_keep
+from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.parts import MaskPolicy, Parts
 from ambiguous_wild.splat.resolution import Level, ceiling_at, coarse_to_fine, divisor_at
 from ambiguous_wild.splat.trainer import TrainConfig, Trainer
@@ -143,13 +144,13 @@ def same(a, b) -> bool:
 
 
 class FakeTime:
-    """A clock that moves a millisecond each time it is read, and on request."""
+    """A clock that moves about a millisecond each time it is read, and on request; sums are exact."""
 
     def __init__(self):
         self.now = 0.0
 
     def perf_counter(self):
-        self.now += 1e-3
+        self.now += 2.0**-10
         return self.now
 
     def monotonic(self):
@@ -176,6 +177,24 @@ def test_probing_changes_nothing_and_costs_no_training_time(scene, tmp_path, fak
     values = [row["psnr_probe"] for row in probed.timeline if row["psnr_probe"] is not None]
     assert values == [12.5] * 4
     assert probed.clock.now() == pytest.approx(without.clock.now())
+
+
+def test_under_a_budget_probes_take_no_iteration_from_the_run(scene, tmp_path, fake_time):
+    def slow_probe(draw):
+        draw(scene.test[0].camera)
+        fake_time.now += 1000.0
+        return 12.5
+
+    def run(name, **kw):  # effects learn: each run has its own
+        return trained(scene, tmp_path / name, parts=with_effects(Parts(), ("exposure",)), budget_s=1.0, **kw)
+
+    without, probed = run("a", probes=0), run("b", probes=8, probe=slow_probe)
+    assert probed.iteration == without.iteration > 20
+    assert bits(without) == bits(probed)
+    assert probed.clock.now() == without.clock.now()
+    assert probed.clock.parts_s == without.clock.parts_s
+    assert [row["wall_s"] for row in probed.timeline] == [row["wall_s"] for row in without.timeline]
+    assert sum(row["psnr_probe"] is not None for row in probed.timeline) == 8
 
 
 def test_the_timeline_is_a_table(scene, tmp_path):

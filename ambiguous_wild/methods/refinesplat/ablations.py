@@ -8,7 +8,10 @@ from __future__ import annotations
 from ambiguous_wild.methods.ablation import Group, Variant
 
 _NO_MASKS = ("mask.use_local=false", "mask.use_global=false")
-_PLAIN_DENSITY = ("density.decides=photometric", "density.clone_shift=0", "density.merge_every=0")
+_NO_SUPPORT = ("density.support.least_share=0",)
+_PLAIN_DENSITY = (
+    "density.decides=photometric", "density.clone_shift=0", "density.merge_every=0", *_NO_SUPPORT,
+)  # fmt: skip
 _CR = ("lambda_cr=0.2",)
 _PRINTED_LOSSES = ("lambda_id=1", "lambda_cr=0.2")
 _NO_GATE = ("mask.gate=0", "mask.least=0")
@@ -21,7 +24,7 @@ _ALL_PRINTED = (
     "mask.variant=sigmoid", "mask.statistic=entropy", "mask.combine=union", "mask.scope=photo",
     "mask.threshold=literal", *_NO_GATE, *_NO_AGREEMENT, "mask.static_tracks=0", "mask.least_alpha=0",
     "mask.ceiling=0", "mask.cosine=plain", "mask.spread=var", *_NO_GLOBAL_GATE, "mask.fill=0",
-    "mask.dilation=5", "density.merge.form=literal", "density.merge.most=0", *_PRINTED_LOSSES,
+    "mask.dilation=5", "density.merge.form=literal", "density.merge.most=0", *_NO_SUPPORT, *_PRINTED_LOSSES,
 )  # fmt: skip
 
 ABLATIONS = (
@@ -68,9 +71,14 @@ ABLATIONS = (
         "Entropy and merging in density control",
         (
             Variant("neither", _PLAIN_DENSITY, "(a)"),
-            Variant("entropy", ("density.merge_every=0",), "(b) entropy, no merging"),
-            Variant("merging", ("density.decides=photometric", "density.clone_shift=0"), "(c) merging alone"),
-            Variant("both", ("density.decides=total",), "(d)"),
+            Variant("entropy", ("density.merge_every=0", *_NO_SUPPORT), "(b) entropy, no merging"),
+            Variant(
+                "merging",
+                ("density.decides=photometric", "density.clone_shift=0", *_NO_SUPPORT),
+                "(c) merging alone",
+            ),
+            Variant("both", _NO_SUPPORT, "(d)"),
+            Variant("support", ("density.decides=total",), "and what masks hide in every photo goes"),
             # without entropy terms their gradient is 0 and `decides` decides nothing: these rows have them
             Variant(
                 "losses-total", (*_PRINTED_LOSSES, "density.decides=total"), "with L_id, L_cr: L decides"
@@ -169,6 +177,7 @@ ABLATIONS = (
             Variant("spread-var", (*_ON_FEATURES, "mask.spread=var"), "mean + variance"),
             Variant("no-global-gate", (*_ON_FEATURES, *_NO_GLOBAL_GATE)),
             Variant("overlap-literal", ("density.merge.form=literal",), "a density, not a share"),
+            Variant("no-support", _NO_SUPPORT, "what masks hide in every photo stays"),
             Variant("whole-components", ("density.merge.most=0",), "clusters of any size merge"),
             Variant("losses", _PRINTED_LOSSES, "L_id + 0.2 L_cr"),
             Variant("all", _ALL_PRINTED, "all of them together"),

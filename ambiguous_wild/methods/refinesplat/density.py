@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.methods.refinesplat.merging import MergeConfig, clusters, merge_members, merge_pairs
+from ambiguous_wild.methods.refinesplat.support import Support, SupportConfig
 from ambiguous_wild.splat.density import DensityConfig, DensityControl, rotation_matrices
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.rendered import Gradients
@@ -34,6 +35,7 @@ class EntropyDensityConfig(DensityConfig):
     merge_every: float = 1000.0  # nominal iterations between merges; 0 = never
     merge_grad: float = 5e-5  # tau_e: only Gaussians whose mean statistic is below it may merge
     merge: MergeConfig = field(default_factory=MergeConfig)
+    support: SupportConfig = field(default_factory=SupportConfig)  # what masks hide in every photo goes
 
 
 class EntropyAwareDensity(DensityControl):
@@ -50,6 +52,8 @@ class EntropyAwareDensity(DensityControl):
         self.downhill = torch.zeros(0, 3)  # [N, 3] sum of -dL/dmean over views, world
         self.last_merge = 0.0  # nominal
         self.merged = 0  # Gaussians that merging removed so far
+        self.support = Support(config.support)
+        self.last_judged = 0  # iteration
 
     def statistic(self, gradients: Gradients) -> Tensor:
         extra = gradients.screen_extra
@@ -63,10 +67,29 @@ class EntropyAwareDensity(DensityControl):
         return self.config.decides != "photometric"
 
     @torch.no_grad()
-    def observe(self, step: Step, gradients: Gradients) -> None:
-        super().observe(step, gradients)
+    def observe(self, step: Step, gradients: Gradients, keep: Tensor | None = None) -> None:
+        super().observe(step, gradients, keep)
         if step.nominal <= self.config.stop:
             self.downhill -= gradients.means
+        if self.support.due(step.iteration):
+            self.support.match(len(step.gaussians), step.gaussians.device)
+            self.support.look(step.gaussians.means, step.rendered.visible, step.camera, keep)
+
+    @torch.no_grad()
+    def refine(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> tuple[Gaussians, list[str]]:
+        """As 3DGS, and every `min_every` iterations to the end, what no kept pixel vouches for goes."""
+        gaussians, events = super().refine(step, gaussians, optimiser)
+        due = step.iteration - self.last_judged >= self.config.min_every
+        if events or not due or self.config.support.least_share <= 0:
+            return gaussians, events  # one change of rows an iteration
+        self.last_judged = step.iteration
+        self._match(gaussians)
+        drop = self.support.judge()
+        if not bool(drop.any()) or bool(drop.all()):
+            return gaussians, events
+        optimiser.flush()
+        self.log.now.pruned += int(drop.sum())
+        return self.keep_rows(gaussians, optimiser, ~drop), [*events, "prune"]
 
     def clone_offset(self, gaussians: Gaussians, rows: Tensor) -> Tensor | None:
         """Down the entropy-aware gradient (Fig. 3b), by a share of the standard deviation along it."""
@@ -108,11 +131,13 @@ class EntropyAwareDensity(DensityControl):
     def _select(self, stay: Tensor) -> None:
         super()._select(stay)
         self.downhill = self.downhill[stay]
+        self.support.select(stay)
 
     def _match(self, gaussians: Gaussians) -> None:
         super()._match(gaussians)
         pad = torch.zeros(max(len(gaussians) - len(self.downhill), 0), 3, device=gaussians.device)
         self.downhill = torch.cat([self.downhill.to(gaussians.device), pad])
+        self.support.match(len(gaussians), gaussians.device)
 
     def _clear(self, gaussians: Gaussians) -> None:
         super()._clear(gaussians)
@@ -123,9 +148,13 @@ class EntropyAwareDensity(DensityControl):
             "downhill": self.downhill,
             "last_merge": self.last_merge,
             "merged": self.merged,
+            "support": self.support.state_dict(),
+            "last_judged": self.last_judged,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         super().load_state_dict(state)
         self.downhill = state["downhill"]
         self.last_merge, self.merged = state["last_merge"], state["merged"]
+        self.support.load_state_dict(state["support"])
+        self.last_judged = state["last_judged"]

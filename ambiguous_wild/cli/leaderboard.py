@@ -1,0 +1,208 @@
+"""`aw leaderboard`: take runs in, publish the page, check what is there."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    from ambiguous_wild.harness.leaderboard.add import Report
+
+_board = click.option(
+    "--board",
+    type=click.Path(path_type=Path, file_okay=False),
+    default=Path("leaderboard"),
+    show_default=True,
+    help="Folder of the leaderboard.",
+)
+_json = click.option("--json", "as_json", is_flag=True, help="Print the same facts as JSON.")
+
+
+@click.group("leaderboard")
+def command() -> None:
+    """Numbers that others can trust, as CSVs and a page.
+
+    \b
+    aw leaderboard add runs                 check finished runs and take them in
+    aw leaderboard remove --method NAME     take runs down again
+    aw leaderboard publish -o site          CSVs and a page that opens from a file
+    aw leaderboard check                    what is wrong with what is there
+    """
+
+
+@command.command("add")
+@click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path))
+@_board
+@click.option(
+    "--dataset", help="Of these runs.  [default: what their scene says; of 'aw simulate': simulated]"
+)
+@click.option(
+    "--scenes",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Where the scenes lie (a scene, or a folder of them).  [default: where the runs say]",
+)
+@click.option(
+    "--images",
+    type=click.IntRange(0, 20),
+    default=1,
+    show_default=True,
+    help="Test images a scene of which small copies are kept for the page.",
+)
+@click.option("--replace", is_flag=True, help="A run with other numbers replaces the one on the board.")
+@click.option("--quick", is_flag=True, help="Recompute PSNR alone, not every metric.")
+@click.option("--dry-run", is_flag=True, help="Check, and write nothing.")
+@_json
+def add_command(
+    runs: tuple[Path, ...],
+    board: Path,
+    dataset: str | None,
+    scenes: Path | None,
+    images: int,
+    replace: bool,
+    quick: bool,
+    dry_run: bool,
+    as_json: bool,
+) -> None:
+    """Check RUNS (run folders, or folders of them) and add those that pass.
+
+    Changed, partial, failed and foreign runs are refused, one line each; runs that are not finished are left
+    for later. Whoever adds a run twice changes nothing.
+    """
+    from ambiguous_wild.core import AwError
+    from ambiguous_wild.harness.leaderboard.add import add
+
+    with _bar() as tick:
+        reports = add(
+            board,
+            runs,
+            dataset=dataset,
+            scenes=scenes,
+            images=images,
+            replace_other=replace,
+            quick=quick,
+            dry=dry_run,
+            tick=tick,
+        )
+    _print_reports(reports, as_json)
+    counts = Counter(r.outcome for r in reports)
+    told = ", ".join(f"{n} {outcome}" for outcome, n in counts.items())
+    dry_note = " (nothing written)" if dry_run else ""
+    click.echo(
+        f"{len(reports)} run{'' if len(reports) == 1 else 's'}: {told}{dry_note}; board {board}", err=True
+    )
+    if counts["refused"]:
+        sys.exit(AwError.exit_code)
+
+
+def _print_reports(reports: list[Report], as_json: bool) -> None:
+    if as_json:
+        rows = [{"run": str(r.run), "outcome": r.outcome, "error": r.error or None} for r in reports]
+        click.echo(json.dumps(rows, indent=2))
+        return
+    for r in reports:
+        if r.error:
+            click.secho(
+                f"{r.outcome}: {' '.join(r.error.split())}", fg="red" if r.outcome == "refused" else None
+            )
+
+
+class _bar:
+    """A bar over the runs, where somebody looks."""
+
+    def __enter__(self) -> Any:
+        self.bar: Any = None
+        return self.tick
+
+    def tick(self, done: int, total: int) -> None:
+        from tqdm import tqdm
+
+        if self.bar is None:
+            self.bar = tqdm(total=total, unit="run", disable=not sys.stderr.isatty(), file=sys.stderr)
+        self.bar.update(done - self.bar.n)
+
+    def __exit__(self, *_: object) -> None:
+        if self.bar is not None:
+            self.bar.close()
+
+
+@command.command("remove")
+@_board
+@click.option("--method", required=True, help="Whose runs.")
+@click.option("--dataset", help="Only these.")
+@click.option("--scene", help="Only these.")
+@click.option("--setting", help="Only these, as the board has it.")
+@click.option("--seed", type=click.IntRange(0), help="Only these.")
+@click.option("--dry-run", is_flag=True, help="Say what would go, and change nothing.")
+def remove_command(
+    board: Path,
+    method: str,
+    dataset: str | None,
+    scene: str | None,
+    setting: str | None,
+    seed: int | None,
+    dry_run: bool,
+) -> None:
+    """Take runs down, with their pictures; the board is then as if they had never been there."""
+    from ambiguous_wild.harness.leaderboard.remove import remove
+
+    gone = remove(board, method=method, dataset=dataset, scene=scene, setting=setting, seed=seed, dry=dry_run)
+    for entry in gone:
+        click.echo(f"{'would remove' if dry_run else 'removed'}: {entry.name}")
+    click.echo(f"{len(gone)} run{'' if len(gone) == 1 else 's'}; board {board}", err=True)
+
+
+@command.command("publish")
+@_board
+@click.option("-o", "--out", required=True, type=click.Path(path_type=Path), help="Folder of the page.")
+@click.option("--reported", is_flag=True, help="Show what papers print beside the measured numbers, marked.")
+@click.option("--title", default="Leaderboard", show_default=True, help="Of the page.")
+@_json
+def publish_command(board: Path, out: Path, reported: bool, title: str, as_json: bool) -> None:
+    """Write CSVs and a page that works from a file, from the board's CSVs alone.
+
+    OUT holds index.html, data/ and images/ afterwards; an earlier page there is replaced.
+    """
+    import dataclasses
+
+    from ambiguous_wild.harness.leaderboard.publish import publish
+
+    done = publish(board, out, reported=reported, title=title)
+    if as_json:
+        click.echo(json.dumps(dataclasses.asdict(done), indent=2))
+    told = f"{done.runs} runs of {done.datasets} datasets, {done.images} pictures, {done.reported} reported numbers"
+    click.echo(f"wrote {out / 'index.html'}: {told}", err=True)
+
+
+@command.command("check")
+@_board
+@click.option("--strict", is_flag=True, help="Exit with 1 where the audit asks anything.")
+@_json
+def check_command(board: Path, strict: bool, as_json: bool) -> None:
+    """Read the board again: hashes, duplicates, files that do not follow; then audit its numbers.
+
+    What is wrong ends with exit code 2. What the audit finds are questions, as with 'aw audit'.
+    """
+    import dataclasses
+
+    from ambiguous_wild.core import AwError
+    from ambiguous_wild.harness.audit.run import to_text
+    from ambiguous_wild.harness.leaderboard.check import check
+
+    found = check(board)
+    if as_json:
+        click.echo(json.dumps(dataclasses.asdict(found), indent=2, ensure_ascii=False))
+    else:
+        for problem in found.problems:
+            click.secho(f"wrong: {problem}", fg="red")
+        click.echo(to_text(list(found.findings)), nl=bool(found.findings))
+    counts = f"{len(found.problems)} problems, {len(found.findings)} findings of the audit"
+    click.echo(f"{found.runs} runs: {counts}; board {board}", err=True)
+    if found.problems:
+        sys.exit(AwError.exit_code)
+    if strict and found.findings:
+        sys.exit(1)

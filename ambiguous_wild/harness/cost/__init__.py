@@ -1,0 +1,1 @@
+"""What accuracy costs: time to reach it, dB per minute, which method to pay for."""

@@ -1,0 +1,68 @@
+"""What each curve reaches, what it costs, and which of them nothing beats at its price."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from ambiguous_wild.harness.cost.curves import Curve, Summary, scenes_of, summary
+from ambiguous_wild.harness.cost.read import NUMBERS, CostRun
+
+
+@dataclass(frozen=True)
+class Point:
+    """A curve as one point, over all scenes of the report."""
+
+    curve: str
+    method: str
+    length: str
+    runs: int
+    psnr: Summary  # dB
+    minutes: Summary  # of training, with what comes before the first step where that is asked for
+    setup_s: Summary
+    numbers: dict[str, Summary]  # ms an iteration, Gaussians, MB, frames a second
+    front: bool = False  # no other reaches as much in less time
+
+
+def points(curves: Sequence[Curve], scenes: Sequence[str] = (), *, setup: bool = False) -> list[Point]:
+    """One point a curve, the front of training time against PSNR marked.
+
+    Args:
+        curves: from `curves_of`.
+        scenes: the means are over these; empty = every scene that any curve has.
+        setup: count what comes before the first step as time too.
+    """
+    scenes = tuple(scenes) or scenes_of(curves)
+    made = [_point(curve, scenes, setup) for curve in curves]
+    best = {id(p) for p in pareto(made)}
+    return [replace(p, front=id(p) in best) for p in made]
+
+
+def pareto(among: Sequence[Point]) -> list[Point]:
+    """Those that no other beats in PSNR without taking longer, by time; a missing number is never on it."""
+    known = [p for p in among if not math.isnan(p.psnr.mean) and not math.isnan(p.minutes.mean)]
+    front: list[Point] = []
+    for point in sorted(known, key=lambda p: (p.minutes.mean, -p.psnr.mean)):
+        if not front or point.psnr.mean > front[-1].psnr.mean:
+            front.append(point)
+    return front
+
+
+def _point(curve: Curve, scenes: Sequence[str], setup: bool) -> Point:
+    def minutes(run: CostRun) -> float:
+        return (run.train_s + (run.setup_s if setup else 0.0)) / 60.0
+
+    def number(name: str) -> Summary:
+        return summary(curve, scenes, lambda run: run.numbers[name])
+
+    return Point(
+        curve.name,
+        curve.method,
+        curve.length.text,
+        len([run for run in curve.runs if run.scene in scenes]),
+        summary(curve, scenes, lambda run: run.psnr),
+        summary(curve, scenes, minutes),
+        summary(curve, scenes, lambda run: run.setup_s),
+        {name: number(name) for name in NUMBERS},
+    )

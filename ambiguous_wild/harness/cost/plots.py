@@ -1,0 +1,227 @@
+"""The plots of the cost report: timelines, budgets, fronts and what each change brings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ambiguous_wild.harness.cost.curves import Curve, Summary, longest, summary, timeline
+from ambiguous_wild.harness.cost.front import Point
+from ambiguous_wild.harness.cost.pairs import Change
+from ambiguous_wild.harness.cost.plot_style import (
+    GREY,
+    finite,
+    label_right,
+    looks,
+    new_figure,
+    save,
+    text,
+    ticks_of_time,
+)
+from ambiguous_wild.harness.cost.report import PLOTS, Report
+from ambiguous_wild.harness.cost.text import Unit, per_minute, time_unit
+from ambiguous_wild.harness.render_tables import plain
+from ambiguous_wild.io.palette import CATEGORIES, plot_colour
+
+AXES = (
+    ("minutes", "training time", True),
+    ("model_mb", "model size (MB)", True),
+    ("fps", "frames a second", False),
+)
+KINDS = {"effect": 0, "interval": 1, "option": 2}
+
+
+def draw_all(report: Report, folder: Path) -> list[Path]:
+    """Every plot that the runs give something to draw for, as SVG and PNG; returns what was written."""
+    written = []
+    for name, draw in zip(PLOTS, (draw_timelines, draw_budgets, draw_front, draw_changes)):
+        figure = draw(report)
+        written += [] if figure is None else save(figure, folder / name)
+    return written
+
+
+def _panels(report: Report) -> list[tuple[str, tuple[str, ...]]]:
+    """(title, scenes) of each panel: the mean first where there are several."""
+    panels: list[tuple[str, tuple[str, ...]]] = [(scene, (scene,)) for scene in report.scenes]
+    return [(f"mean over {len(panels)} scenes", report.scenes), *panels] if len(panels) > 1 else panels
+
+
+def draw_timelines(report: Report) -> Any | None:
+    """Test PSNR over training time: seeds thin, their mean thick, their spread at the end."""
+    curves = [c for c in longest(report.curves) if any(len(run.points) > 1 for run in c.runs)]
+    if not curves:
+        return None
+    panels, look, unit = _panels(report), looks([c.name for c in report.curves]), time_unit(report)
+    figure, axes = new_figure(
+        len(panels), reading="thick: mean over seeds; thin: each seed; bars: sample deviation over seeds"
+    )
+    for panel, (title, scenes) in zip(axes, panels):
+        ends = [end for c in curves if (end := _timeline(panel, c, scenes, look[c.name], unit)) is not None]
+        _finish(panel, title, f"training time ({unit.name})", ends)
+        panel.set_xlim(left=0.0)
+    return figure
+
+
+def _timeline(
+    axes: Any, curve: Curve, scenes: tuple[str, ...], look: dict[str, Any], unit: Unit
+) -> Any | None:
+    scale = unit.per_minute / 60.0
+    if len(scenes) == 1:
+        for run in curve.on(scenes[0]):
+            at = np.array(run.points).reshape(-1, 2)
+            axes.plot(at[:, 0] * scale, at[:, 1], **look, linewidth=0.7, alpha=0.45)
+    seconds, psnr = timeline(curve, scenes)
+    axes.plot(seconds * scale, psnr, **look, linewidth=2.0)
+    x = unit.of(summary(curve, scenes, lambda run: run.train_s / 60.0))
+    return _end(axes, curve.name, x, summary(curve, scenes, lambda run: run.psnr), look)
+
+
+def _end(axes: Any, name: str, x: Summary, y: Summary, look: dict[str, Any]) -> Any | None:
+    if not finite(x.mean, y.mean):
+        return None
+    _dot(axes, x, y, look["color"])
+    return name, x.mean, y.mean, look["color"]
+
+
+def _dot(axes: Any, x: Summary, y: Summary, colour: Any) -> None:
+    xerr, yerr = (e if finite(e) else None for e in (x.spread, y.spread))
+    axes.errorbar(x.mean, y.mean, xerr=xerr, yerr=yerr, fmt="o", color=colour, markersize=5.5, elinewidth=1.2,
+                  capsize=2.5, zorder=3)  # fmt: skip
+
+
+def draw_budgets(report: Report) -> Any | None:
+    """PSNR at the end of runs of several lengths: each dot was trained for that long from the start."""
+    lengths = {name: [c for c in report.curves if c.name == name] for name in {c.name for c in report.curves}}
+    if all(len(curves) < 2 for curves in lengths.values()):
+        return None
+    panels, look, unit = _panels(report), looks(list(lengths)), time_unit(report)
+    figure, axes = new_figure(
+        len(panels), reading="every dot is a training of that length; bars: sample deviation over seeds"
+    )
+    for panel, (title, scenes) in zip(axes, panels):
+        ends, times = [], []
+        for name in sorted(lengths):
+            ends_of = _joined(panel, lengths[name], scenes, look[name], unit)
+            times += [x for x, _ in ends_of]
+            ends += [(name, *ends_of[-1], look[name]["color"])] if ends_of else []
+        _finish(panel, title, f"training time ({unit.name})", ends)
+        if times:
+            ticks_of_time(panel, _few(times))
+    return figure
+
+
+def _joined(
+    axes: Any, curves: Sequence[Curve], scenes: tuple[str, ...], look: dict[str, Any], unit: Unit
+) -> list[tuple[float, float]]:
+    ends = []
+    for curve in curves:
+        x = unit.of(summary(curve, scenes, lambda run: run.train_s / 60.0))
+        y = summary(curve, scenes, lambda run: run.psnr)
+        if finite(x.mean, y.mean):
+            ends.append((x.mean, y.mean))
+            _dot(axes, Summary(x.mean), y, look["color"])
+    ends.sort()
+    axes.plot([x for x, _ in ends], [y for _, y in ends], **look, linewidth=2.0)
+    return ends
+
+
+def _few(times: Sequence[float]) -> list[float]:
+    """Times rounded to two digits, those that would touch left out."""
+    kept: list[float] = []
+    for time in sorted({float(f"{t:.2g}") for t in times}):
+        if not kept or time > 1.3 * kept[-1]:
+            kept.append(time)
+    return kept
+
+
+def draw_front(report: Report) -> Any | None:
+    """PSNR against time, megabytes and frames a second; the grey line is what nothing beats at its price."""
+    look, unit = looks([p.curve for p in report.points]), time_unit(report)
+    panels = [
+        axis for axis in AXES if any(finite(_x(p, axis[0], unit).mean, p.psnr.mean) for p in report.points)
+    ]
+    if not panels:
+        return None
+    figure, axes = new_figure(
+        len(panels), reading="grey: nothing reaches more for as little; bars: sample deviation over seeds"
+    )
+    for panel, (key, label, less_is_better) in zip(axes, panels):
+        known = [p for p in report.points if finite(_x(p, key, unit).mean, p.psnr.mean)]
+        _front_line(panel, [(_x(p, key, unit).mean, p.psnr.mean) for p in known], less_is_better)
+        for p in known:
+            _dot(panel, _x(p, key, unit), p.psnr, look[p.curve]["color"])
+        for name in {p.curve for p in known}:  # trainings of several lengths
+            line = [(_x(p, key, unit).mean, p.psnr.mean) for p in known if p.curve == name]
+            panel.plot([x for x, _ in line], [y for _, y in line], **look[name], linewidth=1.0, alpha=0.6)
+        last = {p.curve: p for p in known}  # of a curve of several lengths, the longest has the name
+        ends = [(p.curve, _x(p, key, unit).mean, p.psnr.mean, look[p.curve]["color"]) for p in last.values()]
+        if key == "minutes":
+            label = f"{label}{' and set-up' if report.setup else ''} ({unit.name})"
+        over = f"mean over {len(report.scenes)} scenes" if len(report.scenes) > 1 else report.scenes[0]
+        _finish(panel, over, f"{label}, {'less' if less_is_better else 'more'} is better", ends)
+        panel.margins(x=0.08)
+        times = [_x(p, key, unit).mean for p in known]
+        if key == "minutes" and max(times) > 5.0 * min(times) > 0.0:
+            ticks_of_time(panel, _few(times))
+    return figure
+
+
+def _x(point: Point, key: str, unit: Unit) -> Summary:
+    return unit.of(point.minutes) if key == "minutes" else point.numbers[key]
+
+
+def _front_line(axes: Any, at: Sequence[tuple[float, float]], less_is_better: bool) -> None:
+    front: list[tuple[float, float]] = []
+    for x, y in sorted(at, key=lambda p: (p[0] if less_is_better else -p[0], -p[1])):
+        if not front or y > front[-1][1]:
+            front.append((x, y))
+    axes.step([x for x, _ in front], [y for _, y in front], where="post", color="0.82", linewidth=5.0,
+              solid_capstyle="round", zorder=1)  # fmt: skip
+
+
+def draw_changes(report: Report) -> Any | None:
+    """A row a change: dB gained with its interval, and beside it what it costs."""
+    rows = [c for c in report.changes if finite(c.db.mean)]
+    if not rows:
+        return None
+    unit = time_unit(report)
+    figure, (axes,) = new_figure(1, panel=(8.6, 1.1 + 0.36 * len(rows)))
+    for height, change in enumerate(reversed(rows)):
+        colour = plot_colour(CATEGORIES[KINDS[change.kind]])
+        if finite(change.low, change.high):
+            axes.plot([change.low, change.high], [height, height], color=colour, linewidth=2.0)
+        axes.plot([change.db.mean], [height], "o", color=colour, markersize=6)
+        axes.annotate(_price(change, unit), (1.02, height), xycoords=("axes fraction", "data"), fontsize=8,
+                      va="center", color=GREY, annotation_clip=False)  # fmt: skip
+    axes.axvline(0.0, color="0.6", linewidth=0.8)
+    axes.set_yticks(range(len(rows)), [plain(_what(c)) for c in reversed(rows)], fontsize=8, parse_math=False)
+    axes.set_ylim(-0.6, len(rows) - 0.4)
+    axes.grid(axis="x", color="0.92")
+    axes.grid(axis="y", visible=False)
+    axes.set_xlabel("PSNR gained (dB), bar: 95 % interval over the test images", fontsize=8)
+    return figure
+
+
+def _what(change: Change) -> str:
+    if change.kind == "effect":
+        return f"{change.method}: + {change.name}, {change.length}"
+    return f"{change.method}: {change.name} {change.before} → {change.after}, {change.length}"
+
+
+def _price(change: Change, unit: Unit) -> str:
+    if not finite(change.minutes.mean):
+        return "time unknown"
+    if change.same_time:
+        return "in the same time"
+    extra, rate = unit.of(change.minutes).mean, per_minute(change)
+    return f"{extra:+.{unit.digits}f} {unit.name}" + (f", {rate} dB a minute" if extra > 0.0 else "")
+
+
+def _finish(axes: Any, title: str, x_label: str, ends: Sequence[tuple[str, float, float, Any]]) -> None:
+    text(axes, "title", label=title, fontsize=9, loc="left")
+    text(axes, "xlabel", label=x_label, fontsize=8)
+    text(axes, "ylabel", label="test PSNR (dB)", fontsize=8)
+    label_right(axes, ends)

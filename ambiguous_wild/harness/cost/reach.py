@@ -1,0 +1,125 @@
+"""How long it takes to reach a given PSNR."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from ambiguous_wild.harness.cost.curves import Curve, Summary, scenes_of, summary
+from ambiguous_wild.harness.cost.read import CostRun
+
+BELOW_BEST = (3.0, 1.0, 0.5)  # dB below what the best curve ends at, where no target is given
+
+
+@dataclass(frozen=True)
+class Target:
+    """A PSNR to reach; relative to the best curve of each scene, or the same everywhere."""
+
+    db: float  # below the best, or absolute
+    relative: bool
+
+    @property
+    def text(self) -> str:
+        return f"best - {self.db:g} dB" if self.relative else f"{self.db:g} dB"
+
+
+@dataclass(frozen=True)
+class Reach:
+    """When a curve reaches a target."""
+
+    scene: str | None  # None: the mean over all scenes
+    curve: str
+    length: str
+    target: str
+    psnr: float  # dB to reach; NaN: differs from scene to scene, or nothing to be relative to
+    minutes: Summary  # of training; missing unless every run reaches it
+    reached: int  # runs that do
+    runs: int
+    bound: bool  # some had reached it by their first probe: the time is an upper bound
+
+
+def times_to_reach(
+    curves: Sequence[Curve], targets: Sequence[float] = (), *, setup: bool = False
+) -> list[Reach]:
+    """For every scene, curve and target; then for the mean over scenes, where there are several.
+
+    Of curves that differ in length alone the one that is there first counts, and its length is told: a
+    short training is often there before the long one, whose schedule takes its time.
+
+    Args:
+        curves: from `curves_of`.
+        targets: in dB; empty = `BELOW_BEST` below the best of each scene.
+        setup: count what comes before the first step too.
+    """
+    wanted = [Target(t, False) for t in dict.fromkeys(targets)] or [Target(t, True) for t in BELOW_BEST]
+    scenes = scenes_of(curves)
+    lengths: dict[str, list[Curve]] = {}
+    for curve in curves:
+        lengths.setdefault(curve.name, []).append(curve)
+    levels = {(t, scene): _level(t, curves, scene) for t in wanted for scene in scenes}
+    rows = []
+    groups: list[tuple[str | None, tuple[str, ...]]] = [(scene, (scene,)) for scene in scenes]
+    if len(scenes) > 1:
+        groups.insert(0, (None, scenes))
+    for name, members in groups:
+        for target in wanted:
+            level = {scene: levels[target, scene] for scene in members}
+            rows += [
+                _soonest([_reach(c, target, name, level, setup) for c in same]) for same in lengths.values()
+            ]
+    return rows
+
+
+def _soonest(rows: Sequence[Reach]) -> Reach:
+    """Of several lengths the one that is there first; where none always is, the one that most often is."""
+    there = [row for row in rows if math.isfinite(row.minutes.mean)]
+    if there:
+        return min(there, key=lambda row: row.minutes.mean)
+    return max(reversed(rows), key=lambda row: (row.runs > 0, row.reached / max(row.runs, 1)))
+
+
+def first_time(run: CostRun, psnr: float) -> tuple[float, bool]:
+    """Seconds of training until the run reaches `psnr` dB, by a straight line between two probes.
+
+    Returns:
+        (seconds, whether it had reached it by its first probe); NaN if it never does.
+    """
+    if math.isnan(psnr):
+        return math.nan, False
+    before: tuple[float, float] | None = None
+    for at, value in run.points:
+        if value >= psnr:
+            if before is None:
+                return at, True
+            share = (psnr - before[1]) / (value - before[1])
+            return before[0] + (share if math.isfinite(share) else 1.0) * (at - before[0]), False
+        before = (at, value)
+    return math.nan, False
+
+
+def _level(target: Target, curves: Sequence[Curve], scene: str) -> float:
+    if not target.relative:
+        return target.db
+    ends = [summary(curve, (scene,), lambda run: run.psnr).mean for curve in curves]
+    return max((end for end in ends if math.isfinite(end)), default=math.nan) - target.db
+
+
+def _reach(curve: Curve, target: Target, scene: str | None, level: dict[str, float], setup: bool) -> Reach:
+    runs = [run for name in level for run in curve.on(name)]
+    found = {id(run): first_time(run, level[run.scene]) for run in runs}
+
+    def minutes(run: CostRun) -> float:
+        return (found[id(run)][0] + (run.setup_s if setup else 0.0)) / 60.0
+
+    return Reach(
+        scene,
+        curve.name,
+        curve.length.text,
+        target.text,
+        next(iter(level.values())) if len(level) == 1 or not target.relative else math.nan,
+        summary(curve, tuple(level), minutes),
+        sum(math.isfinite(at) for at, _ in found.values()),
+        len(runs),
+        any(early for _, early in found.values()),
+    )

@@ -1,0 +1,230 @@
+"""Runs as the cost report reads them: what was asked for, what it reached, and how it got there.
+
+Unlike a comparison, this takes many runs of one method on one scene with one seed: they differ in length,
+effects or options, and their differences are what is measured.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.core.config import config_hash
+from ambiguous_wild.harness.store import FAILED, RESULT, read_config, read_result, run_folders
+from ambiguous_wild.metrics import stats
+
+# of the training: they change how a run is kept and watched, not its result
+BOOKKEEPING = ("seed", "checkpoint_every_s", "probes", "iterations", "budget_s")
+NUMBERS = ("ms_per_iteration", "gaussians", "model_mb", "fps")
+
+
+@dataclass(frozen=True, order=True)
+class Length:
+    """How long a run was asked to train."""
+
+    budget_s: float  # 0.0: as many iterations as below
+    iterations: int  # 0: a budget
+
+    @property
+    def text(self) -> str:
+        if not self.budget_s:
+            return f"{self.iterations} iterations"
+        minutes = self.budget_s / 60.0
+        return (
+            f"{minutes:g} min" if self.budget_s % 30.0 == 0.0 and minutes >= 1.0 else f"{self.budget_s:g} s"
+        )
+
+
+@dataclass(frozen=True)
+class CostRun:
+    """One run, finished or failed."""
+
+    folder: Path
+    method: str
+    scene: str
+    seed: int
+    asked: str  # effects as they were asked for: "auto", "all", or their names
+    effects: frozenset[str]  # that were on
+    options: tuple[tuple[str, Any], ...]  # of the method, flat
+    length: Length
+    rest: str  # hash of whatever else decides the result: scene, device, code, protocol
+    psnr: float  # dB, mean over the test images; NaN: failed or not measured
+    images: dict[str, float]  # PSNR by test image
+    train_s: float
+    setup_s: float  # features and masks before the first step; short where a cache held them
+    numbers: dict[str, float]  # see NUMBERS; NaN where not measured
+    points: tuple[tuple[float, float], ...]  # (seconds of training, PSNR in dB), in order of time
+    error: str = ""
+
+    @property
+    def base(self) -> str:
+        """The method's own name: an ablation calls its runs method@group-variant."""
+        host, at, part = self.method.partition("@")
+        return host if at and "=" not in part else self.method
+
+
+@dataclass(frozen=True)
+class Found:
+    """Every run below some folders."""
+
+    runs: tuple[CostRun, ...]
+    notes: tuple[str, ...]  # what could not be read, failed or is not finished
+
+
+def read_cost_runs(folders: Sequence[Path], *, scenes: Sequence[str] = ()) -> Found:
+    """Every run below the folders, each once.
+
+    Args:
+        folders: of `aw bench` or `aw ablate`, or folders of such folders.
+        scenes: only these; empty = all.
+
+    Raises:
+        AwError: no such folder, no finished run, an unknown scene, or one run twice.
+    """
+    runs: list[CostRun] = []
+    notes: list[str] = []
+    for folder in _each_once(folders):
+        path = next((folder / n for n in (RESULT, FAILED) if (folder / n).exists()), None)
+        if path is None:
+            notes.append(f"not finished, left out: {folder}")
+            continue
+        try:
+            runs.append(_run(folder, read_result(path)))
+        except AwError as error:
+            notes.append(f"left out: {error}")
+    known = sorted({run.scene for run in runs})
+    for name in scenes:
+        if name not in known:
+            from ambiguous_wild.core.errors import unknown
+
+            raise unknown("scene", name, known)
+    runs = [run for run in runs if not scenes or run.scene in scenes]
+    if all(math.isnan(run.psnr) for run in runs):
+        raise AwError(
+            "no finished run with a PSNR below "
+            + ", ".join(str(f) for f in folders)
+            + ": 'aw bench --method NAME --scene SCENE -o RUNS' makes one"
+        )
+    _refuse_twice(runs)
+    notes += [f"failed: {r.method} on {r.scene}, seed {r.seed}: {r.error}" for r in runs if r.error]
+    return Found(tuple(runs), tuple(notes))
+
+
+def _each_once(folders: Sequence[Path]) -> list[Path]:
+    """The run folders below; one folder may lie in another that is given too."""
+    found: dict[Path, Path] = {}
+    for root in folders:
+        if not root.is_dir():
+            raise AwError(f"no folder of runs {root}: give the folder that 'aw bench -o' wrote")
+        for folder in run_folders(root):
+            found.setdefault(folder.resolve(), folder)
+    return list(found.values())
+
+
+def _run(folder: Path, result: dict[str, Any]) -> CostRun:
+    config = read_config(folder)
+    train, scene = _mapping(config.get("train")), _mapping(config.get("scene"))
+    cost = result["cost"]
+    images = {row["name"]: _number(row.get("psnr")) for row in result["per_image"]}
+    psnr, train_s = stats.mean(list(images.values())), _number(cost.get("train_s"))
+    effects = config.get("effects") or result["facts"].get("effects") or []
+    rest = {
+        "scene": result["scene_hash"],
+        "factor": scene.get("factor"),
+        "train": {k: v for k, v in train.items() if k not in BOOKKEEPING},
+        "device": config.get("device", cost.get("device")),
+        "protocol": config.get("protocol", "full"),
+        "code": [config.get("source"), result["version"]],
+        "images": sorted(images),
+    }
+    return CostRun(
+        folder=folder,
+        method=result["method"],
+        scene=result["scene"],
+        seed=result["seed"],
+        asked=_asked(folder) or ", ".join(effects),
+        effects=frozenset(map(str, effects)),
+        options=tuple(sorted(_flat(result["options"]).items())),
+        length=_length(train, cost),
+        rest=config_hash(rest),
+        psnr=psnr,
+        images=images,
+        train_s=train_s,
+        setup_s=_number(cost.get("setup_s")),
+        numbers={name: _number(cost.get(name)) for name in NUMBERS},
+        points=_points(folder / "timeline.csv", train_s, psnr),
+        error=result["error"] or "",
+    )
+
+
+def _length(train: dict[str, Any], cost: dict[str, Any]) -> Length:
+    budget = _number(train.get("budget_s"))
+    if budget > 0.0:
+        return Length(budget, 0)
+    iterations = _number(train.get("iterations", cost.get("iterations")))
+    return Length(0.0, 0 if math.isnan(iterations) else int(iterations))
+
+
+def _asked(folder: Path) -> str:
+    """What --effects said, where it said a word: its effects may differ from scene to scene."""
+    try:
+        said = json.loads((folder / "effects.json").read_text(encoding="utf-8")).get("asked", "")
+    except (OSError, ValueError, AttributeError, RecursionError):
+        return ""
+    return said if said in ("auto", "all") else ""
+
+
+def _points(path: Path, train_s: float, psnr: float) -> tuple[tuple[float, float], ...]:
+    """The probes of a timeline, and the measured PSNR as the last of them."""
+    points = []
+    try:
+        with open(path, newline="", encoding="utf-8") as f:
+            for row in csv.DictReader(f):
+                at, value = _number(row.get("wall_s")), _number(row.get("psnr_probe"))
+                if math.isfinite(at) and math.isfinite(value):
+                    points.append((at, value))
+    except (OSError, ValueError, csv.Error):
+        points = []
+    if math.isfinite(train_s) and math.isfinite(psnr):
+        # The timeline rounds to milliseconds; the last probe is the result, measured before it was saved.
+        points = [p for p in points if p[0] < train_s - 0.002] + [(train_s, psnr)]
+    return tuple(sorted(points))
+
+
+def _refuse_twice(runs: Iterable[CostRun]) -> None:
+    seen: dict[tuple[Any, ...], Path] = {}
+    for run in runs:
+        key = (run.method, run.scene, run.seed, run.effects, run.options, run.length, run.rest)
+        if key in seen:
+            raise AwError(
+                f"two runs of {run.method} on {run.scene} with seed {run.seed} and the same settings: "
+                f"{seen[key]} and {run.folder}; leave one of them out"
+            )
+        seen[key] = run.folder
+
+
+def _mapping(value: Any) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}
+
+
+def _number(value: Any) -> float:
+    try:
+        return math.nan if value is None or isinstance(value, bool) else float(value)
+    except (TypeError, ValueError):
+        return math.nan
+
+
+def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            flat |= _flat(value, f"{prefix}{key}.")
+        else:
+            flat[prefix + str(key)] = tuple(map(str, value)) if isinstance(value, list) else value
+    return flat

@@ -1,0 +1,167 @@
+"""The cost report for a terminal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from ambiguous_wild.harness.cost.curves import Summary
+from ambiguous_wild.harness.cost.pairs import Change
+from ambiguous_wild.harness.cost.reach import Reach
+from ambiguous_wild.harness.cost.report import Report
+from ambiguous_wild.harness.render_tables import plain
+
+MISSING = "—"
+SHORT_MIN = 3.0  # trainings below this are told in seconds
+
+
+@dataclass(frozen=True)
+class Listing:
+    """A small table: a title, a head, rows of text."""
+
+    title: str
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+def to_text(report: Report) -> str:
+    """Every table of the report, aligned, and what is missing below."""
+    parts = []
+    for listing in listings(report):
+        parts += [plain(listing.title), *_aligned(listing), ""]
+    parts += ["±: sample standard deviation over seeds"] if _has_spread(report) else []
+    parts += [plain(note) for note in report.notes]
+    parts += [f"made by: {plain(report.made_by)}"] if report.made_by else []
+    return "\n".join(parts) + "\n"
+
+
+@dataclass(frozen=True)
+class Unit:
+    """Of the times that are shown; files hold minutes."""
+
+    name: str
+    per_minute: float
+    digits: int
+
+    def of(self, minutes: Summary) -> Summary:
+        return Summary(minutes.mean * self.per_minute, minutes.spread * self.per_minute)
+
+
+def time_unit(report: Report) -> Unit:
+    """Seconds where every training is short, else minutes."""
+    minutes = [
+        run.train_s / 60.0 for curve in report.curves for run in curve.runs if not math.isnan(run.train_s)
+    ]
+    return Unit("s", 60.0, 1) if max(minutes, default=0.0) < SHORT_MIN else Unit("min", 1.0, 2)
+
+
+def listings(report: Report) -> list[Listing]:
+    """The tables: what each curve reaches, how soon, and what each change brings."""
+    tables = [_points(report)]
+    scenes: dict[str | None, list[Reach]] = {}
+    for row in report.reach:
+        scenes.setdefault(row.scene, []).append(row)
+    tables += [_reached(scene, rows, report) for scene, rows in scenes.items()]
+    for kind, title in (
+        ("effect", "what each effect brings, on runs that differ in it alone"),
+        ("interval", "what refreshing more often brings, on runs that differ in the interval alone"),
+        ("option", "what other options bring, on runs that differ in one alone"),
+    ):
+        rows = [c for c in report.changes if c.kind == kind]
+        tables += [_changed(title, rows, time_unit(report))] if rows else []
+    return tables
+
+
+def _points(report: Report) -> Listing:
+    over = f"mean over {len(report.scenes)} scenes" if len(report.scenes) > 1 else report.scenes[0]
+    unit = time_unit(report)
+    rows = []
+    for p in report.points:
+        n, front = p.numbers, "yes" if p.front else ""
+        rows.append((
+            p.curve, p.length, str(p.runs), number(p.psnr, 2), number(unit.of(p.minutes), unit.digits),
+            front, number(p.setup_s, 1), number(n["ms_per_iteration"], 1),
+            number(n["gaussians"], 0, spread=False), number(n["model_mb"], 1, spread=False),
+            number(n["fps"], 1, spread=False),
+        ))  # fmt: skip
+    took = f"{unit.name} with set-up" if report.setup else unit.name
+    head = ("method", "trained for", "runs", "PSNR dB", took, "on the front", "set-up s", "ms/iter",
+            "Gaussians", "MB", "FPS")  # fmt: skip
+    return Listing(f"what each method reaches, and what it costs ({over})", head, tuple(rows))
+
+
+def _reached(scene: str | None, rows: Sequence[Reach], report: Report) -> Listing:
+    unit = time_unit(report)
+    targets = list(dict.fromkeys(row.target for row in rows))
+    by_key = {(row.curve, row.target): row for row in rows}
+    several = len({curve.length for curve in report.curves}) > 1
+    lines = [
+        (name, *(_when(by_key[name, target], unit, several) for target in targets))
+        for name in dict.fromkeys(row.curve for row in rows)
+    ]
+    psnr = {row.target: row.psnr for row in rows}
+    head = [t if math.isnan(psnr[t]) or t == f"{psnr[t]:g} dB" else f"{t} ({psnr[t]:.2f})" for t in targets]
+    where = "mean over all scenes" if scene is None else scene
+    counted = (
+        f"{'minutes' if unit.name == 'min' else 'seconds'} of training{' and set-up' if report.setup else ''}"
+    )
+    return Listing(f"{counted} to reach a test PSNR ({where})", ("method", *head), tuple(lines))
+
+
+def _when(row: Reach, unit: Unit, several: bool) -> str:
+    if not row.runs:
+        return "no run"
+    if row.reached < row.runs:
+        return "never" if not row.reached else f"{row.reached} of {row.runs} runs"
+    if math.isnan(row.minutes.mean):  # a scene without a run
+        return MISSING
+    text = ("≤ " if row.bound else "") + number(unit.of(row.minutes), unit.digits)
+    return f"{text} (in {row.length})" if several else text
+
+
+def _changed(title: str, rows: Sequence[Change], unit: Unit) -> Listing:
+    head = ("change", "method", "trained for", "pairs", "dB gained", "95 % interval", f"extra {unit.name}",
+            "extra ms/iter", "dB per extra min")  # fmt: skip
+    lines = []
+    for c in rows:
+        what = c.name if c.kind == "effect" else f"{c.name} {c.before} → {c.after}"
+        interval = MISSING if math.isnan(c.low) else f"{c.low:+.2f} to {c.high:+.2f}"
+        lines.append((
+            what, c.method, c.length, str(c.pairs), number(c.db, 2, sign=True), interval,
+            number(unit.of(c.minutes), unit.digits, sign=True), number(c.ms, 1, sign=True), per_minute(c),
+        ))  # fmt: skip
+    return Listing(title, head, tuple(lines))
+
+
+def per_minute(change: Change) -> str:
+    """dB an extra minute, or why there is none."""
+    if math.isnan(change.minutes.mean) or math.isnan(change.db.mean):
+        return MISSING
+    if change.same_time:
+        return "same time"
+    return f"{change.per_minute:+.2f}" if change.minutes.mean > 0.0 else "takes less"
+
+
+def number(value: Summary, digits: int, *, sign: bool = False, spread: bool = True) -> str:
+    """A mean and its deviation over seeds; a dash where it is missing."""
+    if math.isnan(value.mean):
+        return MISSING
+    text = f"{value.mean:{'+' if sign else ''},.{digits}f}"
+    return text if math.isnan(value.spread) or not spread else f"{text} ± {value.spread:.{digits}f}"
+
+
+def _has_spread(report: Report) -> bool:
+    return any(not math.isnan(p.psnr.spread) for p in report.points)
+
+
+def _aligned(listing: Listing) -> list[str]:
+    lines = [tuple(map(plain, line)) for line in (listing.head, *listing.rows)]
+    widths = [max(len(line[i]) for line in lines) for i in range(len(listing.head))]
+    text = [
+        "  ".join(
+            [line[0].ljust(widths[0]), *(cell.rjust(w) for cell, w in zip(line[1:], widths[1:]))]
+        ).rstrip()
+        for line in lines
+    ]
+    return [text[0], "  ".join("─" * w for w in widths), *text[1:]]

@@ -1,0 +1,177 @@
+"""Take runs in: each is checked, and the board changes only by those that pass."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.leaderboard import pictures
+from ambiguous_wild.harness.leaderboard.board import dataset_file, measured, read_board, write_board
+from ambiguous_wild.harness.leaderboard.entry import CHECKED, Entry, Key
+from ambiguous_wild.harness.leaderboard.scenes import Scenes
+from ambiguous_wild.harness.leaderboard.verify import Unfinished, Verified, verify
+from ambiguous_wild.harness.store import run_folders
+from ambiguous_wild.io.atomic import sweep
+from ambiguous_wild.io.lock import folder_lock
+
+Outcome = Literal["added", "there already", "replaced", "refused", "unfinished"]
+Tick = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Report:
+    """What became of one run."""
+
+    run: Path
+    outcome: Outcome
+    error: str = ""
+
+
+def add(
+    board: Path,
+    paths: Sequence[Path],
+    *,
+    dataset: str | None = None,
+    scenes: Path | None = None,
+    images: int = 1,
+    replace_other: bool = False,
+    quick: bool = False,
+    dry: bool = False,
+    tick: Tick = lambda done, total: None,
+) -> list[Report]:
+    """Check runs and add those that pass.
+
+    Args:
+        board: folder of the leaderboard; made where there is none.
+        paths: run folders, or folders of runs.
+        dataset: of all these runs; None: what their scenes say.
+        scenes: where the scenes lie, if not where the runs say.
+        images: test images a scene of which small copies are kept.
+        replace_other: a run with other numbers takes the place of the one on the board.
+        quick: of the metrics recompute PSNR alone.
+        dry: write nothing.
+        tick: called with (runs done, runs).
+
+    Returns:
+        One report a run, in the order of their paths.
+
+    Raises:
+        AwError: no run there, the board is damaged or in use.
+    """
+    runs = _find(paths)
+    with folder_lock(board, "aw leaderboard add"):
+        if not dry:
+            sweep(measured(board))
+        there = read_board(board)
+        finder = Scenes(scenes, dataset, there)
+        reports: dict[Path, Report] = {}
+        passed: list[Verified] = []
+        for done, run in enumerate(sorted(runs)):
+            tick(done, len(runs))
+            try:
+                passed.append(verify(run, finder, quick=quick))
+            except Unfinished as error:
+                reports[run] = Report(run, "refused" if run in paths else "unfinished", str(error))
+            except AwError as error:
+                reports[run] = Report(run, "refused", str(error))
+        tick(len(runs), len(runs))
+        merged = _merge(board, there, passed, replace_other, reports)
+        if not dry:
+            taken = [v for v in passed if reports[v.run].outcome != "refused"]
+            if taken:
+                write_board(board, merged)
+                pictures.keep(board, taken, images)  # after its run: no picture without one
+    return [reports[run] for run in sorted(runs)]
+
+
+def _find(paths: Sequence[Path]) -> set[Path]:
+    found: set[Path] = set()
+    for path in paths:
+        if not path.is_dir():
+            raise AwError(f"no run folder {path}: give a folder that 'aw bench -o' wrote")
+        below = list(run_folders(path))
+        if not below:
+            raise AwError(f"no run in {path}: 'aw bench --method NAME --scene SCENE -o {path}' makes one")
+        found.update(below)
+    return found
+
+
+def _merge(
+    board: Path, there: list[Entry], passed: list[Verified], replace_other: bool, reports: dict[Path, Report]
+) -> list[Entry]:
+    """The runs of the board afterwards; fills in the reports."""
+    entries = {e.key: e for e in there}
+    for reason, bad in _conflicts(board, there, passed):
+        reports[bad.run] = Report(bad.run, "refused", reason)
+    for v in passed:
+        if v.run in reports:
+            continue
+        old = entries.get(v.entry.key)
+        if old is None:
+            reports[v.run] = Report(v.run, "added")
+            entries[v.entry.key] = v.entry
+        elif old.result_hash == v.entry.result_hash and old.config_hash == v.entry.config_hash:
+            reports[v.run] = Report(v.run, "there already")
+            # Whatever was checked once against the photos stays so.
+            better = max(old.checked, v.entry.checked, key=CHECKED.index)
+            entries[v.entry.key] = replace(old, checked=better)
+        elif replace_other:
+            reports[v.run] = Report(v.run, "replaced")
+            entries[v.entry.key] = v.entry
+        else:
+            reports[v.run] = Report(v.run, "refused", _other_numbers(v, old))
+    return [entries[k] for k in sorted(entries)]
+
+
+def _other_numbers(new: Verified, old: Entry) -> str:
+    differing = [k for k in old.quality if old.quality[k] != new.entry.quality.get(k)]
+    key = differing[0] if differing else None
+    shown = (
+        f"{key} {new.entry.quality.get(key)} here and {old.quality[key]} there"
+        if key
+        else "only its cost differs"
+    )
+    return (
+        f"{new.run}: {old.name} is on the board with another result ({shown}); leave it out, or pass "
+        "--replace"
+    )
+
+
+def _conflicts(board: Path, there: list[Entry], passed: list[Verified]) -> list[tuple[str, Verified]]:
+    """(why, run) of those that cannot stand together; the same whatever the order they came in."""
+    cells: dict[Key, list[Verified]] = defaultdict(list)
+    hashes: dict[tuple[str, str], set[str]] = defaultdict(set)
+    spelt: dict[Path, set[str]] = defaultdict(set)
+    for e in (*there, *(v.entry for v in passed)):
+        hashes[e.dataset, e.scene].add(e.scene_hash)
+        spelt[dataset_file(board, e.dataset)].add(e.dataset)
+    for v in passed:
+        cells[v.entry.key].append(v)
+    on_board = {(e.dataset, e.scene): e.scene_hash for e in there}
+    names_on_board = {e.dataset for e in there}
+    found: list[tuple[str, Verified]] = []
+    for v in passed:
+        e, same = v.entry, cells[v.entry.key]
+        known = on_board.get((e.dataset, e.scene))
+        others = [o for o in same if o.entry.result_hash != e.result_hash]
+        if len(names := spelt[dataset_file(board, e.dataset)]) > 1 and e.dataset not in names_on_board:
+            reason = (
+                f"{v.run}: dataset {e.dataset!a} is also spelt {min(names - {e.dataset})!a}; spell it alike"
+            )
+        elif len(hashes[e.dataset, e.scene]) > 1 and e.scene_hash != known:
+            other = min(hashes[e.dataset, e.scene] - {e.scene_hash})
+            reason = (
+                f"{v.run}: scene {e.scene!a} has hash {e.scene_hash[:12]}, another run's of that name has "
+                f"{other[:12]}: other photos, split or size, so their numbers do not compare; put it under "
+                "another --dataset"
+            )
+        elif others:
+            reason = f"{v.run} and {others[0].run} are the same cell with other numbers; give one of them"
+        else:
+            continue
+        found.append((reason, v))
+    return found

@@ -1,0 +1,91 @@
+"use strict";
+// What the page knows, and means that keep what is missing missing.
+const DATA = JSON.parse(document.getElementById("data").textContent);
+const $ = (id) => document.getElementById(id);
+const COSTS = ["train_s", "model_mb", "fps", "gaussians"];
+const state = { dataset: "", scene: "", metric: "", method: "", reported: true, sort: {} };
+
+/** An element; children that are strings become text, never markup. */
+function h(name, attributes = {}, ...children) {
+  const element = document.createElement(name);
+  for (const [key, value] of Object.entries(attributes)) {
+    if (key.startsWith("on")) element.addEventListener(key.slice(2), value);
+    else if (value !== null && value !== undefined) element.setAttribute(key, value);
+  }
+  element.append(...children.filter((c) => c !== null && c !== undefined));
+  return element;
+}
+
+function svg(name, attributes = {}, ...children) {
+  const element = document.createElementNS("http://www.w3.org/2000/svg", name);
+  for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
+  element.append(...children);
+  return element;
+}
+
+const number = (value) => (value === "inf" ? Infinity : value === "-inf" ? -Infinity : value ?? NaN);
+const unique = (values) => [...new Set(values)];
+const byName = (a, b) => a.localeCompare(b, "en", { numeric: true, sensitivity: "base" }) || (a < b ? -1 : a > b ? 1 : 0);
+const mean = (values) => (values.length ? values.reduce((a, b) => a + b, 0) / values.length : NaN);
+const groupKey = (run) => JSON.stringify([run.method, run.setting, run.options]);
+const measure = (key) => (Object.hasOwn(DATA.measures, key) ? DATA.measures[key] : { label: key, better: null, digits: 3 });
+
+/** Sample deviation; NaN for one value, or where one is not finite. */
+function spread(values) {
+  if (values.length < 2 || !values.every(Number.isFinite)) return NaN;
+  const m = mean(values);
+  return Math.sqrt(values.reduce((a, v) => a + (v - m) ** 2, 0) / (values.length - 1));
+}
+
+function shown(value, digits) {
+  if (Number.isNaN(value)) return "–";
+  if (!Number.isFinite(value)) return value > 0 ? "∞" : "-∞";
+  return digits === 0 ? Math.round(value).toLocaleString("en") : value.toFixed(digits);
+}
+
+const valueOf = (run, key) => number(Object.hasOwn(run.quality, key) ? run.quality[key] : Object.hasOwn(run.cost, key) ? run.cost[key] : NaN);
+const runsOf = (dataset) => DATA.runs.filter((r) => r.dataset === dataset);
+const scenesOf = (dataset) => unique(runsOf(dataset).map((r) => r.scene)).sort(byName);
+const measuredDatasets = () => unique(DATA.runs.map((r) => r.dataset)).sort(byName);
+
+/** Groups of runs that differ in scene and seed alone, those the method filter lets through. */
+function groups(dataset) {
+  const found = new Map();
+  for (const run of runsOf(dataset)) {
+    const key = groupKey(run);
+    if (!found.has(key)) found.set(key, { key, method: run.method, setting: run.setting, options: run.options, runs: [] });
+    found.get(key).runs.push(run);
+  }
+  const all = [...found.values()];
+  for (const g of all) {
+    // Options are named where methods and settings alone do not tell groups apart.
+    const twins = all.filter((o) => o.method === g.method && o.setting === g.setting);
+    g.about = twins.length > 1 && g.options ? `${g.setting}, options ${g.options}` : g.setting;
+  }
+  const asked = state.method.trim().toLowerCase();
+  return all.filter((g) => `${g.method} ${g.about}`.toLowerCase().includes(asked));
+}
+
+/** Mean over seeds, then over scenes: {value, spread, seeds: [...]}; missing where a scene or a value is. */
+function summary(group, key, scenes) {
+  const runs = scenes.map((scene) => group.runs.filter((r) => r.scene === scene).sort((a, b) => a.seed - b.seed));
+  const value = mean(runs.map((of) => mean(of.map((r) => valueOf(r, key)))));
+  const seeds = runs[0]?.map((r) => r.seed) ?? [];
+  // Seed by seed, so that the spread is that of the number shown: needs the same seeds in every scene.
+  const same = runs.every((of) => of.length === seeds.length && of.every((r, i) => r.seed === seeds[i]));
+  const bySeed = same && !Number.isNaN(value) ? seeds.map((_, i) => mean(runs.map((of) => valueOf(of[i], key)))) : [];
+  return { value, spread: spread(bySeed), seeds: bySeed };
+}
+
+/** Rank 1, 2, 3 of each value, or null; equal in print is equal in rank. */
+function ranks(values, key) {
+  const { better, digits } = measure(key);
+  const printed = values.map((v) => (Number.isFinite(v) ? Number(v.toFixed(digits)) : v));
+  const known = printed.filter((v) => !Number.isNaN(v));
+  if (!better || new Set(known).size < 2) return values.map(() => null);
+  return printed.map((v) => {
+    if (Number.isNaN(v)) return null;
+    const ahead = known.filter((o) => (better === "higher" ? o > v : o < v)).length;
+    return ahead < 3 ? ahead + 1 : null;
+  });
+}

@@ -1,0 +1,92 @@
+"""Metrics computed again from the saved renders and the scene's test photos."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ambiguous_wild.core import AwError, Scene, View
+from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.io.images import read_png_rgb
+from ambiguous_wild.metrics import image as image_metrics
+
+TOLERANCE = 1e-6  # the same arithmetic on the same 8-bit pixels; another CPU may round otherwise
+
+
+def check_photos(
+    run: Path,
+    scene: Scene,
+    rows: list[dict[str, Any]],
+    renders: Mapping[str, Path],
+    *,
+    half: bool = False,
+    quick: bool = False,
+) -> None:
+    """Compare every image's metrics with those of its render and photo.
+
+    Args:
+        run: the run folder, for messages.
+        scene: with the test photos.
+        rows: per image, name and metrics.
+        renders: PNG by image name.
+        half: the right half was measured.
+        quick: PSNR alone.
+
+    Raises:
+        AwError: an image left out or added, a photo that was changed, or a number that does not follow.
+    """
+    views = {view.name: view for view in scene.test}
+    if set(views) != set(renders):
+        odd = sorted(set(views) ^ set(renders))
+        raise AwError(
+            f"{run} is partial: measured are {len(renders)} images, scene {scene.root} has {len(views)} test "
+            f"photos ({shortlist(odd)} in one of them only); a mean over a part is no result"
+        )
+    known = ("psnr",) if quick else tuple(image_metrics.METRICS)
+    for metric in known:
+        lacking = [row["name"] for row in rows if metric not in row]
+        if lacking and len(lacking) < len(rows):
+            raise AwError(f"{run} is partial: no {metric} of {shortlist(lacking)}, but of the other images")
+    for row in rows:
+        name = row["name"]
+        render, photo = read_png_rgb(renders[name]), _photo(scene, views[name])
+        if render.shape != photo.shape:
+            raise AwError(f"{renders[name]} is not of the size of {views[name].image_path}: it was changed")
+        if half:
+            right = slice(photo.shape[1] // 2, None)
+            render, photo = (np.ascontiguousarray(picture[:, right]) for picture in (render, photo))
+        for metric in known:
+            if metric in row:
+                _compare(run, name, metric, row[metric], image_metrics.METRICS[metric](render, photo))
+
+
+def _compare(run: Path, name: str, metric: str, said: float | None, computed: float) -> None:
+    value = math.nan if said is None else float(said)
+    same = (
+        value == computed
+        or abs(value - computed) <= TOLERANCE
+        or (math.isnan(value) and math.isnan(computed))
+    )
+    if not same:
+        raise AwError(
+            f"{run} was changed: {metric} of {name} is {value:.6f} in metrics.json, render and photo give "
+            f"{computed:.6f}; restore the files, or run it again with 'aw bench --overwrite always'"
+        )
+
+
+def _photo(scene: Scene, view: View) -> np.ndarray:  # [H, W, 3] uint8
+    """The test photo, whose bytes are what the scene's hash was made of."""
+    files = scene.info.get("files")
+    relative = view.image_path.relative_to(scene.root).as_posix()
+    if (
+        isinstance(files, dict)
+        and relative in files
+        and sha256_file(view.image_path) != files[relative]["sha256"]
+    ):
+        raise AwError(f"{view.image_path} is not the photo that scene.json lists: restore it")
+    return read_png_rgb(view.image_path)

@@ -1,0 +1,194 @@
+"""The page: one index.html with CSVs and pictures beside it, made from the board's CSVs alone."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import json
+import math
+import os
+import re
+import shutil
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.leaderboard import pictures
+from ambiguous_wild.harness.leaderboard.board import files_of, read_board
+from ambiguous_wild.harness.leaderboard.entry import Entry, in_order
+from ambiguous_wild.harness.leaderboard.reported import Printed, read_reported, reported_csv
+from ambiguous_wild.harness.leaderboard.sheet import to_number
+from ambiguous_wild.harness.measures import measure
+from ambiguous_wild.io.atomic import atomic_dir, sweep_siblings
+from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.io.lock import folder_lock
+
+GENERATOR = '<meta name="generator" content="aw leaderboard publish">'
+OURS = {"index.html", "data", "images"}
+SCRIPTS = ("page_data.js", "page_table.js", "page_plot.js", "page_main.js")
+COSTS = ("train_s", "model_mb", "fps", "gaussians", "peak_rss_mb")
+PRINTED_LABELS = {"lpips": "LPIPS", "memory": "memory", "gpu_hours": "GPU h", "fps": "FPS"}
+LABELS = {"train_s": "training s", "model_mb": "model MB", "peak_rss_mb": "peak memory MB"}
+
+
+@dataclass(frozen=True)
+class Published:
+    """What the page shows."""
+
+    runs: int
+    datasets: int
+    images: int
+    reported: int
+
+
+def publish(board: Path, out: Path, *, reported: bool = False, title: str = "Leaderboard") -> Published:
+    """Write the page; an earlier page in `out` is replaced once the new one is whole.
+
+    Args:
+        board: folder of the leaderboard.
+        out: for index.html, data/*.csv and images/.
+        reported: show what papers print, too.
+        title: of the page.
+
+    Raises:
+        AwError: the board is damaged, or `out` holds something else.
+    """
+    if not board.is_dir():
+        raise AwError(f"no leaderboard {board}: 'aw leaderboard add RUNS --board {board}' makes one")
+    out = Path(os.path.abspath(out))
+    with folder_lock(out, "aw leaderboard publish"):
+        _restore(out)
+        _check_folder(out)
+        sweep_siblings(out)
+        entries, index = read_board(board), pictures.read_index(board)
+        printed = read_reported(board) if reported else []
+        with atomic_dir(out) as folder:
+            names = _write_data(board, folder / "data", entries, printed)
+            for row in index:
+                _copy_picture(
+                    pictures.folder_of(board) / row["file"], folder / "images" / row["file"], row["sha256"]
+                )
+            text = page(title, _facts(entries, index, printed, names))
+            (folder / "index.html").write_text(text, encoding="utf-8")
+    return Published(len(entries), len({e.dataset for e in entries}), len(index), len(printed))
+
+
+def _restore(out: Path) -> None:
+    """Put the old page back where a killed call had moved it away and not yet the new one in."""
+    if out.exists():
+        return
+    for left in sorted(out.parent.glob(f".{out.name}.old-*")):
+        if (left / out.name / "index.html").is_file():
+            os.replace(left / out.name, out)
+            return
+
+
+def _check_folder(out: Path) -> None:
+    if not out.exists():
+        return
+    if not out.is_dir():
+        raise AwError(f"{out} is a file; choose another -o")
+    names = {p.name for p in out.iterdir()}
+    page_there = out / "index.html"
+    made = (
+        page_there.is_file() and GENERATOR in page_there.read_text(encoding="utf-8", errors="replace")[:2000]
+    )
+    if names and (not made or names - OURS):
+        odd = sorted(names - OURS)[0] if names - OURS else "another page"
+        raise AwError(f"{out} holds something else than a published board ({odd}); choose another -o")
+
+
+def _write_data(board: Path, folder: Path, entries: Sequence[Entry], printed: Sequence[Printed]) -> list[str]:
+    folder.mkdir()
+    files = {path.name: text for path, text in files_of(board, entries).items()}
+    if printed:
+        files["reported.csv"] = reported_csv(printed)
+    for name, text in files.items():
+        (folder / name).write_text(text, encoding="utf-8")
+    return list(files)
+
+
+def _copy_picture(source: Path, target: Path, digest: str) -> None:
+    if not source.is_file() or sha256_file(source) != digest:
+        raise AwError(
+            f"picture {source} is missing or changed: restore it, or add its runs again with "
+            "'aw leaderboard add'"
+        )
+    target.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(source, target)
+
+
+def _facts(
+    entries: Sequence[Entry], index: Iterable[Mapping[str, str]], printed: Sequence[Printed], files: list[str]
+) -> dict[str, Any]:
+    """What the page's script reads."""
+    order = in_order({k for e in entries for k in e.quality})
+    missing = {k for e in entries for k in e.missing}
+    measures = {
+        k: {"label": LABELS.get(k, m.label), "better": m.better, "digits": m.digits}
+        for k in (*order, *sorted(missing), *COSTS, "lpips_alex")
+        for m in (measure(k),)
+    }
+    for n in printed:
+        label = PRINTED_LABELS.get(n.metric, measure(n.metric).label)
+        measures.setdefault(n.metric, {"label": label, "better": measure(n.metric).better, "digits": 3})
+    columns = (
+        "dataset", "scene", "method", "setting", "options", "seed", "images", "missing", "device", "hardware",
+        "version", "source", "code_hash", "config_hash", "scene_hash", "result_hash", "checked", "reproduce",
+    )  # fmt: skip
+    return {
+        "order": order,
+        "measures": measures,
+        "runs": [
+            {k: getattr(e, k) for k in columns}
+            | {
+                "quality": _numbers(e.quality),
+                "cost": _numbers({k: v for k, v in e.cost.items() if k in COSTS}),
+            }
+            for e in entries
+        ],
+        "images": [
+            {k: v for k, v in row.items() if k not in ("sha256", "psnr")}
+            | {"psnr": _number(to_number(row["psnr"], "psnr"))}
+            for row in index
+        ],
+        "reported": [n.plain() for n in printed],
+        "files": files,
+    }
+
+
+def _numbers(values: Mapping[str, float]) -> dict[str, Any]:
+    return {k: _number(v) for k, v in values.items()}
+
+
+def _number(value: float) -> float | str | None:
+    """As JSON has it: no NaN, no infinity."""
+    if math.isfinite(value):
+        return value
+    return None if math.isnan(value) else str(value)
+
+
+def page(title: str, facts: Mapping[str, Any]) -> str:
+    """The page; data and title can be anything and stay text."""
+    here = Path(__file__).resolve().parent
+    template = (here / "page.html").read_text(encoding="utf-8")
+    style = (here / "page.css").read_text(encoding="utf-8")
+    script = "\n".join((here / name).read_text(encoding="utf-8") for name in SCRIPTS)
+    data = json.dumps(facts, ensure_ascii=False, allow_nan=False, separators=(",", ":"), sort_keys=True)
+    for char in "<>&\u2028\u2029":  # no text in it can end the element it stands in
+        data = data.replace(char, f"\\u{ord(char):04x}")
+    # A picture beside a file:// page is not 'self' in every browser.
+    policy = (
+        f"default-src 'none'; img-src 'self' file: data:; style-src {_digest(style)}; "
+        f"script-src {_digest(script)}; base-uri 'none'; form-action 'none'"
+    )
+    parts = {"POLICY": policy, "TITLE": html.escape(title), "STYLE": style, "SCRIPT": script, "DATA": data}
+    # In one pass: what is put in is not looked at again.
+    return re.sub(r"/\*([A-Z]+)\*/", lambda found: parts[found[1]], template)
+
+
+def _digest(text: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"

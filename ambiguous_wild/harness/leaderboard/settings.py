@@ -1,0 +1,144 @@
+"""What sets a run apart, in words, and the command that makes it again."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.core.config import config_hash, to_plain
+
+
+def setting(config: Mapping[str, Any]) -> str:
+    """Length, effects, protocol, limits: "2000 iterations, effects exposure".
+
+    Only what the run itself says, for it is part of a cell: a method's defaults, which later versions change,
+    have no say in it. Options have a hash of their own.
+    """
+    train = config["train"]
+    words = [_length(train)]
+    if config.get("effects"):
+        words.append("effects " + "+".join(map(str, config["effects"])))
+    if config.get("protocol", "full") != "full":
+        words.append(f"{config['protocol']} images")
+    if train.get("resolution", "auto") != "auto":
+        words.append(f"resolution {train['resolution']}")
+    if train.get("max_gaussians") is not None:
+        words.append(f"at most {train['max_gaussians']} Gaussians")
+    return ", ".join(words)
+
+
+def _length(train: Mapping[str, Any]) -> str:
+    seconds = train.get("budget_s")
+    if seconds is None:
+        return f"{train.get('iterations')} iterations"
+    return f"{seconds / 60:g} min" if seconds >= 60 else f"{seconds:g} s"
+
+
+def options_hash(config: Mapping[str, Any]) -> str:
+    """First 8 hex digits over the method's options; empty where it has none."""
+    return config_hash(config["options"])[:8] if config["options"] else ""
+
+
+def command(result: Mapping[str, Any], config: Mapping[str, Any]) -> str:
+    """The command that makes the run again, the scene by its name."""
+    if isinstance(result.get("reproduce"), str):
+        return _without_paths(result["reproduce"])
+    train, method = config["train"], config["method"]
+    words = [
+        "aw",
+        "bench",
+        "--method",
+        method,
+        "--scene",
+        config["scene"].get("name"),
+        "--seed",
+        train["seed"],
+    ]
+    if config["source"]:
+        words += ["--plugin", "METHOD.py"]
+    if train.get("budget_s") is None:
+        words += ["--iterations", train.get("iterations")]
+    else:
+        words += ["--budget", f"{train['budget_s']:g}s"]
+    for flag, value, usual in (
+        ("--resolution", train.get("resolution"), "auto"),
+        ("--max-gaussians", train.get("max_gaussians"), None),
+        ("--protocol", config.get("protocol", "full"), "full"),
+        ("--factor", config["scene"].get("factor"), None),
+    ):
+        if value != usual:
+            words += [flag, value]
+    words += ["--effects", ",".join(map(str, config.get("effects") or ["none"]))]
+    for key, value in (_changed(config) or {}).items():
+        words += ["--set", f"{method.split('@')[0]}.{key}={value}"]
+    words += ["--device", config.get("device", "cpu"), "-o", "runs"]
+    return shlex.join(str(w) for w in words)
+
+
+def _without_paths(text: str) -> str:
+    """The command with scene and plugin by their names: where they lay is nobody else's business."""
+    try:
+        words = shlex.split(text)
+    except ValueError:
+        return text
+    for at, flag in enumerate(words[:-1]):
+        if flag in ("--scene", "--plugin"):
+            words[at + 1] = Path(words[at + 1]).name
+    return shlex.join(words)
+
+
+def _changed(config: Mapping[str, Any]) -> dict[str, str] | None:
+    """Options that are not the method's defaults; None where the defaults are not known here."""
+    usual = _defaults(config["method"]) if not config["source"] else None
+    if usual is None:
+        return None
+    options = _flat(config["options"])
+    return {k: _word(v) for k, v in sorted(options.items()) if k not in usual or usual[k] != v}
+
+
+@cache
+def _defaults(method: str) -> dict[str, Any] | None:
+    from ambiguous_wild.methods.registry import get_method
+
+    if "@" in method:
+        return None  # a variant is its own setting, and its name says it
+    try:
+        return _flat(to_plain(get_method(method).options()))
+    except (AwError, ImportError):
+        return None
+
+
+def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return flat
+
+
+def _word(value: Any) -> str:
+    return ",".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
+
+
+def hardware(path: Path, result: Mapping[str, Any]) -> str:
+    """What the times depend on: "Intel Xeon, 2 threads", or the GPU.
+
+    Raises:
+        AwError: env.json is damaged.
+    """
+    try:
+        facts = json.loads(path.read_text(encoding="utf-8"))
+        name = facts.get("gpu") or facts["cpu"]
+    except (OSError, ValueError, KeyError, AttributeError, RecursionError):
+        raise AwError(
+            f"{path} is damaged: restore it, or run again with 'aw bench --overwrite always'"
+        ) from None
+    threads = result["cost"].get("threads")
+    count = (
+        "" if facts.get("gpu") or threads is None else f", {threads:g} thread{'' if threads == 1 else 's'}"
+    )
+    return " ".join(str(name).split())[:100] + count

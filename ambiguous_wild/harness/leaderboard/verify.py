@@ -1,0 +1,223 @@
+"""Whether a run folder is what it says: each check refuses with one line."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from ambiguous_wild.core import AwError, Scene
+from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.harness.identity import config_identity
+from ambiguous_wild.harness.leaderboard.entry import COST, FIRST, LAST, Entry
+from ambiguous_wild.harness.leaderboard.photos import check_photos
+from ambiguous_wild.harness.leaderboard.scenes import Scenes
+from ambiguous_wild.harness.leaderboard.settings import command, hardware, options_hash, setting
+from ambiguous_wild.harness.leaderboard.sheet import check_text
+from ambiguous_wild.harness.store import FAILED, MASK_SCORES, RESULT, read_config, read_result
+from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.io.images import read_png_rgb
+from ambiguous_wild.metrics import stats
+
+PLY = "point_cloud.ply"
+ENVIRONMENT = "env.json"
+RENDERS = Path("renders") / "test"
+# Measured on part of a picture: one without such a pixel has no value, and is no gap in the mean.
+PARTIAL = ("psnr_valid", "psnr_covered", "psnr_uncovered")
+ANEW = "run it again with 'aw bench --overwrite always'"
+
+
+class Unfinished(AwError):
+    """The run has no result yet: nothing is wrong with it."""
+
+
+@dataclass(frozen=True)
+class Verified:
+    """A run that may stand on the board."""
+
+    entry: Entry
+    run: Path
+    names: tuple[str, ...]  # of the test images
+    psnr: Mapping[str, float]  # by image
+    scene: Scene | None  # None: not at hand
+
+
+def verify(run: Path, scenes: Scenes, *, quick: bool = False) -> Verified:
+    """Check a run and make its row.
+
+    Args:
+        run: the run folder.
+        scenes: finds the run's scene and its dataset.
+        quick: of the metrics recompute PSNR alone.
+
+    Raises:
+        Unfinished: it has no result yet.
+        AwError: it failed, was changed, is partial, or not one of ours; says what to do.
+    """
+    result, config = _result(run), _config(run)
+    _check_identity(run, result, config)
+    renders = _check_files(run, result, ours=not config["source"])
+    scene = scenes.find(run, config)
+    if scene is not None:
+        check_photos(run, scene, result["per_image"], renders, half=_half(config), quick=quick)
+    dataset = scenes.dataset(run, scene, result["scene_hash"])
+    quality, missing = _qualities(run, result)
+    cost = {k: float(v) for k, v in result["cost"].items() if isinstance(v, (int, float)) and v == v}
+    entry = Entry(
+        dataset=check_text("dataset", dataset),
+        scene=check_text(f"scene name of {run}", result["scene"]),
+        method=check_text(f"method name of {run}", result["method"]),
+        setting=setting(config),
+        options=options_hash(config),
+        seed=result["seed"],
+        images=len(renders),
+        quality=quality,
+        cost=cost,
+        missing=missing,
+        device=str(config.get("device", "")),
+        hardware=hardware(run / ENVIRONMENT, result),
+        version=result["version"],
+        source=config["source"],
+        code_hash=str(result.get("code_hash", "")),
+        config_hash=result["config_hash"],
+        scene_hash=result["scene_hash"],
+        result_hash=sha256_file(run / RESULT),
+        checked="files" if scene is None else "photos",
+        reproduce=command(result, config),
+    )
+    psnr = {row["name"]: row.get("psnr", math.nan) for row in result["per_image"]}
+    return Verified(entry, run, tuple(sorted(renders)), psnr, scene)
+
+
+def _result(run: Path) -> dict[str, Any]:
+    if not (run / RESULT).is_file():
+        if (run / FAILED).is_file():
+            failed = read_result(run / FAILED)
+            raise AwError(
+                f"{run} failed ({' '.join(str(failed['error']).split())[:120]}); a failed run has no "
+                f"numbers: {ANEW}"
+            )
+        raise Unfinished(f"{run} has no {RESULT}: still running, or stopped; the same 'aw bench' finishes it")
+    result = read_result(run / RESULT)
+    if result["status"] != "ok":
+        raise AwError(f"{run} failed, its {RESULT} says; a failed run has no numbers: {ANEW}")
+    if result["seed"] < 0:
+        raise AwError(f"{run / RESULT} has seed {result['seed']}; seeds count from 0")
+    return result
+
+
+def _config(run: Path) -> dict[str, Any]:
+    config = read_config(run)
+    wrong = [k for k in ("train", "scene", "options") if not isinstance(config.get(k), dict)]
+    wrong += [k for k in ("method", "source", "config_hash", "version") if not isinstance(config.get(k), str)]
+    if wrong:
+        raise AwError(
+            f"{run / 'config.yaml'} is absent, damaged or not of 'aw bench' ({shortlist(wrong)}); without it "
+            "nobody can say what was run: restore it, or run again"
+        )
+    return config
+
+
+def _check_identity(run: Path, result: dict[str, Any], config: dict[str, Any]) -> None:
+    """Configuration and result are of each other, and of code that can be named."""
+    try:
+        computed = config_identity(config)
+    except (TypeError, ValueError) as error:
+        raise AwError(f"{run / 'config.yaml'} has no hash ({error}); {ANEW}") from None
+    for where, known in (("config.yaml", config["config_hash"]), (RESULT, result["config_hash"])):
+        if known != computed:
+            raise AwError(
+                f"{run} was changed: config.yaml hashes to {computed[:12]}, {where} says {str(known)[:12]}; "
+                f"restore both files, or {ANEW}"
+            )
+    pairs = {
+        "method": (config["method"], result["method"]),
+        "scene": (config["scene"].get("name"), result["scene"]),
+        "scene hash": (config["scene"].get("sha256"), result["scene_hash"]),
+        "seed": (config["train"].get("seed"), result["seed"]),
+        "options": (config["options"], result["options"]),
+        "version": (config["version"], result["version"]),
+        "protocol": (config.get("protocol", "full"), result["facts"].get("protocol", "full")),
+    }
+    for what, (asked, got) in pairs.items():
+        if asked != got:
+            raise AwError(
+                f"{run} was changed: {what} is {str(asked)[:40]!a} in config.yaml and {str(got)[:40]!a} in "
+                f"{RESULT}; restore both files, or {ANEW}"
+            )
+    _check_source(run, config)
+
+
+def _check_source(run: Path, config: dict[str, Any]) -> None:
+    from ambiguous_wild.methods.registry import BUILTIN
+
+    source, method = config["source"], config["method"]
+    if source and not re.fullmatch(r"[0-9a-f]{64}", source):
+        raise AwError(f"{run}: source {source[:40]!a} in config.yaml is no sha256 of a method's file; {ANEW}")
+    # A variant "method@..." is the method's code under another setting.
+    if not source and method.split("@")[0] not in {entry.name for entry in BUILTIN}:
+        raise AwError(
+            f"{run}: method {method[:60]!a} is none of this package and config.yaml has no hash of its code, "
+            "so nobody can say what ran; run it as a file, see docs/add-a-method.md"
+        )
+
+
+def _check_files(run: Path, result: dict[str, Any], *, ours: bool) -> dict[str, Path]:
+    """Image name -> render; everything a result rests on is there."""
+    # A program of others may have no splats; then its result says no size either.
+    size = result["cost"].get("model_mb")
+    needed = (ENVIRONMENT,) if size is None and not ours else (PLY, ENVIRONMENT)
+    lacking = [name for name in needed if not (run / name).is_file()]
+    renders = {row["name"]: run / RENDERS / _inside(run, row["name"]) for row in result["per_image"]}
+    lacking += [str(path.relative_to(run)) for path in renders.values() if not path.is_file()]
+    if lacking:
+        raise AwError(f"{run} is partial, it lacks {shortlist(lacking)}: restore what is gone, or {ANEW}")
+    if not renders:
+        raise AwError(f"{run} measured no test image: a scene without test views has no place on a board")
+    there = set((run / RENDERS).rglob("*.png"))
+    unlisted = sorted(str(p.relative_to(run / RENDERS)) for p in there - set(renders.values()))
+    if unlisted or len(set(renders.values())) < len(renders):
+        what = f"{shortlist(unlisted)} was rendered" if unlisted else "two images share a render"
+        raise AwError(f"{run} is partial: {what} and {RESULT} does not list it; {ANEW}")
+    if PLY in needed and (
+        size is None or not math.isclose(size, (run / PLY).stat().st_size / 1e6, abs_tol=1e-6)
+    ):
+        raise AwError(f"{run} was changed: {PLY} is not of the size that {RESULT} says; {ANEW}")
+    for path in renders.values():
+        read_png_rgb(path)
+    return renders
+
+
+def _inside(run: Path, name: str) -> str:
+    pure = PurePosixPath(name)
+    if pure.is_absolute() or ".." in pure.parts or not pure.name or "\\" in name:
+        raise AwError(f"{run} names a test image outside itself: {name[:60]!a}; it is no run of ours")
+    return str(pure.with_suffix(".png"))
+
+
+def _qualities(run: Path, result: dict[str, Any]) -> tuple[dict[str, float], tuple[str, ...]]:
+    """(mean over the images by metric, metrics that lack a value somewhere)."""
+    names = {k for row in result["per_image"] for k in row if k != "name"} | set(result["missing"])
+    for name in sorted(names):
+        if (
+            not re.fullmatch(r"[a-z][a-z0-9_.]{0,60}", name)
+            or name in (*FIRST, *LAST)
+            or name.startswith(COST)
+        ):
+            raise AwError(f"{run}: {name[:60]!a} cannot name a metric: lower case, digits, '_' and '.'")
+    rows = result["per_image"]
+    means = {
+        name: stats.mean([row.get(name) for row in rows if name in row or name not in PARTIAL])
+        for name in names
+    }
+    masks = result["masks"] or {}
+    means |= {f"mask_{k}": float(masks[k]) for k in MASK_SCORES if masks.get(k) is not None}
+    missing = tuple(sorted(k for k, v in means.items() if math.isnan(v)))
+    return {k: v for k, v in means.items() if not math.isnan(v)}, missing
+
+
+def _half(config: dict[str, Any]) -> bool:
+    return config.get("protocol", "full") == "half"

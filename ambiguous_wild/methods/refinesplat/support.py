@@ -1,0 +1,83 @@
+"""Which Gaussians the kept pixels vouch for.
+
+A Gaussian that stands behind a mask in every photo that has it in its frame is never corrected: whatever
+it has become stays, and a view between those photos shows it as a dark blotch in mid-air. What nobody
+vouches for is removed; where it was right, the hole it leaves is no evidence for a mask (`least_alpha`) and
+is learnt anew.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ambiguous_wild.core import Camera
+
+
+@dataclass(frozen=True)
+class SupportConfig:
+    """When a Gaussian counts as vouched for by nobody."""
+
+    least_share: float = 0.1  # of the looks its centre must lie on a kept pixel; 0 = never removed (printed)
+    looks: int = 8  # with its centre in the frame before it is judged
+    every: int = 4  # iterations between looks
+
+
+class Support:
+    """Counts, a row a Gaussian, how often its centre lay in the frame and how often on a kept pixel."""
+
+    def __init__(self, config: SupportConfig) -> None:
+        self.config = config
+        self.looked = torch.zeros(0)  # [N]
+        self.kept = torch.zeros(0)  # [N]
+
+    def due(self, iteration: int) -> bool:
+        """Whether this iteration is looked at."""
+        return self.config.least_share > 0 and iteration % self.config.every == 0
+
+    def look(self, means: Tensor, visible: Tensor, camera: Camera, keep: Tensor | None) -> None:
+        """Add one view.
+
+        Args:
+            means: [N, 3] in the world.
+            visible: [N] bool, passed every cull of the render.
+            camera: of the step.
+            keep: [H, W] float32 at the camera's size, 1 = static; None = all of it.
+        """
+        rows = torch.nonzero(visible).squeeze(1)
+        pose = torch.tensor(camera.cam_from_world.tolist(), dtype=means.dtype, device=means.device)
+        local = means[rows] @ pose[:3, :3].T + pose[:3, 3]
+        z = local[:, 2].clamp(min=1e-6)
+        u = torch.floor(local[:, 0] / z * camera.fx + camera.cx).long()
+        v = torch.floor(local[:, 1] / z * camera.fy + camera.cy).long()
+        inside = (local[:, 2] > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+        rows, u, v = rows[inside], u[inside], v[inside]
+        self.looked[rows] += 1.0
+        self.kept[rows] += 1.0 if keep is None else (keep[v, u] > 0.5).to(self.kept.dtype)
+
+    def judge(self) -> Tensor:
+        """Who is to go, [N] bool; the evidence on those who were judged and stay counts half from now on."""
+        judged = self.looked >= self.config.looks
+        drop = judged & (self.kept < self.config.least_share * self.looked)
+        half = torch.where(judged, 0.5, 1.0)
+        self.looked, self.kept = self.looked * half, self.kept * half
+        return drop
+
+    def select(self, stay: Tensor) -> None:
+        """Keep the rows `stay` [N] bool."""
+        self.looked, self.kept = self.looked[stay], self.kept[stay]
+
+    def match(self, count: int, device: torch.device) -> None:
+        """Pad with zeros for new rows; after a resume, bring the counts to the device."""
+        pad = torch.zeros(max(count - len(self.looked), 0), device=device)
+        self.looked = torch.cat([self.looked.to(device), pad])
+        self.kept = torch.cat([self.kept.to(device), pad])
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"looked": self.looked, "kept": self.kept}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.looked, self.kept = state["looked"], state["kept"]

@@ -1,0 +1,65 @@
+"""`aw cost`, and the runs of several lengths that it reads."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from ambiguous_wild.cli.cost import command
+from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.grid import cell_folder, plan_cells
+from ambiguous_wild.harness.several import grouped
+from ambiguous_wild.splat.trainer import TrainConfig
+from tests.harness.fake_cost import cost_run
+from tests.tiny_scene import write_tiny_scene
+
+
+def test_tables_on_standard_output_and_files_beside(tmp_path: Path) -> None:
+    runs = tmp_path / "my runs"
+    cost_run(runs, "a", psnr=(20.0,), train_s=300.0, probes=[(100.0, 15.0), (200.0, 19.0)])
+    out = tmp_path / "out"
+    done = CliRunner().invoke(command, [str(runs), "--target", "17", "-o", str(out), "--no-plots"])
+    assert done.exit_code == 0, done.output
+    assert "minutes of training to reach a test PSNR (yard)" in done.stdout and "2.50" in done.stdout
+    assert f"made by: aw cost '{runs}' -o {out} --target 17" in done.stdout
+    assert sorted(p.name for p in out.iterdir()) == [
+        "cost.csv",
+        "cost.json",
+        "time-to-psnr.csv",
+        "timelines.csv",
+    ]
+    printed = CliRunner().invoke(
+        command, [str(runs), "--target", "17", "-o", str(out), "--no-plots", "--json"]
+    )
+    assert json.loads(printed.stdout) == json.loads((out / "cost.json").read_text())
+
+
+def test_a_target_that_is_no_number_is_refused(tmp_path: Path) -> None:
+    error = CliRunner().invoke(command, [str(tmp_path), "--target", "nan"]).exception
+    assert isinstance(error, AwError) and "--target" in str(error)
+
+
+def test_several_lengths_and_effects_have_folders_of_their_own(tmp_path: Path) -> None:
+    scene = write_tiny_scene(tmp_path / "scene")
+    planned = {
+        effects: plan_cells(["3dgs"], [scene], [0], TrainConfig(), effects=effects)
+        for effects in ("none", "exposure, poses")
+    }
+    cells = grouped(planned, [180.0, 60.0, 60.0])
+    folders = [str(cell_folder(Path("o"), cell)) for cell in cells]
+    assert folders == [
+        f"o/budget-{b}s/effects-{e}/scene/3dgs/seed0" for b in (60, 180) for e in ("none", "exposure+poses")
+    ]
+    assert len({cell.identity for cell in cells}) == 4
+    (alone,) = grouped({"none": planned["none"]}, [60.0])
+    assert cell_folder(Path("o"), alone) == Path("o/scene/3dgs/seed0")
+    assert alone.identity == cells[0].identity  # where a run lies is not what it is
+    assert grouped({"none": planned["none"]}) == planned["none"]
+
+
+@pytest.mark.parametrize("words", [[], ["absent"]])
+def test_no_runs_is_an_error(words: list[str]) -> None:
+    assert CliRunner().invoke(command, words).exit_code != 0

@@ -1,0 +1,50 @@
+"""Run folders with timelines and settings, for the tests of the cost report."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from ambiguous_wild.harness.store import write_result
+from tests.harness.fake_runs import fake_result
+
+
+def cost_run(
+    root: Path,
+    method: str,
+    scene: str = "yard",
+    seed: int = 0,
+    *,
+    psnr: tuple[float, ...] = (20.0, 22.0),
+    train_s: float = 60.0,
+    effects: tuple[str, ...] = (),
+    options: dict[str, Any] | None = None,
+    budget_s: float | None = None,
+    probes: list[tuple[float, float]] | None = None,
+    ms: float = 100.0,
+    model_mb: float = 1.0,
+    **changes: Any,
+) -> Path:
+    """A finished run with a timeline of (seconds, dB); returns its folder."""
+    folder = root / scene / "".join(c if c.isalnum() else "_" for c in method) / f"seed{seed}"
+    result = fake_result(method, scene, seed, psnr, options=options or {}, **changes)
+    if result["cost"]:
+        result["cost"] |= {"train_s": train_s, "setup_s": 5.0, "ms_per_iteration": ms, "model_mb": model_mb}
+    write_result(folder / ("failed.json" if result["status"] == "failed" else "metrics.json"), result)
+    config = {
+        "method": method,
+        "train": {"iterations": 100, "budget_s": budget_s, "seed": seed, "probes": 8},
+        "scene": {"name": scene, "factor": 1},
+        "device": "cpu",
+    } | ({"effects": list(effects)} if effects else {})
+    (folder / "config.yaml").write_text(yaml.safe_dump(config), encoding="utf-8")
+    rows = probes if probes is not None else [(train_s, float(np.mean(psnr)))] if psnr else []
+    with open(folder / "timeline.csv", "w", newline="", encoding="utf-8") as f:
+        writer = csv.writer(f)
+        writer.writerow(["wall_s", "iteration", "loss", "gaussians", "psnr_probe"])
+        writer.writerows([at, 1, 0.1, 10, "" if value is None else value] for at, value in rows)
+    return folder

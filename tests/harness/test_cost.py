@@ -1,0 +1,263 @@
+"""The cost of accuracy: times between probes, pairs that differ in one thing, fronts, and what is missing."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.cost.curves import Curve, Summary, curves_of, summary, timeline
+from ambiguous_wild.harness.cost.front import Point, pareto, points
+from ambiguous_wild.harness.cost.pairs import changes
+from ambiguous_wild.harness.cost.plot_style import spread_out
+from ambiguous_wild.harness.cost.plots import draw_all
+from ambiguous_wild.harness.cost.reach import first_time, times_to_reach
+from ambiguous_wild.harness.cost.read import CostRun, Found, read_cost_runs
+from ambiguous_wild.harness.cost.report import cost_report, write_report
+from ambiguous_wild.harness.cost.text import to_text
+from tests.harness.fake_cost import cost_run
+from tests.harness.fake_runs import failed
+
+RISING = [(10.0, 10.0), (20.0, 18.0), (40.0, 20.0)]
+HOSTILE = "=cmd|$x_1$<script>\x1b[31m"
+
+
+def read(*folders: Path) -> Found:
+    return read_cost_runs(folders)
+
+
+def only(found: Found) -> CostRun:
+    (run,) = found.runs
+    return run
+
+
+def test_time_to_reach_lies_between_two_probes(tmp_path: Path) -> None:
+    cost_run(tmp_path, "a", psnr=(20.0,), train_s=40.0, probes=[*RISING[:2], (25.0, None), RISING[2]])  # type: ignore[list-item]
+    run = only(read(tmp_path))
+    assert run.points == tuple(RISING)
+    assert first_time(run, 14.0) == (15.0, False)
+    assert first_time(run, 19.0) == (30.0, False)
+    assert first_time(run, 20.0) == (40.0, False)
+    assert first_time(run, 9.0) == (10.0, True)  # reached by the first probe: an upper bound
+    assert math.isnan(first_time(run, 20.01)[0])
+
+
+def test_the_first_time_counts_where_psnr_falls_again(tmp_path: Path) -> None:
+    cost_run(tmp_path, "a", psnr=(15.0,), train_s=30.0, probes=[(10.0, 10.0), (20.0, 20.0), (30.0, 15.0)])
+    assert first_time(only(read(tmp_path)), 15.0) == (15.0, False)
+
+
+def test_a_time_is_missing_where_one_run_never_gets_there(tmp_path: Path) -> None:
+    for seed, end in ((0, 20.0), (1, 18.5)):
+        cost_run(tmp_path, "a", seed=seed, psnr=(end,), train_s=40.0, probes=[*RISING[:2], (40.0, end)])
+    curves = curves_of(read(tmp_path).runs)
+    (low,) = times_to_reach(curves, [14.0])
+    assert low.minutes == Summary(0.25, 0.0) and (low.reached, low.runs) == (2, 2)
+    (high,) = times_to_reach(curves, [19.0])
+    assert math.isnan(high.minutes.mean) and (high.reached, high.runs) == (1, 2)
+    with_setup = times_to_reach(curves, [14.0], setup=True)[0]
+    assert with_setup.minutes.mean == pytest.approx(20.0 / 60.0)
+
+
+def test_of_several_lengths_the_one_that_is_there_first_is_told(tmp_path: Path) -> None:
+    short, long = tmp_path / "budget-40s", tmp_path / "budget-80s"
+    cost_run(short, "a", psnr=(20.0,), train_s=40.0, budget_s=40.0, probes=RISING)
+    cost_run(
+        long, "a", psnr=(22.0,), train_s=80.0, budget_s=80.0, probes=[(10.0, 8.0), (40.0, 16.0), (80.0, 22.0)]
+    )
+    curves = curves_of(read(tmp_path).runs)
+    assert [(c.name, c.length.text) for c in curves] == [("a", "40 s"), ("a", "80 s")]
+    by_target = {r.target: r for r in times_to_reach(curves, [18.0, 21.0, 30.0])}
+    assert by_target["18 dB"].length == "40 s" and by_target["18 dB"].minutes.mean == pytest.approx(20 / 60)
+    assert by_target["21 dB"].length == "80 s"
+    assert by_target["30 dB"].reached == 0
+
+
+def test_default_targets_hang_on_the_best_of_each_scene(tmp_path: Path) -> None:
+    cost_run(tmp_path, "a", "one", psnr=(20.0,), train_s=40.0, probes=RISING)
+    cost_run(tmp_path, "a", "two", psnr=(30.0,), train_s=40.0, probes=[(20.0, 20.0), (40.0, 30.0)])
+    rows = {(r.scene, r.target): r for r in times_to_reach(curves_of(read(tmp_path).runs))}
+    assert rows["one", "best - 1 dB"].psnr == 19.0 and rows["two", "best - 1 dB"].psnr == 29.0
+    mean = rows[None, "best - 1 dB"]
+    assert mean.minutes.mean == pytest.approx((30.0 + 38.0) / 2 / 60) and math.isnan(mean.psnr)
+
+
+def test_failed_and_absent_cells_make_means_missing_and_are_named(tmp_path: Path) -> None:
+    for method in ("a", "b", "c"):
+        cost_run(tmp_path, method, "one", psnr=(20.0,), train_s=40.0, probes=RISING)
+    cost_run(tmp_path, "a", "two", psnr=(22.0,), train_s=40.0, probes=RISING)
+    lost = {k: v for k, v in failed("b", "two").items() if k not in ("method", "scene", "seed", "options")}
+    cost_run(tmp_path, "b", "two", psnr=(), **lost)
+    report = cost_report(read(tmp_path), targets=[15.0])
+    psnr = {p.curve: p.psnr.mean for p in report.points}
+    assert psnr["a"] == 21.0 and math.isnan(psnr["b"]) and math.isnan(psnr["c"])
+    assert [p.curve for p in report.points if p.front] == ["a"]
+    minutes = {r.curve: r.minutes.mean for r in report.reach if r.scene is None}
+    assert math.isfinite(minutes["a"]) and math.isnan(minutes["b"]) and math.isnan(minutes["c"])
+    notes = "\n".join(report.notes)
+    assert "failed: b on two" in notes and "no run: c" in notes and "on two" in notes
+
+
+def test_an_effect_is_measured_on_pairs_that_differ_in_it_alone(tmp_path: Path) -> None:
+    for seed in (0, 1):
+        for name, effects, gain, extra in (("n", (), 0.0, 0.0), ("e", ("exposure",), 1.5, 30.0),
+                                           ("b", ("exposure", "poses"), 1.0, 90.0)):  # fmt: skip
+            cost_run(tmp_path / name, "a", seed=seed, psnr=(20.0 + gain + seed, 22.0 + gain), effects=effects,
+                     train_s=60.0 + extra, ms=100.0 + extra)  # fmt: skip
+    cost_run(tmp_path / "other", "a", seed=7, psnr=(40.0, 40.0), effects=("exposure",))  # has no partner
+    found = {c.name: c for c in changes(read(tmp_path).runs)}
+    assert found.keys() == {"exposure", "poses"}
+    exposure, poses = found["exposure"], found["poses"]
+    assert (exposure.pairs, exposure.db.mean, exposure.db.spread) == (2, 1.5, 0.0)
+    assert exposure.minutes.mean == pytest.approx(0.5) and exposure.ms.mean == pytest.approx(30.0)
+    assert exposure.per_minute == pytest.approx(3.0)
+    assert exposure.low == exposure.high == 1.5  # every picture gains the same
+    assert poses.db.mean == -0.5 and poses.per_minute == pytest.approx(-0.5)
+
+
+def test_a_refresh_interval_is_turned_towards_what_costs_more(tmp_path: Path) -> None:
+    for every, psnr, seconds in ((1, 21.0, 120.0), (10, 20.5, 60.0)):
+        options = {"mask": {"mask_every": every}, "other": 3}
+        cost_run(tmp_path / str(every), "a", psnr=(psnr,), train_s=seconds, ms=seconds, options=options)
+    cost_run(tmp_path / "two", "a", psnr=(30.0,), options={"mask": {"mask_every": 1}, "other": 4}, ms=1.0)
+    found = {(c.kind, c.name): c for c in changes(read(tmp_path).runs)}
+    interval = found["interval", "mask.mask_every"]
+    assert (interval.before, interval.after) == ("10", "1")
+    assert interval.per_minute == pytest.approx(0.5)
+    assert found["option", "other"].pairs == 1  # mask_every 1 in both
+    assert len(found) == 2  # nothing of runs that differ in two
+
+
+def test_runs_of_an_ablation_are_pairs_of_their_method(tmp_path: Path) -> None:
+    cost_run(tmp_path, "a", psnr=(20.0,), options={"merge_every": 0}, ms=1.0)
+    cost_run(tmp_path, "a@density-merging", psnr=(21.0,), options={"merge_every": 1}, train_s=90.0, ms=2.0)
+    cost_run(
+        tmp_path, "a@mask=b", psnr=(25.0,), options={"merge_every": 2}, ms=3.0
+    )  # a graft is another method
+    (change,) = changes(read(tmp_path).runs)
+    assert change.method == "a" and change.db.mean == 1.0
+
+
+def test_under_a_budget_both_take_as_long_and_no_rate_is_given(tmp_path: Path) -> None:
+    for name, effects, psnr in (("n", (), 20.0), ("e", ("exposure",), 21.0)):
+        cost_run(
+            tmp_path / name,
+            "a",
+            psnr=(psnr,),
+            effects=effects,
+            train_s=60.01 + len(effects) * 0.02,
+            budget_s=60.0,
+        )
+    (change,) = changes(read(tmp_path).runs)
+    assert change.db.mean == 1.0 and change.same_time and math.isnan(change.per_minute)
+    assert "same time" in to_text(cost_report(read(tmp_path)))
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.tuples(st.integers(1, 6), st.integers(1, 6)), min_size=1, max_size=12))
+def test_the_front_is_what_no_other_dominates(at: list[tuple[int, int]]) -> None:
+    made = [
+        Point(str(i), "m", "", 1, Summary(float(psnr)), Summary(float(minutes)), Summary(), {})
+        for i, (minutes, psnr) in enumerate(at)
+    ]
+    front = {
+        (p.minutes.mean, p.psnr.mean)
+        for p in pareto([*made, Point("x", "m", "", 0, Summary(), Summary(1.0), Summary(), {})])
+    }
+    expected = {
+        (m, d) for m, d in at
+        if not any((m2 <= m and d2 >= d) and (m2, d2) != (m, d) for m2, d2 in at)
+    }  # fmt: skip
+    assert front == expected
+
+
+def test_spread_is_of_seeds_over_the_mean_over_scenes(tmp_path: Path) -> None:
+    values = {("one", 0): 20.0, ("one", 1): 22.0, ("two", 0): 30.0, ("two", 1): 30.0}
+    for (scene, seed), psnr in values.items():
+        cost_run(tmp_path, "a", scene, seed, psnr=(psnr,))
+    (point,) = points(curves_of(read(tmp_path).runs))
+    assert point.psnr.mean == 25.5
+    assert point.psnr.spread == pytest.approx(np.std([25.0, 26.0], ddof=1))
+
+
+def test_a_mean_timeline_exists_only_where_every_run_has_one(tmp_path: Path) -> None:
+    cost_run(tmp_path, "a", seed=0, psnr=(20.0,), train_s=40.0, probes=RISING)
+    cost_run(tmp_path, "a", seed=1, psnr=(24.0,), train_s=36.0, probes=[(12.0, 12.0), (36.0, 24.0)])
+    (curve,) = curves_of(read(tmp_path).runs)
+    seconds, psnr = timeline(curve, ("yard",))
+    assert (seconds[0], seconds[-1]) == (12.0, 36.0)
+    assert psnr[0] == pytest.approx((11.6 + 12.0) / 2) and psnr[-1] == pytest.approx((19.6 + 24.0) / 2)
+    assert len(timeline(curve, ("yard", "absent"))[0]) == 0
+    assert math.isnan(summary(Curve("a", "a", curve.length, ()), ("yard",), lambda run: run.psnr).mean)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.floats(0, 10), max_size=8), st.floats(0.1, 2))
+def test_labels_keep_their_order_and_distance(heights: list[float], gap: float) -> None:
+    placed = spread_out(heights, gap)
+    order = sorted(range(len(heights)), key=lambda i: heights[i])
+    assert all(placed[b] - placed[a] >= gap - 1e-6 for a, b in pairwise(order))
+    if len(heights) == 1:
+        assert placed == heights
+
+
+def test_files_hold_what_is_printed_and_hostile_names_stay_text(tmp_path: Path) -> None:
+    for length in (40.0, 80.0):
+        cost_run(
+            tmp_path / f"{length}",
+            HOSTILE,
+            psnr=(20.0,),
+            train_s=length,
+            budget_s=length,
+            probes=[(20.0, 18.0)],
+        )
+    out = tmp_path / "out"
+    report = cost_report(read(tmp_path), targets=[19.0], made_by="aw cost runs")
+    written = [p.name for p in write_report(report, out) + draw_all(report, out)]
+    assert {"cost.json", "cost.csv", "time-to-psnr.csv", "timelines.csv", "timelines.svg", "timelines.png",
+            "budgets.png", "front.svg"} <= set(written) and "changes.csv" not in written  # fmt: skip
+    data = json.loads((out / "cost.json").read_text())
+    assert data["curves"][0]["minutes_std"] is None and data["made_by"] == "aw cost runs"
+    rows = list(csv.DictReader((out / "cost.csv").open()))
+    assert all(row["curve"].startswith("'=") for row in rows) and len(rows) == 2
+    svg = (out / "timelines.svg").read_text()
+    assert "<script" not in svg and "\x1b" not in svg
+    assert "\x1b" not in to_text(report)
+
+
+def test_only_an_earlier_report_is_taken_away(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    for name in ("changes.csv", "notes.txt"):
+        (out / name).write_text("mine")
+    cost_run(tmp_path / "runs", "a")
+    report = cost_report(read(tmp_path / "runs", tmp_path / "runs" / "yard"))  # a folder in a folder: one run
+    assert [p.runs for p in report.points] == [1]
+    write_report(report, out)
+    assert (out / "changes.csv").read_text() == "mine"  # nothing here was a report of ours
+    (out / "changes.csv").unlink()
+    (out / "budgets.png").write_text("of a report")
+    write_report(report, out)
+    assert sorted(p.name for p in out.iterdir()) == ["cost.csv", "cost.json", "notes.txt", "time-to-psnr.csv",
+                                                     "timelines.csv"]  # fmt: skip
+
+
+def test_errors_say_what_to_do(tmp_path: Path) -> None:
+    with pytest.raises(AwError, match="no folder of runs"):
+        read(tmp_path / "absent")
+    with pytest.raises(AwError, match="no finished run"):
+        read(tmp_path)
+    cost_run(tmp_path / "x", "a")
+    cost_run(tmp_path / "y", "a")
+    with pytest.raises(AwError, match="two runs of a"):
+        read(tmp_path)
+    with pytest.raises(AwError, match="unknown scene"):
+        read_cost_runs([tmp_path / "x"], scenes=["gard"])

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ambiguous_wild.cli.engines import Engine, Grid, Session, engine_options
 from ambiguous_wild.cli.options import training_options
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.extras import install_command
@@ -37,7 +38,13 @@ def parse_budget(text: str) -> float:
 
 
 @click.command(name="bench")
-@click.option("--method", "methods", multiple=True, required=True, help="A name of 'aw methods'; repeatable.")
+@click.option(
+    "--method",
+    "methods",
+    multiple=True,
+    required=True,
+    help="A name of 'aw methods', FILE.py:RECIPE, external:FILE.yaml or nerfbaselines:METHOD; repeatable.",
+)
 @click.option(
     "--scene",
     "scenes",
@@ -107,8 +114,10 @@ def parse_budget(text: str) -> float:
     show_default=True,
     help="Draw what the method saw into RUN/pictures; changes nothing else.",
 )
+@engine_options
 @click.option("--json", "as_json", is_flag=True, help="Print the outcome of every run as JSON.")
 def command(
+    engine: Engine,
     methods: tuple[str, ...],
     scenes: tuple[Path, ...],
     seeds: tuple[int, ...],
@@ -143,6 +152,7 @@ def command(
     aw bench --method 3dgs --method refinesplat --scene scene --budget 1m --budget 3m --budget 10m -o runs
     aw bench --method 3dgs --method robustsplat --mask refinesplat --scene scene -o runs
 
+    With --jobs 4 four cells run at a time, with --engine ray as many as a cluster has room for.
     --mask, --density and --regulariser plug parts of one method into every METHOD: the runs are called
     3dgs@mask=refinesplat, which is also a METHOD.
 
@@ -155,6 +165,7 @@ def command(
     seconds = [parse_budget(budget) for budget in budgets]
     if math.isnan(checkpoint_every):
         raise AwError("--checkpoint-every nan: give a number of seconds")
+    engine.check()
 
     from ambiguous_wild.methods.graft import graft_name, idle_regulariser
     from ambiguous_wild.methods.registry import get_method, load_plugin
@@ -179,7 +190,8 @@ def command(
     from ambiguous_wild.io.atomic import check_output
     from ambiguous_wild.splat.trainer import TrainConfig
 
-    chosen = choose_device(device)
+    session = Session(engine, threads)
+    chosen = session.device(device)
     train = TrainConfig(
         iterations=iterations or TrainConfig.iterations,
         budget_s=seconds[0] if seconds else None,
@@ -222,19 +234,24 @@ def command(
                 err=True,
             )
     check_output(output / "run")  # before half a minute of compiling
-    if chosen == "cpu":
+    if chosen == "cpu" and not engine.remote and any(cell.method.program is None for cell in cells):
         prepare_cpu(threads)
-    progress = Progress(len(cells))
-    reports = run_cells(
-        cells,
-        output,
-        overwrite=overwrite,  # type: ignore[arg-type]
-        cache_dir=cache,
-        tick=progress.tick,
-        pictures=pictures,
-        on_start=progress.start,
-        on_end=progress.end,
-    )
+    if engine.in_process:
+        progress = Progress(len(cells))
+        reports = run_cells(
+            cells,
+            output,
+            overwrite=overwrite,  # type: ignore[arg-type]
+            cache_dir=cache,
+            tick=progress.tick,
+            pictures=pictures,
+            on_start=progress.start,
+            on_end=progress.end,
+        )
+    else:
+        cache = cache or output / ".cache"
+        with session:
+            reports = session.run(Grid(cells, output, overwrite, cache, pictures, plugins, methods))  # type: ignore[arg-type]
     _finish(reports, output, as_json, [str(output / group) for group in {cell.group: None for cell in cells}])
 
 
@@ -310,10 +327,10 @@ class Progress:
             self.bar.close()
             self.bar = None
         if report.outcome != "failed" or self.cells > 1:  # a single failure is the command's one error line
-            click.echo(f"    {_outcome_line(report)}", err=True)
+            click.echo(f"    {outcome_line(report)}", err=True)
 
 
-def _outcome_line(report: CellReport) -> str:
+def outcome_line(report: CellReport) -> str:
     if report.outcome == "kept":
         return "finished before, kept"
     if report.outcome == "skipped":
@@ -322,11 +339,15 @@ def _outcome_line(report: CellReport) -> str:
         return "failed: " + " ".join(report.error.split())
     cost, images = report.result["cost"], report.result["per_image"]
     values = [float(row["psnr"]) for row in images]
-    psnr = f"PSNR {sum(values) / len(values):.2f} dB over {len(values)} test views, " if values else ""
-    return (
-        f"{psnr}{cost['train_s']:.0f} s training, {cost['ms_per_iteration']:.1f} ms/iteration, "
-        f"{cost['gaussians']:,} Gaussians"
-    )
+    parts = [f"PSNR {sum(values) / len(values):.2f} dB over {len(values)} test views"] if values else []
+    # Of an external program not everything is known.
+    known = {
+        "train_s": "{:.0f} s training",
+        "ms_per_iteration": "{:.1f} ms/iteration",
+        "gaussians": "{:,} Gaussians",
+    }
+    parts += [text.format(cost[name]) for name, text in known.items() if cost.get(name) is not None]
+    return ", ".join(parts)
 
 
 def _finish(reports: list[CellReport], output: Path, as_json: bool, folders: list[str]) -> None:

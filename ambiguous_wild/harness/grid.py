@@ -59,7 +59,7 @@ def plan_cells(
     Raises:
         AwError: unknown method, option or scene; two scenes of the same name.
     """
-    named = {entry.name: entry for entry in map(get_method, methods)}  # one graft may be written two ways
+    named = _named(methods)
     by_method = _settings_by_method(settings, list(named.values()))
     entries = [(entry, by_method[name]) for name, entry in named.items()]
     distinct = list({path.resolve(): path for path in scenes}.values())
@@ -83,6 +83,16 @@ def plan_cells(
                     Cell(entry, resolved, scene, identity, config, device, chosen[entry.name], protocol)
                 )
     return cells
+
+
+def _named(methods: Sequence[str]) -> dict[str, MethodEntry]:
+    """The methods by name, each once: a graft may be written two ways, and so may a path."""
+    named: dict[str, MethodEntry] = {}
+    for entry in map(get_method, methods):
+        other = named.setdefault(entry.name, entry)
+        if other.source_hash != entry.source_hash:
+            raise AwError(f"two methods are called {entry.name}: their runs would share a folder; rename one")
+    return named
 
 
 def _settings_by_method(settings: Iterable[str], entries: Sequence[MethodEntry]) -> dict[str, dict[str, str]]:
@@ -124,8 +134,25 @@ def run_cells(
     Raises:
         AwError: a run folder holds another configuration (found before anything is trained).
     """
-    folders = [cell_folder(output, cell) for cell in cells]
     cache_dir = cache_dir or output / ".cache"
+    reports = []
+    for cell, folder in zip(cells, checked_folders(cells, output, overwrite, cache_dir)):
+        if on_start is not None:
+            on_start(cell, folder)
+        report = run_isolated(cell, folder, cache_dir, overwrite, tick, pictures)
+        if on_end is not None:
+            on_end(cell, report)
+        reports.append(report)
+    return reports
+
+
+def checked_folders(cells: Sequence[Cell], output: Path, overwrite: Overwrite, cache_dir: Path) -> list[Path]:
+    """The run folder of every cell, after a look at all of them.
+
+    Raises:
+        AwError: one holds another configuration or is nobody's run, or nothing can be written there.
+    """
+    folders = [cell_folder(output, cell) for cell in cells]
     for cell, folder in zip(cells, folders):
         if folder.exists() and overwrite != "never":
             refuse_strange_folder(folder)
@@ -133,18 +160,10 @@ def run_cells(
                 refuse_other_config(folder, cell)
     for needed in (output, cache_dir):
         check_output(needed / "run")  # what cannot be written is found before it is needed
-    reports = []
-    for cell, folder in zip(cells, folders):
-        if on_start is not None:
-            on_start(cell, folder)
-        report = _isolated(cell, folder, cache_dir, overwrite, tick, pictures)
-        if on_end is not None:
-            on_end(cell, report)
-        reports.append(report)
-    return reports
+    return folders
 
 
-def _isolated(
+def run_isolated(
     cell: Cell,
     folder: Path,
     cache_dir: Path,
@@ -152,6 +171,7 @@ def _isolated(
     tick: Callable[[Any], None] | None,
     pictures: bool,
 ) -> CellReport:
+    """Run one cell; its error is its report. Every engine calls this."""
     try:
         return run_cell(cell, folder, cache_dir=cache_dir, overwrite=overwrite, tick=tick, pictures=pictures)
     except Exception as error:

@@ -29,6 +29,7 @@ from ambiguous_wild.harness.store import read_result, write_result
 from ambiguous_wild.io.atomic import sweep, write_json, write_text
 from ambiguous_wild.io.lock import folder_lock
 from ambiguous_wild.io.ply import write_splat_ply
+from ambiguous_wild.methods.external.program import DONE, LOGS, WORK
 from ambiguous_wild.methods.registry import MethodEntry
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.effects import with_effects
@@ -130,7 +131,7 @@ def run_cell(
                 shutil.rmtree(folder)
             else:
                 refuse_other_config(folder, cell)
-                if _finished(folder):
+                if is_finished(folder):
                     return CellReport(folder, "kept")
         folder.mkdir(parents=True, exist_ok=True)
         sweep(folder)
@@ -141,7 +142,12 @@ def run_cell(
         write_json(folder / "env.json", environment(cell.device))
         cell.chosen.write(folder / EFFECTS)
         try:
-            result = _train_and_measure(cell, folder, cache_dir, tick, pictures)
+            if cell.method.program is not None:
+                from ambiguous_wild.harness.external import run_program
+
+                result = run_program(cell, folder)
+            else:
+                result = _train_and_measure(cell, folder, cache_dir, tick, pictures)
         except Exception as error:
             _record_failure(cell, folder, error)
             raise
@@ -149,7 +155,7 @@ def run_cell(
     return CellReport(folder, "trained", result=result)
 
 
-def _finished(folder: Path) -> bool:
+def is_finished(folder: Path) -> bool:
     """Whether the folder has a result that can be read; a damaged one is made again."""
     if not (folder / RESULT).is_file():
         return False
@@ -190,6 +196,8 @@ def refuse_other_config(folder: Path, cell: Cell) -> None:
     """Raise AwError if the folder was made by another configuration; names the keys that differ."""
     path = folder / "config.yaml"
     present = {p.name for p in folder.iterdir() if not p.name.startswith(".")}
+    if not (folder / WORK / DONE).exists():
+        present -= {WORK, LOGS}  # of an external program that has not finished training
     if not path.exists() or present <= _WORTHLESS:
         return  # it stopped before the first checkpoint: there is nothing to lose
     try:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import fcntl
 import os
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from ambiguous_wild.core.errors import AwError
@@ -38,6 +39,26 @@ def folder_lock(folder: Path | str, doing: str) -> Iterator[None]:
         # Unlinked while still held, so that no stale file stays behind.
         path.unlink(missing_ok=True)
         os.close(handle)
+
+
+@contextmanager
+def patient_lock(folder: Path | str, doing: str, patience_s: float) -> Iterator[None]:
+    """`folder_lock`, but wait for whoever holds it.
+
+    Raises:
+        Busy: it is still held after `patience_s` seconds.
+    """
+    deadline = time.monotonic() + patience_s
+    with ExitStack() as stack:
+        while True:
+            try:
+                stack.enter_context(folder_lock(folder, doing))
+                break
+            except Busy:
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(0.5)
+        yield
 
 
 def _locked(path: Path, folder: Path) -> int:

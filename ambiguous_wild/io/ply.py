@@ -116,6 +116,20 @@ def read_splat_ply(path: Path | str) -> dict[str, np.ndarray]:
     }
 
 
+def splat_count(path: Path | str) -> int:
+    """Number of Gaussians by the file's header.
+
+    Raises:
+        AwError: no such file, or no PLY that `read_splat_ply` would take.
+    """
+    path = Path(path)
+    try:
+        with open(path, "rb") as f:
+            return _header(path, f.read(_MAX_HEADER))[0]
+    except OSError as error:
+        raise AwError(f"cannot read {path}: {error.strerror or error}") from None
+
+
 def _header(path: Path, head: bytes) -> tuple[int, np.dtype, int]:
     """Number of vertices, their record, and where the data starts."""
     if not head.startswith(b"ply"):

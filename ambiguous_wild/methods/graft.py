@@ -19,6 +19,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from ambiguous_wild.core.errors import AwError, unknown
+from ambiguous_wild.methods.references import is_reference
 from ambiguous_wild.methods.registry import MethodEntry, NoOptions, all_methods, get_method, resolve
 
 if TYPE_CHECKING:
@@ -33,6 +34,8 @@ def graft_name(host: str, donors: Mapping[str, str | None]) -> str:
 
     Donors of places that the host's name already fills are replaced.
     """
+    if not any(donors.values()) and is_reference(host):
+        return host  # an @ in a path is part of the path
     base, _, rest = host.partition("@")
     filled = dict(_pairs(host)) if rest else {}
     filled |= {place: donor for place, donor in donors.items() if donor}

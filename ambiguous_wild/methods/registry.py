@@ -1,7 +1,8 @@
 """Which methods there are. Listing them imports neither torch nor any method's code.
 
-A method of one's own is found in three ways: `register(...)`, the entry-point group
-`ambiguous_wild.methods`, or a file given as `--plugin my_method.py` (see docs/add-a-method.md).
+A method of one's own is found in four ways: `register(...)`, the entry-point group
+`ambiguous_wild.methods`, a file given as `--plugin my_method.py`, or a reference to a recipe in a file,
+`--method my_method.py:my_recipe` (see docs/add-a-method.md).
 """
 
 from __future__ import annotations
@@ -16,12 +17,14 @@ import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.methods.ablation import Group
 
 if TYPE_CHECKING:
+    from ambiguous_wild.methods.external.program import Program
     from ambiguous_wild.splat.parts import Parts
 
 ENTRY_POINTS = "ambiguous_wild.methods"
@@ -47,6 +50,8 @@ class MethodEntry:
     # effects that `aw bench` may switch on by itself where a scene calls for them; a baseline has none, it
     # stays what its paper defines
     auto_effects: tuple[str, ...] = ()
+    # somebody else's program, run as it is instead of parts on our trainer, see methods/external/
+    program: Program | None = None
 
     def options(self) -> Any:
         """The method's options at their defaults (a frozen dataclass instance)."""
@@ -138,11 +143,16 @@ def all_methods() -> dict[str, MethodEntry]:
 
 
 def get_method(name: str) -> MethodEntry:
-    """The method of that name; "host@mask=donor" is a graft, see graft.py.
+    """The method of that name; "host@mask=donor" is a graft, see graft.py, and "recipe.py:my_recipe",
+    "external:FILE" and "nerfbaselines:METHOD" are references, see references.py.
 
     Raises:
         AwError: there is none; names the nearest.
     """
+    from ambiguous_wild.methods.references import is_reference, load_reference
+
+    if is_reference(name):
+        return load_reference(name)
     methods = all_methods()
     if name not in methods and "@" in name:
         from ambiguous_wild.methods.graft import grafted
@@ -163,6 +173,22 @@ def load_plugin(path: Path | str) -> list[str]:
     if not path.is_file():
         raise AwError(f"no plugin file {path}: give the path of a .py file that calls register(...)")
     before = dict(_registered)
+    import_file(path)
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    added = [key for key, entry in _registered.items() if before.get(key) is not entry]
+    if not added:
+        raise AwError(f"plugin {path} registers no method: call register(MethodEntry(...)) in it")
+    for key in added:
+        _registered[key] = dataclasses.replace(_registered[key], source_hash=digest)
+    return added
+
+
+def import_file(path: Path) -> ModuleType:
+    """The module of a Python file, run anew.
+
+    Raises:
+        AwError: it is no Python file, or fails when it is loaded; names the line.
+    """
     name = f"aw_plugin_{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
@@ -180,13 +206,7 @@ def load_plugin(path: Path | str) -> list[str]:
         raise AwError(
             f"plugin {path}{line} fails when it is loaded: {type(error).__name__}: {error}"
         ) from error
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    added = [key for key, entry in _registered.items() if before.get(key) is not entry]
-    if not added:
-        raise AwError(f"plugin {path} registers no method: call register(MethodEntry(...)) in it")
-    for key in added:
-        _registered[key] = dataclasses.replace(_registered[key], source_hash=digest)
-    return added
+    return module
 
 
 def _line_in(error: BaseException, path: Path) -> str:

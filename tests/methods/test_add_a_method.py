@@ -45,3 +45,9 @@ def test_the_file_of_the_page_trains_and_is_measured(plugin, tmp_path):
 
     kept = sum((read_gray(m) > 127).mean() for m in masks) / len(masks)
     assert kept == pytest.approx(0.7, abs=0.03)
+
+
+def test_the_function_of_the_page_is_a_method_by_its_path(plugin):
+    entry = registry.get_method(f"{plugin}:build")
+    assert entry.name == "build"
+    assert entry.build(entry.options()).mask.config.percentile == 0.85

@@ -1,0 +1,258 @@
+"""A cell as plain values that another process or machine makes again, and the one function that runs it.
+
+A `Cell` holds code (a method's recipe) and an opened scene. What travels is how to get them: names, options,
+paths and the sources of plugins. Whoever runs it compares the identity of what it made with the one it was
+sent, so that another version of the code, of a plugin or of the scene is an error and never a number.
+"""
+
+from __future__ import annotations
+
+import functools
+import platform
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ambiguous_wild.core import AwError, Scene
+from ambiguous_wild.core.config import config_hash, from_plain, to_plain
+from ambiguous_wild.harness.choosing import Chosen
+from ambiguous_wild.harness.grid import run_isolated
+from ambiguous_wild.harness.run import (
+    FAILED,
+    RESULT,
+    Cell,
+    CellReport,
+    Overwrite,
+    Protocol,
+    error_line,
+    failed_result,
+    scene_identity,
+)
+from ambiguous_wild.harness.store import write_result
+from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.io.lock import Busy, folder_lock, patient_lock
+from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.methods.references import load_reference, reference_file, with_file
+from ambiguous_wild.methods.registry import get_method, load_plugin
+from ambiguous_wild.splat.trainer import TrainConfig
+
+# A node that is lost keeps its lock until the file server forgets it (NFS: 90 s by default).
+LOCK_WAIT_S = 150.0
+
+
+@dataclass(frozen=True)
+class Source:
+    """Code that a method comes from: a plugin, or a reference such as ``recipe.py:my_recipe``."""
+
+    text: str  # the reference as typed, or the plugin's path
+    plugin: bool
+    path: str = ""  # absolute path of its file, if it has one
+    content: bytes = b""
+
+
+@dataclass(frozen=True)
+class Job:
+    """How to make a cell again, and how to run it."""
+
+    method: str
+    sources: tuple[Source, ...]
+    options: dict[str, Any]
+    scene: str  # absolute path
+    factor: int | None
+    device: str
+    protocol: Protocol
+    train: dict[str, Any]
+    chosen: Chosen
+    identity: str
+    code: str  # `code_hash` of the sender
+    folder: str  # absolute path of the run folder
+    cache_dir: str
+    overwrite: Overwrite
+    pictures: bool
+    threads: int | None  # of the CPU kernels; None = as many as there are
+    token: str = ""  # a file that the runner must see, see `check_shared`
+
+    @property
+    def title(self) -> str:
+        return f"{self.method} on {Path(self.scene).name}, seed {self.train['seed']}"
+
+
+@dataclass(frozen=True)
+class Shared:
+    """What all jobs of one grid have in common."""
+
+    cache_dir: Path
+    overwrite: Overwrite = "missing"
+    pictures: bool = True
+    threads: int | None = None
+    sources: tuple[Source, ...] = ()
+    token: str = ""
+
+
+def read_sources(plugins: Sequence[Path], methods: Sequence[str]) -> tuple[Source, ...]:
+    """The code behind what was typed as --plugin and --method; names of `aw methods` need none."""
+    sources = [_source(str(path), True, path) for path in plugins]
+    for name in methods:
+        # A graft may have a reference as its host.
+        host = name if reference_file(name) else name.partition("@")[0]
+        file = reference_file(host)
+        if file is not None:
+            sources.append(_source(host, False, file))
+        elif host.startswith("nerfbaselines:"):
+            sources.append(Source(host, False))
+    return tuple(sources)
+
+
+def _source(text: str, plugin: bool, path: Path) -> Source:
+    return Source(text, plugin, str(path.resolve()), path.read_bytes())
+
+
+def make_job(cell: Cell, folder: Path, shared: Shared) -> Job:
+    """The job of a cell whose method `get_method` finds once the sources are loaded."""
+    return Job(
+        method=cell.method.name,
+        sources=shared.sources,
+        options=to_plain(cell.options),
+        scene=str(cell.scene.root.resolve()),
+        factor=cell.scene.info.get("loaded_factor"),
+        device=cell.device,
+        protocol=cell.protocol,
+        train=to_plain(cell.train),
+        chosen=cell.chosen,
+        identity=cell.identity,
+        code=code_hash(),
+        folder=str(folder.absolute()),
+        cache_dir=str(shared.cache_dir.absolute()),
+        overwrite=shared.overwrite,
+        pictures=shared.pictures,
+        threads=shared.threads,
+        token=shared.token,
+    )
+
+
+def run_job(job: Job) -> CellReport:
+    """Make the cell and run it as `aw bench` does in one process; every error is a report."""
+    folder = Path(job.folder)
+    try:
+        check_shared(job)
+        cell = make_cell(job)
+        if cell.device == "cpu" and cell.method.program is None:
+            _prepare_cpu(job.threads)
+    except Exception as error:
+        return CellReport(folder, "failed", error=error_line(error))
+    try:
+        with patient_lock(folder, "aw bench", LOCK_WAIT_S):
+            pass
+    except Busy as error:
+        return CellReport(folder, "failed", error=str(error))
+    return run_isolated(cell, folder, Path(job.cache_dir), job.overwrite, None, job.pictures)
+
+
+def make_cell(job: Job) -> Cell:
+    """The cell that the job describes.
+
+    Raises:
+        AwError: this process runs other code than the sender, or something on the way differs there.
+    """
+    if job.code != code_hash():
+        raise AwError(
+            f"{platform.node()} runs another state of ambiguous_wild than the machine that sent the run: "
+            "install the same on every node"
+        )
+    for source in job.sources:
+        _load(source)
+    entry = get_method(job.method)
+    scene = _scene(job.scene, job.factor)
+    cell = Cell(
+        method=entry,
+        options=from_plain(type(entry.options()), job.options, f"options of {job.method}"),
+        scene=scene,
+        scene_id=scene_identity(scene),
+        train=from_plain(TrainConfig, job.train, "train"),
+        device=job.device,
+        chosen=job.chosen,
+        protocol=job.protocol,
+    )
+    if cell.identity != job.identity:
+        raise AwError(
+            f"{job.title}: {platform.node()} makes another run of it than the machine that sent it: "
+            f"the scene {job.scene} or a file of the method differs there"
+        )
+    return cell
+
+
+def check_shared(job: Job, wait_s: float = 30.0) -> None:
+    """Make sure that this machine sees the folder that results go to.
+
+    Raises:
+        AwError: it does not see the file that the sender left there.
+    """
+    deadline = time.monotonic() + wait_s
+    while job.token and not Path(job.token).exists():  # NFS remembers for seconds what was not there
+        if time.monotonic() > deadline:
+            raise AwError(
+                f"{platform.node()} does not see {Path(job.token).parent}: give a folder on storage that all "
+                "nodes share as -o, or send scenes and results with --transfer store"
+            )
+        time.sleep(1.0)
+
+
+def record_lost(cell: Cell, folder: Path, error: str) -> CellReport:
+    """A run whose process died says so in its folder; its checkpoints stay, so that it may go on."""
+    try:
+        with folder_lock(folder, "aw bench"):
+            if folder.is_dir() and not (folder / RESULT).exists():
+                write_result(folder / FAILED, failed_result(cell, error))
+    except (AwError, OSError):
+        pass  # the report below says it all the same
+    return CellReport(folder, "failed", error=error)
+
+
+def _load(source: Source) -> None:
+    if not source.path:
+        load_reference(source.text)
+        return
+    path = _present(source)
+    if source.plugin:
+        load_plugin(path)
+    else:
+        load_reference(with_file(source.text, path))
+
+
+@functools.cache
+def _present(source: Source) -> Path:
+    """The source's own file where this machine has it, else a copy."""
+    path = Path(source.path)
+    try:
+        if path.read_bytes() == source.content:
+            return path
+    except OSError:
+        pass
+    copy = Path(tempfile.mkdtemp(prefix="aw-source-")) / path.name
+    copy.write_bytes(source.content)
+    return copy
+
+
+@functools.lru_cache(maxsize=4)
+def _scene(path: str, factor: int | None) -> Scene:
+    # The sender has compared every hash; a copy with other sizes or another scene.json is found all the same.
+    return load_scene(path, factor=factor, verify="quick")
+
+
+def _prepare_cpu(threads: int | None) -> None:
+    from ambiguous_wild.splat.cpu import set_threads
+    from ambiguous_wild.splat.cpu.warmup import warm_up
+
+    if threads is not None:
+        set_threads(threads)
+    warm_up()
+
+
+@functools.cache
+def code_hash() -> str:
+    """sha256 over the package's Python files: what runs on a node must be what was asked for."""
+    root = Path(__file__).resolve().parents[2]
+    return config_hash({p.relative_to(root).as_posix(): sha256_file(p) for p in sorted(root.rglob("*.py"))})

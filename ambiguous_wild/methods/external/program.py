@@ -1,0 +1,56 @@
+"""What an external method is to the harness: something that is started and leaves pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NoReturn, Protocol
+
+from ambiguous_wild.core import AwError, Scene
+
+WORK, LOGS = "external", "logs"  # folders of a run: what the program writes, and what it says
+DONE = "done.json"  # in WORK: the commands that ended, and the seconds they took
+
+
+@dataclass(frozen=True)
+class Task:
+    """One run of a program."""
+
+    scene: Scene
+    options: Any  # the method's frozen dataclass
+    seed: int
+    iterations: int
+    budget_s: float | None  # training time, where the run has one instead of a length
+    device: str  # "cpu" or "cuda"
+    folder: Path  # the run folder
+    work: Path  # folder for what the program writes; kept when a run is resumed
+    logs: Path  # folder of its logs
+
+
+@dataclass(frozen=True)
+class Produced:
+    """What a program left behind, and what is known of its cost."""
+
+    renders: Mapping[str, Path]  # test view -> 8-bit PNG at the size of its photo
+    masks: Mapping[str, Path] = field(default_factory=dict)  # train view -> PNG, white = kept
+    ply: Path | None = None  # splats, as 3DGS writes them
+    cost: Mapping[str, float] = field(default_factory=dict)  # train_s, render_s and what else is known
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+
+class Program(Protocol):
+    """Trains, renders the test views, and says where things are."""
+
+    def run(self, task: Task) -> Produced:
+        """Go on where a stopped run ended.
+
+        Raises:
+            AwError: it fails, takes too long, or does not leave what it should.
+        """
+        ...
+
+
+def no_parts(options: Any) -> NoReturn:
+    """The recipe of a method that has none."""
+    raise AwError("an external method is a program of its own: it has no parts that fit into another method")

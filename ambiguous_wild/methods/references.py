@@ -1,0 +1,109 @@
+"""Methods that are named by where they lie: a recipe in a file, a program's description, NerfBaselines.
+
+recipe.py:my_recipe     a function, or a MethodEntry, in a Python file
+external:my.yaml        a program with commands of its own, see external/description.py
+nerfbaselines:METHOD    a method of NerfBaselines in its own environment, see external/nerfbaselines.py
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import inspect
+import re
+import typing
+from pathlib import Path
+
+from ambiguous_wild.core.errors import AwError, unknown
+from ambiguous_wild.core.names import check_name
+from ambiguous_wild.methods import registry
+from ambiguous_wild.methods.registry import MethodEntry
+
+EXTERNAL, NERFBASELINES = "external:", "nerfbaselines:"
+_RECIPE = re.compile(r"(?P<path>.+\.py):(?P<name>[A-Za-z_]\w*)")
+
+
+def is_reference(name: str) -> bool:
+    """Whether the name says where the method lies."""
+    return name.startswith((EXTERNAL, NERFBASELINES)) or _RECIPE.fullmatch(name) is not None
+
+
+def reference_file(name: str) -> Path | None:
+    """The file that a reference names; None where it names none."""
+    if name.startswith(EXTERNAL):
+        return Path(name.removeprefix(EXTERNAL))
+    match = None if name.startswith(NERFBASELINES) else _RECIPE.fullmatch(name)
+    return Path(match["path"]) if match else None
+
+
+def with_file(name: str, path: Path) -> str:
+    """The same reference to a file that lies elsewhere."""
+    if name.startswith(EXTERNAL):
+        return f"{EXTERNAL}{path}"
+    return f"{path}:{name.rpartition(':')[2]}"
+
+
+def load_reference(name: str) -> MethodEntry:
+    """The method behind a reference; registered, so that its name alone finds it from now on.
+
+    Raises:
+        AwError: no such file, nothing fit in it, or its name is taken by another method.
+    """
+    if name.startswith(EXTERNAL):
+        from ambiguous_wild.methods.external.description import load_description
+
+        entry = load_description(Path(name.removeprefix(EXTERNAL)))
+    elif name.startswith(NERFBASELINES):
+        from ambiguous_wild.methods.external.nerfbaselines import nerfbaselines_entry
+
+        entry = nerfbaselines_entry(name.removeprefix(NERFBASELINES))
+    else:
+        entry = _recipe(name)
+    return _registered(entry, name)
+
+
+def _registered(entry: MethodEntry, name: str) -> MethodEntry:
+    known = registry.all_methods().get(entry.name)
+    if known is not None and known.source_hash != entry.source_hash:
+        raise AwError(f"{name} is called {entry.name!r}, and so is another method: give it another name")
+    return registry.register(entry)
+
+
+def _recipe(name: str) -> MethodEntry:
+    """A MethodEntry of the file, or one made of a function that returns `Parts`."""
+    path_text, _, attribute = name.rpartition(":")
+    path = Path(path_text)
+    if not path.is_file():
+        raise AwError(f"no file {path} for --method {name}: write PATH.py:NAME of a recipe in it")
+    module = registry.import_file(path)
+    found = getattr(module, attribute, None)
+    if found is None:
+        public = [key for key, value in vars(module).items() if callable(value) and not key.startswith("_")]
+        raise unknown(f"recipe in {path}", attribute, public)
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    if isinstance(found, MethodEntry):
+        return dataclasses.replace(found, source_hash=digest)
+    if not inspect.isfunction(found):
+        raise AwError(
+            f"{name} is a {type(found).__name__}: it must be a function that returns Parts, or a MethodEntry"
+        )
+    config = _config_of(found, name)
+    recipe = found if config is not None else lambda options: found()
+    summary = (inspect.getdoc(found) or f"{attribute} of {path.name}").splitlines()[0]
+    return MethodEntry(
+        check_name("method name", attribute), summary, recipe, config=config, source_hash=digest
+    )
+
+
+def _config_of(recipe: typing.Callable[..., object], name: str) -> type | None:
+    """The frozen dataclass that the function takes; None where it takes nothing."""
+    required = [p for p in inspect.signature(recipe).parameters.values() if p.default is p.empty]
+    if not required:
+        return None
+    try:
+        config = typing.get_type_hints(recipe).get(required[0].name)
+    except NameError as error:
+        raise AwError(f"{name}: {error} in the types of its arguments") from None
+    if len(required) > 1 or not (isinstance(config, type) and dataclasses.is_dataclass(config)):
+        raise AwError(f"{name} must take nothing, or one argument whose type is a dataclass of options")
+    return config

@@ -1,0 +1,110 @@
+"""A method named by where it lies: `recipe.py:my_recipe`."""
+
+import pytest
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.methods import registry
+from ambiguous_wild.methods.graft import graft_name
+from ambiguous_wild.methods.references import is_reference, reference_file, with_file
+
+CODE = r'''
+from dataclasses import dataclass
+from ambiguous_wild.methods import MethodEntry
+from ambiguous_wild.splat.parts import Parts
+
+@dataclass(frozen=True)
+class Config:
+    sh_degree: int = 2
+
+def plain():
+    """As it comes.
+
+    More of it."""
+    return Parts()
+
+def tuned(config: Config):
+    return Parts(sh_degree=config.sh_degree)
+
+def untyped(config):
+    return Parts()
+
+def wrong(config: "Nowhere"):
+    return Parts()
+
+entry = MethodEntry("its-own-name", "made by hand", tuned, config=Config)
+number = 3
+'''
+
+
+@pytest.fixture(autouse=True)
+def _methods(monkeypatch):
+    monkeypatch.setattr(registry, "_registered", {})
+
+
+@pytest.fixture
+def recipe(tmp_path):
+    (tmp_path / "recipe.py").write_text(CODE)
+    return tmp_path / "recipe.py"
+
+
+def test_a_function_without_options(recipe):
+    entry = registry.get_method(f"{recipe}:plain")
+    assert (entry.name, entry.summary) == ("plain", "As it comes.")
+    assert entry.build(entry.options()).sh_degree == 3
+    assert registry.get_method("plain").source_hash == entry.source_hash  # its name finds it from now on
+
+
+def test_a_function_with_options_and_an_entry(recipe):
+    for name, called in (("tuned", "tuned"), ("entry", "its-own-name")):
+        entry = registry.get_method(f"{recipe}:{name}")
+        assert entry.name == called
+        assert entry.options().sh_degree == 2
+        assert entry.build(entry.options()).sh_degree == 2
+
+
+def test_a_changed_file_is_another_method(recipe):
+    before = registry.get_method(f"{recipe}:plain").source_hash
+    recipe.write_text(CODE + "# changed\n")
+    with pytest.raises(AwError, match="so is another method"):
+        registry.get_method(f"{recipe}:plain")
+    registry._registered.clear()
+    assert registry.get_method(f"{recipe}:plain").source_hash != before
+
+
+def test_it_is_a_host_of_grafts(recipe):
+    entry = registry.get_method(f"{recipe}:plain@mask=truth")
+    assert entry.name == "plain@mask=truth"
+    assert graft_name(f"{recipe}:plain", {"mask": "truth"}) == f"{recipe}:plain@mask=truth"
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("plian", "did you mean 'plain'"),
+        ("number", "is a int"),
+        ("untyped", "one argument whose type is a dataclass"),
+        ("wrong", "in the types of its arguments"),
+    ],
+)
+def test_what_is_no_recipe_is_one_clear_line(recipe, name, message):
+    with pytest.raises(AwError, match=message):
+        registry.get_method(f"{recipe}:{name}")
+
+
+def test_a_file_that_is_not_there_or_is_broken(recipe, tmp_path):
+    with pytest.raises(AwError, match="no file"):
+        registry.get_method(f"{tmp_path}/absent.py:plain")
+    recipe.write_text("x = (")
+    with pytest.raises(AwError, match=r"recipe.py, line 1"):
+        registry.get_method(f"{recipe}:plain")
+
+
+def test_what_is_a_reference(tmp_path):
+    assert not is_reference("3dgs") and not is_reference("3dgs@mask=refinesplat")
+    assert not is_reference("recipe.py") and not is_reference("a.py:x@mask=truth")
+    assert reference_file("dir/a.py:x").name == "a.py"
+    assert reference_file("nerfbaselines:x") is None and is_reference("nerfbaselines:x")
+    assert with_file("dir/a.py:x", tmp_path / "b.py") == f"{tmp_path}/b.py:x"
+    assert with_file("external:dir/a.yaml", tmp_path / "b.yaml") == f"external:{tmp_path}/b.yaml"
+    # an @ in a path is part of the path
+    assert graft_name("external:/a@b/x.yaml", {"mask": None}) == "external:/a@b/x.yaml"

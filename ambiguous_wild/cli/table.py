@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from ambiguous_wild.harness.layouts.grid import Layout
     from ambiguous_wild.harness.store import Runs
 
-STYLES = ("text", "markdown", "csv", "latex", "html")
+STYLES = ("text", "markdown", "csv", "latex", "html", "tidy")
 LAYOUTS = ("blocks", "paper", "means", "memory", "ablation")
 
 
@@ -69,7 +69,15 @@ def command(
     aw table runs
     aw table runs --layout paper --format latex -o table.tex
     aw table runs --layout means --format html --reported -o means.html
+    aw table runs --format tidy -o results.csv    one row a method, scene, seed, image and metric
     """
+    if style == "tidy":
+        if layout != "blocks" or datasets or reported or reported_from or sheet:
+            raise AwError(
+                "--format tidy goes with --metric, --scene and -o alone: it is every number there is"
+            )
+        _write_tidy(_read(runs), output, metrics, scenes)
+        return
     if layout in ("blocks", "ablation"):
         refused = {"--dataset": datasets, "--reported": reported or reported_from}
         if layout == "ablation":
@@ -107,6 +115,20 @@ def _read(runs: Path) -> Runs:
     from ambiguous_wild.harness.store import read_runs
 
     return read_runs(runs)
+
+
+def _write_tidy(found: Runs, output: Path | None, metrics: Sequence[str], scenes: Sequence[str]) -> None:
+    from ambiguous_wild.harness.table_frame import tidy, to_csv
+    from ambiguous_wild.io.atomic import write_text
+
+    frame = tidy(found, metrics=metrics, scenes=scenes)
+    for run in found.incomplete:
+        click.echo(f"incomplete: {run.folder}: {run.reason}", err=True)
+    if output is None:
+        click.echo(to_csv(frame), nl=False)
+        return
+    write_text(output, to_csv(frame))
+    click.echo(f"wrote {output}: {len(frame)} rows", err=True)
 
 
 def _blocks(

@@ -12,14 +12,19 @@ import numpy as np
 import torch
 
 from ambiguous_wild.core import Camera, Scene, View
+from ambiguous_wild.harness.regions import Regions, find_regions
+from ambiguous_wild.harness.regions import true_distractor as true_distractor  # as it always was here
 from ambiguous_wild.io.atomic import atomic_dir
-from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
+from ambiguous_wild.io.images import read_png_rgb, write_png
 from ambiguous_wild.metrics import image as image_metrics
 from ambiguous_wild.metrics import lpips
 from ambiguous_wild.metrics import masks as mask_metrics
+from ambiguous_wild.metrics.flip import flip
 from ambiguous_wild.splat.trainer import Trainer
 
-FPS_SECONDS = 2.0  # long enough to average over scheduling noise
+FPS_ROUNDS = 5
+FPS_SECONDS = 2.0  # of all rounds together: long enough to average over scheduling noise
+FULL_IMAGE = image_metrics.METRICS | {"flip": flip}
 
 
 @dataclass(frozen=True)
@@ -48,7 +53,12 @@ def mean_psnr(truth: list[TestPhoto], draw: Callable[[Camera], np.ndarray]) -> f
 
 
 def render_and_measure(
-    trainer: Trainer, truth: list[TestPhoto], folder: Path, *, half: bool = False
+    trainer: Trainer,
+    truth: list[TestPhoto],
+    folder: Path,
+    *,
+    half: bool = False,
+    scene: Scene | None = None,
 ) -> tuple[list[dict[str, Any]], dict[str, str]]:
     """Render the test views to PNG and measure what was written.
 
@@ -58,14 +68,18 @@ def render_and_measure(
         folder: for the PNG files.
         half: NeRF-W's protocol: colour effects are fitted on the left half of each test photo, columns
             0 to ceil(W / 2), everything else stays, and the right half, from W // 2, is measured.
+        scene: what the metrics of regions are about; None = the trainer's.
 
     Returns:
         Per-image metrics, and for each metric that is missing the reason.
     """
     missing = {name: reason for name, reason in lpips.available().items() if reason is not None}
     if not truth:
-        missing |= dict.fromkeys(image_metrics.METRICS, "the scene has no test views")
+        missing |= dict.fromkeys(FULL_IMAGE, "the scene has no test views")
         return [], missing
+    scene = getattr(trainer.data, "scene", None) if scene is None else scene
+    regions = Regions({}, {}) if scene is None else find_regions(scene)
+    missing |= regions.missing
     names = [name for name in lpips.available() if name not in missing]
     networks = {name: lpips.load(name) for name in names}
     rows = []
@@ -80,7 +94,8 @@ def render_and_measure(
                 right = slice(photo.shape[1] // 2, None)
                 drawn, photo = (np.ascontiguousarray(picture[:, right]) for picture in (drawn, photo))
             row: dict[str, Any] = {"name": t.view.name}
-            row |= {name: metric(drawn, photo) for name, metric in image_metrics.METRICS.items()}
+            row |= {name: metric(drawn, photo) for name, metric in FULL_IMAGE.items()}
+            row |= regions.psnr(t.view.name, drawn, photo)
             row |= {name: network(drawn, photo) for name, network in networks.items()}
             rows.append(row)
     return rows, missing
@@ -120,25 +135,25 @@ def write_masks(trainer: Trainer, folder: Path) -> dict[str, Any] | None:
     return {"iou": total.iou, "precision": total.precision, "recall": total.recall, "images": len(counts)}
 
 
-def true_distractor(scene: Scene, view: View) -> np.ndarray | None:
-    """[H, W] bool, True on distractors, where the capture brought the truth."""
-    path = scene.root / "truth" / "distractor" / Path(view.name).with_suffix(".png").name
-    if not path.exists():
-        return None
-    mask = read_gray(path) >= 128
-    return mask if mask.shape == (view.camera.height, view.camera.width) else None
+def frames_per_second(trainer: Trainer) -> dict[str, float]:
+    """Rendered frames a second over the views of the scene, after a warm-up.
 
-
-def frames_per_second(trainer: Trainer) -> float:
-    """Rendered frames a second over the views of the scene, after a warm-up round."""
+    Returns:
+        fps, the median of several rounds, and fps_low and fps_high, the slowest and the fastest of them.
+    """
     cameras = [v.camera for v in (trainer.data.scene.test or trainer.data.scene.train)]
     for camera in cameras[:3]:
-        trainer.render(camera)
+        trainer.render(camera).image.cpu()
+    rounds = [_frames_per_second(trainer, cameras, FPS_SECONDS / FPS_ROUNDS) for _ in range(FPS_ROUNDS)]
+    return {"fps": float(np.median(rounds)), "fps_low": min(rounds), "fps_high": max(rounds)}
+
+
+def _frames_per_second(trainer: Trainer, cameras: list[Camera], least_s: float) -> float:
     frames, begin = 0, time.perf_counter()
     while True:
         # .cpu() waits for a GPU; on the CPU it costs nothing.
         trainer.render(cameras[frames % len(cameras)]).image.cpu()
         frames += 1
         seconds = time.perf_counter() - begin
-        if seconds >= FPS_SECONDS:
+        if seconds >= least_s:
             return frames / seconds

@@ -31,6 +31,10 @@ MEASURES: dict[str, Measure] = {
         Measure("ssim_inria", "SSIM Inria", "higher", 3),
         Measure("lpips_vgg", "LPIPS vgg", "lower", 3),
         Measure("lpips_vgg_01", "LPIPS vgg 01", "lower", 3),
+        Measure("flip", "FLIP", "lower", 3),
+        Measure("psnr_valid", "PSNR valid", "higher", 2),
+        Measure("psnr_covered", "PSNR covered", "higher", 2),
+        Measure("psnr_uncovered", "PSNR uncovered", "higher", 2),
         Measure("mask_iou", "mask IoU", "higher", 3, per_image=False),
         Measure("mask_precision", "mask precision", "higher", 3, per_image=False),
         Measure("mask_recall", "mask recall", "higher", 3, per_image=False),
@@ -41,9 +45,14 @@ MEASURES: dict[str, Measure] = {
         Measure("fps", "FPS", "higher", 1, per_image=False),
         Measure("gaussians", "Gaussians", "lower", 0, per_image=False),
         Measure("model_mb", "MB", "lower", 1, per_image=False),
+        Measure("fps_low", "FPS low", "higher", 1, per_image=False),
+        Measure("fps_high", "FPS high", "higher", 1, per_image=False),
         Measure("peak_rss_mb", "peak RSS MB", "lower", 0, per_image=False),
+        Measure("peak_cuda_mb", "peak CUDA MB", "lower", 0, per_image=False),
     )
 }
+# Measured on part of a picture: one without such a pixel has no value, and is no gap in a mean.
+PARTIAL = ("psnr_valid", "psnr_covered", "psnr_uncovered")
 ALWAYS = ("psnr", "ssim", "lpips_alex")  # shown even where missing: the reason stands below the table
 COST = ("train_s", "ms_per_iteration", "fps", "gaussians", "model_mb")
 # A metric that is not listed takes its direction from its family: psnr_distractor is a PSNR.

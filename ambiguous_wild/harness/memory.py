@@ -9,12 +9,26 @@ from pathlib import Path
 _PROC = Path("/proc/self")
 
 
-def reset_peak() -> None:
-    """Forget the peak so far, where the system can (Linux)."""
+def reset_peak(device: str = "cpu") -> None:
+    """Forget the peaks so far: of the process where the system can (Linux), and of a GPU."""
+    if device.startswith("cuda"):
+        import torch
+
+        torch.cuda.reset_peak_memory_stats(device)
     try:
         (_PROC / "clear_refs").write_text("5")
     except OSError:
         return
+
+
+def peak_memory(device: str = "cpu") -> dict[str, float]:
+    """peak_rss_mb, and on a GPU peak_cuda_mb: the most its tensors held at once since `reset_peak`."""
+    peaks = {"peak_rss_mb": peak_rss_mb()}
+    if device.startswith("cuda"):
+        import torch
+
+        peaks["peak_cuda_mb"] = torch.cuda.max_memory_allocated(device) / 1e6
+    return peaks
 
 
 def peak_rss_mb() -> float:

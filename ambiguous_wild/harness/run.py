@@ -23,7 +23,8 @@ from ambiguous_wild.harness.choosing import Chosen
 from ambiguous_wild.harness.environment import environment
 from ambiguous_wild.harness.identity import IGNORED, config_identity
 from ambiguous_wild.harness.identity import scene_identity as scene_identity  # as it always was here
-from ambiguous_wild.harness.memory import peak_rss_mb, reset_peak
+from ambiguous_wild.harness.memory import peak_memory, reset_peak
+from ambiguous_wild.harness.provenance import provenance
 from ambiguous_wild.harness.store import read_result, write_result
 from ambiguous_wild.io.atomic import sweep, write_json, write_text
 from ambiguous_wild.io.lock import folder_lock
@@ -154,7 +155,7 @@ def run_cell(
         except Exception as error:
             _record_failure(cell, folder, error)
             raise
-        write_result(folder / RESULT, result)
+        write_result(folder / RESULT, result | provenance(cell))
     return CellReport(folder, "trained", result=result)
 
 
@@ -174,7 +175,7 @@ def _record_failure(cell: Cell, folder: Path, error: Exception) -> None:
     if not isinstance(error, (AwError, OSError)):
         # Ours, not the user's: the whole story goes beside the run, one line into the table.
         write_text(folder / TRACEBACK, "".join(traceback.format_exception(error)))
-    write_result(folder / FAILED, failed_result(cell, error_line(error)))
+    write_result(folder / FAILED, failed_result(cell, error_line(error)) | provenance(cell))
 
 
 def error_line(error: Exception) -> str:
@@ -236,7 +237,7 @@ def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 def _train_and_measure(
     cell: Cell, folder: Path, cache_dir: Path, tick: Callable[[Trainer], None] | None, pictures: bool
 ) -> dict[str, Any]:
-    reset_peak()
+    reset_peak(cell.device)
     device = torch.device(cell.device)
     data = load_train_data(cell.scene, device=device, seed=cell.train.seed, cache_dir=cache_dir)
     parts = with_effects(cell.method.build(cell.options), cell.chosen.effects)
@@ -265,7 +266,7 @@ def _train_and_measure(
         folder / "point_cloud.ply", {k: v.cpu().numpy() for k, v in trainer.neutral_model().items()}
     )
     per_image, missing = evaluate.render_and_measure(
-        trainer, truth, folder / "renders" / "test", half=cell.protocol == "half"
+        trainer, truth, folder / "renders" / "test", half=cell.protocol == "half", scene=cell.scene
     )
     masks = evaluate.write_masks(trainer, folder / "masks")
     if recorder is not None:
@@ -286,8 +287,8 @@ def _train_and_measure(
         | trainer.watchdog.facts()
         | _effect_facts(cell, trainer),
         "cost": cost
+        | evaluate.frames_per_second(trainer)
         | {
-            "fps": evaluate.frames_per_second(trainer),
             "model_mb": (folder / "point_cloud.ply").stat().st_size / 1e6,
         },
         "config_hash": cell.identity,
@@ -313,7 +314,7 @@ def _cost(cell: Cell, trainer: Trainer) -> dict[str, Any]:
         "ms_per_iteration": trainer.ms_per_iteration,
         "ms_parts": {name: 1e3 * seconds / n for name, seconds in trainer.clock.parts_s.items()},
         "gaussians": len(trainer.gaussians),
-        "peak_rss_mb": peak_rss_mb(),
+        **peak_memory(cell.device),
         "device": cell.device,
         "threads": _threads(),
     }

@@ -20,6 +20,7 @@ import pandas as pd
 import yaml
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.measures import PARTIAL
 from ambiguous_wild.io.atomic import write_json
 
 SCHEMA = 1
@@ -43,6 +44,8 @@ FIELDS: dict[str, type | tuple[type, ...]] = {
     "scene_hash": str,
     "version": str,
 }
+# Fields that results of earlier versions lack.
+OPTIONAL: dict[str, type | tuple[type, ...]] = {"environment": dict, "code_hash": str, "reproduce": str}
 MASK_SCORES = ("iou", "precision", "recall")
 
 
@@ -205,6 +208,8 @@ def _image_rows(results: list[tuple[Path, dict[str, Any]]]) -> Iterator[dict[str
         metrics |= dict.fromkeys(result["missing"])
         for row in result["per_image"]:
             for metric in metrics:
+                if metric in PARTIAL and metric not in row:
+                    continue
                 value = row.get(metric)
                 yield _key(result) | {
                     "image": row["name"],
@@ -245,6 +250,9 @@ def _check(data: Any, where: str) -> None:
         if name not in data:
             _wrong(where, f"{name!r} is absent")
         if not isinstance(data[name], kind) or (kind is int and isinstance(data[name], bool)):
+            _wrong(where, f"{name!r} has the wrong type: {_short(data[name])}")
+    for name, kind in OPTIONAL.items():
+        if name in data and not isinstance(data[name], kind):
             _wrong(where, f"{name!r} has the wrong type: {_short(data[name])}")
     for name in ("method", "scene"):
         if not data[name].strip():

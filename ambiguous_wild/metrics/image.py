@@ -61,9 +61,10 @@ def psnr_from_mse(mse: float) -> float:
 
 
 def ssim(a: np.ndarray, b: np.ndarray) -> float:
-    """Mean SSIM over the pixels whose whole window lies in the picture (as torchmetrics, NerfBaselines).
+    """Mean SSIM over the pixels whose whole window lies in the picture (as scikit-image, NerfBaselines).
 
-    Gaussian window 11x11, sigma 1.5, biased variances, data range 1, per channel.
+    Gaussian window 11x11, sigma 1.5, biased variances, data range 1, per channel. (torchmetrics 1.9 pads by
+    reflection and averages over the border too: another number on small pictures.)
 
     Args:
         a: [H, W, 3] uint8 or float in [0, 1].

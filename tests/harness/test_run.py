@@ -15,6 +15,7 @@ from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.lock import folder_lock
 from ambiguous_wild.io.ply import read_splat_ply
 from ambiguous_wild.methods import MethodEntry, register, registry
+from ambiguous_wild.metrics.flip import flip
 from ambiguous_wild.metrics.image import psnr
 from ambiguous_wild.splat.parts import MaskPolicy, Parts
 from ambiguous_wild.splat.trainer import TrainConfig
@@ -68,10 +69,15 @@ def test_a_run_folder_holds_everything_and_the_numbers_follow_from_it(scene, tmp
     result = read_result(run / "metrics.json")
     for row in result["per_image"]:
         drawn = read_png_rgb(run / "renders" / "test" / row["name"])
-        assert row["psnr"] == pytest.approx(psnr(drawn, read_png_rgb(scene / "images" / row["name"])))
+        photo = read_png_rgb(scene / "images" / row["name"])
+        assert row["psnr"] == pytest.approx(psnr(drawn, photo))
+        assert row["flip"] == pytest.approx(flip(drawn, photo))
     assert result["masks"] == {"iou": 1.0, "precision": 1.0, "recall": 1.0, "images": 6}
     assert result["cost"]["gaussians"] == len(read_splat_ply(run / "point_cloud.ply")["means"])
     assert "lpips_alex" in result["missing"] or "lpips_alex" in result["per_image"][0]
+    assert {"psnr_valid", "psnr_covered", "psnr_uncovered"} <= result["missing"].keys()
+    assert result["environment"] == json.loads((run / "env.json").read_text())
+    assert result["reproduce"].startswith("aw bench --method truth --scene ")
     assert yaml.safe_load((run / "config.yaml").read_text())["train"]["iterations"] == 60
 
 
@@ -122,7 +128,8 @@ def test_a_failing_cell_does_not_take_the_others_with_it(scene, tmp_path):
     assert [r.outcome for r in reports] == ["failed", "trained"]
     assert reports[0].error == "RuntimeError: boom"
     folder = cell_folder(tmp_path, cells[0])
-    assert read_result(folder / "failed.json")["status"] == "failed"
+    result = read_result(folder / "failed.json")
+    assert result["status"] == "failed" and result["code_hash"] and "--method broken" in result["reproduce"]
     assert "boom" in (folder / "traceback.txt").read_text()
 
 
@@ -166,6 +173,7 @@ def test_parts_of_the_cost_are_those_of_training(scene, tmp_path):
     cost = report.result["cost"]
     assert 0 < sum(cost["ms_parts"].values()) <= cost["ms_per_iteration"]
     assert 50 < cost["peak_rss_mb"] < 20_000
+    assert 0 < cost["fps_low"] <= cost["fps"] <= cost["fps_high"]
 
 
 def test_a_scene_named_twice_is_benched_once(scene):

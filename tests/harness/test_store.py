@@ -175,3 +175,11 @@ def test_two_results_for_one_cell_are_refused(tmp_path: Path) -> None:
     write_result(tmp_path / "two" / "metrics.json", fake_result("3dgs"))
     with pytest.raises(AwError, match="two results for method '3dgs' on scene 'yard' with seed 0"):
         read_runs(tmp_path)
+
+
+@pytest.mark.parametrize("field", ["environment", "code_hash", "reproduce"])
+def test_a_field_that_older_results_lack_is_checked_where_it_is(field: str, tmp_path: Path) -> None:
+    save(tmp_path, fake_result("old"))  # it has none of them
+    assert len(read_runs(tmp_path).runs) == 1
+    with pytest.raises(AwError, match=f"'{field}' has the wrong type"):
+        save(tmp_path, fake_result("new", **{field: 7}))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.metrics import lpips
+from tests.metrics.pairs import pairs
 
 ALEX_CONVS = {0: (64, 3, 11), 3: (192, 64, 5), 6: (384, 192, 3), 8: (256, 384, 3), 10: (256, 256, 3)}
 VGG_CHANNELS = {
@@ -65,10 +67,15 @@ def pictures(height: int, width: int, seed: int = 0) -> tuple[np.ndarray, np.nda
     return a, np.clip(a + 0.3 * rng.standard_normal(a.shape), 0, 1)
 
 
+@functools.lru_cache(maxsize=1)
+def convolutions(folder: Path, kind: str) -> dict[str, np.ndarray]:
+    name = "alexnet-owt-7be5be79.pth" if kind == "alex" else "vgg16-397923af.pth"
+    return {k: v.double().numpy() for k, v in torch.load(folder / name, weights_only=True).items()}
+
+
 def naive(folder: Path, kind: str, a: np.ndarray, b: np.ndarray, *, centred: bool) -> float:
     """LPIPS v0.1 in float64 without torch's layers: metrics.md, equation 4."""
-    name = "alexnet-owt-7be5be79.pth" if kind == "alex" else "vgg16-397923af.pth"
-    state = {k: v.double().numpy() for k, v in torch.load(folder / name, weights_only=True).items()}
+    state = convolutions(folder, kind)
     linear = torch.load(folder / f"lpips_{kind}.pth", weights_only=True)
     total = 0.0
     for level, (f, g) in enumerate(
@@ -216,3 +223,17 @@ def test_import_and_availability_do_not_load_torch() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
+
+
+@pytest.mark.parametrize("variant", ["lpips_alex", "lpips_vgg", "lpips_vgg_01"])
+def test_random_and_hard_pairs_equal_the_plain_computation(
+    variant: str, weights: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("AW_WEIGHTS", str(weights))
+    kind, side = ("alex", 31) if variant == "lpips_alex" else ("vgg", 16)
+    metric = lpips.load(variant)
+    for name, (a, b) in pairs(side).items():
+        # the plain computation is slow: no picture is larger than it must be
+        a, b = a[: side + 1, : side + 1], b[: side + 1, : side + 1]
+        expected = naive(weights, kind, a / 255.0, b / 255.0, centred=variant != "lpips_vgg_01")
+        assert metric(a, b) == pytest.approx(expected, abs=1e-4), name

@@ -1,0 +1,89 @@
+"""A result says where it comes from, and its command makes the same cell again."""
+
+from __future__ import annotations
+
+import dataclasses
+import shlex
+from pathlib import Path
+
+import pytest
+
+from ambiguous_wild.cli.bench import command, parse_budget
+from ambiguous_wild.harness.grid import plan_cells
+from ambiguous_wild.harness.provenance import code_hash, provenance, reproduce
+from ambiguous_wild.harness.run import Cell
+from ambiguous_wild.methods import registry
+from ambiguous_wild.methods.registry import load_plugin
+from ambiguous_wild.splat.trainer import TrainConfig
+from tests.tiny_scene import write_tiny_scene
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_tiny_scene(tmp_path_factory.mktemp("data") / "my scene")
+
+
+def typed(text: str) -> Cell:
+    """The cell that the command line asks for."""
+    words = shlex.split(text)
+    assert words[:2] == ["aw", "bench"]
+    given = command.make_context("bench", words[2:]).params
+    train = TrainConfig(
+        iterations=given["iterations"],
+        resolution=given["resolution"],
+        max_gaussians=given["max_gaussians"],
+    )
+    more = {name: given[name] for name in ("settings", "device", "factor", "protocol")}
+    (effects,) = given["effects"]
+    (cell,) = plan_cells(given["methods"], given["scenes"], given["seeds"], train, effects=effects, **more)
+    return cell
+
+
+@pytest.mark.parametrize(
+    ("method", "settings", "more"),
+    [
+        ("3dgs", [], {}),
+        ("refinesplat", ["refinesplat.lambda_cr=0.125", "refinesplat.density.merge_every=0"], {}),
+        ("refinesplat", [], {"effects": "exposure,antialias", "protocol": "half"}),
+        ("3dgs@mask=refinesplat", ["refinesplat.lambda_cr=0.5"], {}),
+    ],
+)
+def test_the_command_of_a_result_makes_the_same_cell(
+    scene: Path, method: str, settings: list[str], more: dict
+) -> None:
+    train = TrainConfig(iterations=70, seed=3, max_gaussians=900, resolution="full")
+    (cell,) = plan_cells([method], [scene], [3], train, settings=settings, **more)
+    assert typed(reproduce(cell)).identity == cell.identity
+
+
+def test_a_variant_of_an_ablation_is_its_method_with_other_settings(scene: Path) -> None:
+    (cell,) = plan_cells(["refinesplat"], [scene], [0], TrainConfig(iterations=9))
+    options = dataclasses.replace(cell.options, lambda_cr=0.25)
+    variant = dataclasses.replace(
+        cell, method=dataclasses.replace(cell.method, name="refinesplat@x-y"), options=options
+    )
+    assert typed(reproduce(variant)).identity == dataclasses.replace(cell, options=options).identity
+
+
+def test_budgets_and_plugins_are_part_of_the_command(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(registry, "_registered", {})
+    plugin = tmp_path / "mine.py"
+    plugin.write_text(
+        "from ambiguous_wild.methods import MethodEntry, register\n"
+        "def build(options):\n    raise RuntimeError\n"
+        "register(MethodEntry('mine', 'of my own', build))\n"
+    )
+    load_plugin(plugin)
+    (cell,) = plan_cells(["mine"], [scene], [0], TrainConfig(budget_s=90.5))
+    words = shlex.split(reproduce(cell))
+    assert words[words.index("--plugin") + 1] == str(plugin)
+    assert parse_budget(words[words.index("--budget") + 1]) == 90.5 and "--iterations" not in words
+
+
+def test_a_result_names_machine_and_code(scene: Path) -> None:
+    (cell,) = plan_cells(["3dgs"], [scene], [0], TrainConfig(iterations=5))
+    facts = provenance(cell)
+    assert facts["environment"]["packages"]["numpy"] and facts["environment"]["device"] == "cpu"
+    assert len(facts["code_hash"]) == len(cell.identity) and facts["code_hash"] == code_hash()

@@ -1,0 +1,91 @@
+"""Which pixels the region metrics are about, on a wall where it can be worked out by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from ambiguous_wild.core import AwError, Camera
+from ambiguous_wild.harness.covered import inverse_depth
+from ambiguous_wild.harness.regions import find_regions
+from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.metrics.masks import psnr_valid
+from tests.tiny_scene import HEIGHT, TEST, TRAIN, WALL_Z, WIDTH, write_tiny_scene
+
+X, Y = (-0.2, 0.8), (-0.5, 0.5)  # a part of the wall, in metres
+
+
+def part_of_wall(camera: Camera) -> np.ndarray:
+    """Pixels that show the part, [H, W] bool."""
+    columns, rows = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    x = camera.center[0] + (columns - camera.cx) / camera.fx * WALL_Z
+    y = (rows - camera.cy) / camera.fy * WALL_Z
+    return (x >= X[0]) & (x <= X[1]) & (y >= Y[0]) & (y <= Y[1])
+
+
+def scene_with_part_hidden(root: Path, photos: int) -> Path:
+    """The tiny scene, the part of its wall hidden by distractors in that many of its six train photos."""
+    write_tiny_scene(root)
+    for view in load_scene(root).train:
+        hidden = part_of_wall(view.camera) & (TRAIN.index(view.name) < photos)
+        cv2.imwrite(str(root / "truth" / "distractor" / view.name), hidden.astype(np.uint8) * 255)
+    return root
+
+
+def test_covered_is_what_was_hidden_in_at_least_half_of_the_views(tmp_path: Path) -> None:
+    scene = load_scene(scene_with_part_hidden(tmp_path / "scene", 4))
+    regions = find_regions(scene)
+    for view in scene.test:
+        expected, got = part_of_wall(view.camera), regions.pixels["psnr_covered"][view.name]
+        assert (expected & got).sum() / (expected | got).sum() > 0.85
+        assert np.array_equal(regions.pixels["psnr_uncovered"][view.name], ~got)
+    assert list(regions.missing) == ["psnr_valid"]
+
+
+def test_what_cannot_be_told_is_missing_with_its_reason(tmp_path: Path) -> None:
+    rarely = find_regions(load_scene(scene_with_part_hidden(tmp_path / "rarely", 2)))
+    assert not rarely.pixels and "half of the train views" in rarely.missing["psnr_covered"]
+    clean = load_scene(write_tiny_scene(tmp_path / "clean", distractors=False))
+    assert find_regions(clean).missing["psnr_uncovered"] == "no train photo shows a distractor"
+    for path in (tmp_path / "clean/truth/distractor").iterdir():
+        path.unlink()
+    assert "no exact masks" in find_regions(load_scene(tmp_path / "clean")).missing["psnr_covered"]
+    few = scene_with_part_hidden(tmp_path / "few", 4)
+    lines = (few / "sparse/0/points3D.txt").read_text().splitlines(keepends=True)
+    (few / "sparse/0/points3D.txt").write_text("".join(lines[:5]))
+    assert "too few sparse points" in find_regions(load_scene(few)).missing["psnr_covered"]
+
+
+def test_a_users_mask_of_a_test_photo_is_what_psnr_valid_measures(tmp_path: Path) -> None:
+    root = write_tiny_scene(tmp_path / "scene")
+    (root / "masks" / "test").mkdir(parents=True)
+    keep = np.zeros((HEIGHT, WIDTH), np.uint8)
+    keep[:10, 40:] = 255
+    cv2.imwrite(str(root / "masks" / "test" / TEST[0]), keep)
+    regions = find_regions(load_scene(root))
+    a, b = np.random.default_rng(0).integers(0, 256, (2, HEIGHT, WIDTH, 3), dtype=np.uint8)
+    assert regions.psnr(TEST[0], a, b) == {"psnr_valid": psnr_valid(a, b, keep)}
+    assert regions.psnr(TEST[1], a, b) == {}  # it has no mask, and no value to invent
+    right = slice(WIDTH // 2, None)
+    half = regions.psnr(TEST[0], a[:, right], b[:, right])
+    assert half == {"psnr_valid": psnr_valid(a[:, right], b[:, right], keep[:, right])}
+    cv2.imwrite(str(root / "masks" / "test" / TEST[0]), keep[:-1])
+    with pytest.raises(AwError, match="its photo is 64x48"):
+        find_regions(load_scene(root))
+
+
+def test_depth_between_points_is_exact_on_a_plane_and_ignores_what_lies_behind() -> None:
+    camera = Camera(60, 40, 50.0, 50.0, 30.0, 20.0, np.eye(4))
+    rng = np.random.default_rng(1)
+    u, v = rng.uniform(-10, 70, 3000), rng.uniform(-10, 50, 3000)
+    x, y = (u - 30) / 50, (v - 20) / 50
+    z = 4.0 / (1.0 + 0.5 * x)  # a slanted wall: x + 2 z / ... linear in 1/z
+    wall = np.stack([x * z, y * z, z], axis=1)
+    inverse = inverse_depth(camera, np.concatenate([wall, 3.0 * wall[::3]]))  # and another behind it
+    assert inverse is not None and inverse.shape == (40, 60)
+    expected = (1.0 + 0.5 * ((np.arange(60) + 0.5 - 30) / 50)) / 4.0
+    assert np.abs(inverse - expected[None, :]).max() < 1e-5
+    assert inverse_depth(camera, wall[:4]) is None

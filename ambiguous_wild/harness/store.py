@@ -17,9 +17,9 @@ from typing import Any, NoReturn
 
 import numpy as np
 import pandas as pd
-import yaml
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.atomic import write_json
 
 SCHEMA = 1
@@ -168,10 +168,9 @@ def _run_folders(root: Path) -> Iterator[Path]:
 def read_config(run: Path) -> dict[str, Any]:
     """The run's config.yaml; empty where it is absent or damaged."""
     try:
-        config = yaml.safe_load((run / CONFIG).read_text(encoding="utf-8"))
-    except (OSError, ValueError, yaml.YAMLError):
+        return plain_yaml.read_mapping(run / CONFIG)
+    except AwError:
         return {}
-    return config if isinstance(config, dict) else {}
 
 
 def _method_and_scene(run: Path) -> tuple[str, str]:

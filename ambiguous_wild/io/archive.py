@@ -1,0 +1,228 @@
+"""Archives from strangers: what comes out is plain files below one folder, or nothing.
+
+Refused by name: paths that lead out, links, devices, encrypted and sparse members, two members of one name,
+and bombs. Sizes are counted while writing; what a header announces is never trusted.
+"""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import stat
+import tarfile
+import unicodedata
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import IO
+
+from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.io.atomic import atomic_dir
+
+_CHUNK = 1 << 20
+_HEADER = 4 << 20  # bytes that all headers of one tar member may take: names and nothing else
+_ZIP_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2)  # others allocate as told
+_LONGEST = 255  # bytes of a name, what file systems hold
+_DEEPEST = 32  # folders inside each other
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What an archive may grow to."""
+
+    files: int = 200_000
+    bytes: int = 50_000_000_000
+    ratio: float = 200.0  # unpacked to packed; photos and models stay under 20
+    free: int = 64 << 20  # bytes that no ratio is asked of: small text packs well
+
+
+@dataclass
+class _Budget:
+    """Counts what one archive has written."""
+
+    archive: Path
+    packed: int
+    limits: Limits
+    written: int = 0
+    names: dict[str, str] = field(default_factory=dict)  # as a careless file system sees it -> as given
+
+    def add(self, count: int) -> None:
+        self.written += count
+        most = min(self.limits.bytes, max(self.limits.free, int(self.limits.ratio * self.packed)))
+        if self.written > most:
+            raise AwError(
+                f"{self.archive} unpacks to more than {most / 1e6:.0f} MB from {self.packed / 1e6:.2f} MB: "
+                "that is a bomb, or no archive of photos; unpack it by hand if you trust it"
+            )
+
+    def place(self, name: str, folder: bool) -> PurePosixPath | None:
+        """Where the member goes below the target; None for the target itself."""
+        path = _inside(self.archive, name)
+        if not path.parts:
+            return None
+        if folder:
+            return path
+        if len(self.names) >= self.limits.files:
+            raise AwError(f"{self.archive} holds more than {self.limits.files} files; unpack a part of it")
+        # Two names that one file system keeps apart and another does not: one would silently win.
+        key = unicodedata.normalize("NFC", str(path)).casefold()
+        if key in self.names:
+            raise AwError(
+                f"{self.archive} holds {_short(name)} and {_short(self.names[key])}, the same file; "
+                "pack it again"
+            )
+        self.names[key] = name
+        return path
+
+
+def extract(archive: Path | str, target: Path | str, limits: Limits | None = None) -> list[str]:
+    """Unpack a .zip, .tar, .tar.gz or .tar.bz2 (known by content) into a new folder.
+
+    The folder appears when everything is in it, or not at all. Rights, owners and times in the archive are
+    not carried over.
+
+    Args:
+        archive: the file.
+        target: the folder to make; must not exist, or be empty.
+        limits: see `Limits`.
+
+    Returns:
+        Names of the files, relative to the target, sorted.
+
+    Raises:
+        AwError: no archive of these kinds, damaged, or refused, with the member that is to blame.
+    """
+    source, out = Path(archive), Path(target)
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise AwError(f"{out} exists; nothing is overwritten: choose another folder or remove it")
+    try:
+        with open(source, "rb") as f:
+            head = f.read(6)
+        budget = _Budget(source, source.stat().st_size, limits or Limits())
+        with atomic_dir(out) as folder, _named_errors(source):
+            if zipfile.is_zipfile(source):
+                _unzip(source, folder, budget)
+            else:
+                _untar(source, head, folder, budget)
+    except OSError as error:
+        raise AwError(f"cannot unpack {source}: {error.strerror or error}") from error
+    return sorted(str(PurePosixPath(name)) for name in budget.names.values())
+
+
+@contextmanager
+def _named_errors(source: Path) -> Iterator[None]:
+    """What the standard library raises for damaged archives, as one line of ours."""
+    try:
+        yield
+    except (zipfile.BadZipFile, tarfile.TarError, zlib.error, EOFError, ValueError, IndexError) as error:
+        raise AwError(f"{source} is a damaged or cut archive ({error}); fetch it again") from error
+    except (NotImplementedError, RuntimeError, KeyError) as error:
+        raise AwError(f"{source} holds what is not unpacked here ({error}); unpack it by hand") from error
+    except OSError as error:
+        if error.errno is not None:
+            raise
+        raise AwError(f"{source} is a damaged or cut archive ({error}); fetch it again") from error
+
+
+def _unzip(source: Path, folder: Path, budget: _Budget) -> None:
+    with zipfile.ZipFile(source) as archive:
+        for member in archive.infolist():
+            mode = member.external_attr >> 16
+            kind = stat.S_IFMT(mode)
+            if kind and not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+                raise _refused(source, member.filename, "a link or device")
+            if member.flag_bits & 0x1:
+                raise NotImplementedError(f"{_short(member.filename)} is encrypted")
+            if member.compress_type not in _ZIP_METHODS:
+                raise NotImplementedError(f"{_short(member.filename)} is packed by a method that is not read")
+            path = budget.place(member.filename, member.is_dir())
+            if path is None:
+                continue
+            if member.is_dir():
+                (folder / path).mkdir(parents=True, exist_ok=True)
+            else:
+                with archive.open(member) as data:
+                    _write(data, folder / path, budget)
+
+
+def _untar(source: Path, head: bytes, folder: Path, budget: _Budget) -> None:
+    with open(source, "rb") as raw:
+        if head.startswith(b"\x1f\x8b"):
+            stream: IO[bytes] = gzip.GzipFile(fileobj=raw)  # type: ignore[assignment]
+        elif head.startswith(b"BZh"):
+            stream = bz2.BZ2File(raw)
+        elif head.startswith(b"\xfd7zXZ"):
+            raise AwError(f"{source} is packed with xz, which is not read; unpack it by hand, or use .tar.gz")
+        else:
+            stream = raw
+        gate = _Gate(source, stream)
+        with tarfile.open(fileobj=gate, mode="r|") as archive:  # type: ignore[call-overload]
+            while True:
+                gate.allowed = _HEADER
+                member = archive.next()
+                archive.members.clear()  # tarfile keeps every header it has read
+                if member is None:
+                    return
+                if member.isdir():
+                    if (path := budget.place(member.name, True)) is not None:
+                        (folder / path).mkdir(parents=True, exist_ok=True)
+                    continue
+                if not member.isreg() or member.issparse():
+                    raise _refused(source, member.name, "a link, device or sparse file")
+                path = budget.place(member.name, False)
+                data = archive.extractfile(member)
+                if path is None or data is None:
+                    raise _refused(source, member.name, "without a name")
+                gate.allowed = member.size + _CHUNK
+                _write(data, folder / path, budget)
+
+
+class _Gate:
+    """Lets through what the next step may need: a header that unpacks to gigabytes is stopped here."""
+
+    def __init__(self, source: Path, stream: IO[bytes]) -> None:
+        self.source, self.stream, self.allowed = source, stream, _HEADER
+
+    def read(self, size: int) -> bytes:
+        data = self.stream.read(size)
+        self.allowed -= len(data)
+        if self.allowed < 0:
+            raise AwError(f"{self.source} has a header of more than {_HEADER >> 20} MB: damaged, or a bomb")
+        return data
+
+
+def _write(data: IO[bytes], path: Path, budget: _Budget) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(path, "xb") as f:
+        while chunk := data.read(_CHUNK):
+            budget.add(len(chunk))
+            f.write(chunk)
+
+
+def _inside(archive: Path, name: str) -> PurePosixPath:
+    """The member's path, proven to stay below the target.
+
+    Raises:
+        AwError: it is absolute, climbs, is of Windows' kind, or holds what no file name should.
+    """
+    path = PurePosixPath(name)
+    # A backslash and a colon are innocent here and a way out elsewhere.
+    if path.is_absolute() or ".." in path.parts or "\\" in name or ":" in name:
+        raise _refused(archive, name, "a path that leads out of the folder")
+    if not name.isprintable() or len(path.parts) > _DEEPEST:
+        raise _refused(archive, name, "no fit file name")
+    if any(len(part.encode("utf-8", errors="surrogateescape")) > _LONGEST for part in path.parts):
+        raise _refused(archive, name, "a name that is too long")
+    return path
+
+
+def _refused(archive: Path, name: str, what: str) -> AwError:
+    return AwError(f"{archive} is not unpacked: its member {_short(name)} is {what}; do not trust it")
+
+
+def _short(name: str) -> str:
+    text = ascii(name)
+    return text if len(text) <= 60 else text[:57] + "..."

@@ -220,7 +220,9 @@ def measure(name: str, wanted: int, tally: Tally, seed: int, save: Callable[[Tal
             for key, value in asdict(done).items():
                 setattr(tally, key, getattr(tally, key) + value)
             save(tally)
-            print(f"{name}: {tally.kills} of {wanted} kills, {tally.bad} bad; {usual_s:.1f} s a run", flush=True)
+            print(
+                f"{name}: {tally.kills} of {wanted} kills, {tally.bad} bad; {usual_s:.1f} s a run", flush=True
+            )
 
 
 def _differing(a: dict[str, str], b: dict[str, str]) -> list[str]:
@@ -229,7 +231,9 @@ def _differing(a: dict[str, str], b: dict[str, str]) -> list[str]:
 
 def table(results: dict[str, Any]) -> str:
     """The Markdown table of docs/robustness.md."""
-    lines = ["| command | kills | runs to the end | half-written | lost or different | left behind | failed |"]
+    lines = [
+        "| command | kills | runs to the end | half-written | lost or different | left behind | failed |"
+    ]
     lines += ["|---|---|---|---|---|---|---|"]
     keys = ("kills", "rounds", "half_written", "lost_or_different", "left_behind", "failed_reruns")
     for name, row in results.items():

@@ -139,7 +139,9 @@ def _feed(reader: Reader, numbers: range, scratch: Path, report: Any) -> None:
                 reader.read(path)
             except AwError as error:
                 verdict = _line_of(error)
-                report.write(f"{verdict}\t{number}\n" if verdict == "refused" else f"crash\t{number}\t{verdict}\n")
+                report.write(
+                    f"{verdict}\t{number}\n" if verdict == "refused" else f"crash\t{number}\t{verdict}\n"
+                )
             except BaseException as error:
                 report.write(f"crash\t{number}\t{_where(error)}\n")
             signal.setitimer(signal.ITIMER_PROF, 0)
@@ -173,7 +175,10 @@ def _where(error: BaseException) -> str:
 
 def table(results: dict[str, Any]) -> str:
     """The Markdown table of docs/robustness.md."""
-    lines = ["| reader | inputs | refused | crashes found | places | fixed | remaining |", "|---|" + "---|" * 6]
+    lines = [
+        "| reader | inputs | refused | crashes found | places | fixed | remaining |",
+        "|---|" + "---|" * 6,
+    ]
     total = [0] * 6
     for name, row in results.items():
         fixed, left = (sum(map(len, row[key].values())) for key in ("fixed", "crashes"))

@@ -95,8 +95,17 @@ def _photo(name: str) -> list[bytes]:
     if name == "png":
         return [_encoded(".png", i) for i in (color, gray, alpha, _picture(3, np.uint16))]
     if name == "tiff":
-        return [_encoded(".tif", color), _encoded(".tif", gray, 259, 1), _encoded(".tif", _picture(3, np.uint16))]
-    others = [_encoded(".bmp", color), _encoded(".bmp", gray), _encoded(".webp", color), _encoded(".webp", alpha)]
+        return [
+            _encoded(".tif", color),
+            _encoded(".tif", gray, 259, 1),
+            _encoded(".tif", _picture(3, np.uint16)),
+        ]
+    others = [
+        _encoded(".bmp", color),
+        _encoded(".bmp", gray),
+        _encoded(".webp", color),
+        _encoded(".webp", alpha),
+    ]
     return [*others, _encoded(".jp2", color)]
 
 
@@ -189,7 +198,13 @@ def _inside_scene(title: str, name: str, mutate: Mutate = fuzz_mutate.damage) ->
 def _plys() -> list[bytes]:
     rng, found = np.random.default_rng(0), []
     for rest in (0, 15):
-        shapes = {"means": (9, 3), "quats": (9, 4), "log_scales": (9, 3), "opacity_logits": (9,), "sh0": (9, 3)}
+        shapes = {
+            "means": (9, 3),
+            "quats": (9, 4),
+            "log_scales": (9, 3),
+            "opacity_logits": (9,),
+            "sh0": (9, 3),
+        }
         arrays = {k: rng.random(s, dtype=np.float32) for k, s in shapes.items()}
         path = _workshop() / "a.ply"
         ply.write_splat_ply(path, arrays | {"sh_rest": np.zeros((9, rest, 3), np.float32)})
@@ -266,7 +281,13 @@ def _plans() -> list[bytes]:
 
 @functools.cache
 def _captures() -> list[bytes]:
-    facts = {"identity": "i", "preset": "tiny", "seed": 0, "files": {"a": hashlib.sha256(b"x").hexdigest()}, "photos": {}}
+    facts = {
+        "identity": "i",
+        "preset": "tiny",
+        "seed": 0,
+        "files": {"a": hashlib.sha256(b"x").hexdigest()},
+        "photos": {},
+    }
     return [json.dumps(facts).encode()]
 
 
@@ -290,7 +311,9 @@ def _answers(kind: str) -> list[bytes]:
     from tests.study.studies import panel, panel_key
 
     _keys()
-    files = panel(panel_key(), {"3dgs": 0.0, "refinesplat": 1.0, "robustsplat": 0.5}, 2, np.random.default_rng(0))
+    files = panel(
+        panel_key(), {"3dgs": 0.0, "refinesplat": 1.0, "robustsplat": 0.5}, 2, np.random.default_rng(0)
+    )
     if kind == "json":
         return [json.dumps(f).encode() for f in files.values()]
     found = []
@@ -349,7 +372,9 @@ def _unpack(path: Path) -> None:
         whole = True
     finally:
         expected = ["target"] if whole else []
-        if sorted(os.listdir(room)) != expected or sorted(os.listdir(path.parent)) != sorted([path.name, "room"]):
+        if sorted(os.listdir(room)) != expected or sorted(os.listdir(path.parent)) != sorted(
+            [path.name, "room"]
+        ):
             raise RuntimeError(f"left behind: {os.listdir(room)}, {os.listdir(path.parent)}")
         if any(p.is_symlink() or not (p.is_file() or p.is_dir()) for p in room.rglob("*")):
             raise RuntimeError("a link or device was made")

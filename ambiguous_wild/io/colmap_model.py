@@ -7,7 +7,7 @@ before anything is allocated.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
@@ -141,6 +141,8 @@ def read_model(folder: Path | str) -> Model:
     for camera in model.cameras.values():
         _check_camera(root, camera)
     for image in model.images.values():
+        if not PurePosixPath(image.name).name or "\0" in image.name:
+            raise AwError(f"{root}: image {image.image_id} has no name: the model is damaged; build it again")
         if image.camera_id not in model.cameras:
             raise AwError(f"{root}: image {image.name!r} names camera {image.camera_id}, which is not there")
     return model

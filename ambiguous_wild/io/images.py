@@ -123,8 +123,8 @@ def decode(
         return None
     if size[0] * size[1] > MAX_PIXELS:
         raise AwError(
-            f"{where} announces {size[0]}x{size[1]} px, more than the {MAX_PIXELS // 1_000_000} megapixels that "
-            "are read; reduce it"
+            f"{where} announces {size[0]}x{size[1]} px, more than the {MAX_PIXELS // 1_000_000} megapixels "
+            "that are read; reduce it"
         )
     try:
         return cv2.imdecode(data, flags)

@@ -16,6 +16,7 @@ from ambiguous_wild.simulate.check import check_spec
 from ambiguous_wild.simulate.effects.settings import KINDS, Effects
 from ambiguous_wild.simulate.spec import CaptureSpec
 
+
 class _Dumper(yaml.SafeDumper):
     """YAML's safe dumper; lists of numbers and words on one line, and no aliases."""
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from ambiguous_wild.core import AwError, Camera, Scene, View
 from ambiguous_wild.harness.ambiguity.sources import Masks
+from ambiguous_wild.io import plain_yaml
 
 OPAQUE = 0.9  # accumulated alpha from which something stands there
 SEEN_BY = 2  # other photos that must see the surface unmasked

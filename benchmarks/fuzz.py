@@ -106,6 +106,8 @@ def _child(reader: Reader, numbers: range, tally: Tally) -> int:
     _, status = os.waitpid(process, 0)
     shutil.rmtree(scratch, ignore_errors=True)
     code = os.waitstatus_to_exitcode(status)
+    if code and last < numbers.start:
+        raise RuntimeError(f"input {numbers.start} of {reader.name} cannot be made")
     if code == 0:
         return numbers.stop
     if code < 0:

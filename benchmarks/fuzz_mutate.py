@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import random
 import struct
@@ -138,17 +139,17 @@ def tree(load: Callable[[str], Any], dump: Callable[[Any], str]) -> Callable[...
 def _changed(root: Any, dice: random.Random) -> Any:
     spots = list(_spots(root))
     if not spots:
-        return dice.choice(_NODES)
+        return copy.deepcopy(dice.choice(_NODES))
     owner, key = dice.choice(spots)
     stroke = dice.random()
     if stroke < 0.75:
-        owner[key] = dice.choice(_NODES)
+        owner[key] = copy.deepcopy(dice.choice(_NODES))
     elif stroke < 0.9:
         del owner[key]
     elif isinstance(owner, dict):
         owner[str(key) + "x"] = owner.pop(key)
     else:
-        owner.append(owner[key])
+        owner.append(copy.deepcopy(owner[key]))
     return root
 
 

@@ -2,9 +2,10 @@
 
     python benchmarks/fuzz.py [--inputs 10000] [--only NAME ...] [--json PATH] [--keep FOLDER]
 
-Each reader (see `fuzz_readers`) gets valid files with seeded damage (see `fuzz_mutate`): the number of an input
-says everything about it. Readers run in a forked child with a limit on its memory (1 GB above what the imports
-take) and its processor time (5 s an input); native code that dies takes the child along and nothing else.
+Each reader (see `fuzz_readers`) gets valid files with seeded damage (see `fuzz_mutate`): the number of an
+input says everything about it. Readers run in a forked child with a limit on its memory (1 GB above what the
+imports take) and its processor time (5 s an input); native code that dies takes the child along and nothing
+else.
 A crash is any exception but AwError, a signal, or a limit. With --keep the inputs that crash are written out.
 
 The count asked for is a total: the results file says how far a reader has come, and the script goes on there.

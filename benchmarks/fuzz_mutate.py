@@ -17,8 +17,8 @@ _WORDS = ("nan", "inf", "-inf", "-1", "0", "1e999", "-0.0", "1e-320", "9" * 30, 
           "[" * 2000, "{" * 500, "a: " * 50, "=cmd()", "&a *a", "!!python/object/apply:os.system ['true']",
           "x" * 5000)  # fmt: skip
 _NODES: tuple[Any, ...] = (
-    None, True, False, 0, -1, 1, 3, 2**63, 10**400, 1e308, -1e308, 5e-324, float("nan"), float("inf"), "", "x",
-    "../x", "/x", "\0", "inf", "x" * 3000, [], {}, [[]], [None], {"": None}, {"a": {}}, [1, 2, 3],
+    None, True, False, 0, -1, 1, 3, 2**63, 10**400, 1e308, -1e308, 5e-324, float("nan"), float("inf"), "",
+    "x", "../x", "/x", "\0", "inf", "x" * 3000, [], {}, [[]], [None], {"": None}, {"a": {}}, [1, 2, 3],
 )  # fmt: skip
 
 

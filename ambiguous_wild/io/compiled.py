@@ -10,7 +10,7 @@ def forgiving(dispatcher: Any) -> Any:
 
     A full disk or a lost power line leaves such files. A decorator, above ``numba.njit(cache=True)``.
     """
-    cache = getattr(dispatcher, "_cache", None)
+    cache: Any = getattr(dispatcher, "_cache", None)
     if not hasattr(cache, "load_overload") or not hasattr(cache, "flush"):
         return dispatcher  # compiled without a cache, or another Numba: as it comes
     load = cache.load_overload

@@ -1,4 +1,4 @@
-"""Disks that are full or read-only, for those who may mount; the tests that ask for one are skipped elsewhere."""
+"""Disks that are full or read-only, for those who may mount; elsewhere tests that ask for one are skipped."""
 
 from __future__ import annotations
 

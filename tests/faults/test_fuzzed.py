@@ -63,7 +63,7 @@ def replaced(path, old, new):
 def test_colmap_text_that_contradicts_itself(tmp_path, file, old, new):
     root = write_tiny_scene(tmp_path / "scene")
     replaced(root / "sparse" / "0" / file, old, new)
-    with pytest.raises(AwError, match="damaged|not what COLMAP writes"):
+    with pytest.raises(AwError, match=r"damaged|not what COLMAP writes"):
         load_scene(root)
 
 
@@ -95,8 +95,8 @@ def test_numbers_without_end(tmp_path, number):
         parse_spec(f"width: 320\nexposure: {number}")
     for name, text in {
         "metrics.json": json.dumps(fake_result("3dgs")).replace("1234", number),
-        "scene.json": '{"schema_version": 1, "files": {}, "factor": %s}' % number,
-        "plan.json": '{"schema": %d, "scene": "s", "decisions": [{"threshold": %s}]}' % (SCHEMA, number),
+        "scene.json": f'{{"schema_version": 1, "files": {{}}, "factor": {number}}}',
+        "plan.json": f'{{"schema": {SCHEMA}, "scene": "s", "decisions": [{{"threshold": {number}}}]}}',
     }.items():
         (tmp_path / name).write_text(text)
     for read, name in ((read_result, "metrics.json"), (read_plan, "plan.json")):
@@ -139,8 +139,9 @@ def test_image_headers_say_the_size_the_decoder_finds(tmp_path):
     import cv2
 
     pixels = np.random.default_rng(0).integers(0, 256, (37, 53, 3), dtype=np.uint8)
-    for suffix, options in ((".png", []), (".jpg", []), (".bmp", []), (".tif", []), (".webp", []),
-                            (".webp", [cv2.IMWRITE_WEBP_QUALITY, 101]), (".jpg", [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])):  # fmt: skip
+    lossless, progressive = [cv2.IMWRITE_WEBP_QUALITY, 101], [cv2.IMWRITE_JPEG_PROGRESSIVE, 1]
+    kinds = [(s, []) for s in (".png", ".jpg", ".bmp", ".tif", ".webp")]
+    for suffix, options in [*kinds, (".webp", lossless), (".jpg", progressive)]:
         data = cv2.imencode(suffix, pixels, options)[1].tobytes()
         assert header_size(data) == (53, 37), suffix
         assert header_size(data[:12]) is None

@@ -42,6 +42,6 @@ def _decision(row: object) -> Decision:
     for name in _TEXTS:
         if not isinstance(values[name], str):
             raise ValueError(f"{name} is no text")
-    values["value"] = math.nan if values["value"] is None else float(values["value"])  # type: ignore[arg-type]
+    values["value"] = math.nan if values["value"] is None else float(values["value"])
     values["threshold"] = float(values["threshold"])  # type: ignore[arg-type]
     return Decision(**values)  # type: ignore[arg-type]

@@ -25,9 +25,11 @@ from ambiguous_wild.io.scene_folder import load_scene, read_scene_json
 from ambiguous_wild.metrics import lpips
 from ambiguous_wild.simulate.spec_file import parse_spec
 from ambiguous_wild.splat import checkpoint
+from ambiguous_wild.study.answers import read_answers
 from ambiguous_wild.study.key import FORMAT, read_key
 from ambiguous_wild.vision.label_maps import read_labels
 from tests.harness.fake_runs import fake_result
+from tests.study.studies import METHODS, panel, panel_key
 from tests.tiny_scene import write_tiny_scene
 
 ROOT = Path(__file__).parents[2]
@@ -104,6 +106,15 @@ def test_numbers_without_end(tmp_path, number):
             read(tmp_path / name)
     with pytest.raises(AwError, match=r"scene\.json"):
         read_scene_json(tmp_path)
+
+
+def test_an_answer_that_took_longer_than_any_number(tmp_path):
+    key = panel_key()
+    (name, data), *_ = panel(key, dict.fromkeys(METHODS, 0.0), 1, np.random.default_rng(0)).items()
+    data["answers"][0]["ms"] = 10**400
+    (tmp_path / name).write_text(json.dumps(data))
+    with pytest.raises(AwError, match="no fit time"):
+        read_answers([tmp_path / name], key)
 
 
 @pytest.mark.parametrize("row", [[], "x", 1.5, None])

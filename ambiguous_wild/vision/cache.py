@@ -77,6 +77,7 @@ def _load(path: Path, expected: Mapping[str, type | str]) -> Arrays | None:
     # np.load, zipfile, zlib and tokenize have a dozen ways to say that an entry is cut or overwritten
     except Exception:
         return None
-    if any(array.dtype != np.dtype(expected[name]) for name, array in arrays.items()):
+    # a member that has lost its first bytes comes as bytes, not as an array
+    if any(getattr(a, "dtype", None) != np.dtype(expected[name]) for name, a in arrays.items()):
         return None
     return arrays

@@ -1,7 +1,9 @@
 """A damaged entry of any cache is made anew: never an error, never used."""
 
 import importlib.util
+import io
 import os
+import zipfile
 
 import numba
 import numpy as np
@@ -10,10 +12,19 @@ import pytest
 import ambiguous_wild.splat.cpu.compile  # noqa: F401  sets where kernels are kept, once
 from ambiguous_wild.vision.cache import cached
 
+
+def zip_of(name, data):
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w") as archive:
+        archive.writestr(name, data)
+    return out.getvalue()
+
+
 DAMAGE = {
     "empty": lambda data: b"",
     "cut": lambda data: data[: len(data) // 2],
     "garbage": lambda data: np.random.default_rng(0).bytes(len(data)),
+    "a member that is no array": lambda data: zip_of("labels.npy", b"no array"),
     "another archive": lambda data: b"PK\x05\x06" + bytes(18),
 }
 LABELS = np.arange(12, dtype=np.int32).reshape(3, 4)

@@ -121,9 +121,13 @@ def _coerce(hint: Any, value: Any, where: str) -> Any:
     if origin in (dict, Mapping) or hint in (dict, Any):
         return value
     if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
-        if not math.isfinite(value):
-            raise AwError(f"{where}: expected a finite number, got {value}")
-        return float(value)
+        try:
+            number = float(value)
+        except OverflowError:  # a whole number of more than 308 digits
+            number = math.inf
+        if not math.isfinite(number):
+            raise AwError(f"{where}: expected a finite number, got {number}")
+        return number
     if hint is int and isinstance(value, float) and value.is_integer():
         return int(value)
     if isinstance(hint, type) and isinstance(value, hint) and not (hint is int and isinstance(value, bool)):

@@ -5,6 +5,8 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+_LONGEST = 2000  # characters of a message; ours have below 700
+
 
 class AwError(Exception):
     """Something the user can mend: one line that says what, where, why, and what to do next.
@@ -13,6 +15,11 @@ class AwError(Exception):
     """
 
     exit_code = 2
+
+    def __init__(self, message: object = "") -> None:
+        text = str(message)
+        # What a damaged file holds may be a word of a megabyte; a message stays one that can be read.
+        super().__init__(text if len(text) <= _LONGEST else f"{text[: _LONGEST - 300]} ... {text[-290:]}")
 
 
 def unknown(kind: str, name: str, choices: Iterable[str], hint: str = "") -> AwError:

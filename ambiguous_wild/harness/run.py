@@ -26,6 +26,7 @@ from ambiguous_wild.harness.identity import scene_identity as scene_identity  # 
 from ambiguous_wild.harness.memory import peak_memory, reset_peak
 from ambiguous_wild.harness.provenance import provenance
 from ambiguous_wild.harness.store import read_result, write_result
+from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.atomic import sweep, write_json, write_text
 from ambiguous_wild.io.lock import folder_lock
 from ambiguous_wild.io.ply import write_splat_ply
@@ -205,11 +206,9 @@ def refuse_other_config(folder: Path, cell: Cell) -> None:
     if not path.exists() or present <= _WORTHLESS:
         return  # it stopped before the first checkpoint: there is nothing to lose
     try:
-        old = yaml.safe_load(path.read_text(encoding="utf-8"))
-        if not isinstance(old, dict):
-            raise ValueError("not a mapping")
-    except (yaml.YAMLError, ValueError, OSError) as error:
-        raise AwError(f"{path} is damaged ({error}); start anew with --overwrite always") from None
+        old = plain_yaml.read_mapping(path)
+    except AwError as error:
+        raise AwError(f"{error}; start anew with --overwrite always") from None
     if old.get("config_hash") == cell.identity:
         return
     ignored = {f"{part}.{key}" for part, keys in IGNORED.items() for key in keys} | {"config_hash"}

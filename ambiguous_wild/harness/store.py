@@ -17,10 +17,10 @@ from typing import Any, NoReturn
 
 import numpy as np
 import pandas as pd
-import yaml
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.measures import PARTIAL
+from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.atomic import write_json
 
 SCHEMA = 1
@@ -171,10 +171,9 @@ def run_folders(root: Path) -> Iterator[Path]:
 def read_config(run: Path) -> dict[str, Any]:
     """The run's config.yaml; empty where it is absent or damaged."""
     try:
-        config = yaml.safe_load((run / CONFIG).read_text(encoding="utf-8"))
-    except (OSError, ValueError, yaml.YAMLError):
+        return plain_yaml.read_mapping(run / CONFIG)
+    except AwError:
         return {}
-    return config if isinstance(config, dict) else {}
 
 
 def _method_and_scene(run: Path) -> tuple[str, str]:
@@ -286,6 +285,8 @@ def _check_images(rows: list[Any], where: str) -> None:
 
 def _check_number(value: Any, what: str, where: str) -> None:
     number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    # JSON's whole numbers have no end, floats have
+    number = number and (isinstance(value, float) or abs(value) < 2**1000)
     if not number and value is not None and value not in ("inf", "-inf"):
         _wrong(where, f"{what} is no number: {_short(value)}")
 
@@ -295,7 +296,10 @@ def _wrong(where: str, what: str) -> NoReturn:
 
 
 def _short(value: Any) -> str:
-    text = repr(value)
+    try:
+        text = repr(value)
+    except ValueError:  # a whole number of thousands of digits
+        text = "a number without end"
     return text if len(text) <= 60 else text[:57] + "..."
 
 

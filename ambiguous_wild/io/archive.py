@@ -1,17 +1,143 @@
-"""Folders as tar archives: packed with a bound, unpacked so that nothing leaves the target."""
+"""Archives from strangers: what comes out is plain files below one folder, or nothing.
+
+Refused by name: paths that lead out, links, devices, encrypted and sparse members, two members of one name,
+and bombs. Sizes are counted while writing; what a header announces is never trusted.
+"""
 
 from __future__ import annotations
 
+import bz2
+import gzip
 import io
-import shutil
+import stat
 import tarfile
-from collections.abc import Callable
+import unicodedata
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import IO
 
 from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.io.atomic import atomic_dir
 
-MOST_FILES = 200_000
+_CHUNK = 1 << 20
+_HEADER = 4 << 20  # bytes that all headers of one tar member may take: names and nothing else
+_ZIP_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2)  # others allocate as told
+_LONGEST = 255  # bytes of a name, what file systems hold
+_DEEPEST = 32  # folders inside each other
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What an archive may grow to."""
+
+    files: int = 200_000
+    bytes: int = 50_000_000_000
+    ratio: float = 200.0  # unpacked to packed; photos and models stay under 20
+    free: int = 64 << 20  # bytes that no ratio is asked of: small text packs well
+
+
+@dataclass
+class _Budget:
+    """Counts what one archive has written."""
+
+    archive: Path
+    packed: int
+    limits: Limits
+    wanted: Callable[[str], bool]
+    written: int = 0
+    wrote: list[str] = field(default_factory=list)
+    names: dict[str, str] = field(default_factory=dict)  # as a careless file system sees it -> as given
+
+    def add(self, count: int) -> None:
+        self.written += count
+        most = min(self.limits.bytes, max(self.limits.free, int(self.limits.ratio * self.packed)))
+        if self.written > most:
+            raise AwError(
+                f"{self.archive} unpacks to more than {most / 1e6:.0f} MB from {self.packed / 1e6:.2f} MB: "
+                "that is a bomb, or no archive of photos; unpack it by hand if you trust it"
+            )
+
+    def place(self, name: str, folder: bool) -> PurePosixPath | None:
+        """Where the member goes below the target; None for the target itself."""
+        path = _inside(self.archive, name)
+        if not path.parts:
+            return None
+        if folder:
+            return path
+        if len(self.names) >= self.limits.files:
+            raise AwError(f"{self.archive} holds more than {self.limits.files} files; unpack a part of it")
+        # Two names that one file system keeps apart and another does not: one would silently win.
+        key = unicodedata.normalize("NFC", str(path)).casefold()
+        if key in self.names:
+            raise AwError(
+                f"{self.archive} holds {_short(name)} and {_short(self.names[key])}, the same file; "
+                "pack it again"
+            )
+        self.names[key] = name
+        return path
+
+
+def extract(archive: Path | str, target: Path | str, limits: Limits | None = None) -> list[str]:
+    """Unpack a .zip, .tar, .tar.gz or .tar.bz2 (known by content) into a new folder.
+
+    The folder appears when everything is in it, or not at all. Rights, owners and times in the archive are
+    not carried over.
+
+    Args:
+        archive: the file.
+        target: the folder to make; must not exist, or be empty.
+        limits: see `Limits`.
+
+    Returns:
+        Names of the files, relative to the target, sorted.
+
+    Raises:
+        AwError: no archive of these kinds, damaged, or refused, with the member that is to blame.
+    """
+    source, out = Path(archive), Path(target)
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise AwError(f"{out} exists; nothing is overwritten: choose another folder or remove it")
+    with atomic_dir(out) as folder:
+        return sorted(unpack(source, folder, limits))
+
+
+def unpack(
+    source: Path | bytes,
+    folder: Path,
+    limits: Limits | None = None,
+    *,
+    wanted: Callable[[str], bool] = lambda name: True,
+) -> list[str]:
+    """As `extract`, into a folder that exists and is the caller's to remove if this fails.
+
+    Args:
+        source: the archive's path, or its bytes.
+        folder: where files go; nothing is written outside it and nothing in it is replaced.
+        limits: see `Limits`; they count what is passed over too.
+        wanted: which names are written; the others are passed over.
+
+    Returns:
+        The names that were written, relative, in the order of the archive.
+
+    Raises:
+        AwError: as `extract`.
+    """
+    name = source if isinstance(source, Path) else Path("the archive")
+    try:
+        packed = source.stat().st_size if isinstance(source, Path) else len(source)
+        budget = _Budget(name, packed, limits or Limits(), wanted)
+        opened = open(source, "rb") if isinstance(source, Path) else io.BytesIO(source)  # noqa: SIM115
+        with opened as raw, _named_errors(name):
+            zipped = zipfile.is_zipfile(raw)
+            raw.seek(0)
+            (_unzip if zipped else _untar)(raw, folder, budget)
+    except OSError as error:
+        raise AwError(f"cannot unpack {name}: {error.strerror or error}") from error
+    return budget.wrote
 
 
 def pack_folder(folder: Path | str, limit_mb: float) -> bytes:
@@ -42,82 +168,129 @@ def pack_folder(folder: Path | str, limit_mb: float) -> bytes:
     return buffer.getvalue()
 
 
-def unpack(
-    source: Path | bytes,
-    target: Path,
-    limit_mb: float,
-    *,
-    wanted: Callable[[str], bool] = lambda name: True,
-) -> list[str]:
-    """Write the files of a tar archive (gz, bz2 and xz too) below a folder that exists.
-
-    Args:
-        source: the archive's path, or its bytes.
-        target: an existing folder; nothing is written outside it and nothing in it is replaced.
-        limit_mb: largest sum of all files in the archive, MB; stops what unpacks to far more than it is.
-        wanted: which names are written; the others are passed over.
-
-    Returns:
-        The names that were written, relative, in the order of the archive.
-
-    Raises:
-        AwError: no readable archive; a name that is absolute, holds ``..`` or is there twice; a link or a
-            device; more than the limit. What was written before stays: unpack into a temporary folder.
-    """
-    where = source if isinstance(source, Path) else "the archive"
-    try:
-        with _opened(source) as archive:
-            return _extract(archive, target, limit_mb, wanted, str(where))
-    except (tarfile.TarError, EOFError, OSError) as error:
-        if isinstance(error, FileNotFoundError):
-            raise AwError(f"there is no archive {where}") from None
-        raise AwError(f"{where} cannot be unpacked: {error}") from error
-
-
-def _opened(source: Path | bytes) -> tarfile.TarFile:
-    file: IO[bytes] = io.BytesIO(source) if isinstance(source, bytes) else open(source, "rb")  # noqa: SIM115
-    try:
-        return tarfile.open(fileobj=file, mode="r:*")
-    except BaseException:
-        file.close()
-        raise
-
-
-def _extract(
-    archive: tarfile.TarFile, target: Path, limit_mb: float, wanted: Callable[[str], bool], where: str
-) -> list[str]:
-    written: list[str] = []
-    total = 0
-    for count, member in enumerate(archive, start=1):
-        name = _inside(member.name, where)
-        total += member.size
-        if count > MOST_FILES or total > limit_mb * 1e6:
-            raise AwError(
-                f"{where} unpacks to more than {limit_mb:.0f} MB or {MOST_FILES} files: not unpacked"
-            )
-        if member.isdir():
-            continue
-        if not member.isfile():
-            raise AwError(f"{where} holds {name!r}, a link or a device: not unpacked")
-        if not wanted(name):
-            continue
-        path = target / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        content = archive.extractfile(member)
-        if content is None or path.exists():
-            raise AwError(f"{where} holds {name!r} twice: not unpacked")
-        with content, open(path, "xb") as f:
-            shutil.copyfileobj(content, f)
-        written.append(name)
-    return written
-
-
-def _inside(name: str, where: str) -> str:
-    pure = PurePosixPath(name)
-    if pure.is_absolute() or ".." in pure.parts or "\\" in name or "\0" in name:
-        raise AwError(f"{where} names a file outside itself: {name!r}: not unpacked")
-    return pure.as_posix()
-
-
 def _hidden(relative: Path) -> bool:
     return any(part.startswith(".") for part in relative.parts)
+
+
+@contextmanager
+def _named_errors(source: Path) -> Iterator[None]:
+    """What the standard library raises for damaged archives, as one line of ours."""
+    try:
+        yield
+    except (zipfile.BadZipFile, tarfile.TarError, zlib.error, EOFError, ValueError, IndexError) as error:
+        raise AwError(f"{source} is a damaged or cut archive ({error}); fetch it again") from error
+    except (NotImplementedError, RuntimeError, KeyError) as error:
+        raise AwError(f"{source} holds what is not unpacked here ({error}); unpack it by hand") from error
+    except OSError as error:
+        if error.errno is not None:
+            raise
+        raise AwError(f"{source} is a damaged or cut archive ({error}); fetch it again") from error
+
+
+def _unzip(raw: IO[bytes], folder: Path, budget: _Budget) -> None:
+    source = budget.archive
+    with zipfile.ZipFile(raw) as archive:
+        for member in archive.infolist():
+            mode = member.external_attr >> 16
+            kind = stat.S_IFMT(mode)
+            if kind and not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+                raise _refused(source, member.filename, "a link or device")
+            if member.flag_bits & 0x1:
+                raise NotImplementedError(f"{_short(member.filename)} is encrypted")
+            if member.compress_type not in _ZIP_METHODS:
+                raise NotImplementedError(f"{_short(member.filename)} is packed by a method that is not read")
+            path = budget.place(member.filename, member.is_dir())
+            if path is None:
+                continue
+            if member.is_dir():
+                (folder / path).mkdir(parents=True, exist_ok=True)
+            else:
+                with archive.open(member) as data:
+                    _write(data, folder, path, budget)
+
+
+def _untar(raw: IO[bytes], folder: Path, budget: _Budget) -> None:
+    source, head = budget.archive, raw.read(6)
+    raw.seek(0)
+    stream = raw
+    if head.startswith(b"\x1f\x8b"):
+        stream = gzip.GzipFile(fileobj=raw)  # type: ignore[assignment]
+    elif head.startswith(b"BZh"):
+        stream = bz2.BZ2File(raw)
+    elif head.startswith(b"\xfd7zXZ"):
+        raise AwError(f"{source} is packed with xz, which is not read; unpack it by hand, or use .tar.gz")
+    gate = _Gate(source, stream)
+    with tarfile.open(fileobj=gate, mode="r|") as archive:  # type: ignore[call-overload]
+        while True:
+            gate.allowed = _HEADER
+            member = archive.next()
+            archive.members.clear()  # tarfile keeps every header it has read
+            if member is None:
+                return
+            if member.isdir():
+                if (path := budget.place(member.name, True)) is not None:
+                    (folder / path).mkdir(parents=True, exist_ok=True)
+                continue
+            if not member.isreg() or member.issparse():
+                raise _refused(source, member.name, "a link, device or sparse file")
+            path = budget.place(member.name, False)
+            data = archive.extractfile(member)
+            if path is None or data is None:
+                raise _refused(source, member.name, "without a name")
+            gate.allowed = member.size + _CHUNK
+            _write(data, folder, path, budget)
+
+
+class _Gate:
+    """Lets through what the next step may need: a header that unpacks to gigabytes is stopped here."""
+
+    def __init__(self, source: Path, stream: IO[bytes]) -> None:
+        self.source, self.stream, self.allowed = source, stream, _HEADER
+
+    def read(self, size: int) -> bytes:
+        data = self.stream.read(size)
+        self.allowed -= len(data)
+        if self.allowed < 0:
+            raise AwError(f"{self.source} has a header of more than {_HEADER >> 20} MB: damaged, or a bomb")
+        return data
+
+
+def _write(data: IO[bytes], folder: Path, name: PurePosixPath, budget: _Budget) -> None:
+    """The member below the folder; what is not wanted is read, for its size counts, and dropped."""
+    if not budget.wanted(str(name)):
+        while chunk := data.read(_CHUNK):
+            budget.add(len(chunk))
+        return
+    path = folder / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(path, "xb") as f:
+        while chunk := data.read(_CHUNK):
+            budget.add(len(chunk))
+            f.write(chunk)
+    budget.wrote.append(str(name))
+
+
+def _inside(archive: Path, name: str) -> PurePosixPath:
+    """The member's path, proven to stay below the target.
+
+    Raises:
+        AwError: it is absolute, climbs, is of Windows' kind, or holds what no file name should.
+    """
+    path = PurePosixPath(name)
+    # A backslash and a colon are innocent here and a way out elsewhere.
+    if path.is_absolute() or ".." in path.parts or "\\" in name or ":" in name:
+        raise _refused(archive, name, "a path that leads out of the folder")
+    if not name.isprintable() or len(path.parts) > _DEEPEST:
+        raise _refused(archive, name, "no fit file name")
+    if any(len(part.encode("utf-8", errors="surrogateescape")) > _LONGEST for part in path.parts):
+        raise _refused(archive, name, "a name that is too long")
+    return path
+
+
+def _refused(archive: Path, name: str, what: str) -> AwError:
+    return AwError(f"{archive} is not unpacked: its member {_short(name)} is {what}; do not trust it")
+
+
+def _short(name: str) -> str:
+    text = ascii(name)
+    return text if len(text) <= 60 else text[:57] + "..."

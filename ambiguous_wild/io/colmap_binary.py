@@ -91,6 +91,8 @@ def read_points(path: Path) -> ModelPoints:
     offsets, tracks = np.zeros(total + 1, np.int64), []
     for i in range(total):
         row = _POINT.unpack(reader.take(_POINT.size))
+        if row[0] >= 2**63:
+            raise AwError(f"{path} is damaged: a point numbered {row[0]}; copy or build the model again")
         ids[i], xyz[i], rgb[i], error[i] = row[0], row[1:4], row[4:7], row[7]
         if row[8] * 8 > len(reader.data) - reader.at:
             raise AwError(f"{path} is damaged: point {row[0]} announces a track of {row[8]}")

@@ -7,7 +7,7 @@ before anything is allocated.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
@@ -27,6 +27,7 @@ MODELS = {
     "RADIAL_FISHEYE": (9, 5),
     "THIN_PRISM_FISHEYE": (10, 12),
 }
+LARGEST_SIDE = 1_000_000  # px
 _BY_ID = {number: (name, count) for name, (number, count) in MODELS.items()}
 
 
@@ -137,10 +138,24 @@ def read_model(folder: Path | str) -> Model:
         images=reader.read_images(paths[1]),
         points=reader.read_points(paths[2]),
     )
+    for camera in model.cameras.values():
+        _check_camera(root, camera)
     for image in model.images.values():
+        if not PurePosixPath(image.name).name or "\0" in image.name:
+            raise AwError(f"{root}: image {image.image_id} has no name: the model is damaged; build it again")
         if image.camera_id not in model.cameras:
             raise AwError(f"{root}: image {image.name!r} names camera {image.camera_id}, which is not there")
     return model
+
+
+def _check_camera(root: Path, camera: ModelCamera) -> None:
+    """Raise AwError for a camera that no lens has; its size is divided by, and allocated."""
+    size = (camera.width, camera.height)
+    if not all(0 < side <= LARGEST_SIDE for side in size) or not np.isfinite(camera.params).all():
+        raise AwError(
+            f"{root}: camera {camera.camera_id} is {size[0]}x{size[1]} px with the parameters "
+            f"{list(camera.params)}: the model is damaged; copy or build it again"
+        )
 
 
 def model_of_id(number: int, where: str) -> tuple[str, int]:

@@ -45,9 +45,9 @@ def read_images(path: Path) -> dict[int, ModelImage]:
             image_id, camera_id, name = int(fields[0]), int(fields[8]), fields[9]
             pose = np.array([float(v) for v in fields[1:8]])
             table = np.array([float(v) for v in rest]).reshape(-1, 3)
-        except (ValueError, IndexError) as error:
+            ids = np.array([int(v) for v in rest[2::3]], dtype=np.int64)
+        except (ValueError, IndexError, OverflowError) as error:
             raise _damaged(path, number) from error
-        ids = np.array([int(v) for v in rest[2::3]], dtype=np.int64)
         images[image_id] = ModelImage(image_id, pose[:4], pose[4:], camera_id, name, table[:, :2].copy(), ids)
     return images
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.atomic import atomic_path
+from ambiguous_wild.io.image_header import MAX_PIXELS, READ, header_size
 
 
 def read_png_rgb(
@@ -77,8 +78,8 @@ def image_size(path: Path | str) -> tuple[int, int]:
             head = f.read(24)
     except OSError as error:
         raise AwError(f"cannot read image {path}: {error.strerror}") from error
-    if head[:8] == b"\x89PNG\r\n\x1a\n" and head[12:16] == b"IHDR":
-        return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
+    if head.startswith(b"\x89PNG") and (size := header_size(head)) is not None:
+        return size
     height, width = _decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION).shape
     return width, height
 
@@ -107,18 +108,39 @@ def write_png(
         temporary.write_bytes(data.tobytes())
 
 
+def decode(
+    data: np.ndarray,  # [bytes] uint8
+    flags: int,  # of cv2.imdecode
+    where: str,  # the file's name, for the message
+) -> np.ndarray | None:
+    """What `cv2.imdecode` makes of the bytes, None where they are damaged; nothing is allocated for a lie.
+
+    Raises:
+        AwError: the header announces more pixels than are read.
+    """
+    size = header_size(data.tobytes())
+    if size is None:  # of no kind that is read: OpenCV has decoders for a dozen more, none of them needed
+        return None
+    if size[0] * size[1] > MAX_PIXELS:
+        raise AwError(
+            f"{where} announces {size[0]}x{size[1]} px, more than the {MAX_PIXELS // 1_000_000} megapixels "
+            "that are read; reduce it"
+        )
+    try:
+        return cv2.imdecode(data, flags)
+    except cv2.error:
+        return None
+
+
 def _decode(path: Path | str, flags: int) -> np.ndarray:
     # Through bytes rather than cv2.imread: non-ASCII names on every platform, and a reason that is ours.
     try:
         data = np.fromfile(path, dtype=np.uint8)
     except OSError as error:
         raise AwError(f"cannot read image {path}: {error.strerror}") from error
-    try:
-        image = cv2.imdecode(data, flags) if data.size else None
-    except cv2.error:
-        image = None
+    image = decode(data, flags, str(path))
     if image is None:
         raise AwError(
-            f"cannot read image {path}: it is empty, cut short or no image; restore it and try again"
+            f"cannot read image {path}: it is empty, cut short or no {READ}; restore it and try again"
         )
     return image

@@ -14,9 +14,9 @@ import numpy as np
 
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.exif import Exif, exif_from_spec
+from ambiguous_wild.io.image_header import MAX_PIXELS
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".jp2", ".heic", ".heif")
-MAX_PIXELS = 120_000_000  # above the largest sensors in use (108 Mpx phones, 102 Mpx cameras)
 MIN_SIDE = 16  # px; nothing can be matched in less
 
 _FORMAT_OF_SUFFIX = {".jpg": "jpeg", ".jpeg": "jpeg", ".tif": "tiff", ".jp2": "jpeg2000", ".heif": "heic"}

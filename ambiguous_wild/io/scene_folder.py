@@ -18,6 +18,7 @@ from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import image_size
 
 SCENE_SCHEMA = 1  # of scene.json; raised when a reader of the old one would be wrong
+MOST_FACTOR = 1000  # of downsampling; the builder makes up to 64
 TEST_EVERY = 8  # the 3DGS and gsplat habit for scenes that bring no lists
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
@@ -108,8 +109,8 @@ def _check_fields(path: Path, info: dict[str, Any]) -> None:
     """Raise AwError where a field that this version reads has the wrong type."""
     factor, name, files = info.get("factor"), info.get("name", ""), info.get("files")
     wrong = []
-    if not _is_count(factor) or factor == 0:
-        wrong.append(f"factor must be a whole number from 1, not {_short(factor)}")
+    if not _is_count(factor) or not 1 <= factor <= MOST_FACTOR:
+        wrong.append(f"factor must be a whole number from 1 to {MOST_FACTOR}, not {_short(factor)}")
     if not isinstance(name, str):
         wrong.append(f"name must be a text, not {_short(name)}")
     if not isinstance(files, dict):
@@ -131,7 +132,10 @@ def _is_count(value: Any) -> TypeGuard[int]:
 
 
 def _short(value: Any) -> str:
-    text = ascii(value)
+    try:
+        text = ascii(value)
+    except ValueError:  # a whole number of thousands of digits
+        text = "a number without end"
     return text if len(text) <= 60 else text[:57] + "..."
 
 

@@ -111,7 +111,15 @@ def _effects(effects: Effects) -> None:
 
 def _between(where: str, value: float, low: float, high: float) -> None:
     if not low <= value <= high:
-        raise AwError(f"{where}: between {low:g} and {high:g}, got {value:g}")
+        raise AwError(f"{where}: between {low:g} and {high:g}, got {_short(value)}")
+
+
+def _short(value: float) -> str:
+    """The number, or what can be said of one too long for a float."""
+    try:
+        return f"{value:g}"
+    except OverflowError:
+        return "a number without end"
 
 
 def _range(where: str, pair: Sequence[float], low: float, high: float) -> None:

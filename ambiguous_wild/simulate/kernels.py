@@ -10,6 +10,7 @@ import math
 
 import numba
 
+from ambiguous_wild.io.compiled import forgiving
 from ambiguous_wild.simulate.marching import march, slope
 
 QUAD, BOX, ELLIPSOID, CAPSULE, CYLINDER, VOLUME = range(6)
@@ -17,6 +18,7 @@ PLANAR, BY_FACE, DOME = range(3)  # how a surface point becomes a texture coordi
 FAR = 1e30
 
 
+@forgiving
 @numba.njit(cache=True, error_model="numpy", inline="never")
 def _intersect(kind, o, d, h, far):
     """Distance along the local ray o + t d to the shape, or `far`. Rays inside an ellipsoid hit its wall."""
@@ -86,6 +88,7 @@ def _intersect(kind, o, d, h, far):
     return best
 
 
+@forgiving
 @numba.njit(cache=True, error_model="numpy", inline="always")
 def _local(table, s, px, py, pz, shift):
     r, c = table[1], table[2]
@@ -98,6 +101,7 @@ def _local(table, s, px, py, pz, shift):
     )
 
 
+@forgiving
 @numba.njit(cache=True, error_model="numpy", inline="never")
 def nearest(table, which, count, o, d, far):
     """Nearest hit among the listed shapes: (distance, shape or -1)."""
@@ -122,6 +126,7 @@ def nearest(table, which, count, o, d, far):
     return best, hit
 
 
+@forgiving
 @numba.njit(cache=True, error_model="numpy", inline="never")
 def _shadowed(table, o, d):
     center, radius, half, kind, casts = table[2], table[4], table[3], table[0], table[9]
@@ -142,6 +147,7 @@ def _shadowed(table, o, d):
     return False
 
 
+@forgiving
 @numba.njit(cache=True, error_model="numpy", inline="never")
 def _normal(kind, p, h, d):
     """Unit normal at the local point, turned against the local ray."""
@@ -171,6 +177,7 @@ def _normal(kind, p, h, d):
     return nx * scale, ny * scale, nz * scale
 
 
+@forgiving
 @numba.njit(cache=True, error_model="numpy", inline="always")
 def _fold(u, size):
     """Texture coordinate to texel, mirrored at the borders so that no seam shows."""
@@ -179,6 +186,7 @@ def _fold(u, size):
     return min(max(u * size - 0.5, 0.0), size - 1.0)
 
 
+@forgiving
 @numba.njit(cache=True, error_model="numpy", inline="never")
 def _bilinear(atlas, t, level, u, v):
     texels, offset, width, height = atlas[0], atlas[1], atlas[2], atlas[3]
@@ -196,6 +204,7 @@ def _bilinear(atlas, t, level, u, v):
     )
 
 
+@forgiving
 @numba.njit(cache=True, error_model="numpy", inline="never")
 def _sample(atlas, t, u, v, lod):
     """Trilinear lookup: two mip levels around `lod`, blended."""
@@ -210,6 +219,7 @@ def _sample(atlas, t, u, v, lod):
     return r0 + f * (r1 - r0), g0 + f * (g1 - g0), b0 + f * (b1 - b0)
 
 
+@forgiving
 @numba.njit(cache=True, error_model="numpy", inline="never")
 def _gloss(strength, sharpness, n, d, sun, sunlit, light):
     """What a polished surface adds: the sun's highlight (Blinn) and the sheen of the sky (Schlick)."""
@@ -229,6 +239,7 @@ def _gloss(strength, sharpness, n, d, sun, sunlit, light):
     )
 
 
+@forgiving
 @numba.njit(cache=True, error_model="numpy", inline="never")
 def shade(table, s, t, o, d, spread, atlas, light, sun, blockers, others, use_others):
     """Colour of shape s at distance t: texture, sun with shadow, sky light from above and below."""

@@ -6,10 +6,13 @@ import math
 
 import numba
 
+from ambiguous_wild.io.compiled import forgiving
+
 _STEPS = 128
 _NEAR_M = 4e-4  # closer than this is the surface
 
 
+@forgiving
 @numba.njit(cache=True, error_model="numpy", inline="never")
 def distance(volume, x, y, z):
     """Trilinear value of `volume` [N, N, N] at a point of the cube [-1, 1]^3, clamped to it."""
@@ -28,6 +31,7 @@ def distance(volume, x, y, z):
     return (1 - c) * low + c * high
 
 
+@forgiving
 @numba.njit(cache=True, error_model="numpy", inline="never")
 def march(volume, o, d, size, far):
     """Distance along the local ray o + t d, d of unit length, to the volume's surface, or `far`."""
@@ -53,6 +57,7 @@ def march(volume, o, d, size, far):
     return far
 
 
+@forgiving
 @numba.njit(cache=True, error_model="numpy", inline="never")
 def slope(volume, p, size, d):
     """Unit normal at the local point by central differences over one cell, turned against the ray."""

@@ -11,28 +11,10 @@ import yaml
 
 from ambiguous_wild.core.config import from_plain, to_plain
 from ambiguous_wild.core.errors import AwError, unknown
+from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.simulate.check import check_spec
 from ambiguous_wild.simulate.effects.settings import KINDS, Effects
 from ambiguous_wild.simulate.spec import CaptureSpec
-
-LARGEST = 1_000_000  # bytes
-
-
-class _Loader(yaml.SafeLoader):
-    """YAML's safe loader, which takes a key twice and an alias that grows without end; this one does not."""
-
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        if self.check_event(yaml.AliasEvent):
-            raise AwError(f"line {self.peek_event().start_mark.line + 1}: aliases (*name) are not read")
-        return super().compose_node(parent, index)
-
-    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-        seen = set()
-        for key, _ in node.value:
-            if key.value in seen:
-                raise AwError(f"line {key.start_mark.line + 1}: the key {key.value!r} is there twice")
-            seen.add(key.value)
-        return super().construct_mapping(node, deep)
 
 
 class _Dumper(yaml.SafeDumper):
@@ -59,13 +41,7 @@ def read_spec(path: Path | str) -> CaptureSpec:
         AwError: no such file, no YAML, or a spec that cannot be made: one line, with where it is.
     """
     where = Path(path)
-    try:
-        if where.stat().st_size > LARGEST:
-            raise AwError(f"{where} is larger than {LARGEST // 10**6} MB: that is no spec")
-        text = where.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
-        raise AwError(f"cannot read the spec {where}: {reason}") from error
+    text = plain_yaml.read_text(where)
     try:
         return parse_spec(text)
     except AwError as error:
@@ -78,15 +54,7 @@ def parse_spec(text: str) -> CaptureSpec:
     Raises:
         AwError: no YAML, an unknown key, a wrong type or a value out of range.
     """
-    try:
-        data = yaml.load(text, Loader=_Loader)
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        line = f" in line {mark.line + 1}" if mark else ""
-        problem = " ".join(str(getattr(error, "problem", None) or "it does not parse").split())
-        raise AwError(f"not YAML{line}: {problem}") from None
-    except (ValueError, TypeError, RecursionError) as error:  # 2025-99-99, an unhashable key, 1000 brackets
-        raise AwError(f"not YAML that a spec is made of: {error}") from None
+    data = plain_yaml.parse(text)
     if not isinstance(data, dict):
         raise AwError("a spec is a list of 'key: value' lines; 'aw simulate NAME --print-spec' shows one")
     for key in ("name", "summary"):

@@ -14,6 +14,7 @@ import numba
 import numpy as np
 
 from ambiguous_wild.core.camera import Camera
+from ambiguous_wild.io.compiled import forgiving
 from ambiguous_wild.simulate.atlas import Atlas
 from ambiguous_wild.simulate.kernels import FAR, nearest, shade
 
@@ -107,6 +108,7 @@ def trace(camera: Camera, static: ShapeTable, movers: ShapeTable, atlas: Atlas, 
     return Traced(clean, distracted, owner, depth)
 
 
+@forgiving
 @numba.njit(cache=True, error_model="numpy", inline="never")
 def _cull(table, o, axis, spread, keep):
     """List the shapes whose bounding sphere meets the cone around `axis`; returns how many."""
@@ -127,6 +129,7 @@ def _cull(table, o, axis, spread, keep):
     return count
 
 
+@forgiving
 @numba.njit(cache=True, error_model="numpy", inline="always")
 def _ray(rotation, k, u, v):
     x, y = (u - k[2]) / k[0], (v - k[3]) / k[1]
@@ -139,6 +142,7 @@ def _ray(rotation, k, u, v):
     ), z
 
 
+@forgiving
 @numba.njit(cache=True, error_model="numpy", parallel=True)
 def _trace(view, static, movers, atlas, light, frame):
     height, width = frame[2].shape
@@ -150,6 +154,7 @@ def _trace(view, static, movers, atlas, light, frame):
         _tile(view, (x0, y0, x1, y1), static, movers, atlas, light, frame)
 
 
+@forgiving
 @numba.njit(cache=True, error_model="numpy", inline="never")
 def _tile(view, box, static, movers, atlas, light, frame):
     rotation, eye, k, side = view

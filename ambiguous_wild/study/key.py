@@ -60,6 +60,7 @@ def read_key(path: Path) -> Key:
 
 
 def _whole(entry: Any) -> bool:
-    if not isinstance(entry, dict) or entry.get("kind") not in _FIELDS:
+    kind = entry.get("kind") if isinstance(entry, dict) else None
+    if not isinstance(kind, str) or kind not in _FIELDS:
         return False
-    return all(isinstance(entry.get(field), str) for field in _FIELDS[entry["kind"]])
+    return all(isinstance(entry.get(field), str) for field in _FIELDS[kind])

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
+import tokenize
 from collections.abc import Sequence
 from pathlib import Path
+from typing import BinaryIO
 
 import cv2
 import numpy as np
@@ -11,6 +14,7 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.io.images import decode
 from ambiguous_wild.vision.progress import Bar, no_bar
 
 SUFFIXES = (".png", ".npy")
@@ -112,8 +116,8 @@ def read_labels(path: Path) -> np.ndarray:
     if path.suffix.lower() == ".npy":
         return _checked(_load_npy(path), path)
     try:
-        image = cv2.imdecode(np.fromfile(path, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
-    except (OSError, cv2.error):
+        image = decode(np.fromfile(path, dtype=np.uint8), cv2.IMREAD_UNCHANGED, f"label map {path}")
+    except OSError:
         image = None
     if image is None:
         raise AwError(f"cannot read label map {path}: it is empty, cut short or no image; restore it")
@@ -127,9 +131,26 @@ def read_labels(path: Path) -> np.ndarray:
 
 def _load_npy(path: Path) -> np.ndarray:
     try:
-        return np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+        with open(path, "rb") as f:
+            return _read_array(f, path.stat().st_size)
+    # a damaged header is parsed as Python: what the parser says of it has no common base class
+    except (OSError, ValueError, EOFError, SyntaxError, tokenize.TokenError, OverflowError) as error:
         raise AwError(f"cannot read label map {path}: {error}; save integers [H, W] with np.save") from error
+
+
+def _read_array(f: BinaryIO, size: int) -> np.ndarray:
+    """The array of a .npy file; a header that announces more than the file holds is refused unallocated."""
+    version = np.lib.format.read_magic(f)
+    if version not in ((1, 0), (2, 0)):
+        raise ValueError(f"format {version} is not read")
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(f)
+    if dtype.hasobject:
+        raise ValueError("it holds Python objects")
+    if any(side < 0 for side in shape) or math.prod(shape) * dtype.itemsize > size - f.tell():
+        raise ValueError(f"cut short: {dtype} {list(shape)} announced")
+    f.seek(0)
+    return np.lib.format.read_array(f, allow_pickle=False)
 
 
 def _checked(array: np.ndarray, path: Path) -> np.ndarray:

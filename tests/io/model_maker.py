@@ -44,6 +44,27 @@ def write_binary(folder: Path, model: Model) -> None:
     colmap_binary.write_points(folder / "points3D.bin", model.points)
 
 
+def write_text(folder: Path, model: Model) -> None:
+    folder.mkdir(parents=True)
+
+    def line(*values) -> str:
+        return " ".join(str(v) for value in values for v in np.atleast_1d(value)) + "\n"
+
+    cameras = [line(c.camera_id, c.model, c.width, c.height, c.params) for c in model.cameras.values()]
+    (folder / "cameras.txt").write_text("".join(cameras))
+    rows = []
+    for i in model.images.values():
+        seen = [v for xy, point in zip(i.xys, i.point_ids) for v in (*xy, point)]
+        rows += [line(i.image_id, i.qvec, i.tvec, i.camera_id, i.name), line(*seen)]
+    (folder / "images.txt").write_text("".join(rows))
+    p, rows = model.points, []
+    for k in range(len(p.ids)):
+        track = slice(p.track_offsets[k], p.track_offsets[k + 1])
+        pairs = np.stack([p.track_image_ids[track], p.track_point2d[track]], axis=1).ravel()
+        rows.append(line(p.ids[k], p.xyz[k], p.rgb[k], p.error_px[k], pairs))
+    (folder / "points3D.txt").write_text("".join(rows))
+
+
 def write_scene(root: Path, names: list[str], factor: int = 2, **kwargs) -> Model:
     """A plain COLMAP scene: images/, images_<factor>/, sparse/0; no lists, no scene.json."""
     model = make_model(names, **kwargs)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import yaml
 
 from ambiguous_wild.core import AwError, Camera, Scene, View
 from ambiguous_wild.harness.ambiguity.sources import Masks
+from ambiguous_wild.io import plain_yaml
 
 OPAQUE = 0.9  # accumulated alpha from which something stands there
 SEEN_BY = 2  # other photos that must see the surface unmasked
@@ -84,9 +84,9 @@ def check_run(scene: Scene, run: Path) -> None:
             f"{run} is no finished run (config.yaml and point_cloud.ply); give RUNS/.../seed_0 of 'aw bench'"
         )
     try:
-        config = yaml.safe_load(path.read_text(encoding="utf-8"))
+        config = plain_yaml.read_mapping(path)
         known, name = config["scene"]["sha256"], config["scene"]["name"]
-    except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError) as error:
+    except (AwError, KeyError, TypeError) as error:
         raise AwError(f"{path} is damaged ({' '.join(str(error).split())}); train the run again") from None
     if known != scene_identity(scene):
         raise AwError(

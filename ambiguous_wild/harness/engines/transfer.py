@@ -12,7 +12,7 @@ from pathlib import Path
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.engines.job import LOCK_WAIT_S, Job, run_job
 from ambiguous_wild.harness.run import CellReport, is_finished
-from ambiguous_wild.io.archive import pack_folder, unpack
+from ambiguous_wild.io.archive import Limits, pack_folder, unpack
 from ambiguous_wild.io.atomic import atomic_dir
 from ambiguous_wild.io.lock import folder_lock, patient_lock
 
@@ -46,7 +46,7 @@ def run_sent(job: Job, scene_key: str, scene: bytes, limit_mb: float) -> Sent:
     with patient_lock(place.parent, "aw bench", LOCK_WAIT_S):
         if not place.is_dir():
             with atomic_dir(place) as temporary:
-                unpack(scene, temporary, limit_mb)
+                unpack(scene, temporary, Limits(bytes=int(limit_mb * 1e6)))
     with tempfile.TemporaryDirectory(prefix="run-", dir=cache) as own:
         folder = Path(own) / "seed"
         here = dataclasses.replace(
@@ -66,7 +66,7 @@ def receive(sent: Sent, job: Job, limit_mb: float) -> CellReport:
     folder = Path(job.folder)
     if sent.content:
         with folder_lock(folder, "aw bench"), atomic_dir(folder) as temporary:
-            unpack(sent.content, temporary, limit_mb)
+            unpack(sent.content, temporary, Limits(bytes=int(limit_mb * 1e6)))
     return sent.report
 
 

@@ -28,18 +28,20 @@ def read_plan(path: Path) -> Plan:
             raise ValueError("scene is no text")
     except FileNotFoundError:
         raise AwError(f"there is no plan {path}; 'aw plan SCENE' makes one") from None
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, OverflowError) as error:
         raise AwError(f"{path} is no plan of 'aw plan' ({error}); make it again") from None
     return Plan(data["scene"], lines, bool(data.get("probed")))
 
 
-def _decision(row: dict[str, object]) -> Decision:
+def _decision(row: object) -> Decision:
+    if not isinstance(row, dict):
+        raise ValueError("a decision is no object")
     values = {f.name: row.get(f.name) for f in fields(Decision)}
     if row.get("decision") not in ("on", "off", "unknown"):
         raise ValueError(f"decision {row.get('decision')!r}")
     for name in _TEXTS:
         if not isinstance(values[name], str):
             raise ValueError(f"{name} is no text")
-    values["value"] = math.nan if values["value"] is None else float(values["value"])  # type: ignore[arg-type]
+    values["value"] = math.nan if values["value"] is None else float(values["value"])
     values["threshold"] = float(values["threshold"])  # type: ignore[arg-type]
     return Decision(**values)  # type: ignore[arg-type]

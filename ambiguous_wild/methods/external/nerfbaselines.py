@@ -18,7 +18,7 @@ from typing import Any
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.core.names import check_name
-from ambiguous_wild.io.archive import unpack
+from ambiguous_wild.io.archive import Limits, unpack
 from ambiguous_wild.io.atomic import atomic_dir, write_json
 from ambiguous_wild.methods.external.process import end_left_over, run_logged
 from ambiguous_wild.methods.external.program import DONE, Produced, Task, no_parts
@@ -26,7 +26,7 @@ from ambiguous_wild.methods.registry import MethodEntry
 
 PROGRAM = "AW_NERFBASELINES"  # environment variable: where its command lies
 TESTED = "1.2.12"
-LIMIT_MB = 50_000  # of an unpacked predictions archive
+LIMITS = Limits(bytes=50_000_000_000)  # of an unpacked predictions archive
 
 
 @dataclass(frozen=True)
@@ -197,7 +197,7 @@ def read_predictions(archive: Path, folder: Path, scene: Scene) -> dict[str, Pat
         AwError: the archive is damaged or hostile, or a test view has no render in it.
     """
     with atomic_dir(folder) as temporary:
-        names = unpack(archive, temporary, LIMIT_MB, wanted=lambda name: name.startswith("color/"))
+        names = unpack(archive, temporary, LIMITS, wanted=lambda name: name.startswith("color/"))
     by_stem = {str(PurePosixPath(name).relative_to("color").with_suffix("")): folder / name for name in names}
     stems = {view.name: str(PurePosixPath(view.name).with_suffix("")) for view in scene.test}
     missing = [name for name, stem in stems.items() if stem not in by_stem]

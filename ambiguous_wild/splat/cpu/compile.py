@@ -16,6 +16,7 @@ from typing import Any
 import numba
 from numba.extending import intrinsic as _intrinsic
 
+from ambiguous_wild.io.compiled import forgiving
 from ambiguous_wild.splat.cpu.cache import kernel_cache
 
 LAYERS = ["omp", "tbb", "workqueue"]  # the first that is there
@@ -39,7 +40,7 @@ def intrinsic(function: Callable[..., Any]) -> Any:
 
 def kernel(function: Callable[..., Any]) -> Any:
     """Compile for one thread; the result is kept on disk. Every operation rounds by itself, as written."""
-    return numba.njit(cache=True, error_model="numpy")(function)
+    return forgiving(numba.njit(cache=True, error_model="numpy")(function))
 
 
 def fused_kernel(function: Callable[..., Any]) -> Any:
@@ -47,14 +48,14 @@ def fused_kernel(function: Callable[..., Any]) -> Any:
 
     NaN and infinity keep their meaning; what must round alike in two kernels does not belong here.
     """
-    return numba.njit(cache=True, error_model="numpy", fastmath={"contract", "arcp"})(function)
+    return forgiving(numba.njit(cache=True, error_model="numpy", fastmath={"contract", "arcp"})(function))
 
 
 class _Serialized:
     """A parallel kernel that one thread of the process runs at a time."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
-        self.compiled = numba.njit(cache=True, parallel=True, error_model="numpy")(function)
+        self.compiled = forgiving(numba.njit(cache=True, parallel=True, error_model="numpy")(function))
         self.__doc__ = function.__doc__
         self.__name__ = function.__name__
 

@@ -1,0 +1,79 @@
+"""YAML that holds data and nothing else: no tags, no aliases, no key twice, no text without end."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from ambiguous_wild.core.errors import AwError
+
+LARGEST = 1_000_000  # bytes; what is read here has a few thousand
+
+
+class PlainLoader(yaml.SafeLoader):
+    """YAML's safe loader, which takes a key twice and an alias that grows without end; this one does not."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            raise AwError(f"line {self.peek_event().start_mark.line + 1}: aliases (*name) are not read")
+        return super().compose_node(parent, index)
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        seen = set()
+        for key, _ in node.value:
+            if not isinstance(key.value, str):
+                raise AwError(f"not YAML that is read here: no word as key in line {key.start_mark.line + 1}")
+            if key.value in seen:
+                raise AwError(f"line {key.start_mark.line + 1}: the key {key.value!r} is there twice")
+            seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
+def parse(text: str) -> Any:
+    """The plain data of a YAML text.
+
+    Raises:
+        AwError: it is no YAML, or uses what is not read here; says the line.
+    """
+    try:
+        return yaml.load(text, Loader=PlainLoader)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f" in line {mark.line + 1}" if mark else ""
+        problem = " ".join(str(getattr(error, "problem", None) or "it does not parse").split())
+        raise AwError(f"not YAML{line}: {problem}") from None
+    # 2025-99-99, a number of ten thousand digits, a thousand brackets; PyYAML's own slips on odd scalars
+    except (ValueError, TypeError, RecursionError, KeyError, AttributeError, IndexError) as error:
+        raise AwError(f"not YAML that is read here: {error or type(error).__name__}") from None
+
+
+def read_text(path: Path) -> str:
+    """The text of a YAML file.
+
+    Raises:
+        AwError: it cannot be read, is no UTF-8, or too large.
+    """
+    try:
+        if path.stat().st_size > LARGEST:
+            raise AwError(f"{path} is larger than {LARGEST // 10**6} MB: that is none of ours")
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
+        raise AwError(f"cannot read {path}: {reason}") from error
+
+
+def read_mapping(path: Path) -> dict[Any, Any]:
+    """A file that holds one mapping.
+
+    Raises:
+        AwError: it cannot be read, or holds something else.
+    """
+    try:
+        data = parse(read_text(path))
+    except AwError as error:
+        raise AwError(f"{path} is damaged ({error})") from None
+    if not isinstance(data, dict):
+        raise AwError(f"{path} is damaged (no 'key: value' lines)")
+    return data

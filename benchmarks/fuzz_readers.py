@@ -1,0 +1,212 @@
+"""Every reader of files that come from others: valid samples, how to damage them, and the call.
+
+The calls are those the commands make. To add a reader, add a line to `READERS`.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import random
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import fuzz_mutate
+import fuzz_samples
+import numpy as np
+import yaml
+
+from ambiguous_wild.harness.audit.table import read_tables
+from ambiguous_wild.harness.planning.file import read_plan
+from ambiguous_wild.harness.run import refuse_other_config
+from ambiguous_wild.harness.store import read_runs
+from ambiguous_wild.io import archive, images, ply, scene_folder
+from ambiguous_wild.io.photos import read_photo
+from ambiguous_wild.metrics import lpips
+from ambiguous_wild.simulate import capture, spec_file
+from ambiguous_wild.simulate.composite.cutouts import read_cutouts
+from ambiguous_wild.splat import checkpoint
+from ambiguous_wild.study.answers import read_answers
+from ambiguous_wild.study.key import read_key
+from ambiguous_wild.vision.cache import cached
+from ambiguous_wild.vision.label_maps import read_labels
+
+Mutate = Callable[[bytes, random.Random, bytes], bytes]
+
+
+@dataclass(frozen=True)
+class Reader:
+    """One way in.
+
+    samples: valid files, made once.
+    mutate: damage.
+    read: what a command does with the file; any error but AwError is a crash.
+    """
+
+    name: str
+    suffix: str
+    samples: Callable[[], list[bytes]]
+    read: Callable[[Path], Any]
+    mutate: Mutate = fuzz_mutate.damage
+
+
+def _scene_images(path: Path) -> None:
+    first = None
+    for read in (images.read_png_rgb, images.read_gray, images.load_image_float, images.image_size):
+        try:
+            read(path)
+        except images.AwError as error:
+            first = first or error
+    if first is not None:
+        raise first
+
+
+def _inside_scene(title: str, name: str, mutate: Mutate = fuzz_mutate.damage) -> Reader:
+    """A reader of one file of a scene folder, by opening the scene."""
+
+    def read(path: Path) -> None:
+        shutil.copyfile(path, fuzz_samples.scene(name) / name)
+        scene_folder.load_scene(fuzz_samples.scene(name))
+
+    @functools.cache
+    def samples() -> list[bytes]:
+        return [(fuzz_samples.scene(name) / name).read_bytes()]
+
+    return Reader(title, Path(name).suffix, samples, read, mutate)
+
+
+def _config(path: Path) -> None:
+    run = fuzz_samples.workshop() / "runs" / "seed0"
+    run.mkdir(parents=True, exist_ok=True)
+    (run / "checkpoint").mkdir(exist_ok=True)
+    shutil.copyfile(path, run / "config.yaml")
+    read_runs(run.parent)
+    refuse_other_config(run, SimpleNamespace(identity="h", config={"method": "3dgs", "train": {}}))  # type: ignore[arg-type]
+
+
+def _scene_json(path: Path) -> None:
+    root = fuzz_samples.scene("scene.json")
+    shutil.copyfile(path, root / "scene.json")
+    scene_folder.load_scene(root)
+
+
+def _result(path: Path) -> None:
+    from ambiguous_wild.harness.render_tables import to_csv
+    from ambiguous_wild.harness.tables import comparison
+
+    runs = fuzz_samples.workshop() / "results" / "scene" / "m" / "seed0"
+    runs.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(path, runs / "metrics.json")
+    to_csv(comparison(read_runs(fuzz_samples.workshop() / "results")))
+
+
+def _capture(path: Path) -> None:
+    truth = fuzz_samples.workshop() / "captured" / "truth"
+    truth.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(path, truth / "capture.json")
+    (truth.parent / "a").write_text("x")
+    capture._earlier(truth.parent, "i", overwrite=False)
+
+
+def _answer(path: Path) -> None:
+    read_answers([path], read_key(fuzz_samples.workshop() / "study.key.json"))
+
+
+def _unpack(path: Path) -> None:
+    """Also a crash: something outside the target, or a target half made."""
+    room = path.parent / "room"
+    shutil.rmtree(room, ignore_errors=True)
+    room.mkdir()
+    whole = False
+    try:
+        archive.extract(path, room / "target")
+        whole = True
+    finally:
+        expected = ["target"] if whole else []
+        if sorted(os.listdir(room)) != expected or sorted(os.listdir(path.parent)) != sorted(
+            [path.name, "room"]
+        ):
+            raise RuntimeError(f"left behind: {os.listdir(room)}, {os.listdir(path.parent)}")
+        if any(p.is_symlink() or not (p.is_file() or p.is_dir()) for p in room.rglob("*")):
+            raise RuntimeError("a link or device was made")
+
+
+def _cutout(path: Path) -> None:
+    folder = path.parent / "cutouts"
+    folder.mkdir(exist_ok=True)
+    shutil.copyfile(path, folder / "a.png")
+    read_cutouts(folder)
+
+
+def _cache(path: Path) -> None:
+    """A damaged entry is made anew: never an error."""
+    shutil.copyfile(path, path.parent / "entry.npz")
+    found = cached(path.parent, "entry", {"labels": np.int32}, lambda: {"labels": np.ones((2, 2), np.int32)})
+    if found["labels"].dtype != np.int32:
+        raise RuntimeError("an entry of another type came back")
+
+
+def _many() -> list[Reader]:
+    photos = [
+        Reader(f"photo {k}", s, functools.partial(fuzz_samples.photos, k), read_photo, m)
+        for k, s, m in (
+            ("jpeg", ".jpg", fuzz_mutate.damage),
+            ("png", ".png", fuzz_mutate.png),
+            ("tiff", ".tif", fuzz_mutate.damage),
+            ("bmp, webp, jp2", ".img", fuzz_mutate.damage),
+        )
+    ]
+    models = [
+        _inside_scene(f"COLMAP {n}.{kind}", f"sparse/0/{n}.{kind}")
+        for kind in ("bin", "txt")
+        for n in ("cameras", "images", "points3D")
+    ]
+    yaml_tree = fuzz_mutate.tree(yaml.safe_load, yaml.safe_dump)
+    tree = fuzz_mutate.json_tree
+    return [
+        *photos,
+        Reader("EXIF", ".jpg", fuzz_samples.with_exif, read_photo, fuzz_mutate.exif),
+        Reader(
+            "scene image png",
+            ".png",
+            functools.partial(fuzz_samples.photos, "png"),
+            _scene_images,
+            fuzz_mutate.png,
+        ),
+        Reader("scene image jpeg", ".jpg", functools.partial(fuzz_samples.photos, "jpeg"), _scene_images),
+        Reader("scene image tiff", ".tif", functools.partial(fuzz_samples.photos, "tiff"), _scene_images),
+        *models,
+        _inside_scene("split list", "train_list.txt"),
+        Reader("splat PLY", ".ply", fuzz_samples.plys, ply.read_splat_ply),
+        Reader("spec YAML", ".yaml", fuzz_samples.specs, spec_file.read_spec, yaml_tree),
+        Reader("config YAML", ".yaml", fuzz_samples.configs, _config),
+        Reader("scene.json", ".json", fuzz_samples.scene_jsons, _scene_json, tree),
+        Reader("metrics.json", ".json", fuzz_samples.results, _result, tree),
+        Reader("plan JSON", ".json", fuzz_samples.plans, read_plan, tree),
+        Reader("capture.json", ".json", fuzz_samples.captures, _capture, tree),
+        Reader("study key", ".json", fuzz_samples.keys, read_key, tree),
+        Reader("answers JSON", ".json", functools.partial(fuzz_samples.answers, "json"), _answer, tree),
+        Reader("answers CSV", ".csv", functools.partial(fuzz_samples.answers, "csv"), _answer),
+        Reader("audit CSV", ".csv", fuzz_samples.tables, lambda path: read_tables([path])),
+        Reader("archive zip", ".zip", functools.partial(fuzz_samples.archives, "zip"), _unpack),
+        Reader("archive tar", ".tar", functools.partial(fuzz_samples.archives, "tar"), _unpack),
+        Reader("checkpoint", ".safetensors", fuzz_samples.checkpoints, checkpoint.load),
+        Reader("LPIPS weights", ".pth", fuzz_samples.weights, lpips._read),
+        Reader(
+            "label map PNG",
+            ".png",
+            functools.partial(fuzz_samples.label_maps, "png"),
+            read_labels,
+            fuzz_mutate.png,
+        ),
+        Reader("label map npy", ".npy", functools.partial(fuzz_samples.label_maps, "npy"), read_labels),
+        Reader("cut-out", ".png", fuzz_samples.cutouts, _cutout, fuzz_mutate.png),
+        Reader("feature and mask cache", ".npz", fuzz_samples.caches, _cache),
+    ]
+
+
+READERS = {reader.name: reader for reader in _many()}

@@ -1,0 +1,90 @@
+"""Row 27: disk full, process killed: run again, and it ends with the same files.
+
+Kills of every stage of build-scene stand in tests/builder/test_killed.py; a hundred kills at random moments
+are benchmarks/faults.py, of which a few run here.
+"""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from ambiguous_wild.builder.workspace import Workspace
+from ambiguous_wild.harness.grid import cell_folder, plan_cells, run_cells
+from ambiguous_wild.io.atomic import write_json
+from ambiguous_wild.io.images import write_png
+from ambiguous_wild.splat.trainer import TrainConfig
+from benchmarks.fault_compare import half_written, state
+from tests.faults.small_disks import grow, small_disk
+from tests.tiny_scene import write_tiny_scene
+
+ROOT = Path(__file__).parents[2]
+SHORT = TrainConfig(iterations=40, probes=0, checkpoint_every_s=0.1)
+
+
+def test_a_bench_killed_at_random_moments_and_run_again_ends_with_the_same_files(tmp_path):
+    report = tmp_path / "faults.json"
+    words = [sys.executable, str(ROOT / "benchmarks/faults.py"), "--kills", "bench=3", "--json", str(report)]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    tally = json.loads(report.read_text())["bench"]
+    assert tally["kills"] == 3
+    assert tally["half_written"] == tally["lost_or_different"] == tally["left_behind"] == 0
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
+
+
+def bench(scene, output):
+    cells = plan_cells(["3dgs"], [scene], [0], SHORT)
+    (report,) = run_cells(cells, output, cache_dir=output / ".cache")
+    return report, cell_folder(output, cells[0])
+
+
+def test_a_bench_on_a_full_disk_says_so_and_with_room_ends_with_the_same_files(scene, tmp_path):
+    reference, folder = bench(scene, tmp_path / "undisturbed")
+    assert reference.outcome == "trained", reference.error
+    expected = state(folder)
+    with small_disk(tmp_path / "disk", 200) as disk:  # a checkpoint of this scene has over 300 kB
+        report, run = bench(scene, disk / "runs")
+        assert report.outcome == "failed"
+        assert "No space left on device" in report.error and "\n" not in report.error
+        assert half_written(disk) == []
+        grow(disk, 20_000)
+        report, run = bench(scene, disk / "runs")
+        assert report.outcome == "trained", report.error
+        assert state(run) == expected
+
+
+def test_a_file_that_does_not_fit_leaves_the_old_one(tmp_path):
+    with small_disk(tmp_path / "disk", 64) as disk:
+        write_json(disk / "a.json", {"old": True})
+        with pytest.raises(OSError, match="No space left"):
+            write_json(disk / "a.json", ["x" * 100] * 1000)
+        assert json.loads((disk / "a.json").read_text()) == {"old": True}
+        assert [p.name for p in disk.iterdir()] == ["a.json"]
+
+
+def test_a_stage_that_does_not_fit_is_absent_and_with_room_is_made(tmp_path):
+    import numpy as np
+
+    noise = np.random.default_rng(0).integers(0, 256, (100, 100, 3), dtype=np.uint8)
+
+    def work(folder):
+        for i in range(4):
+            write_png(folder / f"{i}.png", noise)
+        return {"photos": 4}
+
+    with small_disk(tmp_path / "disk", 80) as disk:
+        with pytest.raises(OSError, match="No space left"):
+            Workspace(disk / "work").run("downsample", [1], work)
+        assert list((disk / "work").iterdir()) == []
+        grow(disk, 1000)
+        result = Workspace(disk / "work").run("downsample", [1], work)
+        assert not result.reused
+        assert result.facts == {"photos": 4}
+        assert half_written(disk) == []

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.extras import install_command
 from ambiguous_wild.harness.environment import installed
 
@@ -97,6 +98,7 @@ def all_checks() -> list[Check]:
         *_vision(),
         *_metrics(),
         _git(),
+        *_extras(),
         *_planned(),
     ]
 
@@ -257,9 +259,31 @@ def _cuda_words(torch: Probe, driver: bool) -> tuple[str, str]:
     return f"torch is built for CUDA {facts['built']}, but sees no GPU", "check the driver with nvidia-smi"
 
 
+def _extras() -> list[Check]:
+    """Packages that one command needs, and a program that has an environment of its own."""
+    from ambiguous_wild.methods.external.nerfbaselines import find_program
+
+    packages = {
+        "ray": ("ray", "aw bench --engine ray"),
+        "choix": ("study", "aw study score: ranking"),
+        "nltk": ("study", "aw study score: agreement"),
+    }
+    checks = []
+    for name, (extra, use) in packages.items():
+        version = installed(name)
+        fix = "" if version else install_command(extra)
+        checks.append(Check("optional", name, version is not None, f"{version or 'absent'} ({use})", fix))
+    try:
+        checks.append(Check("optional", "nerfbaselines", True, f"{find_program()} (its methods)"))
+    except AwError as error:
+        what, _, fix = str(error).partition(": ")
+        checks.append(Check("optional", "nerfbaselines", False, what, fix))
+    return checks
+
+
 def _planned() -> list[Check]:
     """What later versions will use: named without a command, so that nobody installs it for nothing."""
-    packages = {"ray": "grids on several machines", "viser": "interactive viewer"}
+    packages = {"viser": "interactive viewer"}
     return [
         Check(
             "planned", name, bool(version := installed(name)),

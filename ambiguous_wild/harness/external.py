@@ -54,7 +54,11 @@ def run_program(cell: Cell, folder: Path) -> dict[str, Any]:
     truth = evaluate.load_test_photos(cell.scene)
     drawn = _Drawn(truth, produced.renders)
     per_image, missing = evaluate.render_and_measure(
-        cast(Trainer, drawn), truth, folder / "renders" / "test", half=cell.protocol == "half"
+        cast(Trainer, drawn),
+        truth,
+        folder / "renders" / "test",
+        half=cell.protocol == "half",
+        scene=cell.scene,
     )
     return {
         "schema": 1,

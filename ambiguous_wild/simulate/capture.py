@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict
 from importlib.metadata import version
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -195,8 +195,10 @@ def _earlier(out: Path, identity: str, overwrite: bool) -> dict[str, Any] | None
         facts = json.loads(record.read_text(encoding="utf-8"))
         same = facts["identity"] == identity
         made = f"preset {facts['preset']!r}, seed {facts['seed']}"
-        files = dict(facts["files"])
-    except (ValueError, KeyError, TypeError):
+        files = {str(n): h for n, h in facts["files"].items()}
+        if any(PurePosixPath(n).is_absolute() or ".." in PurePosixPath(n).parts for n in files):
+            raise ValueError("a file outside the capture")
+    except (ValueError, KeyError, TypeError, AttributeError):
         facts, same, made, files = {}, False, "an unreadable truth/capture.json", {}
     if same and all((out / n).is_file() and sha256_file(out / n) == h for n, h in files.items()):
         return dict(facts)

@@ -38,11 +38,24 @@ def test_whatever_lacks_comes_with_a_way_to_get_it(report: list[Check]) -> None:
 
 def test_what_no_code_uses_yet_is_said_so_and_not_asked_for(report: list[Check]) -> None:
     planned = {c.name: c for c in report if c.group == "planned"}
-    assert {"ray", "viser"} <= planned.keys()
+    assert planned.keys() == {"viser"}
     assert all("not used by this version yet" in c.detail for c in planned.values())
     source = "".join(p.read_text() for p in checks.PACKAGE.rglob("*.py"))
-    for package in ("ray", "viser"):  # the day one is imported, it is planned no more
+    for package in planned:  # the day one is imported, it is planned no more
         assert f"import {package}" not in source and f"from {package}" not in source
+
+
+def test_what_one_command_needs_comes_with_its_extra(
+    monkeypatch: pytest.MonkeyPatch, report: list[Check]
+) -> None:
+    assert {"ray", "choix", "nltk", "nerfbaselines"} <= {c.name for c in report if c.group == "optional"}
+    monkeypatch.setattr(checks, "installed", lambda name: None)
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.delenv("AW_NERFBASELINES", raising=False)
+    fixes = {c.name: c.fix for c in checks._extras()}
+    assert "[ray]" in fixes["ray"]
+    assert "[study]" in fixes["choix"] and "[study]" in fixes["nltk"]
+    assert fixes["nerfbaselines"].startswith("python3 -m venv")
 
 
 def test_weights_of_foundation_models_come_with_the_command_that_brings_them(report: list[Check]) -> None:

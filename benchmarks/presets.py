@@ -1,0 +1,193 @@
+"""Every preset, from the spec to a trained model: is it built whole, told apart, and given what it calls for?
+
+    python benchmarks/presets.py --work DIR [--presets NAME ...] [--width 480] [--iterations 600]
+
+For each preset: `aw simulate`, `aw build-scene`, `aw ambiguity-report`, `aw plan` and a short `aw bench` of
+3dgs, each command as a user types it. Writes benchmarks/results/presets.json and .md: photos registered,
+class measured against class designed, every decision of the plan against what the preset was designed to call for,
+and the confusion table. A preset that is finished (DIR/<preset>.json) is not made again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ambiguous_wild.harness.environment import environment
+from ambiguous_wild.io.atomic import write_json, write_text
+from ambiguous_wild.simulate.presets import PRESETS
+
+RESULTS = Path(__file__).parent / "results" / "presets"
+# what a preset is designed for -> lines of the plan, any of which answers it
+ANSWERS = {
+    "masks": ("masks",),
+    "colour per photo": ("affine exposure", "appearance embedding"),
+    "antialiasing": ("antialiasing",),
+    "SH degree 3": ("SH degree",),
+    "poses": ("pose refinement",),
+}
+DESIGNED = {
+    "masks": ("masks",),
+    "colour per photo": ("exposure", "appearance"),
+    "antialiasing": ("antialiasing",),
+    "SH degree 3": ("sh",),
+    "poses": ("pose",),
+}
+
+
+class Stopped(Exception):
+    """A command of a preset failed: its last line."""
+
+
+def aw(*words: str) -> tuple[str, float]:
+    """Standard output of one command, and its seconds."""
+    begin = time.perf_counter()
+    done = subprocess.run(
+        [sys.executable, "-m", "ambiguous_wild.cli.main", *words], capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        lines = (done.stderr.strip() or done.stdout.strip() or f"exit code {done.returncode}").splitlines()
+        raise Stopped(f"aw {words[0]}: {lines[-1]}")
+    return done.stdout, time.perf_counter() - begin
+
+
+def measure(preset: str, work: Path, width: int, iterations: int) -> dict[str, Any]:
+    """All there is to say of one preset.
+
+    Raises:
+        Stopped: a command failed.
+    """
+    raw, scene, runs = work / "raw" / preset, work / "scenes" / preset, work / "runs"
+    seconds: dict[str, float] = {}
+    if not (raw / "truth" / "capture.json").is_file():
+        _, seconds["simulate"] = aw("simulate", preset, "-o", str(raw), "--width", str(width))
+    _, seconds["build-scene"] = aw("build-scene", str(raw), "-o", str(scene), "--name", preset)
+    info = json.loads((scene / "scene.json").read_text(encoding="utf-8"))
+    row: dict[str, Any] = {
+        "preset": preset,
+        "photos": info["counts"]["photos"],
+        "registered": info["counts"]["registered"],
+        "designed": PRESETS[preset].designed.ambiguity,
+        "wanted": list(PRESETS[preset].designed.effects),
+    }
+    if PRESETS[preset].distractors:
+        text, seconds["ambiguity-report"] = aw("ambiguity-report", str(scene), "--no-record", "--json")
+        row["report"] = scores(json.loads(text))
+    text, seconds["plan"] = aw("plan", str(scene), "--json")
+    plan = json.loads(text)
+    row["plan"] = {d["effect"]: [d["value"], d["decision"]] for d in plan["decisions"]}
+    words = ("--method", "3dgs", "--iterations", str(iterations), "--effects", "none", "--no-pictures")
+    _, seconds["bench"] = aw("bench", *words, "--scene", str(scene), "-o", str(runs))
+    result = json.loads((runs / preset / "3dgs" / "seed0" / "metrics.json").read_text(encoding="utf-8"))
+    images = [image["psnr"] for image in result["per_image"]]
+    row["psnr_3dgs"] = sum(images) / len(images)
+    return row | {"seconds": {name: round(s, 1) for name, s in seconds.items()}}
+
+
+def scores(facts: dict[str, Any]) -> dict[str, Any]:
+    """Class and the three numbers of an ambiguity report."""
+    found: dict[str, Any] = {"class": facts["class"]}
+    for name, value in facts.items():
+        if isinstance(value, dict) and "value" in value:
+            found[name] = value["value"]
+    return found
+
+
+def decided(row: dict[str, Any]) -> dict[str, tuple[bool, str]]:
+    """Per question: whether the preset was designed for it, and "on", "off" or "unknown"."""
+    table = {}
+    for name, lines in ANSWERS.items():
+        answers = [row["plan"][line][1] for line in lines if line in row["plan"]]
+        told = "on" if "on" in answers else "unknown" if "unknown" in answers else "off"
+        table[name] = (bool(set(DESIGNED[name]) & set(row["wanted"])), told)
+    return table
+
+
+def to_markdown(data: dict[str, Any]) -> str:
+    """The page of the results."""
+    rows = data["presets"]
+    lines = [
+        "# Presets: built, told apart, planned",
+        "",
+        f"{data['width']} px wide, 3dgs {data['iterations']} iterations, seed 0; `{data['command']}`",
+        "",
+        "| preset | registered | 3dgs, dB | designed | reported | colour | cosine | occluded | plan: on | wrong |",
+        "|---|---:|---:|---|---|---:|---:|---:|---|---|",
+    ]
+    confusion = {name: {"has, on": 0, "has, off": 0, "lacks, on": 0, "lacks, off": 0} for name in ANSWERS}
+    for row in rows:
+        if "error" in row:
+            lines.append(f"| {row['preset']} | {row['error']} |" + " |" * 8)
+            continue
+        answers = decided(row)
+        for name, (has, told) in answers.items():
+            confusion[name][f"{'has' if has else 'lacks'}, {'on' if told == 'on' else 'off'}"] += 1
+        wrong = [name for name, (has, told) in answers.items() if has != (told == "on")]
+        on = [name for name, (_, told) in answers.items() if told == "on"]
+        report = row.get("report", {})
+        shown = {k: ("—" if v is None else f"{v:.2f}") for k, v in report.items() if k != "class"}
+        colour = next((v for k, v in shown.items() if k.startswith("colour")), "—")
+        cosine = next((v for k, v in shown.items() if k.startswith("semantic")), "—")
+        lines.append(
+            f"| {row['preset']} | {row['registered']} of {row['photos']} | {row['psnr_3dgs']:.2f} "
+            f"| {row['designed']} | {report.get('class', 'nobody there')} | {colour} | {cosine} "
+            f"| {shown.get('occlusion', '—')} | {', '.join(on) or '—'} | {', '.join(wrong) or '—'} |"
+        )
+    lines += [
+        "",
+        "| effect | has it, on | has it, off | lacks it, on | lacks it, off |",
+        "|---|---:|---:|---:|---:|",
+    ]
+    for name, cells in confusion.items():
+        lines.append(f"| {name} | " + " | ".join(str(n) for n in cells.values()) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--work", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--presets", nargs="+", default=[n for n in PRESETS if n != "tiny"])
+    parser.add_argument("--width", type=int, default=480)
+    parser.add_argument("--iterations", type=int, default=600)
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    args = parser.parse_args(argv)
+    if unknown := set(args.presets) - set(PRESETS):
+        parser.error(f"no preset {', '.join(sorted(unknown))}; 'aw simulate --list' names them")
+    rows = []
+    for k, preset in enumerate(args.presets, 1):
+        kept = args.work / f"{preset}.json"
+        if kept.is_file():
+            rows.append(json.loads(kept.read_text(encoding="utf-8")))
+            continue
+        try:
+            row = measure(preset, args.work, args.width, args.iterations)
+            write_json(kept, row)
+        except Stopped as error:
+            row = {"preset": preset, "error": str(error)}
+        rows.append(row)
+        shown = row.get("error") or f"{row['registered']} of {row['photos']}, {row['seconds']}"
+        print(f"[{k}/{len(args.presets)}] {preset}: {shown}", flush=True)
+    command = f"python benchmarks/presets.py --work DIR --width {args.width} --iterations {args.iterations}"
+    data = {
+        "environment": environment("cpu"),
+        "command": command,
+        "width": args.width,
+        "iterations": args.iterations,
+        "presets": rows,
+    }
+    write_json(args.results.with_suffix(".json"), data)
+    write_text(args.results.with_suffix(".md"), to_markdown(data))
+    print(to_markdown(data))
+    return 1 if any("error" in row for row in rows) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

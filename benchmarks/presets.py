@@ -4,8 +4,8 @@
 
 For each preset: `aw simulate`, `aw build-scene`, `aw ambiguity-report`, `aw plan` and a short `aw bench` of
 3dgs, each command as a user types it. Writes benchmarks/results/presets.json and .md: photos registered,
-class measured against class designed, every decision of the plan against what the preset was designed to call for,
-and the confusion table. A preset that is finished (DIR/<preset>.json) is not made again.
+class measured against class designed, every decision of the plan against what the preset was designed for, and
+the confusion table. A preset that is finished (DIR/<preset>.json) is not made again.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ def to_markdown(data: dict[str, Any]) -> str:
         "",
         f"{data['width']} px wide, 3dgs {data['iterations']} iterations, seed 0; `{data['command']}`",
         "",
-        "| preset | registered | 3dgs, dB | designed | reported | colour | cosine | occluded | plan: on | wrong |",
+        "| preset | placed | 3dgs, dB | designed | reported | colour | cosine | covers | plan: on | wrong |",
         "|---|---:|---:|---|---|---:|---:|---:|---|---|",
     ]
     confusion = {name: {"has, on": 0, "has, off": 0, "lacks, on": 0, "lacks, off": 0} for name in ANSWERS}

@@ -4,8 +4,8 @@
 
 For each preset: `aw simulate`, `aw build-scene`, `aw ambiguity-report`, `aw plan` and a short `aw bench` of
 3dgs, each command as a user types it. Writes benchmarks/results/presets.json and .md: photos registered,
-class measured against class designed, every decision of the plan against what the preset was designed for, and
-the confusion table. A preset that is finished (DIR/<preset>.json) is not made again.
+class measured against class designed, every decision of the plan against what the preset was designed for,
+and the confusion table. A preset that is finished (DIR/<preset>.json) is not made again.
 """
 
 from __future__ import annotations

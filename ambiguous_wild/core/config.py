@@ -27,6 +27,17 @@ def to_plain(config: Any) -> Any:
     return config
 
 
+def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested mappings as one, by dotted keys."""
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        if isinstance(value, Mapping):
+            flat |= flatten(value, f"{prefix}{key}.")
+        else:
+            flat[f"{prefix}{key}"] = value
+    return flat
+
+
 def config_hash(config: Any) -> str:
     """sha256 over the canonical JSON of the config: 64 hex digits."""
     text = json.dumps(to_plain(config), sort_keys=True, separators=(",", ":"), allow_nan=False)

@@ -13,10 +13,9 @@ from typing import Any, cast
 import numpy as np
 import torch
 
-from ambiguous_wild import __version__
 from ambiguous_wild.core import AwError, Camera, Scene, View
-from ambiguous_wild.core.config import to_plain
 from ambiguous_wild.harness import evaluate
+from ambiguous_wild.harness.result import result_of
 from ambiguous_wild.harness.run import Cell
 from ambiguous_wild.io.atomic import atomic_dir, atomic_path
 from ambiguous_wild.io.images import image_size, read_gray, read_png_rgb, write_png
@@ -60,23 +59,14 @@ def run_program(cell: Cell, folder: Path) -> dict[str, Any]:
         half=cell.protocol == "half",
         scene=cell.scene,
     )
-    return {
-        "schema": 1,
-        "method": cell.method.name,
-        "scene": cell.scene.name,
-        "seed": cell.train.seed,
-        "status": "ok",
-        "error": None,
-        "options": to_plain(cell.options),
-        "per_image": per_image,
-        "missing": missing,
-        "masks": _masks(cell.scene, produced.masks, folder / "masks"),
-        "facts": dict(produced.facts) | ({} if cell.protocol == "full" else {"protocol": cell.protocol}),
-        "cost": {"device": cell.device, **produced.cost, **_model(produced, folder)},
-        "config_hash": cell.identity,
-        "scene_hash": cell.scene_id,
-        "version": __version__,
-    }
+    return result_of(
+        cell,
+        per_image=per_image,
+        missing=missing,
+        masks=_masks(cell.scene, produced.masks, folder / "masks"),
+        facts=dict(produced.facts) | ({} if cell.protocol == "full" else {"protocol": cell.protocol}),
+        cost={"device": cell.device, **produced.cost, **_model(produced, folder)},
+    )
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import ambiguous_wild
-from ambiguous_wild.core.config import config_hash, to_plain
+from ambiguous_wild.core.config import config_hash, flatten, to_plain
 from ambiguous_wild.harness.environment import environment
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.methods.registry import MethodEntry, all_methods
@@ -79,7 +79,7 @@ def _base(method: MethodEntry) -> MethodEntry:
 
 def _settings(method: MethodEntry, name: str, options: Any) -> list[str]:
     """METHOD.KEY=VALUE of every option that is not at its default."""
-    now, default = _flat(to_plain(options)), _flat(to_plain(method.options()))
+    now, default = flatten(to_plain(options)), flatten(to_plain(method.options()))
     changed = {key: value for key, value in now.items() if default.get(key, ...) != value}
     found = []
     for key, value in changed.items():
@@ -95,13 +95,6 @@ def _text(value: Any) -> str:
     if isinstance(value, (list, tuple)):
         return ",".join(map(_text, value))
     return "none" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
-
-
-def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in tree.items():
-        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
-    return flat
 
 
 def _plugin(method: MethodEntry) -> Path | None:

@@ -16,7 +16,7 @@ import yaml
 
 from ambiguous_wild import __version__
 from ambiguous_wild.core import AwError, Camera, Scene
-from ambiguous_wild.core.config import to_plain
+from ambiguous_wild.core.config import flatten, to_plain
 from ambiguous_wild.harness import evaluate
 from ambiguous_wild.harness import pictures as run_pictures
 from ambiguous_wild.harness.choosing import Chosen
@@ -25,6 +25,7 @@ from ambiguous_wild.harness.identity import IGNORED, config_identity
 from ambiguous_wild.harness.identity import scene_identity as scene_identity  # as it always was here
 from ambiguous_wild.harness.memory import peak_memory, reset_peak
 from ambiguous_wild.harness.provenance import provenance
+from ambiguous_wild.harness.result import result_of
 from ambiguous_wild.harness.store import read_result, write_result
 from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.atomic import sweep, write_json, write_text
@@ -212,7 +213,7 @@ def refuse_other_config(folder: Path, cell: Cell) -> None:
     if old.get("config_hash") == cell.identity:
         return
     ignored = {f"{part}.{key}" for part, keys in IGNORED.items() for key in keys} | {"config_hash"}
-    before, now = _flat(old), _flat(cell.config)
+    before, now = flatten(old), flatten(cell.config)
     names = [
         k for k in sorted(before.keys() | now.keys()) if before.get(k) != now.get(k) and k not in ignored
     ]
@@ -221,16 +222,6 @@ def refuse_other_config(folder: Path, cell: Cell) -> None:
         f"{folder} holds a run of another configuration ({shown}); "
         "choose another -o, or replace it with --overwrite always"
     )
-
-
-def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in tree.items():
-        if isinstance(value, dict):
-            flat |= _flat(value, f"{prefix}{key}.")
-        else:
-            flat[prefix + key] = value
-    return flat
 
 
 def _train_and_measure(
@@ -270,30 +261,19 @@ def _train_and_measure(
     masks = evaluate.write_masks(trainer, folder / "masks")
     if recorder is not None:
         run_pictures.draw_all(trainer, recorder, folder)
-    return {
-        "schema": 1,
-        "method": cell.method.name,
-        "scene": cell.scene.name,
-        "seed": cell.train.seed,
-        "status": "ok",
-        "error": None,
-        "options": to_plain(cell.options),
-        "per_image": per_image,
-        "missing": missing,
-        "masks": masks,
-        "facts": trainer.parts.mask.facts()
+    return result_of(
+        cell,
+        per_image=per_image,
+        missing=missing,
+        masks=masks,
+        facts=trainer.parts.mask.facts()
         | {"skipped_views": trainer.skipped_views}
         | trainer.watchdog.facts()
         | _effect_facts(cell, trainer),
-        "cost": cost
+        cost=cost
         | evaluate.frames_per_second(trainer)
-        | {
-            "model_mb": (folder / "point_cloud.ply").stat().st_size / 1e6,
-        },
-        "config_hash": cell.identity,
-        "scene_hash": cell.scene_id,
-        "version": __version__,
-    }
+        | {"model_mb": (folder / "point_cloud.ply").stat().st_size / 1e6},
+    )
 
 
 def _effect_facts(cell: Cell, trainer: Trainer) -> dict[str, Any]:
@@ -327,23 +307,7 @@ def _threads() -> int:
 
 def failed_result(cell: Cell, error: str) -> dict[str, Any]:
     """The result of a cell that failed: its error is what it has to show."""
-    return {
-        "schema": 1,
-        "method": cell.method.name,
-        "scene": cell.scene.name,
-        "seed": cell.train.seed,
-        "status": "failed",
-        "error": error,
-        "options": to_plain(cell.options),
-        "per_image": [],
-        "missing": {},
-        "masks": None,
-        "facts": {},
-        "cost": {},
-        "config_hash": cell.identity,
-        "scene_hash": cell.scene_id,
-        "version": __version__,
-    }
+    return result_of(cell, status="failed", error=error)
 
 
 def with_seed(config: TrainConfig, seed: int) -> TrainConfig:

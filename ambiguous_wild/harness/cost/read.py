@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.core.config import config_hash
+from ambiguous_wild.core.config import config_hash, flatten
 from ambiguous_wild.harness.store import FAILED, RESULT, read_config, read_result, run_folders
 from ambiguous_wild.metrics import stats
 
@@ -150,7 +150,7 @@ def _run(folder: Path, result: dict[str, Any]) -> CostRun:
         seed=result["seed"],
         asked=_asked(folder) or ", ".join(effects),
         effects=frozenset(map(str, effects)),
-        options=tuple(sorted(_flat(result["options"]).items())),
+        options=tuple(sorted(_options(result["options"]).items())),
         length=_length(train, cost),
         rest=config_hash(rest),
         psnr=psnr,
@@ -220,11 +220,6 @@ def _number(value: Any) -> float:
         return math.nan
 
 
-def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in tree.items():
-        if isinstance(value, dict):
-            flat |= _flat(value, f"{prefix}{key}.")
-        else:
-            flat[prefix + str(key)] = tuple(map(str, value)) if isinstance(value, list) else value
-    return flat
+def _options(tree: dict[str, Any]) -> dict[str, Any]:
+    """Options by their dotted names; lists as what can be compared and hashed."""
+    return {k: tuple(map(str, v)) if isinstance(v, list) else v for k, v in flatten(tree).items()}

@@ -17,9 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from ambiguous_wild.core import AwError, Scene
-from ambiguous_wild.core.config import config_hash, from_plain, to_plain
+from ambiguous_wild.core.config import from_plain, to_plain
 from ambiguous_wild.harness.choosing import Chosen
 from ambiguous_wild.harness.grid import run_isolated
+from ambiguous_wild.harness.provenance import code_hash
 from ambiguous_wild.harness.run import (
     FAILED,
     RESULT,
@@ -32,7 +33,6 @@ from ambiguous_wild.harness.run import (
     scene_identity,
 )
 from ambiguous_wild.harness.store import write_result
-from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.lock import Busy, folder_lock, patient_lock
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.references import load_reference, reference_file, with_file
@@ -249,10 +249,3 @@ def _prepare_cpu(threads: int | None) -> None:
     if threads is not None:
         set_threads(threads)
     warm_up()
-
-
-@functools.cache
-def code_hash() -> str:
-    """sha256 over the package's Python files: what runs on a node must be what was asked for."""
-    root = Path(__file__).resolve().parents[2]
-    return config_hash({p.relative_to(root).as_posix(): sha256_file(p) for p in sorted(root.rglob("*.py"))})

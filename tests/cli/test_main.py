@@ -44,7 +44,7 @@ def test_every_command_has_help(name: str) -> None:
         (["tabel"], "did you mean 'table'?"),
         (["table"], "Missing argument 'RUNS'"),
         (["table", "nowhere"], "no folder of runs nowhere"),
-        (["table", ".", "--format", "html"], "html"),
+        (["table", ".", "--format", "pdf"], "pdf"),
         (["methods", "--plugin", "mine.py"], "no plugin file mine.py"),
     ],
 )

@@ -258,6 +258,8 @@ def test_effects_and_budgets_are_refused_where_they_cannot_be_kept(scene, tmp_pa
 def test_what_was_started_ends_with_us(tmp_path):
     """On Ctrl-C at once; after kill -9 when the run goes on, so that no two work in one folder."""
     code = (
+        # a shell that runs us in the background has told its children to ignore Ctrl-C
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
         "from pathlib import Path; from ambiguous_wild.methods.external.process import run_logged; "
         f"run_logged('x', ['sh', '-c', 'sleep 60 & wait'], log=Path({str(tmp_path / 'x.log')!r}), "
         "cwd=Path('.'), environment={}, timeout_s=None)"

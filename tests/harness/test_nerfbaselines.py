@@ -132,7 +132,7 @@ def test_what_it_is_not_told_is_said_and_what_is_done_is_not_done_again(scene, c
 
 def test_a_hostile_archive_and_a_failure(scene, calls, tmp_path, monkeypatch):
     monkeypatch.setenv("STAND_IN", "hostile")
-    assert "outside itself" in run(scene, tmp_path / "a").error
+    assert "leads out of the folder" in run(scene, tmp_path / "a").error
     assert not list(tmp_path.rglob("out.png"))
     monkeypatch.setenv("STAND_IN", "broken")
     report = run(scene, tmp_path / "b")

@@ -89,7 +89,9 @@ class EntropyAwareDensity(DensityControl):
             return gaussians, events
         optimiser.flush()
         self.log.now.pruned += int(drop.sum())
-        return self.keep_rows(gaussians, optimiser, ~drop), [*events, "prune"]
+        gaussians = self.keep_rows(gaussians, optimiser, ~drop)
+        self.log.now.count = len(gaussians)
+        return gaussians, ["prune"]
 
     def clone_offset(self, gaussians: Gaussians, rows: Tensor) -> Tensor | None:
         """Down the entropy-aware gradient (Fig. 3b), by a share of the standard deviation along it."""

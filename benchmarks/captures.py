@@ -34,9 +34,10 @@ from captures_report import (
 )
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.cell import Cell
 from ambiguous_wild.harness.environment import environment
 from ambiguous_wild.harness.grid import cell_folder, plan_cells
-from ambiguous_wild.harness.run import RESULT, Cell, refuse_other_config
+from ambiguous_wild.harness.run import RESULT, refuse_other_config
 from ambiguous_wild.harness.store import read_runs
 from ambiguous_wild.io.atomic import write_json, write_text
 from ambiguous_wild.splat.trainer import TrainConfig

@@ -24,8 +24,8 @@ from ambiguous_wild.cli.bench import prepare_cpu
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import with_options
 from ambiguous_wild.harness.ablate import Outcome, read_outcomes
+from ambiguous_wild.harness.cell import Cell
 from ambiguous_wild.harness.grid import plan_cells, run_cells
-from ambiguous_wild.harness.run import Cell
 from ambiguous_wild.io.atomic import atomic_path, write_json
 from ambiguous_wild.io.palette import ADDED, MERGED, plot_colour
 from ambiguous_wild.metrics import stats

@@ -19,7 +19,7 @@ from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.extras import install_command
 
 if TYPE_CHECKING:
-    from ambiguous_wild.harness.run import Cell, CellReport
+    from ambiguous_wild.harness.cell import Cell, CellReport
     from ambiguous_wild.splat.trainer import Trainer
 
 _UNITS = {"s": 1, "m": 60, "min": 60, "h": 3600}

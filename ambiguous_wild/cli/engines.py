@@ -13,9 +13,9 @@ import click
 from ambiguous_wild.core.errors import AwError
 
 if TYPE_CHECKING:
+    from ambiguous_wild.harness.cell import Cell, CellReport, Overwrite
     from ambiguous_wild.harness.engines.job import Job
     from ambiguous_wild.harness.engines.ray_cluster import RayCluster
-    from ambiguous_wild.harness.run import Cell, CellReport, Overwrite
 
 _OPTIONS = (
     click.option("--engine", type=click.Choice(["local", "ray"]), default="local", show_default=True, help="ray: a cluster, see docs/cluster.md."),

@@ -15,8 +15,8 @@ import torch
 
 from ambiguous_wild.core import AwError, Camera, Scene, View
 from ambiguous_wild.harness import evaluate
+from ambiguous_wild.harness.cell import Cell
 from ambiguous_wild.harness.result import result_of
-from ambiguous_wild.harness.run import Cell
 from ambiguous_wild.io.atomic import atomic_dir, atomic_path
 from ambiguous_wild.io.images import image_size, read_gray, read_png_rgb, write_png
 from ambiguous_wild.io.ply import splat_count

@@ -10,13 +10,10 @@ from typing import Any
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import with_options
 from ambiguous_wild.core.errors import unknown
+from ambiguous_wild.harness.cell import Cell, CellReport, Overwrite, Protocol
 from ambiguous_wild.harness.choosing import choose
 from ambiguous_wild.harness.planning.decide import Plan
 from ambiguous_wild.harness.run import (
-    Cell,
-    CellReport,
-    Overwrite,
-    Protocol,
     error_line,
     refuse_other_config,
     refuse_strange_folder,

@@ -16,7 +16,7 @@ from ambiguous_wild.methods.registry import MethodEntry, all_methods
 from ambiguous_wild.splat.trainer import TrainConfig
 
 if TYPE_CHECKING:
-    from ambiguous_wild.harness.run import Cell
+    from ambiguous_wild.harness.cell import Cell
 
 
 def provenance(cell: Cell) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from ambiguous_wild.core.config import to_plain
 from ambiguous_wild.harness.store import SCHEMA
 
 if TYPE_CHECKING:
-    from ambiguous_wild.harness.run import Cell
+    from ambiguous_wild.harness.cell import Cell
 
 
 def result_of(cell: Cell, **measured: Any) -> dict[str, Any]:

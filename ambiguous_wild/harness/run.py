@@ -7,21 +7,19 @@ import shutil
 import time
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 import yaml
 
-from ambiguous_wild import __version__
-from ambiguous_wild.core import AwError, Camera, Scene
-from ambiguous_wild.core.config import flatten, to_plain
+from ambiguous_wild.core import AwError, Camera
+from ambiguous_wild.core.config import flatten
 from ambiguous_wild.harness import evaluate
 from ambiguous_wild.harness import pictures as run_pictures
-from ambiguous_wild.harness.choosing import Chosen
+from ambiguous_wild.harness.cell import Cell, CellReport, Overwrite
 from ambiguous_wild.harness.environment import environment
-from ambiguous_wild.harness.identity import IGNORED, config_identity
+from ambiguous_wild.harness.identity import IGNORED
 from ambiguous_wild.harness.identity import scene_identity as scene_identity  # as it always was here
 from ambiguous_wild.harness.memory import peak_memory, reset_peak
 from ambiguous_wild.harness.provenance import provenance
@@ -32,77 +30,16 @@ from ambiguous_wild.io.atomic import sweep, write_json, write_text
 from ambiguous_wild.io.lock import folder_lock
 from ambiguous_wild.io.ply import write_splat_ply
 from ambiguous_wild.methods.external.program import DONE, LOGS, WORK
-from ambiguous_wild.methods.registry import MethodEntry
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.trainer import TrainConfig, Trainer
 
-Overwrite = Literal["never", "missing", "always"]
-Protocol = Literal["full", "half"]
-Outcome = Literal["trained", "kept", "skipped", "failed"]
 RESULT = "metrics.json"
 FAILED = "failed.json"
 TRACEBACK = "traceback.txt"
 EFFECTS = "effects.json"
 # What a run leaves before anything worth keeping exists in its folder.
 _WORTHLESS = {"config.yaml", "env.json", EFFECTS, FAILED, TRACEBACK}
-
-
-@dataclass(frozen=True)
-class Cell:
-    """What one run is: two cells with the same hash give the same result on the same machine."""
-
-    method: MethodEntry
-    options: Any  # the method's frozen dataclass
-    scene: Scene
-    scene_id: str  # sha256 of what the scene was built from, see `scene_identity`
-    train: TrainConfig
-    device: str = "cpu"
-    chosen: Chosen = field(default_factory=Chosen)  # optional effects, and why
-    protocol: Protocol = "full"  # "half": measured on the right half, colour effects fitted on the left
-    group: str = ""  # folder below the output, where one output takes several lengths or effects
-
-    @property
-    def config(self) -> dict[str, Any]:
-        """The resolved configuration, as written to config.yaml."""
-        train = to_plain(self.train)
-        # keys that say nothing are left out: runs from before they existed keep their identity
-        more: dict[str, Any] = {"effects": list(self.chosen.effects)} if self.chosen.effects else {}
-        if self.protocol != "full":
-            more["protocol"] = self.protocol
-        return more | {
-            "method": self.method.name,
-            "source": self.method.source_hash,
-            "options": to_plain(self.options),
-            "train": train,
-            "scene": {
-                "name": self.scene.name,
-                "sha256": self.scene_id,
-                "factor": self.scene.info.get("loaded_factor"),
-                "path": str(self.scene.root.resolve()),
-            },
-            "device": self.device,
-            "version": __version__,
-        }
-
-    @property
-    def identity(self) -> str:
-        """Hash of what decides the result: not how often it is saved, nor where the scene lies.
-
-        What is done about values that are not finite is left out too: where there are none it does nothing,
-        and where there are the result's facts say so.
-        """
-        return config_identity(self.config)
-
-
-@dataclass
-class CellReport:
-    """What became of a cell."""
-
-    folder: Path
-    outcome: Outcome
-    error: str = ""
-    result: dict[str, Any] = field(default_factory=dict)
 
 
 def run_cell(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 
-from ambiguous_wild.harness.run import Cell
+from ambiguous_wild.harness.cell import Cell
 
 
 def grouped(planned: Mapping[str, Sequence[Cell]], budgets_s: Sequence[float] = ()) -> list[Cell]:

@@ -18,20 +18,11 @@ from typing import Any
 
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import from_plain, to_plain
+from ambiguous_wild.harness.cell import Cell, CellReport, Overwrite, Protocol
 from ambiguous_wild.harness.choosing import Chosen
 from ambiguous_wild.harness.grid import run_isolated
 from ambiguous_wild.harness.provenance import code_hash
-from ambiguous_wild.harness.run import (
-    FAILED,
-    RESULT,
-    Cell,
-    CellReport,
-    Overwrite,
-    Protocol,
-    error_line,
-    failed_result,
-    scene_identity,
-)
+from ambiguous_wild.harness.run import FAILED, RESULT, error_line, failed_result, scene_identity
 from ambiguous_wild.harness.store import write_result
 from ambiguous_wild.io.lock import Busy, folder_lock, patient_lock
 from ambiguous_wild.io.scene_folder import load_scene

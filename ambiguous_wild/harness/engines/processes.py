@@ -11,8 +11,8 @@ from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection, wait
 
+from ambiguous_wild.harness.cell import CellReport
 from ambiguous_wild.harness.engines.job import Job, run_job
-from ambiguous_wild.harness.run import CellReport
 
 STOP_S = 5.0  # between asking a process to end and ending it
 

@@ -14,9 +14,10 @@ from typing import Any, Literal
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.extras import install_command
+from ambiguous_wild.harness.cell import CellReport
 from ambiguous_wild.harness.engines.job import Job, run_job
 from ambiguous_wild.harness.engines.transfer import Sent, receive, run_sent, send_scene, stays
-from ambiguous_wild.harness.run import RESULT, CellReport, error_line, is_finished
+from ambiguous_wild.harness.run import RESULT, error_line, is_finished
 from ambiguous_wild.harness.store import read_result
 
 Transfer = Literal["shared", "store"]

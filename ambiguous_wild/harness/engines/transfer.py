@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.cell import CellReport
 from ambiguous_wild.harness.engines.job import LOCK_WAIT_S, Job, run_job
-from ambiguous_wild.harness.run import CellReport, is_finished
+from ambiguous_wild.harness.run import is_finished
 from ambiguous_wild.io.archive import Limits, pack_folder, unpack
 from ambiguous_wild.io.atomic import atomic_dir
 from ambiguous_wild.io.lock import folder_lock, patient_lock

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from rasterizer import machine
 
-from ambiguous_wild.cli.bench import prepare_cpu
+from ambiguous_wild.cli.devices import prepare_cpu
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import with_options
 from ambiguous_wild.harness.ablate import Outcome, read_outcomes

@@ -72,7 +72,9 @@ def command(
     if iterations is not None and budget is not None:
         raise AwError("--iterations and --budget exclude each other: a run is as long as one of them says")
 
-    from ambiguous_wild.cli.bench import Progress, choose_device, parse_budget, prepare_cpu
+    from ambiguous_wild.cli.bench import parse_budget
+    from ambiguous_wild.cli.devices import choose_device, prepare_cpu
+    from ambiguous_wild.cli.progress import Progress
     from ambiguous_wild.harness.ablate import plan_study
     from ambiguous_wild.harness.ablation_report import report, to_markdown, write_report
     from ambiguous_wild.harness.grid import run_cells

@@ -102,7 +102,7 @@ class Session:
 
     def device(self, device: str) -> str:
         """ "cpu" or "cuda": of a cluster by what its nodes offer, else of this machine."""
-        from ambiguous_wild.cli.bench import choose_device
+        from ambiguous_wild.cli.devices import choose_device
 
         if not self.engine.remote:
             return choose_device(device)
@@ -208,7 +208,7 @@ class ManyAtOnce:
         click.echo(f"begins: {self._name(index)}", err=True)
 
     def end(self, index: int, report: CellReport) -> None:
-        from ambiguous_wild.cli.bench import outcome_line
+        from ambiguous_wild.cli.progress import outcome_line
 
         self.done += 1
         click.echo(

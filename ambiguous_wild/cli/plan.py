@@ -50,7 +50,7 @@ def command(
     check_output(path)
     plan = plan_without_training(loaded)
     if probe or costs:
-        from ambiguous_wild.cli.bench import prepare_cpu
+        from ambiguous_wild.cli.devices import prepare_cpu
 
         prepare_cpu(None)
     if probe:

@@ -96,7 +96,7 @@ def _plain(value: object) -> object:
 
 
 def _devices(wanted: str) -> list[str]:
-    from ambiguous_wild.cli.bench import choose_device, prepare_cpu
+    from ambiguous_wild.cli.devices import choose_device, prepare_cpu
 
     found = choose_device(wanted)  # names what is missing where a GPU was asked for
     devices = ["cuda"] if wanted == "cuda" else ["cpu"] if found == "cpu" else ["cpu", "cuda"]
@@ -106,7 +106,7 @@ def _devices(wanted: str) -> list[str]:
 
 
 def _replay(run: Path) -> None:
-    from ambiguous_wild.cli.bench import prepare_cpu
+    from ambiguous_wild.cli.devices import prepare_cpu
     from ambiguous_wild.harness.replay import replay
 
     prepare_cpu(None)

@@ -160,9 +160,16 @@ def remove_command(
 @_board
 @click.option("-o", "--out", required=True, type=click.Path(path_type=Path), help="Folder of the page.")
 @click.option("--reported", is_flag=True, help="Show what papers print beside the measured numbers, marked.")
+@click.option(
+    "--reported-from",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Show those of the *.csv in this folder.  [default: BOARD/reported, with --reported]",
+)
 @click.option("--title", default="Leaderboard", show_default=True, help="Of the page.")
 @_json
-def publish_command(board: Path, out: Path, reported: bool, title: str, as_json: bool) -> None:
+def publish_command(
+    board: Path, out: Path, reported: bool, reported_from: Path | None, title: str, as_json: bool
+) -> None:
     """Write CSVs and a page that works from a file, from the board's CSVs alone.
 
     OUT holds index.html, data/ and images/ afterwards; an earlier page there is replaced.
@@ -171,10 +178,12 @@ def publish_command(board: Path, out: Path, reported: bool, title: str, as_json:
 
     from ambiguous_wild.harness.leaderboard.publish import publish
 
-    done = publish(board, out, reported=reported, title=title)
+    done = publish(board, out, reported=reported, reported_from=reported_from, title=title)
     if as_json:
         click.echo(json.dumps(dataclasses.asdict(done), indent=2))
-    told = f"{done.runs} runs of {done.datasets} datasets, {done.images} pictures, {done.reported} reported numbers"
+    told = f"{done.runs} runs of {done.datasets} datasets, {done.images} pictures"
+    if done.reported_from is not None:
+        told += f", {done.reported} reported numbers from {done.reported_from}"
     click.echo(f"wrote {out / 'index.html'}: {told}", err=True)
 
 

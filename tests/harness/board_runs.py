@@ -19,7 +19,7 @@ from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.metrics import image as image_metrics
 from tests.tiny_scene import write_tiny_scene
 
-METRICS = ("psnr", "ssim")
+METRICS = ("psnr", "ssim", "ssim_inria")
 
 
 def write_scene(root: Path) -> Path:

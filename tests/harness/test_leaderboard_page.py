@@ -186,7 +186,7 @@ def sorts(page: Browser) -> None:
     page.click("#table thead button[data-key=method]")
     assert names(page) == [HOSTILE, "3dgs", "refinesplat", "robustsplat"]
     # Equal in print is equal in rank: two are of half a MB.
-    ranks = "[...document.querySelectorAll('#table tbody tr')].map((r) => r.children[4].dataset.rank ?? '')"
+    ranks = "[...document.querySelectorAll('#table tbody tr')].map((r) => r.children[5].dataset.rank ?? '')"
     assert sorted(page.run(ranks)) == ["", "1", "2", "2"]
 
 

@@ -67,6 +67,7 @@ def add(
         if not dry:
             sweep(measured(board))
         there = read_board(board)
+        pictures.read_index(board)  # a damaged one is found before anything is written
         finder = Scenes(scenes, dataset, there)
         reports: dict[Path, Report] = {}
         passed: list[Verified] = []
@@ -153,10 +154,14 @@ def _conflicts(board: Path, there: list[Entry], passed: list[Verified]) -> list[
         cells[v.entry.key].append(v)
     on_board = {(e.dataset, e.scene): e.scene_hash for e in there}
     names_on_board = {e.dataset for e in there}
+    configs: dict[str, list[Entry]] = defaultdict(list)
+    for e in (*there, *(v.entry for v in passed)):
+        configs[e.config_hash].append(e)
     found: list[tuple[str, Verified]] = []
     for v in passed:
         e, same = v.entry, cells[v.entry.key]
         known = on_board.get((e.dataset, e.scene))
+        twins = [o for o in configs[e.config_hash] if o.key != e.key]
         others = [o for o in same if o.entry.result_hash != e.result_hash]
         if len(names := spelt[dataset_file(board, e.dataset)]) > 1 and e.dataset not in names_on_board:
             reason = (
@@ -171,6 +176,12 @@ def _conflicts(board: Path, there: list[Entry], passed: list[Verified]) -> list[
             )
         elif others:
             reason = f"{v.run} and {others[0].run} are the same cell with other numbers; give one of them"
+        elif twins:
+            twin = min(twins, key=lambda o: o.key)
+            reason = (
+                f"{v.run}: its configuration is there already as {twin.name} of dataset {twin.dataset!a}; "
+                "give it the same --dataset, or 'aw leaderboard remove' the other"
+            )
         else:
             continue
         found.append((reason, v))

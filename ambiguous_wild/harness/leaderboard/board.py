@@ -8,12 +8,13 @@ BOARD/measured/images/            small pictures, and index.csv that says what t
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Sequence
 from pathlib import Path
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.leaderboard.entry import FIRST, LAST, TIDY, Entry, from_wide, tidy, wide
-from ambiguous_wild.harness.leaderboard.sheet import read_csv, slug, to_csv
+from ambiguous_wild.harness.leaderboard.sheet import read_csv, slug, to_csv, unguard
 from ambiguous_wild.io.atomic import write_text
 
 ALL = "all"
@@ -44,23 +45,66 @@ def dataset_files(board: Path) -> list[Path]:
 def read_board(board: Path) -> list[Entry]:
     """Every run on the board, in order; none where there is no board yet.
 
+    Whoever publishes or writes a board reads it so: what a hand changed must not become what was measured.
+
+    Raises:
+        AwError: a file that is damaged or was changed by hand, or a run that is there twice.
+    """
+    entries, wrong = examine(board)
+    if wrong:
+        raise AwError(wrong[0])
+    return entries
+
+
+def examine(board: Path) -> tuple[list[Entry], list[str]]:
+    """(runs as the files have them, a line for each row and file that was changed by hand).
+
     Raises:
         AwError: a file that is damaged, or a run that is there twice.
     """
     entries: list[Entry] = []
+    wrong: list[str] = []
     for path in dataset_files(board):
         head, rows = read_csv(path, (*FIRST, *LAST))
         found = [from_wide(head, row, f"{path} row {at}") for at, row in enumerate(rows, 2)]
         for e in found:
             if dataset_file(board, e.dataset) != path:
                 raise AwError(f"{path} holds a run of dataset {e.dataset!a}: restore the file")
+        wrong += [
+            f"{path} row {at} ({e.name}) was changed by hand, its cells do not hash to its row_hash: restore "
+            "the file from your version control, or remove it and all.csv and add its runs again"
+            for at, (row, e) in enumerate(zip(rows, found), 2)
+            if row["row_hash"] != e.row_hash
+        ]
         entries += found
     seen: set[object] = set()
     for e in entries:
         if e.key in seen:
             raise AwError(f"{e.name} is twice in {dataset_file(board, e.dataset)}: restore the file")
         seen.add(e.key)
-    return sorted(entries, key=lambda e: e.key)
+    entries.sort(key=lambda e: e.key)
+    # Where a row was changed, all.csv differs by that: it is not to blame.
+    return entries, wrong or _check_all(board, entries)
+
+
+def _check_all(board: Path, entries: Sequence[Entry]) -> list[str]:
+    """Whether all.csv is what the rows give; one that is not there can be made from them."""
+    path = measured(board) / f"{ALL}.csv"
+    if not path.is_file():
+        return []
+    found, expected = path.read_bytes(), to_csv(TIDY, tidy(entries)).encode()
+    if found == expected:
+        return []
+    differing = sorted(set(found.splitlines()) ^ set(expected.splitlines()))
+    cell = next(csv.reader([differing[0].decode("utf-8", "replace")]), [""])[0] if differing else ""
+    names = {e.dataset: dataset_file(board, e.dataset) for e in entries}
+    other = names.get(unguard(cell))
+    about = f"what {other} gives" if other is not None else f"what the other files of {path.parent} give"
+    return [
+        f"{path} is not {about}: rows were changed, added or taken out by hand, or a write was cut off; "
+        f"restore both from your version control. Where {ALL}.csv alone is wrong, remove it: 'aw leaderboard "
+        "add' of any run writes it again"
+    ]
 
 
 def files_of(board: Path, entries: Sequence[Entry]) -> dict[Path, str]:

@@ -13,7 +13,7 @@ from ambiguous_wild.harness.audit.finding import Finding
 from ambiguous_wild.harness.audit.run import audit
 from ambiguous_wild.harness.audit.table import Number
 from ambiguous_wild.harness.leaderboard import pictures
-from ambiguous_wild.harness.leaderboard.board import dataset_files, files_of, read_board
+from ambiguous_wild.harness.leaderboard.board import dataset_files, examine, files_of, measured
 from ambiguous_wild.harness.leaderboard.entry import Entry
 from ambiguous_wild.harness.measures import measure
 from ambiguous_wild.io.hashing import sha256_file
@@ -37,13 +37,17 @@ def check(board: Path) -> Checked:
     Raises:
         AwError: no board.
     """
-    if not board.is_dir():
-        raise AwError(f"no leaderboard {board}: 'aw leaderboard add RUNS --board {board}' makes one")
+    if not measured(board).is_dir():
+        raise AwError(
+            f"no leaderboard {board}, it has no folder 'measured': 'aw leaderboard add RUNS --board {board}' "
+            "makes one"
+        )
     try:
-        entries = read_board(board)
+        entries, wrong = examine(board)
     except AwError as error:
         return Checked(0, (str(error),), ())
-    problems = [*_files(board, entries), *_hashes(entries), *_copies(entries), *_pictures(board, entries)]
+    problems = wrong or list(_files(board, entries))  # files differ by the rows that were changed
+    problems += [*_hashes(entries), *_copies(entries), *_pictures(board, entries)]
     return Checked(len(entries), tuple(problems), tuple(audit(_numbers(entries))))
 
 

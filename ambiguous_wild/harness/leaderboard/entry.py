@@ -8,21 +8,24 @@ from dataclasses import dataclass
 from typing import Literal
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.leaderboard.sheet import Cell, to_number, unguard
+from ambiguous_wild.core.config import config_hash
+from ambiguous_wild.harness.leaderboard.sheet import Cell, number, to_number, unguard
 from ambiguous_wild.harness.measures import MEASURES
 
 FIRST = ("dataset", "scene", "method", "setting", "options", "seed", "images")
 LAST = (
     "missing", "device", "hardware", "version", "source", "code_hash", "config_hash", "scene_hash",
-    "result_hash", "checked", "reproduce",
+    "result_hash", "checked", "reproduce", "row_hash",
 )  # fmt: skip
+NO_TEXT = ("seed", "images", "missing", "checked", "row_hash")  # columns of others than plain text
 COST = "cost_"  # begins the column of a cost; every other column of numbers is a quality
 TIDY = (
     "dataset", "scene", "method", "setting", "options", "seed", "kind", "metric", "value", "device",
     "version", "source", "config_hash", "scene_hash", "checked",
 )  # fmt: skip
-Checked = Literal["photos", "files"]  # what the numbers were compared with: the scene's photos, or nothing
-CHECKED: tuple[Checked, ...] = ("files", "photos")  # the stronger last
+# What was computed again from renders and photos: every metric of pictures, PSNR alone, or nothing.
+Checked = Literal["photos", "psnr", "files"]
+CHECKED: tuple[Checked, ...] = ("files", "psnr", "photos")  # the stronger last
 Key = tuple[str, str, str, str, str, int]
 
 
@@ -60,6 +63,13 @@ class Entry:
     def name(self) -> str:
         return f"{self.method} on {self.scene} with seed {self.seed} ({self.setting})"
 
+    @property
+    def row_hash(self) -> str:
+        """sha256 over the cells of its row: what a hand or a spreadsheet changes there shows."""
+        plain = {k: getattr(self, k) for k in (*FIRST, *LAST) if k != "row_hash"}
+        values = {k: {m: number(v) for m, v in getattr(self, k).items()} for k in ("quality", "cost")}
+        return config_hash(plain | values)
+
 
 def in_order(names: Iterable[str]) -> list[str]:
     """Metrics in the order tables have them, then by name."""
@@ -78,7 +88,7 @@ def wide(entries: Sequence[Entry]) -> tuple[list[str], list[list[Cell]]]:
         row += [e.quality.get(k) for k in quality]
         row += [e.cost.get(k) for k in cost]
         row += [" ".join(e.missing), e.device, e.hardware, e.version, e.source, e.code_hash]
-        rows.append([*row, e.config_hash, e.scene_hash, e.result_hash, e.checked, e.reproduce])
+        rows.append([*row, e.config_hash, e.scene_hash, e.result_hash, e.checked, e.reproduce, e.row_hash])
     return head, rows
 
 
@@ -97,9 +107,12 @@ def from_wide(head: Sequence[str], row: Mapping[str, str], where: str) -> Entry:
     for column in ("seed", "images"):
         if not text[column].isascii() or not text[column].isdigit():
             raise AwError(f"{where}: {column} {text[column][:40]!a} is no count; restore the file")
-    if text["checked"] not in CHECKED:
-        raise AwError(f"{where}: checked is {text['checked'][:40]!a}, neither photos nor files; restore it")
-    names = {k: text[k] for k in (*FIRST, *LAST) if k not in ("seed", "images", "missing", "checked")}
+    checked = next((c for c in CHECKED if c == text["checked"]), None)
+    if checked is None:
+        raise AwError(
+            f"{where}: checked is {text['checked'][:40]!a}, none of {', '.join(CHECKED)}; restore it"
+        )
+    names = {k: text[k] for k in (*FIRST, *LAST) if k not in NO_TEXT}
     return Entry(
         **names,
         seed=int(text["seed"]),
@@ -107,7 +120,7 @@ def from_wide(head: Sequence[str], row: Mapping[str, str], where: str) -> Entry:
         quality={k: v for k, v in numbers.items() if not k.startswith(COST)},
         cost={k.removeprefix(COST): v for k, v in numbers.items() if k.startswith(COST)},
         missing=tuple(text["missing"].split()),
-        checked="photos" if text["checked"] == "photos" else "files",
+        checked=checked,
     )
 
 

@@ -109,7 +109,7 @@ function nameCell(group, width) {
 
 function oneRun(run) {
   const values = DATA.order.filter((k) => Object.hasOwn(run.quality, k)).map((k) => `${measure(k).label} ${shown(valueOf(run, k), measure(k).digits)}`);
-  const checked = run.checked === "photos" ? "metrics computed again from its renders" : "files and hashes checked, the scene was not at hand";
+  const checked = run.checked === "photos" ? "metrics computed again from its renders" : run.checked === "psnr" ? "PSNR computed again from its renders" : "files and hashes checked, the scene was not at hand";
   const code = h("code", {}, run.reproduce);
   return h("div", { class: "run" },
     h("p", {}, h("strong", {}, `${run.scene}, seed ${run.seed}`), `: ${values.join(", ")}`),
@@ -139,7 +139,7 @@ function drawNotes(runs, found, scenes) {
   }
   const machines = unique(runs.map((r) => r.hardware)).sort(byName);
   if (machines.length > 1) notes.push(`Times are of different machines (${machines.join("; ")}) and do not compare across them.`);
-  const files = runs.filter((r) => r.checked !== "photos").length;
+  const files = runs.filter((r) => r.checked === "files").length;
   if (files) notes.push(`${files} of ${runs.length} runs were taken in without their scene at hand: their metrics were not computed again.`);
   $("notes").replaceChildren(...notes.map((n) => h("li", {}, n)));
 }

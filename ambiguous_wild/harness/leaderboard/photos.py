@@ -11,11 +11,18 @@ import numpy as np
 
 from ambiguous_wild.core import AwError, Scene, View
 from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.harness.measures import PARTIAL
+from ambiguous_wild.harness.regions import find_regions
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.metrics import image as image_metrics
+from ambiguous_wild.metrics.flip import flip
 
 TOLERANCE = 1e-6  # the same arithmetic on the same 8-bit pixels; another CPU may round otherwise
+# dB. Which pixels are covered is itself computed: where rounding moves a pixel over the threshold, the mean
+# over thousands of them moves a little.
+REGION_TOLERANCE = {"psnr_covered": 1e-2, "psnr_uncovered": 1e-2}
+FULL_IMAGE = image_metrics.METRICS | {"flip": flip}
 
 
 def check_photos(
@@ -35,10 +42,11 @@ def check_photos(
         rows: per image, name and metrics.
         renders: PNG by image name.
         half: the right half was measured.
-        quick: PSNR alone.
+        quick: PSNR of the whole picture alone.
 
     Raises:
-        AwError: an image left out or added, a photo that was changed, or a number that does not follow.
+        AwError: an image left out or added, a photo that was changed, a number that does not follow, or a
+            render that is the photo itself.
     """
     views = {view.name: view for view in scene.test}
     if set(views) != set(renders):
@@ -47,11 +55,14 @@ def check_photos(
             f"{run} is partial: measured are {len(renders)} images, scene {scene.root} has {len(views)} test "
             f"photos ({shortlist(odd)} in one of them only); a mean over a part is no result"
         )
-    known = ("psnr",) if quick else tuple(image_metrics.METRICS)
+    known = ("psnr",) if quick else tuple(FULL_IMAGE)
     for metric in known:
         lacking = [row["name"] for row in rows if metric not in row]
         if lacking and len(lacking) < len(rows):
             raise AwError(f"{run} is partial: no {metric} of {shortlist(lacking)}, but of the other images")
+    said = {metric for metric in PARTIAL if any(metric in row for row in rows)}
+    regions = None if quick or not said else find_regions(scene)
+    copies = []
     for row in rows:
         name = row["name"]
         render, photo = read_png_rgb(renders[name]), _photo(scene, views[name])
@@ -62,14 +73,46 @@ def check_photos(
             render, photo = (np.ascontiguousarray(picture[:, right]) for picture in (render, photo))
         for metric in known:
             if metric in row:
-                _compare(run, name, metric, row[metric], image_metrics.METRICS[metric](render, photo))
+                _compare(run, name, metric, row[metric], FULL_IMAGE[metric](render, photo))
+        if regions is not None:
+            # A run of before a metric was kept has it of no image; one that has it, has it of all.
+            computed = regions.psnr(name, render, photo)
+            _compare_regions(run, row, {k: v for k, v in computed.items() if k in said})
+        if np.array_equal(render, photo):
+            copies.append(name)
+    if copies:
+        raise AwError(
+            f"{run} shows the test photos themselves: every pixel of {shortlist(copies)} is its photo's, "
+            "which no model renders; render from the model: 'aw bench --overwrite always'"
+        )
 
 
-def _compare(run: Path, name: str, metric: str, said: float | None, computed: float) -> None:
+def _compare_regions(run: Path, row: dict[str, Any], computed: dict[str, float]) -> None:
+    """PSNR on parts of a picture: there where the scene has such pixels, and nowhere else."""
+    name = row["name"]
+    for metric in PARTIAL:
+        if metric in row and metric not in computed:
+            raise AwError(
+                f"{run} was changed: {metric} of {name} is in metrics.json, and its scene has no such pixel "
+                "in that picture; restore the files, or run it again with 'aw bench --overwrite always'"
+            )
+        if metric in computed and metric not in row:
+            raise AwError(
+                f"{run} is partial: no {metric} of {name}, though its scene has such pixels there; restore "
+                "metrics.json, or run it again with 'aw bench --overwrite always'"
+            )
+        if metric in row:
+            tolerance = REGION_TOLERANCE.get(metric, TOLERANCE)
+            _compare(run, name, metric, row[metric], computed[metric], tolerance)
+
+
+def _compare(
+    run: Path, name: str, metric: str, said: float | None, computed: float, tolerance: float = TOLERANCE
+) -> None:
     value = math.nan if said is None else float(said)
     same = (
         value == computed
-        or abs(value - computed) <= TOLERANCE
+        or abs(value - computed) <= tolerance
         or (math.isnan(value) and math.isnan(computed))
     )
     if not same:

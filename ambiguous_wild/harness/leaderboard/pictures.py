@@ -11,10 +11,12 @@ import cv2
 import numpy as np
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.core.config import config_hash
 from ambiguous_wild.harness.leaderboard.board import measured
 from ambiguous_wild.harness.leaderboard.entry import Entry
 from ambiguous_wild.harness.leaderboard.sheet import (
     Cell,
+    number,
     read_csv,
     slug,
     to_csv,
@@ -29,7 +31,7 @@ from ambiguous_wild.io.images import read_png_rgb
 
 INDEX = "index.csv"
 COLUMNS = (
-    "dataset", "scene", "image", "method", "setting", "options", "seed", "psnr", "file", "sha256",
+    "dataset", "scene", "image", "method", "setting", "options", "seed", "psnr", "file", "sha256", "row_hash",
 )  # fmt: skip
 SIDE = 640  # px of the longer side, at most
 QUALITY = 88  # of the JPEG
@@ -71,7 +73,11 @@ def read_index(board: Path) -> list[Row]:
     for at, row in enumerate(rows, 2):
         if row["file"] != _place(row).file:
             raise AwError(f"{path} row {at} names a file that is not its own: restore the index")
-        to_number(row["psnr"], f"{path} row {at}")
+        if row.pop("row_hash") != _row_hash(row, f"{path} row {at}"):
+            raise AwError(
+                f"{path} row {at} was changed by hand, its cells do not hash to its row_hash: "
+                "restore the file from your version control"
+            )
     return rows
 
 
@@ -123,8 +129,15 @@ def _write_index(board: Path, index: Iterable[Row]) -> None:
     for row in sorted(index, key=lambda r: r["file"]):
         seed = int(row["seed"]) if row["seed"] else None
         psnr = to_number(row["psnr"], "psnr")
-        rows.append([*(row[k] for k in COLUMNS[:6]), seed, psnr, row["file"], row["sha256"]])
+        texts = (*(row[k] for k in COLUMNS[:6]), seed, psnr, row["file"], row["sha256"])
+        rows.append([*texts, _row_hash(row, "psnr")])
     write_text(folder_of(board) / INDEX, to_csv(COLUMNS, rows))
+
+
+def _row_hash(row: Row, where: str) -> str:
+    """sha256 over the other cells of a row."""
+    psnr = number(to_number(row["psnr"], where))
+    return config_hash([psnr if k == "psnr" else row[k] for k in COLUMNS[:-1]])
 
 
 def chosen(names: tuple[str, ...], count: int) -> list[str]:

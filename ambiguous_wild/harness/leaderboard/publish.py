@@ -19,7 +19,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.leaderboard import pictures
 from ambiguous_wild.harness.leaderboard.board import files_of, read_board
 from ambiguous_wild.harness.leaderboard.entry import Entry, in_order
-from ambiguous_wild.harness.leaderboard.reported import Printed, read_reported, reported_csv
+from ambiguous_wild.harness.leaderboard.reported import SOURCE, Printed, read_reported, reported_csv
 from ambiguous_wild.harness.leaderboard.sheet import to_number
 from ambiguous_wild.harness.measures import measure
 from ambiguous_wild.io.atomic import atomic_dir, sweep_siblings
@@ -42,15 +42,24 @@ class Published:
     datasets: int
     images: int
     reported: int
+    reported_from: str | None = None  # the folder that was looked into; None: not asked for
 
 
-def publish(board: Path, out: Path, *, reported: bool = False, title: str = "Leaderboard") -> Published:
+def publish(
+    board: Path,
+    out: Path,
+    *,
+    reported: bool = False,
+    reported_from: Path | None = None,
+    title: str = "Leaderboard",
+) -> Published:
     """Write the page; an earlier page in `out` is replaced once the new one is whole.
 
     Args:
         board: folder of the leaderboard.
         out: for index.html, data/*.csv and images/.
-        reported: show what papers print, too.
+        reported: show what papers print, too: BOARD/reported/*.csv.
+        reported_from: show what papers print, too, from this folder.
         title: of the page.
 
     Raises:
@@ -58,13 +67,18 @@ def publish(board: Path, out: Path, *, reported: bool = False, title: str = "Lea
     """
     if not board.is_dir():
         raise AwError(f"no leaderboard {board}: 'aw leaderboard add RUNS --board {board}' makes one")
+    if reported_from is not None and not reported_from.is_dir():
+        raise AwError(
+            f"no folder of reported numbers {reported_from}: give one with *.csv, see docs/audit.md"
+        )
+    source = board / SOURCE if reported and reported_from is None else reported_from
     out = Path(os.path.abspath(out))
     with folder_lock(out, "aw leaderboard publish"):
         _restore(out)
         _check_folder(out)
         sweep_siblings(out)
         entries, index = read_board(board), pictures.read_index(board)
-        printed = read_reported(board) if reported else []
+        printed = read_reported(source) if source is not None else []
         with atomic_dir(out) as folder:
             names = _write_data(board, folder / "data", entries, printed)
             for row in index:
@@ -73,7 +87,13 @@ def publish(board: Path, out: Path, *, reported: bool = False, title: str = "Lea
                 )
             text = page(title, _facts(entries, index, printed, names))
             (folder / "index.html").write_text(text, encoding="utf-8")
-    return Published(len(entries), len({e.dataset for e in entries}), len(index), len(printed))
+    return Published(
+        runs=len(entries),
+        datasets=len({e.dataset for e in entries}),
+        images=len(index),
+        reported=len(printed),
+        reported_from=None if source is None else str(source),
+    )
 
 
 def _restore(out: Path) -> None:

@@ -43,13 +43,12 @@ class Printed:
         return asdict(self)
 
 
-def read_reported(board: Path) -> list[Printed]:
-    """Every number of BOARD/reported/*.csv that says method and scene, in order; none without the folder.
+def read_reported(folder: Path) -> list[Printed]:
+    """Every number of FOLDER/*.csv that says method and scene, in order; none without the folder.
 
     Raises:
         AwError: a file that is unreadable or malformed.
     """
-    folder = board / SOURCE
     if not folder.is_dir() or not any(folder.glob("*.csv")):
         return []
     found = [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+import unicodedata
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash, to_plain
+from ambiguous_wild.harness.leaderboard.sheet import HIDDEN
 
 
 def setting(config: Mapping[str, Any]) -> str:
@@ -44,10 +46,15 @@ def options_hash(config: Mapping[str, Any]) -> str:
     return config_hash(config["options"])[:8] if config["options"] else ""
 
 
-def command(result: Mapping[str, Any], config: Mapping[str, Any]) -> str:
-    """The command that makes the run again, the scene by its name."""
-    if isinstance(result.get("reproduce"), str):
-        return _without_paths(result["reproduce"])
+def command(config: Mapping[str, Any]) -> str:
+    """The command that makes the run again, the scene by its name.
+
+    From the hashed configuration alone: what a result file calls a command is a stranger's text, and whoever
+    reads a board pastes this one into a shell.
+
+    Raises:
+        AwError: it would hold what is not seen: control characters, line breaks, text-direction marks.
+    """
     train, method = config["train"], config["method"]
     words = [
         "aw",
@@ -74,29 +81,21 @@ def command(result: Mapping[str, Any], config: Mapping[str, Any]) -> str:
         if value != usual:
             words += [flag, value]
     words += ["--effects", ",".join(map(str, config.get("effects") or ["none"]))]
-    for key, value in (_changed(config) or {}).items():
+    for key, value in _changed(config).items():
         words += ["--set", f"{method.split('@')[0]}.{key}={value}"]
     words += ["--device", config.get("device", "cpu"), "-o", "runs"]
-    return shlex.join(str(w) for w in words)
+    text = shlex.join(str(w) for w in words)
+    hidden = next((c for c in text if unicodedata.category(c) in HIDDEN), None)
+    if hidden is not None:
+        raise AwError(f"config.yaml holds {hidden!a}, which no command can show: run it again without")
+    return text
 
 
-def _without_paths(text: str) -> str:
-    """The command with scene and plugin by their names: where they lay is nobody else's business."""
-    try:
-        words = shlex.split(text)
-    except ValueError:
-        return text
-    for at, flag in enumerate(words[:-1]):
-        if flag in ("--scene", "--plugin"):
-            words[at + 1] = Path(words[at + 1]).name
-    return shlex.join(words)
-
-
-def _changed(config: Mapping[str, Any]) -> dict[str, str] | None:
-    """Options that are not the method's defaults; None where the defaults are not known here."""
-    usual = _defaults(config["method"]) if not config["source"] else None
+def _changed(config: Mapping[str, Any]) -> dict[str, str]:
+    """Options that are not the method's defaults; of a method in a file, all of them."""
+    usual = {} if config["source"] else _defaults(config["method"])
     if usual is None:
-        return None
+        return {}
     options = _flat(config["options"])
     return {k: _word(v) for k, v in sorted(options.items()) if k not in usual or usual[k] != v}
 
@@ -121,7 +120,10 @@ def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _word(value: Any) -> str:
-    return ",".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
+    """As `--set` reads it."""
+    if isinstance(value, (list, tuple)):
+        return ",".join(map(_word, value))
+    return "none" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def hardware(path: Path, result: Mapping[str, Any]) -> str:

@@ -16,6 +16,7 @@ from ambiguous_wild.core import AwError
 FORMULA = ("=", "+", "-", "@")
 LARGEST = 200_000_000  # bytes
 LONGEST = 200  # characters of a name
+HIDDEN = ("Cc", "Cf", "Cs", "Zl", "Zp")  # Unicode categories of characters that nobody sees
 Cell = str | int | float | None
 
 
@@ -99,7 +100,7 @@ def check_text(kind: str, text: str) -> str:
     Raises:
         AwError: empty, too long, or with control characters or text-direction marks.
     """
-    hidden = next((c for c in text if unicodedata.category(c) in ("Cc", "Cf", "Cs", "Zl", "Zp")), None)
+    hidden = next((c for c in text if unicodedata.category(c) in HIDDEN), None)
     if not text.strip() or len(text) > LONGEST or hidden is not None:
         shown = text if len(text) <= 40 else text[:37] + "..."
         why = "is empty" if not text.strip() else f"holds {hidden!a}" if hidden else "is too long"

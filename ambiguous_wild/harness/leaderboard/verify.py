@@ -17,6 +17,8 @@ from ambiguous_wild.harness.leaderboard.photos import check_photos
 from ambiguous_wild.harness.leaderboard.scenes import Scenes
 from ambiguous_wild.harness.leaderboard.settings import command, hardware, options_hash, setting
 from ambiguous_wild.harness.leaderboard.sheet import check_text
+from ambiguous_wild.harness.leaderboard.values import check_values
+from ambiguous_wild.harness.measures import PARTIAL
 from ambiguous_wild.harness.store import FAILED, MASK_SCORES, RESULT, read_config, read_result
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import read_png_rgb
@@ -25,8 +27,6 @@ from ambiguous_wild.metrics import stats
 PLY = "point_cloud.ply"
 ENVIRONMENT = "env.json"
 RENDERS = Path("renders") / "test"
-# Measured on part of a picture: one without such a pixel has no value, and is no gap in the mean.
-PARTIAL = ("psnr_valid", "psnr_covered", "psnr_uncovered")
 ANEW = "run it again with 'aw bench --overwrite always'"
 
 
@@ -61,16 +61,18 @@ def verify(run: Path, scenes: Scenes, *, quick: bool = False) -> Verified:
     _check_identity(run, result, config)
     renders = _check_files(run, result, ours=not config["source"])
     scene = scenes.find(run, config)
+    check_values(run, result, photos=scene is not None)
     if scene is not None:
         check_photos(run, scene, result["per_image"], renders, half=_half(config), quick=quick)
     dataset = scenes.dataset(run, scene, result["scene_hash"])
     quality, missing = _qualities(run, result)
     cost = {k: float(v) for k, v in result["cost"].items() if isinstance(v, (int, float)) and v == v}
+    words, again = _words(run, config)
     entry = Entry(
         dataset=check_text("dataset", dataset),
         scene=check_text(f"scene name of {run}", result["scene"]),
         method=check_text(f"method name of {run}", result["method"]),
-        setting=setting(config),
+        setting=words,
         options=options_hash(config),
         seed=result["seed"],
         images=len(renders),
@@ -85,8 +87,8 @@ def verify(run: Path, scenes: Scenes, *, quick: bool = False) -> Verified:
         config_hash=result["config_hash"],
         scene_hash=result["scene_hash"],
         result_hash=sha256_file(run / RESULT),
-        checked="files" if scene is None else "photos",
-        reproduce=command(result, config),
+        checked="files" if scene is None else "psnr" if quick else "photos",
+        reproduce=again,
     )
     psnr = {row["name"]: row.get("psnr", math.nan) for row in result["per_image"]}
     return Verified(entry, run, tuple(sorted(renders)), psnr, scene)
@@ -119,6 +121,16 @@ def _config(run: Path) -> dict[str, Any]:
             "nobody can say what was run: restore it, or run again"
         )
     return config
+
+
+def _words(run: Path, config: dict[str, Any]) -> tuple[str, str]:
+    """(setting, command) of a configuration that a stranger wrote."""
+    try:
+        return check_text(f"setting of {run}", setting(config)), command(config)
+    except AwError as error:
+        raise AwError(f"{run}: {error}") from None
+    except (TypeError, ValueError, AttributeError, KeyError) as error:
+        raise AwError(f"{run / 'config.yaml'} is none that 'aw bench' writes ({error}); {ANEW}") from None
 
 
 def _check_identity(run: Path, result: dict[str, Any], config: dict[str, Any]) -> None:

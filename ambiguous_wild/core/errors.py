@@ -38,7 +38,8 @@ def unknown(kind: str, name: str, choices: Iterable[str], hint: str = "") -> AwE
     elif len(known) <= 12:
         tail = "there is: " + ", ".join(known)
     else:
-        tail = f"there are {len(known)}"
+        some = difflib.get_close_matches(name, known, n=3, cutoff=0.0)
+        tail = f"the nearest of {len(known)}: {', '.join(some)}"
     return AwError(f"unknown {kind} {name!r}: {tail}" + (f" ({hint})" if hint else ""))
 
 

@@ -46,7 +46,8 @@ def reproduce(cell: Cell) -> str:
     """
     method, train = cell.method, cell.train
     name = method.name if "=" in method.name else _base(method).name
-    words = ["aw", "bench", "--method", name, "--scene", str(cell.scene.root.resolve())]
+    given = method.given_as or name
+    words = ["aw", "bench", "--method", given, "--scene", str(cell.scene.root.resolve())]
     words += ["--seed", str(train.seed), *_length(train), "--device", cell.device.partition(":")[0]]
     words += ["--resolution", train.resolution, "--effects", ",".join(cell.chosen.effects) or "none"]
     factor = cell.scene.info.get("loaded_factor")
@@ -55,8 +56,8 @@ def reproduce(cell: Cell) -> str:
     words += ["--protocol", cell.protocol] if cell.protocol != "full" else []
     for setting in _settings(method, name, cell.options):
         words += ["--set", setting]
-    plugin = _plugin(method)
-    words += ["--plugin", str(plugin)] if plugin is not None else []
+    for plugin in _plugins(method):
+        words += ["--plugin", str(plugin)]
     return shlex.join(words)
 
 
@@ -97,8 +98,16 @@ def _text(value: Any) -> str:
     return "none" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
 
 
+def _plugins(method: MethodEntry) -> list[Path]:
+    """The files given as --plugin, for a method that came from one, or a graft of such methods."""
+    known = all_methods()
+    members = [known[name] for _, name in method.places if name in known] or [method]
+    # a reference is no plugin: its file need not call register
+    found = [_plugin(member) for member in members if not member.given_as]
+    return [path for path in dict.fromkeys(found) if path is not None]
+
+
 def _plugin(method: MethodEntry) -> Path | None:
-    """The file given as --plugin, for a method that came from one."""
     module = sys.modules.get(getattr(method.recipe, "__module__", "") or "")
     if module is None or not module.__name__.startswith("aw_plugin_") or module.__file__ is None:
         return None

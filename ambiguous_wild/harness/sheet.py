@@ -10,6 +10,7 @@ import numpy as np
 
 from ambiguous_wild.core import AwError, Scene, View
 from ambiguous_wild.harness.store import Runs, read_config
+from ambiguous_wild.io.atomic import atomic_path
 from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.metrics.image import psnr
@@ -31,7 +32,7 @@ def write_sheet(runs: Runs, path: Path, *, scene: str | None = None, views: int 
 
     Args:
         runs: what `read_runs` found.
-        path: PNG to write.
+        path: PNG to write, or JPG by its ending.
         scene: its name; None where the runs are of one scene only.
         views: rows of each kind.
 
@@ -54,8 +55,19 @@ def write_sheet(runs: Runs, path: Path, *, scene: str | None = None, views: int 
     source = _scene_of(next(iter(folders.values())))
     rows = [_test_row(view, folders) for view in _spread(source.test, views)]
     rows += [_train_row(view, folders) for view in _spread(source.train, views)]
-    write_png(path, _stack(rows))
+    _write(path, _stack(rows))
     return len(folders)
+
+
+def _write(path: Path, image: np.ndarray) -> None:  # [H, W, 3] uint8
+    if path.suffix.lower() != ".jpg":
+        write_png(path, image)
+        return
+    done, data = cv2.imencode(".jpg", np.ascontiguousarray(image[:, :, ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 92])
+    if not done:  # a side above 65500 px
+        raise AwError(f"{path}: {list(image.shape[:2])} px are too many for a JPG; write a .png")
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data.tobytes())
 
 
 def _scene_of(folder: Path) -> Scene:

@@ -185,15 +185,18 @@ def _method_and_scene(run: Path) -> tuple[str, str]:
 
 
 def _refuse_duplicates(results: list[tuple[Path, dict[str, Any]]]) -> None:
-    seen: dict[tuple[str, str, int], Path] = {}
+    seen: dict[tuple[str, str, int], tuple[Path, str]] = {}
     for run, result in results:
         key = (result["scene"], result["method"], result["seed"])
         if key in seen:
+            other, settings = seen[key]
+            # of the same settings they are copies, which `aw cost` refuses too
+            both = " ('aw cost' takes both)" if settings != result["config_hash"] else ""
             raise AwError(
-                f"two results for method {key[1]!r} on scene {key[0]!r} with seed {key[2]}: {seen[key]} and "
-                f"{run}; give one of their folders, or move one of them elsewhere ('aw cost' takes both)"
+                f"two results for method {key[1]!r} on scene {key[0]!r} with seed {key[2]}: {other} and "
+                f"{run}; give one of their folders, or move one of them elsewhere{both}"
             )
-        seen[key] = run
+        seen[key] = run, result["config_hash"]
 
 
 def _key(result: dict[str, Any]) -> dict[str, Any]:

@@ -144,7 +144,7 @@ def _columns(runs: Runs, metrics: Sequence[str]) -> tuple[Measure, ...]:
         choices = set(MEASURES) | set(runs.images["metric"]) | of_runs
         for name in metrics:
             if name not in choices:
-                raise unknown("metric", name, choices)
+                raise unknown("metric", name, choices, "'aw table RUNS' shows what was measured")
         listed = [measure(name) for name in dict.fromkeys(metrics)]
         return tuple(replace(m, per_image=False) if m.key in of_runs else m for m in listed)
     present = set(images["metric"]) | set(ALWAYS)

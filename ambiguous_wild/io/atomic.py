@@ -20,12 +20,18 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
     """Yield a temporary path beside `path` with the same suffix; rename it over `path` on success.
 
     On an error the temporary file is removed and `path` stays as it was.
+
+    Raises:
+        OSError: it cannot be written there; names `path`, not the temporary file.
     """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(
-        prefix=f".{target.stem}.", suffix=f".tmp{target.suffix}", dir=target.parent
-    )
+    try:
+        handle, name = tempfile.mkstemp(
+            prefix=f".{target.stem}.", suffix=f".tmp{target.suffix}", dir=target.parent
+        )
+    except OSError as error:
+        raise _named(error, target) from None
     os.close(handle)
     temporary = Path(name)
     try:
@@ -37,9 +43,16 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         os.umask(umask)
         os.chmod(temporary, 0o666 & ~umask)
         os.replace(temporary, target)
-    except BaseException:
+    except BaseException as error:
         temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename in (name, temporary):
+            raise _named(error, target) from error
         raise
+
+
+def _named(error: OSError, target: Path) -> OSError:
+    """The same error about the file that was asked for; OSError makes itself the fitting subclass."""
+    return OSError(error.errno, error.strerror, str(target))
 
 
 @contextmanager

@@ -34,13 +34,19 @@ def graft_name(host: str, donors: Mapping[str, str | None]) -> str:
 
     Donors of places that the host's name already fills are replaced.
     """
-    if not any(donors.values()) and is_reference(host):
-        return host  # an @ in a path is part of the path
-    base, _, rest = host.partition("@")
+    base, rest = split_graft(host)
     filled = dict(_pairs(host)) if rest else {}
     filled |= {place: donor for place, donor in donors.items() if donor}
     text = ",".join(f"{place}={filled[place]}" for place in PLACES if place in filled)
     return f"{base}@{text}" if text else base
+
+
+def split_graft(name: str) -> tuple[str, str]:
+    """(host, what stands after its @); a host may be a reference, whose path may hold an @ too."""
+    if is_reference(name) or "@" not in name:
+        return name, ""
+    host, _, rest = name.rpartition("@")
+    return host, rest
 
 
 def grafted(name: str) -> MethodEntry:
@@ -50,7 +56,7 @@ def grafted(name: str) -> MethodEntry:
         AwError: unknown host, place or donor, or a place filled twice.
     """
     pairs = _pairs(name)
-    host = get_method(name.partition("@")[0])
+    host = get_method(split_graft(name)[0])
     donors = {place: _donor(place, donor) for place, donor in pairs}
     entries = {"host": host} | donors
     fields = [
@@ -68,6 +74,7 @@ def grafted(name: str) -> MethodEntry:
         source_hash=hashlib.sha256("".join(hashes).encode()).hexdigest() if any(hashes) else "",
         places=tuple((place, entry.name) for place, entry in entries.items())
         + tuple((place, donor) for place, donor in pairs if donor in ALIASES),
+        given_as=graft_name(host.given_as, dict(pairs)) if host.given_as else "",
     )
 
 
@@ -119,9 +126,9 @@ def idle_regulariser(method: MethodEntry, options: Any) -> str:
 
 def _pairs(name: str) -> list[tuple[str, str]]:
     """(place, donor) as written after the @."""
-    host, at, rest = name.partition("@")
+    host, rest = split_graft(name)
     pairs: list[tuple[str, str]] = []
-    for text in rest.split(",") if at else []:
+    for text in rest.split(",") if host != name else []:
         place, equals, donor = (part.strip() for part in text.partition("="))
         if not equals or not donor:
             raise AwError(f"method {name!r}: write {host}@mask=METHOD; places are {', '.join(PLACES)}")

@@ -43,8 +43,18 @@ def with_file(name: str, path: Path) -> str:
     return f"{path}:{name.rpartition(':')[2]}"
 
 
-def load_reference(name: str) -> MethodEntry:
+def absolute(name: str) -> str:
+    """The same reference, whatever folder it is read in."""
+    path = reference_file(name)
+    return name if path is None else with_file(name, path.resolve())
+
+
+def load_reference(name: str, *, given_as: str = "") -> MethodEntry:
     """The method behind a reference; registered, so that its name alone finds it from now on.
+
+    Args:
+        name: the reference.
+        given_as: what was typed, where `name` is a copy of that.
 
     Raises:
         AwError: no such file, nothing fit in it, or its name is taken by another method.
@@ -59,7 +69,7 @@ def load_reference(name: str) -> MethodEntry:
         entry = nerfbaselines_entry(name.removeprefix(NERFBASELINES))
     else:
         entry = _recipe(name)
-    return _registered(entry, name)
+    return _registered(dataclasses.replace(entry, given_as=absolute(given_as or name)), name)
 
 
 def _registered(entry: MethodEntry, name: str) -> MethodEntry:

@@ -52,6 +52,8 @@ class MethodEntry:
     auto_effects: tuple[str, ...] = ()
     # somebody else's program, run as it is instead of parts on our trainer, see methods/external/
     program: Program | None = None
+    # how --method names it, where that says where it lies: with the absolute path, see references.py
+    given_as: str = ""
 
     def options(self) -> Any:
         """The method's options at their defaults (a frozen dataclass instance)."""
@@ -69,8 +71,18 @@ class MethodEntry:
         return tuple(resolve(self.ablations))
 
     def build(self, options: Any) -> Parts:
-        """The parts that fill the training loop."""
-        return resolve(self.recipe)(options)
+        """The parts that fill the training loop.
+
+        Raises:
+            AwError: the recipe returned something else.
+        """
+        from ambiguous_wild.splat.parts import Parts
+
+        made = resolve(self.recipe)(options)
+        if not isinstance(made, Parts):
+            what = "None" if made is None else type(made).__name__
+            raise AwError(f"{self.name} returned {what}, it must return Parts (see docs/add-a-method.md)")
+        return made
 
 
 @dataclass(frozen=True)

@@ -49,6 +49,19 @@ def test_csv_is_clean_and_notes_go_to_standard_error(tmp_path: Path) -> None:
     assert f"aw table {tmp_path} --format csv --metric psnr --scene yard" in err
 
 
+def test_an_unknown_metric_names_others_and_a_sheet_is_a_picture(tmp_path: Path) -> None:
+    runs = save(tmp_path / "runs", fake_result("3dgs"))
+    sheet = tmp_path / "sheet.txt"
+    for words, expected in (
+        (["--metric", "nope"], "unknown metric 'nope': the nearest of "),
+        (["--metric", "nope"], "'aw table RUNS' shows what was measured"),
+        (["--sheet", str(sheet)], "ends in .png or .jpg"),
+    ):
+        error = CliRunner().invoke(command, [str(runs), *words]).exception
+        assert isinstance(error, AwError) and expected in str(error)
+    assert not sheet.exists()
+
+
 def test_errors_say_what_to_do(tmp_path: Path) -> None:
     runner = CliRunner()
     for words, expected in (

@@ -56,6 +56,64 @@ def test_the_command_of_a_result_makes_the_same_cell(
     assert typed(reproduce(cell)).identity == cell.identity
 
 
+RECIPE = """
+from dataclasses import dataclass
+from ambiguous_wild.methods import MethodEntry, register
+from ambiguous_wild.splat.parts import Parts
+@dataclass(frozen=True)
+class Config:
+    sh_degree: int = 2
+def build(config: Config):
+    return Parts(sh_degree=config.sh_degree)
+"""
+PROGRAM = """
+name: copycat
+train: train {scene} {strength}
+renders: "{output}/{stem}.png"
+options: {strength: 1}
+"""
+
+
+@pytest.mark.parametrize(
+    ("method", "setting"),
+    [
+        ("my@work/trimmed.py:build", "build.sh_degree=1"),
+        ("my@work/trimmed.py:build@mask=refinesplat", "refinesplat.lambda_cr=0.5"),
+        ("external:my@work/ext.yaml", "copycat.strength=3"),
+        ("nerfbaselines:splatfacto", "nerfbaselines-splatfacto.seed_key=seed"),
+    ],
+)
+def test_a_method_given_by_reference_is_found_again_from_anywhere(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str, setting: str
+) -> None:
+    monkeypatch.setattr(registry, "_registered", {})
+    monkeypatch.setenv("AW_NERFBASELINES", "true")
+    folder = tmp_path / "my@work"
+    folder.mkdir()
+    (folder / "trimmed.py").write_text(RECIPE)
+    (folder / "ext.yaml").write_text(PROGRAM)
+    monkeypatch.chdir(tmp_path)
+    (cell,) = plan_cells([method], [scene], [0], TrainConfig(iterations=9), settings=[setting])
+    text = reproduce(cell)
+    monkeypatch.setattr(registry, "_registered", {})  # another process
+    monkeypatch.chdir("/")
+    assert typed(text).identity == cell.identity
+    assert "--plugin" not in text
+
+
+def test_a_graft_names_the_plugin_of_its_host(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(registry, "_registered", {})
+    plugin = tmp_path / "mine.py"
+    plugin.write_text(f"{RECIPE}\nregister(MethodEntry('mine', 'of my own', build, config=Config))\n")
+    load_plugin(plugin)
+    (cell,) = plan_cells(["mine@mask=truth"], [scene], [0], TrainConfig(iterations=9))
+    words = shlex.split(reproduce(cell))
+    assert words[words.index("--plugin") + 1 :] == [str(plugin)]
+    assert typed(shlex.join(words)).identity == cell.identity
+
+
 def test_a_variant_of_an_ablation_is_its_method_with_other_settings(scene: Path) -> None:
     (cell,) = plan_cells(["refinesplat"], [scene], [0], TrainConfig(iterations=9))
     options = dataclasses.replace(cell.options, lambda_cr=0.25)

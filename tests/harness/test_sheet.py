@@ -32,6 +32,11 @@ def test_a_column_for_the_photo_and_each_method_a_row_for_each_view(runs, tmp_pa
     assert np.array_equal(sheet[BAR : BAR + HEIGHT, WIDTH + GAP : 2 * WIDTH + GAP], render)
 
 
+def test_a_sheet_called_jpg_is_one(runs, tmp_path):
+    write_sheet(read_runs(runs), tmp_path / "sheet.jpg")
+    assert (tmp_path / "sheet.jpg").read_bytes().startswith(b"\xff\xd8\xff")
+
+
 def test_a_scene_that_is_not_there_is_named(runs, tmp_path):
     with pytest.raises(AwError, match="no finished run"):
         write_sheet(read_runs(runs), tmp_path / "sheet.png", scene="elsewhere")

@@ -173,7 +173,11 @@ def test_nothing_there_is_an_error_that_says_what_to_do(tmp_path: Path) -> None:
 def test_two_results_for_one_cell_are_refused(tmp_path: Path) -> None:
     write_result(tmp_path / "one" / "metrics.json", fake_result("3dgs"))
     write_result(tmp_path / "two" / "metrics.json", fake_result("3dgs"))
-    with pytest.raises(AwError, match="two results for method '3dgs' on scene 'yard' with seed 0"):
+    with pytest.raises(AwError, match="two results for method '3dgs' on scene 'yard' with seed 0") as copies:
+        read_runs(tmp_path)
+    assert "aw cost" not in str(copies.value)  # refuses copies too
+    write_result(tmp_path / "two" / "metrics.json", fake_result("3dgs") | {"config_hash": "other"})
+    with pytest.raises(AwError, match="'aw cost' takes both"):
         read_runs(tmp_path)
 
 

@@ -22,6 +22,20 @@ def test_a_failing_write_leaves_the_old_file(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
 
 
+@pytest.mark.parametrize("late", [False, True])
+def test_an_error_names_the_file_that_was_asked_for(tmp_path, monkeypatch, late):
+    target = tmp_path / "x.csv"
+
+    def full(*names, **_):
+        raise PermissionError(13, "Permission denied", str(names[0]) if late else str(tmp_path / ".x.tmp"))
+
+    monkeypatch.setattr(*("os.replace", full) if late else ("tempfile.mkstemp", full))
+    with pytest.raises(PermissionError) as found:
+        write_text(target, "new")
+    assert (found.value.filename, found.value.strerror) == (str(target), "Permission denied")
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_failing_folder_leaves_the_old_folder(tmp_path):
     target = tmp_path / "d"
     with atomic_dir(target) as temporary:

@@ -31,6 +31,12 @@ def untyped(config):
 def wrong(config: "Nowhere"):
     return Parts()
 
+def three():
+    return 3
+
+def nothing():
+    Parts()
+
 entry = MethodEntry("its-own-name", "made by hand", tuned, config=Config)
 number = 3
 '''
@@ -75,6 +81,21 @@ def test_it_is_a_host_of_grafts(recipe):
     entry = registry.get_method(f"{recipe}:plain@mask=truth")
     assert entry.name == "plain@mask=truth"
     assert graft_name(f"{recipe}:plain", {"mask": "truth"}) == f"{recipe}:plain@mask=truth"
+
+
+def test_an_at_in_a_path_is_no_graft(tmp_path):
+    (tmp_path / "a@b").mkdir()
+    (tmp_path / "a@b" / "recipe.py").write_text(CODE)
+    host = f"{tmp_path}/a@b/recipe.py:plain"
+    assert graft_name(host, {"mask": "truth"}) == f"{host}@mask=truth"
+    assert registry.get_method(f"{host}@mask=truth").name == "plain@mask=truth"
+
+
+@pytest.mark.parametrize(("name", "what"), [("three", "int"), ("nothing", "None")])
+def test_what_returns_no_parts_is_said_so(recipe, name, what):
+    entry = registry.get_method(f"{recipe}:{name}")
+    with pytest.raises(AwError, match=f"{name} returned {what}, it must return Parts"):
+        entry.build(entry.options())
 
 
 @pytest.mark.parametrize(

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.harness.cost.curves import Curve, Summary, scenes_of, summary
 from ambiguous_wild.harness.cost.read import CostRun
 
@@ -37,6 +38,7 @@ class Reach:
     reached: int  # runs that do
     runs: int
     bound: bool  # some had reached it by their first probe: the time is an upper bound
+    missing: str = ""  # why there is no mean, whatever the runs reached: a scene without a run, or no probes
 
 
 def times_to_reach(
@@ -76,7 +78,9 @@ def _soonest(rows: Sequence[Reach]) -> Reach:
     there = [row for row in rows if math.isfinite(row.minutes.mean)]
     if there:
         return min(there, key=lambda row: row.minutes.mean)
-    return max(reversed(rows), key=lambda row: (row.runs > 0, row.reached / max(row.runs, 1)))
+    return max(
+        reversed(rows), key=lambda row: (row.runs > 0, not row.missing, row.reached / max(row.runs, 1))
+    )
 
 
 def first_time(run: CostRun, psnr: float) -> tuple[float, bool]:
@@ -112,14 +116,30 @@ def _reach(curve: Curve, target: Target, scene: str | None, level: dict[str, flo
     def minutes(run: CostRun) -> float:
         return (found[id(run)][0] + (run.setup_s if setup else 0.0)) / 60.0
 
+    missing, mean = _missing(curve, level, runs), Summary()
+    if not missing:
+        mean = summary(curve, tuple(level), minutes)
+        if any(run.blind for run in runs):
+            mean = Summary(mean.mean)  # of bounds: how far they lie apart says nothing
     return Reach(
         scene,
         curve.name,
         curve.length.text,
         target.text,
         next(iter(level.values())) if len(level) == 1 or not target.relative else math.nan,
-        summary(curve, tuple(level), minutes),
+        mean,
         sum(math.isfinite(at) for at, _ in found.values()),
         len(runs),
         any(early for _, early in found.values()),
+        missing,
     )
+
+
+def _missing(curve: Curve, scenes: Iterable[str], runs: Sequence[CostRun]) -> str:
+    """Why there is no mean of these runs; empty where there may be one."""
+    gone = [scene for scene in scenes if not curve.on(scene)]
+    if gone:
+        return f"no run on {', '.join(gone)}"
+    blind = [run.blind for run in runs if run.blind]
+    # The end of a run is a bound on when it got there, and no mean is taken of bounds and times.
+    return shortlist(blind, 2) if blind and len(blind) < len(runs) else ""

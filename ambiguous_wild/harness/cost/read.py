@@ -61,6 +61,7 @@ class CostRun:
     numbers: dict[str, float]  # see NUMBERS; NaN where not measured
     points: tuple[tuple[float, float], ...]  # (seconds of training, PSNR in dB), in order of time
     error: str = ""
+    blind: str = ""  # why of the way there only the end is known; empty: it was probed, or failed
 
     @property
     def base(self) -> str:
@@ -143,6 +144,8 @@ def _run(folder: Path, result: dict[str, Any]) -> CostRun:
         "code": [config.get("source"), result["version"]],
         "images": sorted(images),
     }
+    points, damage = _points(folder / "timeline.csv", train_s, psnr)
+    unprobed = f"no probes in {folder / 'timeline.csv'}" if len(points) < 2 else ""
     return CostRun(
         folder=folder,
         method=result["method"],
@@ -158,8 +161,9 @@ def _run(folder: Path, result: dict[str, Any]) -> CostRun:
         train_s=train_s,
         setup_s=_number(cost.get("setup_s")),
         numbers={name: _number(cost.get(name)) for name in NUMBERS},
-        points=_points(folder / "timeline.csv", train_s, psnr),
+        points=points,
         error=result["error"] or "",
+        blind="" if result["error"] else damage or unprobed,
     )
 
 
@@ -180,21 +184,27 @@ def _asked(folder: Path) -> str:
     return said if said in ("auto", "all") else ""
 
 
-def _points(path: Path, train_s: float, psnr: float) -> tuple[tuple[float, float], ...]:
-    """The probes of a timeline, and the measured PSNR as the last of them."""
-    points = []
+def _points(path: Path, train_s: float, psnr: float) -> tuple[tuple[tuple[float, float], ...], str]:
+    """The probes of a timeline, with the measured PSNR as the last of them; and what is wrong with it."""
+    points, damage = [], ""
     try:
         with open(path, newline="", encoding="utf-8") as f:
-            for row in csv.DictReader(f):
+            table = csv.DictReader(f)
+            columns = table.fieldnames or ()
+            if absent := [name for name in ("wall_s", "psnr_probe") if name not in columns]:
+                raise ValueError(f"no column {' and '.join(absent)}")
+            for row in table:
                 at, value = _number(row.get("wall_s")), _number(row.get("psnr_probe"))
                 if math.isfinite(at) and math.isfinite(value):
                     points.append((at, value))
-    except (OSError, ValueError, csv.Error):
+    except OSError:  # an external program leaves none
         points = []
+    except (ValueError, csv.Error) as error:
+        points, damage = [], f"{path} is damaged ({error})"
     if math.isfinite(train_s) and math.isfinite(psnr):
         # The timeline rounds to milliseconds; the last probe is the result, measured before it was saved.
         points = [p for p in points if p[0] < train_s - 0.002] + [(train_s, psnr)]
-    return tuple(sorted(points))
+    return tuple(sorted(points)), damage
 
 
 def _refuse_twice(runs: Iterable[CostRun]) -> None:

@@ -15,7 +15,7 @@ from ambiguous_wild.harness.cost.curves import Curve, Summary, curves_of
 from ambiguous_wild.harness.cost.front import Point, points
 from ambiguous_wild.harness.cost.pairs import Change, changes
 from ambiguous_wild.harness.cost.reach import Reach, times_to_reach
-from ambiguous_wild.harness.cost.read import Found
+from ambiguous_wild.harness.cost.read import CostRun, Found
 from ambiguous_wild.harness.render_tables import csv_text
 from ambiguous_wild.io.atomic import write_json, write_text
 
@@ -71,12 +71,23 @@ def _gaps(curves: Sequence[Curve], scenes: Sequence[str]) -> list[str]:
                 f"no run: {curve.name}, {curve.length.text}, on {', '.join(gone)}; its means over scenes are "
                 "missing"
             )
-    blind = sorted(
-        {run.method for curve in curves for run in curve.runs if not run.error and len(run.points) < 2}
-    )
-    if blind:
+    return lines + _blind([run for curve in curves for run in curve.runs if not run.error])
+
+
+def _blind(runs: Sequence[CostRun]) -> list[str]:
+    """Which runs were not probed: methods of which none was by their name, else each run."""
+    seen = {run.method for run in runs if not run.blind}
+    never = sorted({run.method for run in runs} - seen)
+    lines = [
+        f"{run.blind} ({run.method} on {run.scene}, seed {run.seed}): only its end is known, so there is no "
+        "mean time over it and runs with probes"
+        for run in runs
+        if run.blind and run.method in seen
+    ]
+    lines += [run.blind for run in runs if run.method in never and "damaged" in run.blind]
+    if never:
         lines.append(
-            f"no probes in the timelines of {', '.join(blind)}: of the way to a PSNR only the end is known"
+            f"no probes in the timelines of {', '.join(never)}: of the way to a PSNR only the end is known"
         )
     return lines
 
@@ -142,7 +153,11 @@ def _reach_row(r: Reach) -> dict[str, Any]:
         "target": r.target,
         "psnr": r.psnr,
     }
-    return row | _both("minutes", r.minutes) | {"upper_bound": r.bound, "reached": r.reached, "runs": r.runs}
+    return (
+        row
+        | _both("minutes", r.minutes)
+        | {"upper_bound": r.bound, "reached": r.reached, "runs": r.runs, "missing": r.missing}
+    )
 
 
 def _change_row(c: Change) -> dict[str, Any]:

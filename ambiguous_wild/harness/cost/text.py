@@ -112,9 +112,11 @@ def _reached(scene: str | None, rows: Sequence[Reach], report: Report) -> Listin
 def _when(row: Reach, unit: Unit, several: bool) -> str:
     if not row.runs:
         return "no run"
+    if row.missing:  # the reason stands below the tables
+        return MISSING
     if row.reached < row.runs:
         return "never" if not row.reached else f"{row.reached} of {row.runs} runs"
-    if math.isnan(row.minutes.mean):  # a scene without a run
+    if math.isnan(row.minutes.mean):
         return MISSING
     text = ("≤ " if row.bound else "") + number(unit.of(row.minutes), unit.digits)
     return f"{text} (in {row.length})" if several else text

@@ -26,6 +26,7 @@ from ambiguous_wild.harness.run import FAILED, RESULT, error_line, failed_result
 from ambiguous_wild.harness.store import write_result
 from ambiguous_wild.io.lock import Busy, folder_lock, patient_lock
 from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.methods.graft import split_graft
 from ambiguous_wild.methods.references import load_reference, reference_file, with_file
 from ambiguous_wild.methods.registry import get_method, load_plugin
 from ambiguous_wild.splat.trainer import TrainConfig
@@ -88,7 +89,7 @@ def read_sources(plugins: Sequence[Path], methods: Sequence[str]) -> tuple[Sourc
     sources = [_source(str(path), True, path) for path in plugins]
     for name in methods:
         # A graft may have a reference as its host.
-        host = name if reference_file(name) else name.partition("@")[0]
+        host, _ = split_graft(name)
         file = reference_file(host)
         if file is not None:
             sources.append(_source(host, False, file))
@@ -210,7 +211,7 @@ def _load(source: Source) -> None:
     if source.plugin:
         load_plugin(path)
     else:
-        load_reference(with_file(source.text, path))
+        load_reference(with_file(source.text, path), given_as=with_file(source.text, Path(source.path)))
 
 
 @functools.cache

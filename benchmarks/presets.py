@@ -24,20 +24,13 @@ from ambiguous_wild.io.atomic import write_json, write_text
 from ambiguous_wild.simulate.presets import PRESETS
 
 RESULTS = Path(__file__).parent / "results" / "presets"
-# what a preset is designed for -> lines of the plan, any of which answers it
-ANSWERS = {
-    "masks": ("masks",),
-    "colour per photo": ("affine exposure", "appearance embedding"),
-    "antialiasing": ("antialiasing",),
-    "SH degree 3": ("SH degree",),
-    "poses": ("pose refinement",),
-}
-DESIGNED = {
-    "masks": ("masks",),
-    "colour per photo": ("exposure", "appearance"),
-    "antialiasing": ("antialiasing",),
-    "SH degree 3": ("sh",),
-    "poses": ("pose",),
+# per question: what a preset is designed for, and the lines of the plan, any of which answers it
+QUESTIONS = {
+    "masks": ("masks", ("masks",)),
+    "colour per photo": ("appearance", ("affine exposure", "appearance embedding")),
+    "antialiasing": ("antialiasing", ("antialiasing",)),
+    "SH degree 3": ("sh", ("SH degree",)),
+    "poses": ("pose", ("pose refinement",)),
 }
 
 
@@ -102,10 +95,10 @@ def scores(facts: dict[str, Any]) -> dict[str, Any]:
 def decided(row: dict[str, Any]) -> dict[str, tuple[bool, str]]:
     """Per question: whether the preset was designed for it, and "on", "off" or "unknown"."""
     table = {}
-    for name, lines in ANSWERS.items():
+    for name, (effect, lines) in QUESTIONS.items():
         answers = [row["plan"][line][1] for line in lines if line in row["plan"]]
         told = "on" if "on" in answers else "unknown" if "unknown" in answers else "off"
-        table[name] = (bool(set(DESIGNED[name]) & set(row["wanted"])), told)
+        table[name] = (effect in row["wanted"], told)
     return table
 
 
@@ -120,7 +113,7 @@ def to_markdown(data: dict[str, Any]) -> str:
         "| preset | placed | 3dgs, dB | designed | reported | colour | cosine | covers | plan: on | wrong |",
         "|---|---:|---:|---|---|---:|---:|---:|---|---|",
     ]
-    confusion = {name: {"has, on": 0, "has, off": 0, "lacks, on": 0, "lacks, off": 0} for name in ANSWERS}
+    confusion = {name: {"has, on": 0, "has, off": 0, "lacks, on": 0, "lacks, off": 0} for name in QUESTIONS}
     for row in rows:
         if "error" in row:
             lines.append(f"| {row['preset']} | {row['error']} |" + " |" * 8)

@@ -55,10 +55,10 @@ def command(
     from ambiguous_wild.harness.cost.text import to_text
     from ambiguous_wild.io.atomic import check_output
 
-    check_output(output / "cost.json")
     found = read_cost_runs(runs, scenes=scenes)
     made_by = command_line(runs, output, targets, scenes, with_setup)
     report = cost_report(found, targets=targets, setup=with_setup, made_by=made_by)
+    check_output(output / "cost.json")  # not before: it makes the folder, and there may be nothing to write
     written = write_report(report, output)
     if plots:
         from ambiguous_wild.harness.cost.plots import draw_all

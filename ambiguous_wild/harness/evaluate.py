@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -109,7 +109,22 @@ def _fitted(trainer: Trainer, test: TestPhoto) -> torch.Tensor:
 
 
 def write_masks(trainer: Trainer, folder: Path) -> dict[str, Any] | None:
-    """Write every train view's keep map (white = keep) and score it where the truth is known.
+    """Write every train view's keep map and score it, see `write_keeps`."""
+
+    def keeps() -> Iterator[tuple[View, np.ndarray]]:
+        for index, view in enumerate(trainer.data.scene.train):
+            step = trainer.make_step(max(trainer.iteration, 1), index, divisor=1)
+            keep = trainer.combine_user_keep(step, trainer.parts.mask.predict(step))
+            if keep is not None:
+                yield view, (keep > 0.5).cpu().numpy()
+
+    return write_keeps(trainer.data.scene, keeps(), folder)
+
+
+def write_keeps(
+    scene: Scene, keeps: Iterable[tuple[View, np.ndarray]], folder: Path
+) -> dict[str, Any] | None:
+    """Write keep maps [H, W] bool of train views (white = keep) and score them where the truth is known.
 
     Returns:
         IoU, precision and recall of the distractor pixels, counted over all photos together (a photo
@@ -117,18 +132,13 @@ def write_masks(trainer: Trainer, folder: Path) -> dict[str, Any] | None:
     """
     counts = []
     with atomic_dir(folder) as temporary:
-        for index, view in enumerate(trainer.data.scene.train):
-            step = trainer.make_step(max(trainer.iteration, 1), index, divisor=1)
-            keep = trainer.combine_user_keep(step, trainer.parts.mask.predict(step))
-            if keep is None:
-                continue
-            binary = (keep > 0.5).cpu().numpy()
+        for view, keep in keeps:
             path = temporary / Path(view.name).with_suffix(".png")
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_png(path, binary.astype(np.uint8) * 255)
-            truth = true_distractor(trainer.data.scene, view)
+            write_png(path, keep.astype(np.uint8) * 255)
+            truth = true_distractor(scene, view)
             if truth is not None:
-                counts.append(mask_metrics.confusion(binary, ~truth))
+                counts.append(mask_metrics.confusion(keep, ~truth))
     if not counts:
         return None
     total = mask_metrics.pooled(counts)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,11 +17,10 @@ from ambiguous_wild.core import AwError, Camera, Scene, View
 from ambiguous_wild.harness import evaluate
 from ambiguous_wild.harness.cell import Cell
 from ambiguous_wild.harness.result import result_of
-from ambiguous_wild.io.atomic import atomic_dir, atomic_path
-from ambiguous_wild.io.images import image_size, read_gray, read_png_rgb, write_png
+from ambiguous_wild.io.atomic import atomic_path
+from ambiguous_wild.io.images import image_size, read_gray, read_png_rgb
 from ambiguous_wild.io.ply import splat_count
 from ambiguous_wild.methods.external.program import LOGS, WORK, Produced, Task
-from ambiguous_wild.metrics import masks as mask_metrics
 from ambiguous_wild.splat.trainer import Trainer
 
 
@@ -116,23 +115,14 @@ def _masks(scene: Scene, masks: Mapping[str, Path], folder: Path) -> dict[str, A
     """Copy the keep maps of the train views and score them where the truth is known."""
     if not masks:
         return None
-    counts = []
-    with atomic_dir(folder) as temporary:
+
+    def keeps() -> Iterator[tuple[View, np.ndarray]]:
         for view in scene.train:
-            if view.name not in masks:
-                continue
-            _check_picture(view, masks[view.name], "mask")
-            keep = read_gray(masks[view.name]) >= 128
-            path = temporary / Path(view.name).with_suffix(".png")
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_png(path, keep.astype(np.uint8) * 255)
-            truth = evaluate.true_distractor(scene, view)
-            if truth is not None:
-                counts.append(mask_metrics.confusion(keep, ~truth))
-    if not counts:
-        return None
-    total = mask_metrics.pooled(counts)
-    return {"iou": total.iou, "precision": total.precision, "recall": total.recall, "images": len(counts)}
+            if view.name in masks:
+                _check_picture(view, masks[view.name], "mask")
+                yield view, read_gray(masks[view.name]) >= 128
+
+    return evaluate.write_keeps(scene, keeps(), folder)
 
 
 def _model(produced: Produced, folder: Path) -> dict[str, float]:

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import from_plain
+from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.registry import get_method
 from ambiguous_wild.splat.data import load_train_data
@@ -77,10 +77,11 @@ def replay(run: Path) -> Replay:
 
 
 def _read(path: Path) -> dict[str, Any]:
+    if path.suffix != ".json":
+        return plain_yaml.read_mapping(path)
     try:
-        text = path.read_text(encoding="utf-8")
-        found = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
-    except (OSError, ValueError, yaml.YAMLError) as error:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
         raise AwError(f"cannot read {path}: {error}") from None
     if not isinstance(found, dict):
         raise AwError(f"{path} is damaged: a mapping was expected")

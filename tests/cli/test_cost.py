@@ -63,3 +63,9 @@ def test_several_lengths_and_effects_have_folders_of_their_own(tmp_path: Path) -
 @pytest.mark.parametrize("words", [[], ["absent"]])
 def test_no_runs_is_an_error(words: list[str]) -> None:
     assert CliRunner().invoke(command, words).exit_code != 0
+
+
+def test_without_runs_nothing_is_left_behind(tmp_path: Path) -> None:
+    done = CliRunner().invoke(command, [str(tmp_path / "nowhere"), "-o", str(tmp_path / "out")])
+    assert "no folder of runs" in str(done.exception)
+    assert list(tmp_path.iterdir()) == []

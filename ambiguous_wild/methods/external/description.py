@@ -10,11 +10,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash, from_plain, to_plain
 from ambiguous_wild.core.names import check_name
+from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.methods.external import templates
 from ambiguous_wild.methods.external.commands import CommandProgram
 from ambiguous_wild.methods.external.program import no_parts
@@ -91,8 +90,8 @@ def load_description(path: Path) -> MethodEntry:
 def _parse(path: Path, content: bytes) -> Mapping[str, Any]:
     try:
         text = content.decode()
-        data = tomllib.loads(text) if path.suffix == ".toml" else yaml.safe_load(text)
-    except (ValueError, yaml.YAMLError, RecursionError) as error:
+        data = tomllib.loads(text) if path.suffix == ".toml" else plain_yaml.parse(text)
+    except (AwError, ValueError, RecursionError) as error:
         raise AwError(f"{path} cannot be read: {' '.join(str(error).split())}") from None
     if not isinstance(data, dict):
         raise AwError(f"{path} holds no keys: see docs/external-methods.md for name, train and renders")

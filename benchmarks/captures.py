@@ -3,7 +3,7 @@
     python benchmarks/captures.py --captures DIR... --out DIR [--methods ...] [--seeds 0 1 2]
         [--iterations 2000] [--jobs 2] [--set METHOD.KEY=VALUE ...] [--results STEM] [--report-only]
 
-A DIR is a scene folder or a folder of them. Every run is an `aw bench` of its own with one kernel thread, so
+A DIR is a scene folder or a folder of them. Every run is an `aw bench` of its own with one thread, so that
 --jobs of them share the machine; runs are ordinary run folders under --out: what is finished is kept, what
 stopped resumes. Writes benchmarks/results/captures.json, .csv and .md, which name scenes and no paths, and
 captures-runs.csv, a row a run: what is in it and has the same configuration and scene is not trained again,
@@ -13,6 +13,7 @@ on whatever machine it was. --report-only trains nothing.
 from __future__ import annotations
 
 import argparse
+import os
 import subprocess
 import sys
 from collections.abc import Iterable, Sequence
@@ -87,9 +88,11 @@ def run_all(cells: Sequence[Cell], book: pd.DataFrame, args: argparse.Namespace)
     todo = [c for c in cells if c.identity not in known and not (cell_folder(args.out, c) / RESULT).is_file()]
     print(f"{len(cells)} runs: {len(cells) - len(todo)} finished before, {len(todo)} to go", flush=True)
     failed = []
+    # one thread each in whatever a run calls: those of libraries wait by spinning, on the others' cores
+    env = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     with ThreadPoolExecutor(args.jobs) as pool:
         waiting = {
-            pool.submit(subprocess.run, command(cell, args), capture_output=True, text=True): cell
+            pool.submit(subprocess.run, command(cell, args), env=env, capture_output=True, text=True): cell
             for cell in todo
         }
         for number, done in enumerate(as_completed(waiting), start=1):

@@ -14,6 +14,7 @@ import pandas as pd
 
 from ambiguous_wild.core import Scene
 from ambiguous_wild.harness.evaluate import true_distractor
+from ambiguous_wild.harness.identity import scene_identity
 from ambiguous_wild.harness.store import Runs
 from ambiguous_wild.io.images import read_gray
 from ambiguous_wild.metrics import stats
@@ -42,11 +43,17 @@ BOOK = ["capture", "method", "seed", "config_hash", "threads", *(key for key, _,
 
 
 def facts_of(scene: Scene) -> dict[str, Any]:
-    """Name, photos, and the mean share of distractor pixels in the train photos (None without truth)."""
+    """Name, hash, photos, and the mean share of distractor pixels in the train photos, if known."""
     masks = [true_distractor(scene, view) for view in scene.train]
     known = [float(mask.mean()) for mask in masks if mask is not None]
     share = float(np.mean(known)) if len(known) == len(masks) else None
-    return {"name": scene.name, "train": len(scene.train), "test": len(scene.test), "distractor_share": share}
+    return {
+        "name": scene.name,
+        "sha256": scene_identity(scene),
+        "train": len(scene.train),
+        "test": len(scene.test),
+        "distractor_share": share,
+    }
 
 
 def masked_share(run: Path) -> float:

@@ -100,11 +100,17 @@ def _csv(path: Path) -> None:
         raise ValueError("lines of different lengths")
 
 
+def _html(path: Path) -> None:
+    if not path.read_text(encoding="utf-8").rstrip().endswith("</html>"):
+        raise ValueError("has no end")
+
+
 _WHOLE: dict[str, Callable[[Path], Any]] = {
     "scene.json": _scene,
     ".json": _json,
     ".yaml": _yaml,
     ".csv": _csv,
+    ".html": _html,
     ".png": read_png_rgb,
     ".jpg": read_png_rgb,
     ".ply": read_splat_ply,

@@ -1,6 +1,7 @@
 """Kill commands at random moments, run them again, compare with undisturbed runs.
 
-    python benchmarks/faults.py [--kills bench=60 build-scene=30 simulate=10] [--seed 0] [--json PATH]
+    python benchmarks/faults.py [--kills bench=60 build-scene=30 simulate=10 add=10 publish=20] [--seed 0]
+        [--json PATH]
 
 Kills come in rounds: a command is started in a fresh folder and killed (SIGKILL, the whole process group) at
 a moment drawn evenly over its undisturbed duration, started again and killed again, KILLS_A_ROUND times; then
@@ -36,7 +37,7 @@ from fault_compare import half_written, state  # noqa: E402
 
 RESULTS = Path(__file__).parent / "results" / "faults.json"
 KILLS_A_ROUND = 4
-DEFAULT = {"bench": 60, "build-scene": 30, "simulate": 10}
+DEFAULT = {"bench": 60, "build-scene": 30, "simulate": 10, "add": 10, "publish": 20}
 
 
 @dataclass(frozen=True)
@@ -96,11 +97,35 @@ def _simulate(inputs: Path, out: Path) -> list[str]:
     return ["simulate", "tiny", "-o", str(out / "raw"), "--views", "6", "--width", "96"]
 
 
+def _runs(inputs: Path) -> None:
+    """Two finished runs."""
+    _tiny_scene(inputs)
+    for seed in ("0", "1"):
+        words = ["bench", "--method", "3dgs", "--scene", str(inputs / "scene"), "--iterations", "20"]
+        words += ["--threads", "1", "--seed", seed, "--cache", str(inputs / "cache")]
+        finish([*words, "-o", str(inputs / "runs")], inputs / "runs.log")
+
+
+def _board(inputs: Path) -> None:
+    _runs(inputs)
+    finish(_add(inputs, inputs), inputs / "add.log")
+
+
+def _add(inputs: Path, out: Path) -> list[str]:
+    return ["leaderboard", "add", str(inputs / "runs"), "--board", str(out / "board"), "--dataset", "tiny"]
+
+
+def _publish(inputs: Path, out: Path) -> list[str]:
+    return ["leaderboard", "publish", "--board", str(inputs / "board"), "-o", str(out / "site")]
+
+
 # To add a command, add a line here.
 VICTIMS = {
     "bench": Victim(_tiny_scene, _bench),
     "build-scene": Victim(_tiny_capture, _build),
     "simulate": Victim(lambda inputs: None, _simulate),
+    "add": Victim(_runs, _add),
+    "publish": Victim(_board, _publish),
 }
 
 
@@ -109,6 +134,8 @@ def preload() -> None:
     import ambiguous_wild.builder.pipeline
     import ambiguous_wild.builder.undistort
     import ambiguous_wild.harness.grid
+    import ambiguous_wild.harness.leaderboard.add
+    import ambiguous_wild.harness.leaderboard.publish
     import ambiguous_wild.simulate.capture
     import ambiguous_wild.splat.trainer  # noqa: F401
 

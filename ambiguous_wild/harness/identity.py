@@ -16,6 +16,9 @@ IGNORED: dict[str, tuple[str, ...]] = {
     "train": ("checkpoint_every_s", "probes", "on_nonfinite"),
     "scene": ("path",),
 }
+# Files of a scene that say how it came to be, versions included, and that nothing is trained or scored on:
+# the same photos simulated by a later version are the same scene.
+RECORDS = ("truth/capture.json",)
 
 
 def config_identity(config: Mapping[str, Any]) -> str:
@@ -37,7 +40,11 @@ def config_identity(config: Mapping[str, Any]) -> str:
 def scene_identity(scene: Scene) -> str:
     """sha256 that stands for the scene: over its files' hashes, its split and the size it is loaded at."""
     files = scene.info.get("files")
-    known = {name: entry["sha256"] for name, entry in files.items()} if isinstance(files, dict) else {}
+    known = (
+        {name: entry["sha256"] for name, entry in files.items() if name not in RECORDS}
+        if isinstance(files, dict)
+        else {}
+    )
     split = [(v.name, v.split, v.camera.width, v.camera.height) for v in scene.views]
     if not known:
         # A plain COLMAP scene lists no hashes: cameras and points stand for it.

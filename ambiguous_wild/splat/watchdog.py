@@ -1,7 +1,6 @@
 """Finds the first value of a run that is not finite, keeps what reproduces it, and undoes it where asked.
 
-Looking is cheap: a tensor with a NaN or an infinity in it has a sum that is not finite, so one sum of each
-tensor decides, and only where it is not finite (a large but sound sum may overflow too) are rows looked at.
+Looking is cheap: one pass over the tensors' bits, and only where a value is not finite are rows looked at.
 Gradients are looked at in every step, before anything is changed; those of the higher harmonics
 (45 of a Gaussian's 59 floats) are the constant's times a polynomial of a unit vector: what breaks them
 breaks the constant too. Parameters are looked at every `EVERY` iterations, after growth and before every
@@ -13,7 +12,7 @@ from __future__ import annotations
 import math
 import shlex
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -24,6 +23,7 @@ from torch import Tensor
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.atomic import atomic_path, write_json
 from ambiguous_wild.splat import checkpoint
+from ambiguous_wild.splat.cpu.finite import all_finite
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.losses import PhotometricLoss
 from ambiguous_wild.splat.rendered import Gradients
@@ -97,9 +97,10 @@ class Watchdog:
 
         Adam would not show it: its kernel takes a moment that is NaN for one too small to count.
         """
-        named = {name: getattr(gradients, name) for name, _ in step.gaussians.items() if name != _LARGE}
-        if not _sums_are_finite(named):
-            bad = _bad_rows(named)
+        if not _finite(
+            [gradients.means, gradients.quats, gradients.log_scales, gradients.opacity_logits, gradients.sh0]
+        ):
+            bad = _bad_rows({n: getattr(gradients, n) for n, _ in step.gaussians.items() if n != _LARGE})
             if bad:
                 found = {f"d_{name}": getattr(gradients, name) for name in bad}
                 raise self._found("gradient", step.iteration, step.view, bad, _seen(step, keep, loss) | found)
@@ -110,7 +111,7 @@ class Watchdog:
 
     def look_at_parameters(self, iteration: int, view: int, gaussians: Gaussians) -> None:
         """Raise NonFinite if a parameter is not finite: now and then, after growth, before a checkpoint."""
-        if not _sums_are_finite(dict(gaussians.items())):
+        if not _finite([tensor for _, tensor in gaussians.items()]):
             bad = _bad_rows(dict(gaussians.items()))
             if bad:
                 raise self._found("parameter", iteration, view, bad, {"gaussians": dict(gaussians.items())})
@@ -193,9 +194,12 @@ class Watchdog:
         self.every = 1 if rollbacks else EVERY
 
 
-def _sums_are_finite(tensors: Mapping[str, Tensor]) -> bool:
-    # torch's sum is several times as fast as isfinite().all(), which writes a tensor of its own
-    return all(math.isfinite(float(t.sum())) for t in tensors.values())
+def _finite(tensors: Sequence[Tensor]) -> bool:
+    if tensors[0].device.type == "cpu":
+        return all_finite(tensors)
+    # On a GPU a sum each: several times as fast as isfinite().all(), which writes a tensor of its own. A
+    # large but sound one may overflow; the rows tell.
+    return bool(torch.isfinite(torch.stack([tensor.sum() for tensor in tensors])).all())
 
 
 def _bad_rows(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

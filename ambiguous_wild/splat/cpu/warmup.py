@@ -35,6 +35,7 @@ def warm_up(announce: Callable[[str], None] = lambda text: None) -> float:
     Args:
         announce: told once, before, if the compiled kernels are not on disk yet.
     """
+    from ambiguous_wild.splat.cpu.finite import all_finite
     from ambiguous_wild.splat.cpu.render import render_cpu
     from ambiguous_wild.splat.losses import photometric, ssim_map
     from ambiguous_wild.splat.optim import SplatAdam
@@ -54,6 +55,9 @@ def warm_up(announce: Callable[[str], None] = lambda text: None) -> float:
     gradients = rendered.backward(loss.d_image)
     rendered.backward(loss.d_image, d_image_extra=loss.d_image)
     rendered.backward(loss.d_image, absolute=True)
+    # as many tensors as the watchdog gives: of gradients, of parameters
+    all_finite([tensor for name, tensor in gaussians.items() if name != "sh_rest"])
+    all_finite([tensor for _, tensor in gaussians.items()])
     optimiser.step(gradients, rendered.visible)
     render_cpu(gaussians, camera)
     optimiser.flush()

@@ -1,0 +1,153 @@
+"""What deciding by itself loses: `--effects auto` against sets of effects picked by hand, the answer known.
+
+    python benchmarks/auto.py --scenes DIR --out DIR [--presets NAME ...] [--iterations 1000] [--factor 2]
+
+Scenes are those that benchmarks/presets.py built (its --work DIR/scenes). On each, RefineSplat is trained
+with `auto`, with what the preset was designed for (colour per photo once as exposure, once as appearance;
+with and without SH degree 1 where nothing shines), with nothing and with everything. Writes
+benchmarks/results/auto.json and .md: test PSNR and seconds of each, and auto against the best other: PSNR
+first, the quicker one within 0.02 dB. Where both are the same set, their times differ by the machine's noise
+alone and are not compared. Seconds are of training; what deciding takes (SfM points, no training) is in the
+results of presets.py.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ambiguous_wild.harness.environment import environment
+from ambiguous_wild.io.atomic import write_json, write_text
+from ambiguous_wild.simulate.presets import PRESETS
+
+RESULTS = Path(__file__).parent / "results" / "auto"
+METHOD = "refinesplat"
+TIE_DB = 0.02
+# what a preset was designed for -> the trainer's effects that answer it
+ANSWERS = {"appearance": ("exposure", "appearance"), "antialiasing": ("antialias",), "pose": ("poses",)}
+
+
+def sets_of(preset: str) -> dict[str, str]:
+    """name -> value of --effects."""
+    designed = PRESETS[preset].designed.effects
+    wanted = [effect for effect in designed if effect in ANSWERS]
+    found = {"auto": "auto", "none": "none", "all": "all"}
+    for k in range(max((len(ANSWERS[effect]) for effect in wanted), default=1)):
+        picked = [ANSWERS[effect][min(k, len(ANSWERS[effect]) - 1)] for effect in wanted]
+        matt = [] if "sh" in designed else ["sh1"]  # no gloss, no higher harmonics
+        for names in (picked, picked + matt):
+            if names:
+                found["+".join(names)] = ",".join(names)
+    return found
+
+
+def train(scene: Path, effects: str, out: Path, args: argparse.Namespace) -> dict[str, Any]:
+    """One run: test PSNR, seconds of training, and the effects that were on.
+
+    Raises:
+        RuntimeError: the run failed, with its last line.
+    """
+    words = ["bench", "--method", METHOD, "--scene", str(scene), "--effects", effects, "--no-pictures"]
+    words += ["--iterations", str(args.iterations), "--factor", str(args.factor), "-o", str(out)]
+    done = subprocess.run(
+        [sys.executable, "-m", "ambiguous_wild.cli.main", *words], capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        raise RuntimeError((done.stderr.strip().splitlines() or ["no output"])[-1])
+    run = out / scene.name / METHOD / "seed0"
+    result = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
+    told = run / "effects.json"
+    chosen = json.loads(told.read_text(encoding="utf-8")).get("effects", []) if told.is_file() else None
+    images = [image["psnr"] for image in result["per_image"]]
+    return {
+        "psnr": sum(images) / len(images),
+        "train_s": result["cost"]["train_s"],
+        "setup_s": result["cost"].get("setup_s"),
+        "effects": chosen,
+    }
+
+
+def measure(preset: str, args: argparse.Namespace) -> dict[str, Any]:
+    """Every set on one preset, and auto against the best of the others."""
+    scene = args.scenes / preset
+    runs = {name: train(scene, value, args.out / name, args) for name, value in sets_of(preset).items()}
+    others = {name: run for name, run in runs.items() if name != "auto"}
+    top = max(run["psnr"] for run in others.values())
+    near = {name: run for name, run in others.items() if run["psnr"] >= top - TIE_DB}
+    best = min(near, key=lambda name: near[name]["train_s"])
+    same = runs["auto"]["effects"] == runs[best]["effects"]
+    return {
+        "preset": preset,
+        "runs": runs,
+        "best": best,
+        "auto_minus_best_db": runs["auto"]["psnr"] - runs[best]["psnr"],
+        "same_set": same,
+        "auto_over_best_time": None if same else runs["auto"]["train_s"] / runs[best]["train_s"],
+    }
+
+
+def to_markdown(data: dict[str, Any]) -> str:
+    """The page of the results."""
+    lines = [
+        "# Effects: what `auto` loses against the best set picked by hand",
+        "",
+        f"{METHOD}, {data['iterations']} iterations, --factor {data['factor']}, seed 0; dB / s of training",
+        "",
+        "| preset | auto chose | auto | none | all | designed for | best | auto - best, dB | time |",
+        "|---|---|---:|---:|---:|---|---|---:|---:|",
+    ]
+    for row in data["presets"]:
+        if "error" in row:
+            lines.append(f"| {row['preset']} | {row['error']} |" + " |" * 7)
+            continue
+        shown = {name: f"{run['psnr']:.2f} / {run['train_s']:.0f}" for name, run in row["runs"].items()}
+        chosen = row["runs"]["auto"]["effects"]
+        hand = "; ".join(f"{k}: {v}" for k, v in shown.items() if k not in ("auto", "none", "all"))
+        lines.append(
+            f"| {row['preset']} | {', '.join(chosen or []) or 'none'} | {shown['auto']} | {shown['none']} "
+            f"| {shown['all']} | {hand or 'none'} | {row['best']} | {row['auto_minus_best_db']:+.2f} "
+            f"| {'same set' if row['same_set'] else format(row['auto_over_best_time'], '.2f')} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--scenes", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the runs")
+    parser.add_argument("--presets", nargs="+", default=[n for n in PRESETS if n != "tiny"])
+    parser.add_argument("--iterations", type=int, default=1000)
+    parser.add_argument("--factor", type=int, default=2)
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    args = parser.parse_args(argv)
+    rows = []
+    for k, preset in enumerate(args.presets, 1):
+        try:
+            rows.append(measure(preset, args))
+        except RuntimeError as error:
+            rows.append({"preset": preset, "error": str(error)})
+        row = rows[-1]
+        shown = row.get("error") or f"{row['auto_minus_best_db']:+.2f} dB against {row['best']}"
+        print(f"[{k}/{len(args.presets)}] {preset}: {shown}", flush=True)
+        data = {
+            "environment": environment("cpu"),
+            "method": METHOD,
+            "iterations": args.iterations,
+            "factor": args.factor,
+            "presets": rows,
+        }
+        write_json(args.results.with_suffix(".json"), data)
+        write_text(args.results.with_suffix(".md"), to_markdown(data))
+    print(to_markdown(data))
+    return 1 if any("error" in row for row in rows) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

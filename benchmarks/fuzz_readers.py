@@ -21,6 +21,7 @@ import numpy as np
 import yaml
 
 from ambiguous_wild.harness.audit.table import read_tables
+from ambiguous_wild.harness.leaderboard import board, pictures
 from ambiguous_wild.harness.planning.file import read_plan
 from ambiguous_wild.harness.run import refuse_other_config
 from ambiguous_wild.harness.store import read_runs
@@ -112,6 +113,20 @@ def _capture(path: Path) -> None:
     capture._earlier(truth.parent, "i", overwrite=False)
 
 
+def _board(path: Path) -> None:
+    measured = path.parent / "board" / "measured"
+    measured.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(path, measured / "tiny.csv")
+    board.read_board(measured.parent)
+
+
+def _board_images(path: Path) -> None:
+    kept = path.parent / "board" / "measured" / "images"
+    kept.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(path, kept / "index.csv")
+    pictures.read_index(kept.parent.parent)
+
+
 def _answer(path: Path) -> None:
     read_answers([path], read_key(fuzz_samples.workshop() / "study.key.json"))
 
@@ -192,6 +207,8 @@ def _many() -> list[Reader]:
         Reader("answers JSON", ".json", functools.partial(fuzz_samples.answers, "json"), _answer, tree),
         Reader("answers CSV", ".csv", functools.partial(fuzz_samples.answers, "csv"), _answer),
         Reader("audit CSV", ".csv", fuzz_samples.tables, lambda path: read_tables([path])),
+        Reader("leaderboard CSV", ".csv", fuzz_samples.boards, _board),
+        Reader("leaderboard images", ".csv", fuzz_samples.board_images, _board_images),
         Reader("archive zip", ".zip", functools.partial(fuzz_samples.archives, "zip"), _unpack),
         Reader("archive tar", ".tar", functools.partial(fuzz_samples.archives, "tar"), _unpack),
         Reader("checkpoint", ".safetensors", fuzz_samples.checkpoints, checkpoint.load),

@@ -10,6 +10,7 @@ import gzip
 import hashlib
 import io
 import json
+import math
 import os
 import shutil
 import tarfile
@@ -23,6 +24,9 @@ import numpy as np
 import torch
 import yaml
 
+from ambiguous_wild.harness.leaderboard import pictures
+from ambiguous_wild.harness.leaderboard.entry import Entry, wide
+from ambiguous_wild.harness.leaderboard.sheet import to_csv
 from ambiguous_wild.io import images, ply
 from ambiguous_wild.simulate import spec_file
 from ambiguous_wild.simulate.presets import preset
@@ -219,6 +223,34 @@ def tables() -> list[bytes]:
     head = "method,scene,metric,value,table,setting,dataset,variant,mark,printed\n"
     rows = [f"m{i},yard,psnr,2{i}.5{i},t,,d,unknown,{i + 1},\n" for i in range(3)]
     return [(head + "".join(rows)).encode(), b'method,scene,metric,value\n"a, b",yard,ssim,1e-1\n']
+
+
+@functools.cache
+def boards() -> list[bytes]:
+    quality = {"psnr": math.inf, "ssim": 0.9, "lpips_alex": 0.25}
+    entries = [
+        Entry(
+            "tiny", "a, b", "=m", "2000 iterations", "", seed, 8, quality, {"train_s": 1.5}, ("flip",), "cpu",
+            "a processor", "0.1.0", "", "c0", f"c{seed + 1}", "5c", "e5", "photos", "aw bench",
+        )
+        for seed in range(2)
+    ]  # fmt: skip
+    return [to_csv(*wide(entries)).encode()]
+
+
+@functools.cache
+def board_images() -> list[bytes]:
+    place = pictures._Place("tiny", "a, b", "1.png", "=m", "2000 iterations")
+    kept = pictures.folder_of(workshop() / "board")
+    pictures._write(workshop() / "board", place, _one_png(), "0", 20.5, index := {})
+    pictures._write_index(workshop() / "board", index.values())
+    return [(kept / pictures.INDEX).read_bytes()]
+
+
+def _one_png() -> Path:
+    path = workshop() / "one.png"
+    path.write_bytes(encoded(".png", picture()))
+    return path
 
 
 @functools.cache

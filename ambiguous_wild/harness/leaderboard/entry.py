@@ -9,7 +9,7 @@ from typing import Literal
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash
-from ambiguous_wild.harness.leaderboard.sheet import Cell, number, to_number, unguard
+from ambiguous_wild.harness.leaderboard.sheet import Cell, number, to_count, to_number, unguard
 from ambiguous_wild.harness.measures import MEASURES
 
 FIRST = ("dataset", "scene", "method", "setting", "options", "seed", "images")
@@ -104,9 +104,7 @@ def from_wide(head: Sequence[str], row: Mapping[str, str], where: str) -> Entry:
         for k in head
         if k not in FIRST and k not in LAST and not math.isnan(value := to_number(row[k], f"{where}, {k}"))
     }
-    for column in ("seed", "images"):
-        if not text[column].isascii() or not text[column].isdigit():
-            raise AwError(f"{where}: {column} {text[column][:40]!a} is no count; restore the file")
+    counts = {column: to_count(text[column], f"{where}: {column}") for column in ("seed", "images")}
     checked = next((c for c in CHECKED if c == text["checked"]), None)
     if checked is None:
         raise AwError(
@@ -115,8 +113,8 @@ def from_wide(head: Sequence[str], row: Mapping[str, str], where: str) -> Entry:
     names = {k: text[k] for k in (*FIRST, *LAST) if k not in NO_TEXT}
     return Entry(
         **names,
-        seed=int(text["seed"]),
-        images=int(text["images"]),
+        seed=counts["seed"],
+        images=counts["images"],
         quality={k: v for k, v in numbers.items() if not k.startswith(COST)},
         cost={k.removeprefix(COST): v for k, v in numbers.items() if k.startswith(COST)},
         missing=tuple(text["missing"].split()),

@@ -19,6 +19,7 @@ from ambiguous_wild.harness.leaderboard.sheet import (
     number,
     read_csv,
     slug,
+    to_count,
     to_csv,
     to_number,
     unguard,
@@ -78,6 +79,8 @@ def read_index(board: Path) -> list[Row]:
                 f"{path} row {at} was changed by hand, its cells do not hash to its row_hash: "
                 "restore the file from your version control"
             )
+        if row["seed"]:
+            to_count(row["seed"], f"{path} row {at}: seed")
     return rows
 
 

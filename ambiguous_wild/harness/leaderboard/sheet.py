@@ -81,6 +81,17 @@ def read_csv(path: Path, required: Sequence[str]) -> tuple[list[str], list[dict[
     return head, [dict(zip(head, line)) for line in lines[1:]]
 
 
+def to_count(text: str, where: str) -> int:
+    """The whole number from 0 on of a cell.
+
+    Raises:
+        AwError: it holds none, or one of more than 18 digits.
+    """
+    if not (text.isascii() and text.isdigit()) or len(text) > 18:
+        raise AwError(f"{where} {text[:40]!a} is no count; restore the file")
+    return int(text)
+
+
 def to_number(cell: str, where: str) -> float:
     """The number in a cell; NaN for an empty one.
 

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.harness.measures import Measure
 from ambiguous_wild.harness.store import Runs
+from ambiguous_wild.methods.registry import knows_truth
 
 LENGTHS_DIFFER = 1.1  # a note is due where the longest training has this many times the shortest's steps
 
@@ -21,6 +22,7 @@ def notes(
         *_absent(runs, methods, scenes),
         *(f"incomplete: {i.folder}: {i.reason}" for i in runs.incomplete),
         *_not_ranked(runs),
+        *_bounds(methods),
         *_missing(runs, columns),
         *_not_comparable(runs, columns),
     )
@@ -49,6 +51,11 @@ def _not_ranked(runs: Runs) -> list[str]:
         for (method, scene), count in open_runs.items()
         if (method, scene) in done
     ]
+
+
+def _bounds(methods: Sequence[str]) -> list[str]:
+    known = [method for method in methods if knows_truth(method)]
+    return [f"not ranked: {shortlist(known)}: shown exact masks or clean photos"] if known else []
 
 
 def _missing(runs: Runs, columns: Sequence[Measure]) -> list[str]:

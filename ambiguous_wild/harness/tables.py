@@ -21,6 +21,7 @@ from ambiguous_wild.core.errors import shortlist, unknown
 from ambiguous_wild.harness.measures import ALWAYS, COST, MEASURES, Measure, measure
 from ambiguous_wild.harness.store import Runs
 from ambiguous_wild.harness.table_notes import notes
+from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.metrics import stats
 
 State = Literal["ok", "missing", "failed", "absent"]
@@ -43,7 +44,7 @@ class Row:
     method: str
     cells: tuple[Cell, ...]  # one a column
     runs: int  # finished runs behind it
-    ranked: bool = True  # False: a run behind it is unfinished
+    ranked: bool = True  # False: a run behind it is unfinished, or the method knows the truth
 
 
 @dataclass(frozen=True)
@@ -174,8 +175,8 @@ def _scene_row(index: _Index, method: str, scene: str, columns: tuple[Measure, .
             interval = stats.bootstrap_interval(images.to_numpy().mean(axis=1))
             low, high = interval.low, interval.high
         cells.append(Cell(value, stats.spread(values), low, high))
-    finished = (method, scene) not in index.unfinished
-    return Row(method, tuple(cells), len(index.runs[method, scene]), ranked=finished)
+    ranked = (method, scene) not in index.unfinished and not knows_truth(method)
+    return Row(method, tuple(cells), len(index.runs[method, scene]), ranked=ranked)
 
 
 def _mean_row(

@@ -138,6 +138,14 @@ BUILTIN = (
 _registered: dict[str, MethodEntry] = {}
 
 
+def knows_truth(name: str) -> bool:
+    """Whether a method of this name is shown what no capture in the wild has: exact masks, or clean photos.
+
+    Such a row says what is possible; tables do not rank it among the others.
+    """
+    return name in ("3dgs+truth", "3dgs-clean") or "mask=truth" in name.partition("@")[2].split(",")
+
+
 def register(entry: MethodEntry) -> MethodEntry:
     """Add a method; a later one of the same name replaces the earlier."""
     if not entry.name or any(c in entry.name for c in "/\\\0") or entry.name.startswith("."):

@@ -150,6 +150,7 @@ def test_the_page_in_a_browser(board: Path, tmp_path: Path) -> None:
         page.open(site)
         assert page.run("document.querySelector('h1').textContent") == "<b>T & T</b>"
         sorts(page)
+        who_knows_the_truth_is_not_ranked(page)
         filters(page)
         rows_open(page)
         reported_stay_apart(page)
@@ -167,6 +168,19 @@ def test_the_page_in_a_browser(board: Path, tmp_path: Path) -> None:
             "!document.getElementById('empty').hidden && document.getElementById('compare').hidden"
         )
         assert page.run("document.getElementById('measured').hidden") and page.errors == []
+
+
+def who_knows_the_truth_is_not_ranked(page: Browser) -> None:
+    psnr = "document.querySelector('#table td:nth-child(2)[data-rank=\"1\"]')"
+    first = f"{psnr}.parentElement.querySelector('button').textContent"
+    assert page.run(first) == "refinesplat"
+    assert page.run("document.querySelectorAll('#table .badge').length") == 0
+    page.run("DATA.bounds.push('refinesplat'); drawMeasured()")
+    assert page.run(first) == HOSTILE
+    assert page.run("document.querySelector('#table .badge').closest('tr').textContent").startswith(
+        "refinesplat"
+    )
+    page.run("DATA.bounds.pop(); drawMeasured()")
 
 
 def sorts(page: Browser) -> None:

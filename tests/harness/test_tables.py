@@ -166,6 +166,16 @@ def test_a_method_with_an_unfinished_seed_shows_its_mean_but_no_rank(tmp_path: P
     assert "not ranked: a on one: 1 run of it incomplete" in table.notes
 
 
+def test_who_knows_the_truth_is_not_ranked(tmp_path: Path) -> None:
+    best = {"3dgs+truth": 50.0, "mine@density=a,mask=truth": 40.0, "3dgs-clean": 45.0}
+    rest = {"mine@mask=mask=truths": 30.0, "3dgs": 20.0}
+    table = table_of(tmp_path, *(fake_result(m, psnr=(p,)) for m, p in (best | rest).items()))
+    assert [cell(table, m, "psnr").rank for m in best] == [None] * 3
+    assert [cell(table, m, "psnr").rank for m in rest] == [1, 2]
+    (note,) = [n for n in table.notes if n.startswith("not ranked")]
+    assert all(m in note for m in best)
+
+
 def test_missing_metrics_carry_their_reason_once(tmp_path: Path) -> None:
     table = table_of(tmp_path, fake_result("a"), fake_result("b"))
     assert cell(table, "a", "lpips_alex").state == "missing"

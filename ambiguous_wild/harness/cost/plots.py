@@ -25,6 +25,7 @@ from ambiguous_wild.harness.cost.report import PLOTS, Report
 from ambiguous_wild.harness.cost.text import Unit, per_minute, time_unit
 from ambiguous_wild.harness.render_tables import plain
 from ambiguous_wild.io.palette import CATEGORIES, plot_colour
+from ambiguous_wild.methods.registry import knows_truth
 
 AXES = (
     ("minutes", "training time", True),
@@ -150,7 +151,8 @@ def draw_front(report: Report) -> Any | None:
     )
     for panel, (key, label, less_is_better) in zip(axes, panels):
         known = [p for p in report.points if finite(_x(p, key, unit).mean, p.psnr.mean)]
-        _front_line(panel, [(_x(p, key, unit).mean, p.psnr.mean) for p in known], less_is_better)
+        rivals = [p for p in known if not knows_truth(p.method)]
+        _front_line(panel, [(_x(p, key, unit).mean, p.psnr.mean) for p in rivals], less_is_better)
         for p in known:
             _dot(panel, _x(p, key, unit), p.psnr, look[p.curve]["color"])
         for name in {p.curve for p in known}:  # trainings of several lengths

@@ -11,6 +11,7 @@ from ambiguous_wild.harness.layouts.significance import Ties
 from ambiguous_wild.harness.measures import Measure
 from ambiguous_wild.harness.store import Runs
 from ambiguous_wild.harness.tables import Block, Table, comparison
+from ambiguous_wild.methods.registry import knows_truth
 
 PER_TABLE = 6  # scenes side by side, as the papers have it
 MEAN = "Mean"
@@ -135,7 +136,8 @@ def _layout(
     lines = []
     for k, row in enumerate(table.blocks[0].rows):
         entries = [e for block in shown for e in _row_entries(block, k, table, ties)]
-        lines.append(Line(row.method, tuple(entries), note="" if row.ranked else "unfinished, not ranked"))
+        why = "knows the truth" if knows_truth(row.method) else "unfinished"
+        lines.append(Line(row.method, tuple(entries), note="" if row.ranked else f"{why}, not ranked"))
     return Layout(title, tuple(columns), tuple(lines), table.notes)
 
 

@@ -64,7 +64,7 @@ function drawPlot() {
   }
   root.append(svg("text", { class: "axis", x: (left + right) / 2, y: height - 10, "text-anchor": "middle" }, `${measure(kx).label}${log ? " (logarithmic)" : ""}`),
     svg("text", { class: "axis", transform: `translate(14 ${(top + bottom) / 2}) rotate(-90)`, "text-anchor": "middle" }, measure(ky).label));
-  const front = pareto(points, kx, ky);
+  const front = pareto(points.filter((p) => !isBound(p.group)), kx, ky);
   if (front.length > 1) {
     const path = front.map((p, i) => (i ? `H${px(p.x.value)}V${py(p.y.value)}` : `M${px(p.x.value)} ${py(p.y.value)}`)).join("");
     root.append(svg("path", { class: "front", d: path }));

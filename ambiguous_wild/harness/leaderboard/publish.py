@@ -25,6 +25,7 @@ from ambiguous_wild.harness.measures import measure
 from ambiguous_wild.io.atomic import atomic_dir, sweep_siblings
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.lock import folder_lock
+from ambiguous_wild.methods.registry import knows_truth
 
 GENERATOR = '<meta name="generator" content="aw leaderboard publish">'
 OURS = {"index.html", "data", "images"}
@@ -161,6 +162,7 @@ def _facts(
     )  # fmt: skip
     return {
         "order": order,
+        "bounds": sorted({e.method for e in entries if knows_truth(e.method)}),
         "measures": measures,
         "runs": [
             {k: getattr(e, k) for k in columns}

@@ -25,7 +25,6 @@ from typing import Any
 
 import numpy as np
 
-from ambiguous_wild.harness.covered import world_points
 from ambiguous_wild.io.images import write_png
 from ambiguous_wild.simulate.capture import plan
 from ambiguous_wild.simulate.develop import depth_m, develop
@@ -33,6 +32,7 @@ from ambiguous_wild.simulate.effects.moment import Moment
 from ambiguous_wild.simulate.presets import preset, resized
 from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.cpu.warmup import warm_up
+from ambiguous_wild.vision.sparse_surface import world_points
 
 METHODS = ("3dgs", "robustsplat", "refinesplat")
 CLOCK = {"train_s", "setup_s", "ms_per_iteration", "ms_parts", "fps", "fps_low", "fps_high", "peak_rss_mb"}

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import AwError, Camera
-from ambiguous_wild.harness.covered import inverse_depth
 from ambiguous_wild.harness.regions import find_regions
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.metrics.masks import psnr_valid
+from ambiguous_wild.vision.sparse_surface import inverse_depth
 from tests.tiny_scene import HEIGHT, TEST, TRAIN, WALL_Z, WIDTH, write_tiny_scene
 
 X, Y = (-0.2, 0.8), (-0.5, 0.5)  # a part of the wall, in metres

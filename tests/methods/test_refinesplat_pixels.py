@@ -12,10 +12,10 @@ from ambiguous_wild.methods.refinesplat.multiview import (
     Hearsay,
     MultiViewConfig,
     _agree,
-    _quantile,
     _weight,
     discount,
     nearest_views,
+    quantile_of,
 )
 from ambiguous_wild.methods.refinesplat.pixels import PixelEvidence
 from ambiguous_wild.methods.refinesplat.structure import (
@@ -107,7 +107,7 @@ def test_quantiles_are_numpys_without_what_is_missing():
     for quantile in (0.0, 0.25, 0.5, 0.8, 1.0):
         with pytest.warns(RuntimeWarning):
             expected = np.nanquantile(stack, quantile, axis=0)
-        assert np.allclose(_quantile(stack, quantile), expected, equal_nan=True, atol=1e-6)
+        assert np.allclose(quantile_of(stack, quantile), expected, equal_nan=True, atol=1e-6)
 
 
 def test_discount_by_hand():

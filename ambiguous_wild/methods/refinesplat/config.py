@@ -8,6 +8,7 @@ from typing import Literal
 from ambiguous_wild.core import AwError
 from ambiguous_wild.methods.refinesplat.density import EntropyDensityConfig
 from ambiguous_wild.methods.refinesplat.entropy import Statistic, Variant
+from ambiguous_wild.methods.refinesplat.first_look import FirstLookConfig
 from ambiguous_wild.methods.refinesplat.identity import PsiConfig
 from ambiguous_wild.methods.refinesplat.masking import Spread
 from ambiguous_wild.methods.refinesplat.multiview import MultiViewConfig
@@ -78,12 +79,13 @@ class RefineSplatConfig:
     """Times in nominal iterations (of 30 000); the `min_` fields are real iterations of the run."""
 
     mask: MaskConfig = field(default_factory=MaskConfig)
+    first_look: FirstLookConfig = field(default_factory=FirstLookConfig)  # what counts until masks begin
     features: str = "labhog"  # back end of phi, see docs/foundation-models.md; `dinov2-small` is the paper's
     instances: str = "graph"  # back end of the instance masks; `grounded-video:...` is the paper's
     segments: SegmentConfig = field(default_factory=SegmentConfig)  # of `graph`
     psi: PsiConfig = field(default_factory=PsiConfig)  # the frozen identity classifier
     density: EntropyDensityConfig = field(default_factory=EntropyDensityConfig)  # growth and merging
-    mask_start: float = 500.0  # warm-up: before it every pixel counts
+    mask_start: float = 500.0  # warm-up: before it every pixel counts that the first look lets through
     min_mask_start: int = 250  # a render of fewer iterations means nothing
     reset_pause: float = 300.0  # masks are not refreshed for so long after an opacity reset
     min_reset_pause: int = 200

@@ -88,7 +88,7 @@ class Elsewhere:
         heard = [self._at(j, xyz, self.colours[view]) for j in asked]
         evidence = np.stack([h for h, _ in heard])
         return Hearsay(
-            _quantile(evidence, self.config.quantile),
+            quantile_of(evidence, self.config.quantile),
             _weight(np.isfinite(evidence), np.stack([a for _, a in heard]), self.config),
         )
 
@@ -127,13 +127,25 @@ def _agree(ours: np.ndarray, theirs: np.ndarray, same: np.ndarray, most: float) 
     other content, but only if far more agree without it: before a crowd it is chance.
     """
     difference = np.subtract(ours, theirs, dtype=np.float32) / np.float32(255.0)
+    difference -= common_offset(difference, same, most)
+    return same & (np.abs(difference).mean(axis=2) < most)
+
+
+def common_offset(difference: np.ndarray, same: np.ndarray, most: float = 0.06) -> np.ndarray:
+    """What two pictures of the same surfaces differ by everywhere, [3] float32; zeros where that is chance.
+
+    Args:
+        difference: [h, w, 3] of their colours in [0, 1].
+        same: [h, w] bool, where they show the same surface.
+        most: difference up to which two colours are the same.
+    """
     some = difference[::2, ::2][same[::2, ::2]]
     if len(some):
         common = np.median(some, axis=0)
         as_they_are = np.count_nonzero(np.abs(some).mean(axis=1) < most)
         if np.count_nonzero(np.abs(some - common).mean(axis=1) < most) > _FAR_MORE * as_they_are:
-            difference -= common.astype(np.float32)
-    return same & (np.abs(difference).mean(axis=2) < most)
+            return common.astype(np.float32)
+    return np.zeros(3, np.float32)
 
 
 def _weight(seen: np.ndarray, agree: np.ndarray, config: MultiViewConfig) -> np.ndarray:
@@ -175,7 +187,7 @@ def _small(photo: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return np.clip(np.rint(small * 255.0), 0, 255).astype(np.uint8)
 
 
-def _quantile(stack: np.ndarray, quantile: float) -> np.ndarray:
+def quantile_of(stack: np.ndarray, quantile: float) -> np.ndarray:
     """Quantile over the first axis of [n, h, w] of what is not NaN, linear between ranks; NaN where all is.
 
     One sort: numpy's nanquantile takes fifty times as long on such a stack.

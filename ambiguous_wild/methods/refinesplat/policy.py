@@ -23,6 +23,7 @@ from ambiguous_wild.methods.refinesplat.evidence import (
     scaled_by,
     silence,
 )
+from ambiguous_wild.methods.refinesplat.first_look import first_keep
 from ambiguous_wild.methods.refinesplat.inputs import FrozenInputs
 from ambiguous_wild.methods.refinesplat.losses import consistency_loss, identity_loss, instance_matrix
 from ambiguous_wild.methods.refinesplat.pixels import PixelEvidence
@@ -71,9 +72,12 @@ class RefineSplatMask(MaskPolicy):
             memory=config.mask.memory,
         )
 
+        self.first = self._first_look(data) if config.first_look.on else {}
+
     def keep(self, step: Step) -> Tensor | None:
         if not self._begun(step):
-            return None
+            first = self.first.get(step.view)
+            return None if first is None else shrink_keep(first, step.divisor)
         visit = self.visits.get(step.view, 0)
         due = step.view not in self.keeps or visit % self.config.mask_every == 0
         if due and not self._paused(step):
@@ -107,6 +111,20 @@ class RefineSplatMask(MaskPolicy):
 
     def regularises(self) -> bool:
         return self.config.lambda_id > 0 or self.config.lambda_cr > 0
+
+    def _first_look(self, data: TrainData) -> dict[int, Tensor]:
+        """View -> what counts before masks begin, [H, W] float32; none where nothing is known."""
+        found = first_keep(
+            data.cameras,
+            [photo.cpu().numpy() for photo in data.photos],
+            data.scene.points.xyz,
+            self.config.first_look,
+        )
+        return {
+            view: torch.from_numpy(keep.astype(np.float32)).to(data.device)
+            for view, keep in enumerate(found)
+            if keep is not None
+        }
 
     def predict(self, step: Step) -> Tensor | None:
         if not self._begun(step):

@@ -11,6 +11,7 @@ from ambiguous_wild.methods.refinesplat.first_look import FirstLookConfig, first
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
 VIEWS, DEPTH = 7, 4.0
+JUDGE_ALL = FirstLookConfig(least=0.0)
 
 
 def camera(view: int) -> Camera:
@@ -45,7 +46,7 @@ def passers(shift: int = 9) -> tuple[list[np.ndarray], list[np.ndarray]]:
 
 def keeps(photos, config=None, cloud=None):
     cameras = [camera(view) for view in range(VIEWS)]
-    return first_keep(cameras, photos, points() if cloud is None else cloud, config or FirstLookConfig())
+    return first_keep(cameras, photos, points() if cloud is None else cloud, config or JUDGE_ALL)
 
 
 def share_of(keep: np.ndarray, where: np.ndarray) -> float:
@@ -61,7 +62,16 @@ def test_what_no_other_photo_shows_waits_and_the_wall_does_not():
 
 
 def test_a_wall_alone_counts_whole():
-    assert all(keep.all() for keep in keeps([wall(view) for view in range(VIEWS)]))
+    photos = [wall(view) for view in range(VIEWS)]
+    assert keeps(photos, FirstLookConfig()) == [None] * VIEWS
+    assert all(keep.all() for keep in keeps(photos, JUDGE_ALL))
+
+
+def test_a_start_can_bear_a_little():
+    photos, masks = passers()
+    share = float(np.mean(masks))
+    assert all(keep is not None for keep in keeps(photos, FirstLookConfig(least=0.6 * share)))
+    assert keeps(photos, FirstLookConfig(least=1.5 * share)) == [None] * VIEWS
 
 
 def test_a_photo_of_other_exposure_is_not_left_out():
@@ -77,7 +87,7 @@ def test_where_nothing_is_known_everything_counts():
     left = points()[points()[:, 0] < 0]
     right = np.s_[:, WIDTH // 2 + 14 :]  # no sparse point of a wall there
     assert all(keep[right].all() for keep in keeps(photos, cloud=left))
-    alone = dataclasses.replace(FirstLookConfig(), known_by=VIEWS)  # more than there are others
+    alone = dataclasses.replace(JUDGE_ALL, known_by=VIEWS)  # more than there are others
     assert keeps(photos, alone) == [None] * VIEWS
 
 
@@ -100,6 +110,6 @@ def test_what_stands_still_before_the_wall_is_no_passer():
 @pytest.mark.parametrize("views", [2, 16])
 def test_the_same_every_time(views):
     photos, _ = passers()
-    config = dataclasses.replace(FirstLookConfig(), views=views, known_by=1)
+    config = dataclasses.replace(JUDGE_ALL, views=views, known_by=1)
     first, second = keeps(photos, config), keeps(photos, config)
     assert all(torch.equal(torch.from_numpy(a), torch.from_numpy(b)) for a, b in zip(first, second))

@@ -33,12 +33,13 @@ class FirstLookConfig:
     threshold: float = 0.02  # difference of colour in [0, 1] above which a pixel waits
     normal: float = 3.0  # and above this many times what is normal in the photo
     known_by: int = 3  # seen by fewer others, a surface is not judged
+    least: float = 0.1  # of a photo: where less would wait, nothing does; a start can bear that much
 
 
 def first_keep(
     cameras: Sequence[Camera], photos: Sequence[np.ndarray], points: np.ndarray, config: FirstLookConfig
 ) -> list[np.ndarray | None]:
-    """What to learn from at first, per photo [H, W] bool; None where nothing is known of its surfaces.
+    """What to learn from at first, per photo [H, W] bool; None where everything counts.
 
     Args:
         cameras: of the photos.
@@ -96,7 +97,7 @@ def _difference(
 
 
 def _judge(told: list[np.ndarray], shape: tuple[int, ...], config: FirstLookConfig) -> np.ndarray | None:
-    """The keep map [H, W] bool of a photo from what the others told."""
+    """The keep map [H, W] bool of a photo from what the others told; None where everything counts."""
     if not told:
         return None
     stack = np.stack(told)
@@ -107,5 +108,7 @@ def _judge(told: list[np.ndarray], shape: tuple[int, ...], config: FirstLookConf
     # What is normal: less than half of a photo is behind distractors, or nobody could tell.
     normal = float(np.quantile(evidence[known], 0.4))
     passing = known & (evidence > max(config.threshold, config.normal * normal))
+    if passing.mean() < config.least:
+        return None
     full = cv2.resize(passing.astype(np.float32), (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)
     return full < 0.5

@@ -113,7 +113,7 @@ class RefineSplatMask(MaskPolicy):
         return self.config.lambda_id > 0 or self.config.lambda_cr > 0
 
     def _first_look(self, data: TrainData) -> dict[int, Tensor]:
-        """View -> what counts before masks begin, [H, W] float32; none where nothing is known."""
+        """View -> what counts before masks begin, [H, W] float32; none where everything does."""
         found = first_keep(
             data.cameras,
             [photo.cpu().numpy() for photo in data.photos],

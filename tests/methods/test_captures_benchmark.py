@@ -101,9 +101,10 @@ def test_the_script_trains_what_is_missing_and_tabulates(tmp_path):
     first = subprocess.run(words, capture_output=True, text=True, check=True)
     assert "4 runs: 0 finished before, 4 to go" in first.stdout
     data = json.loads((tmp_path / "out.json").read_text())
-    assert data["captures"] == [
-        {"name": "with", "train": 6, "test": 2, "distractor_share": pytest.approx(144 / (64 * 48))}
-    ]
+    (capture,) = data["captures"]
+    assert len(capture.pop("sha256")) == 64
+    share = pytest.approx(144 / (64 * 48))
+    assert capture == {"name": "with", "train": 6, "test": 2, "distractor_share": share}
     assert data["threads"] == [1]
     truth = {r["method"]: r for r in data["rows"]}["3dgs@mask=truth"]
     assert truth["masked_share"] == pytest.approx(100 * 14 * 14 / (64 * 48), abs=1e-4)

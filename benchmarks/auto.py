@@ -15,14 +15,15 @@ from __future__ import annotations
 
 import argparse
 import json
-import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from presets import Stopped, aw, check_presets, mean_psnr, save
+
 from ambiguous_wild.harness.environment import environment
-from ambiguous_wild.io.atomic import write_json, write_text
+from ambiguous_wild.harness.store import RESULT, read_result
 from ambiguous_wild.simulate.presets import PRESETS
 
 RESULTS = Path(__file__).parent / "results" / "auto"
@@ -50,22 +51,17 @@ def train(scene: Path, effects: str, out: Path, args: argparse.Namespace) -> dic
     """One run: test PSNR, seconds of training, and the effects that were on.
 
     Raises:
-        RuntimeError: the run failed, with its last line.
+        Stopped: the run failed.
     """
     words = ["bench", "--method", METHOD, "--scene", str(scene), "--effects", effects, "--no-pictures"]
     words += ["--iterations", str(args.iterations), "--factor", str(args.factor), "-o", str(out)]
-    done = subprocess.run(
-        [sys.executable, "-m", "ambiguous_wild.cli.main", *words], capture_output=True, text=True, check=False
-    )
-    if done.returncode:
-        raise RuntimeError((done.stderr.strip().splitlines() or ["no output"])[-1])
+    aw(*words)
     run = out / scene.name / METHOD / "seed0"
-    result = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
+    result = read_result(run / RESULT)
     told = run / "effects.json"
     chosen = json.loads(told.read_text(encoding="utf-8")).get("effects", []) if told.is_file() else None
-    images = [image["psnr"] for image in result["per_image"]]
     return {
-        "psnr": sum(images) / len(images),
+        "psnr": mean_psnr(result),
         "train_s": result["cost"]["train_s"],
         "setup_s": result["cost"].get("setup_s"),
         "effects": chosen,
@@ -127,11 +123,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--factor", type=int, default=2)
     parser.add_argument("--results", type=Path, default=RESULTS)
     args = parser.parse_args(argv)
+    check_presets(parser, args.presets)
     rows = []
     for k, preset in enumerate(args.presets, 1):
         try:
             rows.append(measure(preset, args))
-        except RuntimeError as error:
+        except Stopped as error:
             rows.append({"preset": preset, "error": str(error)})
         row = rows[-1]
         shown = row.get("error") or f"{row['auto_minus_best_db']:+.2f} dB against {row['best']}"
@@ -143,8 +140,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             "factor": args.factor,
             "presets": rows,
         }
-        write_json(args.results.with_suffix(".json"), data)
-        write_text(args.results.with_suffix(".md"), to_markdown(data))
+        save(args.results, data, to_markdown(data))
     print(to_markdown(data))
     return 1 if any("error" in row for row in rows) else 0
 

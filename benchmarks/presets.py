@@ -20,7 +20,9 @@ from pathlib import Path
 from typing import Any
 
 from ambiguous_wild.harness.environment import environment
+from ambiguous_wild.harness.store import RESULT, read_result
 from ambiguous_wild.io.atomic import write_json, write_text
+from ambiguous_wild.metrics import stats
 from ambiguous_wild.simulate.presets import PRESETS
 
 RESULTS = Path(__file__).parent / "results" / "presets"
@@ -77,10 +79,25 @@ def measure(preset: str, work: Path, width: int, iterations: int) -> dict[str, A
     row["plan"] = {d["effect"]: [d["value"], d["decision"]] for d in plan["decisions"]}
     words = ("--method", "3dgs", "--iterations", str(iterations), "--effects", "none", "--no-pictures")
     _, seconds["bench"] = aw("bench", *words, "--scene", str(scene), "-o", str(runs))
-    result = json.loads((runs / preset / "3dgs" / "seed0" / "metrics.json").read_text(encoding="utf-8"))
-    images = [image["psnr"] for image in result["per_image"]]
-    row["psnr_3dgs"] = sum(images) / len(images)
+    row["psnr_3dgs"] = mean_psnr(read_result(runs / preset / "3dgs" / "seed0" / RESULT))
     return row | {"seconds": {name: round(s, 1) for name, s in seconds.items()}}
+
+
+def mean_psnr(result: dict[str, Any]) -> float:
+    """Of a run's test photos."""
+    return stats.mean([image["psnr"] for image in result["per_image"]])
+
+
+def check_presets(parser: argparse.ArgumentParser, names: Sequence[str]) -> None:
+    """End with a usage error where a name is none of a preset."""
+    if unknown := set(names) - set(PRESETS):
+        parser.error(f"no preset {', '.join(sorted(unknown))}; 'aw simulate --list' names them")
+
+
+def save(results: Path, data: dict[str, Any], text: str) -> None:
+    """The results beside each other: .json and .md."""
+    write_json(results.with_suffix(".json"), data)
+    write_text(results.with_suffix(".md"), text)
 
 
 def scores(facts: dict[str, Any]) -> dict[str, Any]:
@@ -152,8 +169,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--iterations", type=int, default=600)
     parser.add_argument("--results", type=Path, default=RESULTS)
     args = parser.parse_args(argv)
-    if unknown := set(args.presets) - set(PRESETS):
-        parser.error(f"no preset {', '.join(sorted(unknown))}; 'aw simulate --list' names them")
+    check_presets(parser, args.presets)
     rows = []
     for k, preset in enumerate(args.presets, 1):
         kept = args.work / f"{preset}.json"
@@ -176,8 +192,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "iterations": args.iterations,
         "presets": rows,
     }
-    write_json(args.results.with_suffix(".json"), data)
-    write_text(args.results.with_suffix(".md"), to_markdown(data))
+    save(args.results, data, to_markdown(data))
     print(to_markdown(data))
     return 1 if any("error" in row for row in rows) else 0
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import shlex
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -37,7 +37,7 @@ FOLDER = "nonfinite"
 REPORT, GOOD, STEP = "report.json", "good.safetensors", "step.safetensors"
 EVERY = 50  # iterations between looks at the parameters
 MOST_ROLLBACKS = 5  # a run that needs more is not worth saving
-_LARGE = "sh_rest"
+_LOOKED_AT = ("means", "quats", "log_scales", "opacity_logits", "sh0")  # of the gradients, see above
 
 
 @dataclass(frozen=True)
@@ -97,10 +97,9 @@ class Watchdog:
 
         Adam would not show it: its kernel takes a moment that is NaN for one too small to count.
         """
-        if not _finite(
-            [gradients.means, gradients.quats, gradients.log_scales, gradients.opacity_logits, gradients.sh0]
-        ):
-            bad = _bad_rows({n: getattr(gradients, n) for n, _ in step.gaussians.items() if n != _LARGE})
+        named = {name: getattr(gradients, name) for name in _LOOKED_AT}
+        if not _finite(named):
+            bad = _bad_rows(named)
             if bad:
                 found = {f"d_{name}": getattr(gradients, name) for name in bad}
                 raise self._found("gradient", step.iteration, step.view, bad, _seen(step, keep, loss) | found)
@@ -111,10 +110,11 @@ class Watchdog:
 
     def look_at_parameters(self, iteration: int, view: int, gaussians: Gaussians) -> None:
         """Raise NonFinite if a parameter is not finite: now and then, after growth, before a checkpoint."""
-        if not _finite([tensor for _, tensor in gaussians.items()]):
-            bad = _bad_rows(dict(gaussians.items()))
+        named = dict(gaussians.items())
+        if not _finite(named):
+            bad = _bad_rows(named)
             if bad:
-                raise self._found("parameter", iteration, view, bad, {"gaussians": dict(gaussians.items())})
+                raise self._found("parameter", iteration, view, bad, {"gaussians": named})
 
     def _found(
         self, what: Any, iteration: int, view: int, bad: Mapping[str, Tensor], seen: Mapping[str, Any]
@@ -194,7 +194,8 @@ class Watchdog:
         self.every = 1 if rollbacks else EVERY
 
 
-def _finite(tensors: Sequence[Tensor]) -> bool:
+def _finite(named: Mapping[str, Tensor]) -> bool:
+    tensors = list(named.values())
     if tensors[0].device.type == "cpu":
         return all_finite(tensors)
     # On a GPU a sum each: several times as fast as isfinite().all(), which writes a tensor of its own. A

@@ -63,16 +63,16 @@ class RefineSplatMask(MaskPolicy):
         config = self.config
         if config.mask.needs_identities or self.regularises():
             _ = self.inputs.semantics  # part of what the method costs before its first step
+        photos = [photo.cpu().numpy() for photo in data.photos]
         self.pixels = PixelEvidence(
-            [photo.cpu().numpy() for photo in data.photos],
+            photos,
             data.cameras,
             config.mask.multiview,
             base=config.mask.base,
             least_alpha=config.mask.least_alpha,
             memory=config.mask.memory,
         )
-
-        self.first = self._first_look(data) if config.first_look.on else {}
+        self.first = self._first_look(photos) if config.first_look.on else {}
 
     def keep(self, step: Step) -> Tensor | None:
         if not self._begun(step):
@@ -112,14 +112,10 @@ class RefineSplatMask(MaskPolicy):
     def regularises(self) -> bool:
         return self.config.lambda_id > 0 or self.config.lambda_cr > 0
 
-    def _first_look(self, data: TrainData) -> dict[int, Tensor]:
+    def _first_look(self, photos: list[np.ndarray]) -> dict[int, Tensor]:
         """View -> what counts before masks begin, [H, W] float32; none where everything does."""
-        found = first_keep(
-            data.cameras,
-            [photo.cpu().numpy() for photo in data.photos],
-            data.scene.points.xyz,
-            self.config.first_look,
-        )
+        data = self.data
+        found = first_keep(data.cameras, photos, data.scene.points.xyz, self.config.first_look)
         return {
             view: torch.from_numpy(keep.astype(np.float32)).to(data.device)
             for view, keep in enumerate(found)

@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from ambiguous_wild.splat.optim import SplatAdam
 
 
+NO_SIZE_PRUNING = 1e9  # `prune_scale` of those who prune by opacity alone
+
+
 @dataclass(frozen=True)
 class DensityConfig:
     """Times in nominal iterations (of 30 000); the `min_` fields are real iterations of the run."""

@@ -12,7 +12,12 @@ from torch import Tensor
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.methods.refinesplat.merging import MergeConfig, clusters, merge_members, merge_pairs
 from ambiguous_wild.methods.refinesplat.support import Support, SupportConfig
-from ambiguous_wild.splat.density import DensityConfig, DensityControl, rotation_matrices
+from ambiguous_wild.splat.density import (
+    NO_SIZE_PRUNING,
+    DensityConfig,
+    DensityControl,
+    rotation_matrices,
+)
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.rendered import Gradients
 
@@ -30,6 +35,7 @@ class EntropyDensityConfig(DensityConfig):
     start: float = 10_000.0
     stop: float = 20_000.0
     resets: tuple[float, ...] = (15_000.0, 18_000.0)
+    prune_scale: float = NO_SIZE_PRUNING  # as RobustSplat: sky and far walls are larger than any limit
     decides: Decides = "total"  # the gradient that grows: of L, of L_GS alone, of the entropy terms alone
     clone_shift: float = 0.5  # a clone lies this many of its standard deviations down the gradient; 0 = on it
     merge_every: float = 1000.0  # nominal iterations between merges; 0 = never

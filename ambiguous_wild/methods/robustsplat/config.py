@@ -6,9 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.splat.density import DensityConfig
-
-NO_SIZE_PRUNING = 1e9  # extents; the authors prune by opacity alone
+from ambiguous_wild.splat.density import NO_SIZE_PRUNING, DensityConfig
 
 
 def _delayed_growth() -> DensityConfig:

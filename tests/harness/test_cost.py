@@ -55,6 +55,15 @@ def test_the_first_time_counts_where_psnr_falls_again(tmp_path: Path) -> None:
     assert first_time(only(read(tmp_path)), 15.0) == (15.0, False)
 
 
+def test_who_is_shown_the_truth_sets_no_target(tmp_path: Path) -> None:
+    cost_run(tmp_path, "refinesplat", psnr=(20.0,), train_s=40.0, probes=RISING)
+    cost_run(tmp_path, "3dgs+truth", psnr=(30.0,), train_s=40.0, probes=[(10.0, 29.0), (40.0, 30.0)])
+    rows = times_to_reach(curves_of(read(tmp_path).runs))
+    assert {row.psnr for row in rows} == {17.0, 19.0, 19.5}
+    alone = [run for run in read(tmp_path).runs if run.method == "3dgs+truth"]
+    assert {row.psnr for row in times_to_reach(curves_of(alone))} == {27.0, 29.0, 29.5}
+
+
 def test_a_time_is_missing_where_one_run_never_gets_there(tmp_path: Path) -> None:
     for seed, end in ((0, 20.0), (1, 18.5)):
         cost_run(tmp_path, "a", seed=seed, psnr=(end,), train_s=40.0, probes=[*RISING[:2], (40.0, end)])

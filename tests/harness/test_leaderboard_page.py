@@ -162,6 +162,7 @@ def test_the_page_in_a_browser(board: Path, tmp_path: Path) -> None:
             url.startswith(site.removesuffix("index.html")) for url in page.requests
         )
         the_choice_is_in_the_address(page, site)
+        what_has_no_mean_is_a_note(page)
         on_a_phone(page, site)
         page.open((tmp_path / "empty" / "index.html").as_uri())
         assert page.run(
@@ -225,6 +226,20 @@ def filters(page: Browser) -> None:
     assert names(page) == [] and "Nothing measured" in page.run("document.getElementById('said').textContent")
     type_in(page, "")
     assert "Another CPU" in page.run("document.getElementById('notes').textContent")
+
+
+def what_has_no_mean_is_a_note(page: Browser) -> None:
+    headed = "document.querySelector('#table thead button[data-key=ssim]') !== null"
+    notes = "document.getElementById('notes').textContent"
+    assert page.run(headed) and "No mean over all scenes" not in page.run(notes)
+    page.run("DATA.runs.filter((r) => r.scene === 'yard').forEach((r) => { delete r.quality.ssim; })")
+    choose(page, "scene", "yard")
+    choose(page, "scene", "all scenes")
+    assert not page.run(headed)
+    assert "nothing to measure it on: SSIM." in page.run(notes)
+    choose(page, "scene", "porch")
+    assert page.run(headed)
+    choose(page, "scene", "all scenes")
 
 
 def rows_open(page: Browser) -> None:

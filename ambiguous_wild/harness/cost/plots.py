@@ -75,9 +75,13 @@ def _timeline(
             at = np.array(run.points).reshape(-1, 2)
             axes.plot(at[:, 0] * scale, at[:, 1], **look, linewidth=0.7, alpha=0.45)
     seconds, psnr = timeline(curve, scenes)
-    axes.plot(seconds * scale, psnr, **look, linewidth=2.0)
     x = unit.of(summary(curve, scenes, lambda run: run.train_s / 60.0))
-    return _end(axes, curve.name, x, summary(curve, scenes, lambda run: run.psnr), look)
+    y = summary(curve, scenes, lambda run: run.psnr)
+    seconds = seconds * scale
+    if finite(x.mean, y.mean) and len(seconds) and x.mean >= seconds[-1]:  # the dot belongs to its curve
+        seconds, psnr = np.append(seconds, x.mean), np.append(psnr, y.mean)
+    axes.plot(seconds, psnr, **look, linewidth=2.0)
+    return _end(axes, curve.name, x, y, look)
 
 
 def _end(axes: Any, name: str, x: Summary, y: Summary, look: dict[str, Any]) -> Any | None:
@@ -180,8 +184,9 @@ def _front_line(axes: Any, at: Sequence[tuple[float, float]], less_is_better: bo
     for x, y in sorted(at, key=lambda p: (p[0] if less_is_better else -p[0], -p[1])):
         if not front or y > front[-1][1]:
             front.append((x, y))
+    # the ring shows a front of one point, which has no line
     axes.step([x for x, _ in front], [y for _, y in front], where="post", color="0.82", linewidth=5.0,
-              solid_capstyle="round", zorder=1)  # fmt: skip
+              solid_capstyle="round", marker="o", markersize=13, zorder=1)  # fmt: skip
 
 
 def draw_changes(report: Report) -> Any | None:

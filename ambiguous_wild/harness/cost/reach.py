@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.harness.cost.curves import Curve, Summary, scenes_of, summary
 from ambiguous_wild.harness.cost.read import CostRun
+from ambiguous_wild.methods.registry import knows_truth
 
 BELOW_BEST = (3.0, 1.0, 0.5)  # dB below what the best curve ends at, where no target is given
 
@@ -51,7 +52,7 @@ def times_to_reach(
 
     Args:
         curves: from `curves_of`.
-        targets: in dB; empty = `BELOW_BEST` below the best of each scene.
+        targets: in dB; empty = `BELOW_BEST` below the best of each scene that is not shown the truth.
         setup: count what comes before the first step too.
     """
     wanted = [Target(t, False) for t in dict.fromkeys(targets)] or [Target(t, True) for t in BELOW_BEST]
@@ -105,7 +106,9 @@ def first_time(run: CostRun, psnr: float) -> tuple[float, bool]:
 def _level(target: Target, curves: Sequence[Curve], scene: str) -> float:
     if not target.relative:
         return target.db
-    ends = [summary(curve, (scene,), lambda run: run.psnr).mean for curve in curves]
+    # what is shown the truth sets no target for those who are not
+    rivals = [curve for curve in curves if not all(knows_truth(run.method) for run in curve.runs)]
+    ends = [summary(curve, (scene,), lambda run: run.psnr).mean for curve in rivals or curves]
     return max((end for end in ends if math.isfinite(end)), default=math.nan) - target.db
 
 

@@ -65,7 +65,11 @@ function drawMeasured() {
   const runs = runsOf(state.dataset).filter((r) => !state.scene || r.scene === state.scene);
   const scenes = state.scene ? [state.scene] : scenesOf(state.dataset);
   const found = groups(state.dataset).map((g) => ({ ...g, runs: g.runs.filter((r) => scenes.includes(r.scene)) })).filter((g) => g.runs.length);
-  const measuredOnes = measuredColumns(runs, scenes);
+  const every = measuredColumns(runs, scenes);
+  // a mean over scenes of which one lacks the metric is missing for everybody: a note says so, not an empty column
+  const filled = (c) => found.some((g) => !Number.isNaN(summary(g, c.metric, c.of).value));
+  const measuredOnes = every.some(filled) ? every.filter((c) => c.small || filled(c)) : every;
+  const empty = every.filter((c) => !measuredOnes.includes(c));
   const rows = found.map((g) => ({ group: g, title: `${g.method} ${g.about}`, cells: measuredOnes.map((c) => summary(g, c.metric, c.of)) }));
   const seeds = (row) => unique(row.group.runs.map((r) => r.seed)).length;
   const columns = [
@@ -91,7 +95,7 @@ function drawMeasured() {
   const where = state.scene || (scenes.length === 1 ? scenes[0] : `the mean over ${scenes.length} scenes`);
   $("said").textContent = rows.length ? `${rows.length} of ${unique(runsOf(state.dataset).map(groupKey)).length} entries, ${where}` : "Nothing measured fits this choice.";
   $("table").parentElement.hidden = !rows.length;
-  drawNotes(runs, found, scenes);
+  drawNotes(runs, found, scenes, empty);
   remember();
 }
 
@@ -130,10 +134,11 @@ async function copy(code, button) {
   setTimeout(() => { button.textContent = "Copy"; }, 1500);
 }
 
-function drawNotes(runs, found, scenes) {
+function drawNotes(runs, found, scenes, empty) {
   const notes = [];
   const missing = unique(runs.flatMap((r) => r.missing)).filter((k) => !runs.some((r) => Object.hasOwn(r.quality, k)));
   if (missing.length) notes.push(`Not measured in any of these runs: ${missing.map((k) => measure(k).label).join(", ")}.`);
+  if (empty.length) notes.push(`No mean over all scenes, because some have nothing to measure it on: ${empty.map((c) => c.label).join(", ")}. Choose a scene, or the metric, to see it.`);
   for (const g of found) {
     const lacking = scenes.filter((s) => !g.runs.some((r) => r.scene === s));
     if (lacking.length) notes.push(`${g.method} (${g.about}) has no run on ${lacking.join(", ")}: no mean.`);

@@ -37,6 +37,7 @@ from fault_compare import half_written, state  # noqa: E402
 
 RESULTS = Path(__file__).parent / "results" / "faults.json"
 KILLS_A_ROUND = 4
+COMMANDS = {"add": "aw leaderboard add", "publish": "aw leaderboard publish"}  # where it is not aw NAME
 DEFAULT = {"bench": 60, "build-scene": 30, "simulate": 10, "add": 10, "publish": 20}
 
 
@@ -264,7 +265,7 @@ def table(results: dict[str, Any]) -> str:
     lines += ["|---|---|---|---|---|---|---|"]
     keys = ("kills", "rounds", "half_written", "lost_or_different", "left_behind", "failed_reruns")
     for name, row in results.items():
-        lines.append(f"| `aw {name}` | " + " | ".join(str(row[k]) for k in keys) + " |")
+        lines.append(f"| `{COMMANDS.get(name, f'aw {name}')}` | " + " | ".join(str(row[k]) for k in keys) + " |")
     total = [sum(row[k] for row in results.values()) for k in keys]
     return "\n".join([*lines, "| all | " + " | ".join(map(str, total)) + " |"])
 

@@ -41,7 +41,7 @@ from ambiguous_wild.harness.grid import cell_folder, plan_cells
 from ambiguous_wild.harness.run import RESULT, refuse_other_config
 from ambiguous_wild.harness.store import read_runs
 from ambiguous_wild.io.atomic import write_json, write_text
-from ambiguous_wild.splat.trainer import TrainConfig
+from ambiguous_wild.splat.pace import TrainConfig
 
 RESULTS = Path(__file__).parent / "results" / "captures"
 METHODS = ("3dgs", "robustsplat", "dronesplat", "refinesplat", "3dgs+truth", "3dgs-clean")

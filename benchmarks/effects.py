@@ -26,8 +26,9 @@ from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.cpu.warmup import warm_up
 from ambiguous_wild.splat.effects import ALL, with_effects
 from ambiguous_wild.splat.effects.base import Effect
+from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.parts import Parts
-from ambiguous_wild.splat.trainer import TrainConfig, Trainer
+from ambiguous_wild.splat.trainer import Trainer
 
 # what a scene is said to call for -> the line of the plan
 LINES = {

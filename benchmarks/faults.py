@@ -265,7 +265,9 @@ def table(results: dict[str, Any]) -> str:
     lines += ["|---|---|---|---|---|---|---|"]
     keys = ("kills", "rounds", "half_written", "lost_or_different", "left_behind", "failed_reruns")
     for name, row in results.items():
-        lines.append(f"| `{COMMANDS.get(name, f'aw {name}')}` | " + " | ".join(str(row[k]) for k in keys) + " |")
+        lines.append(
+            f"| `{COMMANDS.get(name, f'aw {name}')}` | " + " | ".join(str(row[k]) for k in keys) + " |"
+        )
     total = [sum(row[k] for row in results.values()) for k in keys]
     return "\n".join([*lines, "| all | " + " | ".join(map(str, total)) + " |"])
 

@@ -29,7 +29,8 @@ from ambiguous_wild.splat.cpu.render import render_cpu
 from ambiguous_wild.splat.cpu.warmup import warm_up
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
-from ambiguous_wild.splat.trainer import TrainConfig, Trainer
+from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.trainer import Trainer
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "results" / "long-run.json"
@@ -160,7 +161,7 @@ def train(method: str, scene_root: Path, folder: Path, iterations: int) -> list[
     trainer.resume()
     looks = Looks(folder / "looks.json", trainer.iteration, max(iterations // ROWS, 1))
     trainer.train(tick=looks)
-    return [look | row for look, row in zip(looks.rows, trainer.timeline)]
+    return [look | row for look, row in zip(looks.rows, trainer.timeline.rows)]
 
 
 class Looks:

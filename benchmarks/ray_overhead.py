@@ -23,7 +23,7 @@ from ambiguous_wild.harness.engines.ray_cluster import RayCluster, RayOptions
 from ambiguous_wild.harness.environment import environment
 from ambiguous_wild.harness.grid import cell_folder, plan_cells, run_cells
 from ambiguous_wild.io.atomic import write_json
-from ambiguous_wild.splat.trainer import TrainConfig
+from ambiguous_wild.splat.pace import TrainConfig
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from tests.tiny_scene import write_tiny_scene

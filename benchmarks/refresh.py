@@ -29,7 +29,7 @@ from ambiguous_wild.harness.grid import plan_cells, run_cells
 from ambiguous_wild.io.atomic import atomic_path, write_json
 from ambiguous_wild.io.palette import ADDED, MERGED, plot_colour
 from ambiguous_wild.metrics import stats
-from ambiguous_wild.splat.trainer import TrainConfig
+from ambiguous_wild.splat.pace import TrainConfig
 
 RESULTS = Path(__file__).parent / "results" / "refresh.json"
 METHOD = "refinesplat"

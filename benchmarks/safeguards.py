@@ -28,9 +28,10 @@ from ambiguous_wild.io.atomic import write_json
 from ambiguous_wild.splat.cpu import set_threads
 from ambiguous_wild.splat.cpu.render import render_cpu
 from ambiguous_wild.splat.cpu.warmup import warm_up
+from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.step import TrainData
-from ambiguous_wild.splat.trainer import TrainConfig, Trainer
+from ambiguous_wild.splat.trainer import Trainer
 
 RESULTS = Path(__file__).parent / "results" / "safeguards.json"
 CASES = ((1_000, 64, 36), (30_000, 240, 136))

@@ -79,7 +79,7 @@ def command(
     from ambiguous_wild.harness.ablation_report import report, to_markdown, write_report
     from ambiguous_wild.harness.grid import run_cells
     from ambiguous_wild.io.atomic import check_output
-    from ambiguous_wild.splat.trainer import TrainConfig
+    from ambiguous_wild.splat.pace import TrainConfig
 
     on = choose_device(device)
     train = TrainConfig(

@@ -188,7 +188,7 @@ def command(
     from ambiguous_wild.harness.grid import plan_cells, run_cells
     from ambiguous_wild.harness.several import grouped
     from ambiguous_wild.io.atomic import check_output
-    from ambiguous_wild.splat.trainer import TrainConfig
+    from ambiguous_wild.splat.pace import TrainConfig
 
     session = Session(engine, threads)
     chosen = session.device(device)

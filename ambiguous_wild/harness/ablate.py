@@ -16,7 +16,7 @@ from ambiguous_wild.harness.run import FAILED, RESULT
 from ambiguous_wild.harness.store import read_result
 from ambiguous_wild.methods.ablation import DEFAULT, Group, Variant, choose_groups, folder_name
 from ambiguous_wild.methods.registry import MethodEntry, get_method
-from ambiguous_wild.splat.trainer import TrainConfig
+from ambiguous_wild.splat.pace import TrainConfig
 
 
 @dataclass(frozen=True)

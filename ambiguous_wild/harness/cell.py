@@ -12,7 +12,7 @@ from ambiguous_wild.core.config import to_plain
 from ambiguous_wild.harness.choosing import Chosen
 from ambiguous_wild.harness.identity import config_identity
 from ambiguous_wild.methods.registry import MethodEntry
-from ambiguous_wild.splat.trainer import TrainConfig
+from ambiguous_wild.splat.pace import TrainConfig
 
 Overwrite = Literal["never", "missing", "always"]
 Protocol = Literal["full", "half"]

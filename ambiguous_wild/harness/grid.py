@@ -23,7 +23,7 @@ from ambiguous_wild.harness.run import (
 from ambiguous_wild.io.atomic import check_output
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.registry import MethodEntry, get_method
-from ambiguous_wild.splat.trainer import TrainConfig
+from ambiguous_wild.splat.pace import TrainConfig
 
 
 def plan_cells(

@@ -13,7 +13,7 @@ from ambiguous_wild.core.config import config_hash, flatten, to_plain
 from ambiguous_wild.harness.environment import environment
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.methods.registry import MethodEntry, all_methods
-from ambiguous_wild.splat.trainer import TrainConfig
+from ambiguous_wild.splat.pace import TrainConfig
 
 if TYPE_CHECKING:
     from ambiguous_wild.harness.cell import Cell

@@ -32,7 +32,8 @@ from ambiguous_wild.io.ply import write_splat_ply
 from ambiguous_wild.methods.external.program import DONE, LOGS, WORK
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.effects import with_effects
-from ambiguous_wild.splat.trainer import TrainConfig, Trainer
+from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.trainer import Trainer
 
 RESULT = "metrics.json"
 FAILED = "failed.json"

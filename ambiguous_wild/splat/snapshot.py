@@ -1,14 +1,11 @@
-"""The whole state of a training run as one tree, and its timeline as a table."""
+"""The whole state of a training run as one tree."""
 
 from __future__ import annotations
 
-import csv
-import io
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.io.atomic import write_text
 from ambiguous_wild.splat.clock import Clock
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.optim import SplatAdam
@@ -30,8 +27,8 @@ def take(trainer: Trainer) -> dict[str, Any]:
         "density": trainer.density.state_dict(),
         "mask": trainer.parts.mask.state_dict(),
         **({} if trainer.effects is None else {"effects": trainer.effects.state_dict()}),
-        "timeline": trainer.timeline,
-        "loss": [trainer.loss_sum, trainer.loss_count],
+        "timeline": trainer.timeline.rows,
+        "loss": [trainer.timeline.loss_sum, trainer.timeline.loss_count],
         "skipped": sorted(trainer.skipped),
         **({"rollbacks": rollbacks} if rollbacks else {}),
     }
@@ -45,7 +42,7 @@ def restore(trainer: Trainer, state: dict[str, Any], path: Path) -> None:
     """
     try:
         trainer.gaussians = Gaussians(**state["gaussians"]).to(trainer.data.device)
-        trainer.optimiser = SplatAdam(trainer.gaussians, trainer.learning_rates(0.0))
+        trainer.optimiser = SplatAdam(trainer.gaussians, trainer.pace.learning_rates(0.0))
         trainer.optimiser.load_state_dict(state["optimiser"])
         trainer.density.load_state_dict(state["density"])
         trainer.parts.mask.load_state_dict(state["mask"])
@@ -54,19 +51,9 @@ def restore(trainer: Trainer, state: dict[str, Any], path: Path) -> None:
         trainer.iteration = state["iteration"]
         trainer.setup_s = state["setup_s"]
         trainer.clock = Clock(state["elapsed_s"], dict(state["parts_s"]))
-        trainer.timeline = list(state["timeline"])
-        trainer.loss_sum, trainer.loss_count = state["loss"]
+        trainer.timeline.rows = list(state["timeline"])
+        trainer.timeline.loss_sum, trainer.timeline.loss_count = state["loss"]
         trainer.skipped = set(state["skipped"])
         trainer.watchdog.load_state_dict(state.get("rollbacks", []))
     except (KeyError, TypeError) as error:
         raise AwError(f"checkpoint {path} lacks {error}; train again with --overwrite always") from None
-
-
-def write_timeline(path: Path, rows: list[dict[str, Any]]) -> None:
-    """timeline.csv: one line a hundredth of the run; empty cells where nothing was measured."""
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, names, lineterminator="\n", restval="")
-    writer.writeheader()
-    writer.writerows({k: "" if v is None else v for k, v in row.items()} for row in rows)
-    write_text(path, text.getvalue())

@@ -5,12 +5,9 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,32 +19,13 @@ from ambiguous_wild.splat.effects.chain import Chain
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.optim import SplatAdam
+from ambiguous_wild.splat.pace import Pace, TrainConfig
 from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.render import render
 from ambiguous_wild.splat.rendered import Rendered
-from ambiguous_wild.splat.resolution import FULL, Level, ceiling_at, coarse_to_fine, divisor_at
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData
-from ambiguous_wild.splat.watchdog import NonFinite, OnNonFinite, Watchdog
-
-COARSE_UNTIL = 0.4  # share of the run; measured on simulated captures, see docs/training.md
-TIMELINE_ROWS = 100
-
-
-@dataclass(frozen=True)
-class TrainConfig:
-    """How long, on what, how often saved. What is learnt how is the method's (`Parts`)."""
-
-    iterations: int = NOMINAL_ITERATIONS
-    budget_s: float | None = None  # seconds of training instead of a number of iterations
-    seed: int = 0
-    resolution: Literal["auto", "full", "coarse-to-fine"] = "auto"  # auto: coarse-to-fine under a budget
-    max_gaussians: int | None = None  # None: the method's own ceiling
-    torch_threads: int = 1  # fixed, not the machine's: the split of a sum decides its last bits
-    checkpoint_every_s: float = 60.0
-    probes: int = 8  # times the test PSNR is probed; the clock stands still meanwhile
-    on_nonfinite: OnNonFinite = (
-        "stop"  # or go back to the last checkpoint and leave the photo out, see watchdog.py
-    )
+from ambiguous_wild.splat.timeline import ROWS, Timeline
+from ambiguous_wild.splat.watchdog import NonFinite, Watchdog
 
 
 class Trainer:
@@ -77,12 +55,10 @@ class Trainer:
         self.probe = probe
         names = [view.name for view in data.scene.train]
         self.watchdog = Watchdog(folder, config.on_nonfinite, config.seed, names)
-        self.extent = data.scene.extent
         self.clock = Clock()
         self.setup_s = 0.0  # seconds before the first step, of the process that began the run
         self.iteration = 0
-        self.timeline: list[dict[str, Any]] = []
-        self.loss_sum, self.loss_count = 0.0, 0  # since the last row of the timeline
+        self.timeline = Timeline()
         self.skipped: set[int] = set()  # views that were all masked at some step
         self._pyramid: dict[tuple[int, int], Tensor] = {}
 
@@ -90,75 +66,20 @@ class Trainer:
         self.gaussians = Gaussians.from_points(
             points.xyz, points.rgb, sh_degree=parts.sh_degree, opacity=parts.start_opacity
         ).to(data.device)
-        self.start_count = len(self.gaussians)
-        self.levels = self._levels()
-        self.optimiser = SplatAdam(self.gaussians, self.learning_rates(0.0))
-        self.density = parts.density(parts.density_config, self.extent, config.seed)
+        start, most = len(self.gaussians), parts.density_config.max_gaussians
+        self.pace = Pace(config, parts.schedule, data, start=start, most=most)
+        self.optimiser = SplatAdam(self.gaussians, self.pace.learning_rates(0.0))
+        self.density = parts.density(parts.density_config, data.scene.extent, config.seed)
         parts.mask.setup(data)
         self.effects = Chain(parts.effects, data) if parts.effects else None
 
-    # -- schedule ---------------------------------------------------------------------------------
-
     def progress(self, iteration: int) -> float:
         """Share of the run that lies behind after `iteration` steps, in [0, 1]."""
-        if self.config.budget_s is not None:
-            return min(self.clock.now() / self.config.budget_s, 1.0)
-        return min(iteration / self.config.iterations, 1.0)
+        return self.pace.progress(iteration, self.clock.now())
 
     @property
     def done(self) -> bool:
         return self.progress(self.iteration) >= 1.0
-
-    def _short(self) -> bool:
-        return self.config.budget_s is not None or self.config.iterations < self.parts.schedule.short_below
-
-    def _most_gaussians(self) -> int:
-        """Growth ends here: a short run can neither afford nor settle more than the photos can tell apart.
-
-        Simulated courtyard at 240x135, 3000 iterations: 14 000, 20 000, 32 000 and 64 000 Gaussians gave
-        RefineSplat 30.3, 31.1, 31.3 and 30.7 dB at 9.5, 11.3, 13.6 and 19.6 ms an iteration.
-        """
-        if self.config.max_gaussians is not None:
-            return self.config.max_gaussians
-        most = self.parts.density_config.max_gaussians
-        if not self._short():
-            return most
-        pixels = float(np.median([photo.shape[0] * photo.shape[1] for photo in self.data.photos]))
-        return min(most, max(self.start_count, int(self.parts.schedule.per_pixel_short * pixels)))
-
-    def _levels(self) -> tuple[Level, ...]:
-        wanted: str = self.config.resolution
-        if wanted == "auto":
-            wanted = "coarse-to-fine" if self.config.budget_s is not None else self.parts.schedule.resolution
-        if wanted == "full":
-            return FULL
-        sample = self.data.photos[:: max(len(self.data.photos) // 8, 1)]
-        return coarse_to_fine([photo.cpu().numpy() for photo in sample], COARSE_UNTIL)
-
-    def learning_rates(self, progress: float) -> dict[str, float]:
-        """Of every tensor, at this share of the run."""
-        s = self.parts.schedule
-        last = s.lr_means_final_short if self._short() else s.lr_means_final
-        return {
-            "means": self.extent * s.lr_means * (last / s.lr_means) ** progress,
-            "quats": s.lr_quats,
-            "log_scales": s.lr_scales,
-            "opacity_logits": s.lr_opacity,
-            "sh0": s.lr_sh0,
-            "sh_rest": s.lr_sh_rest,
-        }
-
-    def epoch_of(self, iteration: int) -> int:
-        """Passes over all views that were complete before this iteration."""
-        return (iteration - 1) // len(self.data.photos)
-
-    def _view_at(self, iteration: int) -> int:
-        """Every view once an epoch in an order of its own; a function of the seed, so it has no state."""
-        n = len(self.data.photos)
-        epoch, k = self.epoch_of(iteration), (iteration - 1) % n
-        return int(np.random.default_rng([self.config.seed, 0x51, epoch]).permutation(n)[k])
-
-    # -- one step ---------------------------------------------------------------------------------
 
     def _photo(self, view: int, divisor: int) -> Tensor:
         if divisor == 1:
@@ -200,7 +121,7 @@ class Trainer:
     def make_step(self, iteration: int, view: int, divisor: int | None = None) -> Step:
         """Render a train view as the loop does; also used to predict masks afterwards."""
         progress = self.progress(iteration)
-        divisor = divisor_at(self.levels, progress) if divisor is None else divisor
+        divisor = self.pace.divisor(progress) if divisor is None else divisor
         camera = shrink_camera(self.data.cameras[view], divisor)
         if self.effects is not None:
             camera = self.effects.camera(view, camera)
@@ -213,7 +134,7 @@ class Trainer:
             nominal=nominal,
             view=view,
             divisor=divisor,
-            ceiling=ceiling_at(self.start_count, self._most_gaussians(), divisor, progress, COARSE_UNTIL),
+            ceiling=self.pace.ceiling(divisor, progress),
             photo=self._photo(view, divisor),
             camera=camera,
             rendered=rendered,
@@ -236,8 +157,8 @@ class Trainer:
         """
         iteration = self.iteration + 1
         part = self.clock.part
-        view = self._view_at(iteration)
-        if self.watchdog.skips(self.epoch_of(iteration), view):
+        view = self.pace.view(iteration)
+        if self.watchdog.skips(self.pace.epoch(iteration), view):
             self.iteration = iteration
             return math.nan
         step = self.make_step(iteration, view)
@@ -264,9 +185,8 @@ class Trainer:
         with part("watchdog"):
             self.watchdog.look_at_gradients(step, keep, loss, gradients)
         with part("optimiser"):
-            self.optimiser.step(
-                gradients, step.rendered.visible, self.learning_rates(self.progress(iteration))
-            )
+            rates = self.pace.learning_rates(self.progress(iteration))
+            self.optimiser.step(gradients, step.rendered.visible, rates)
         with part("density"):
             self.density.observe(step, gradients, keep)
             self.gaussians, events = self.density.refine(step, self.gaussians, self.optimiser)
@@ -283,8 +203,6 @@ class Trainer:
                 self.watchdog.look_at_parameters(iteration, view, self.gaussians)
         self.iteration = iteration
         return loss.value
-
-    # -- the loop ---------------------------------------------------------------------------------
 
     def train(self, *, tick: Callable[[Trainer], None] | None = None) -> None:
         """Run to the end; saves as it goes, probes on schedule.
@@ -319,10 +237,9 @@ class Trainer:
             self.watchdog.handle(self, error)
             return
         self.clock.stop()
-        if not math.isnan(loss):
-            self.loss_sum, self.loss_count = self.loss_sum + loss, self.loss_count + 1
+        self.timeline.loss(loss)
         after = self.progress(self.iteration)
-        if int(after * TIMELINE_ROWS) > int(before * TIMELINE_ROWS):
+        if int(after * ROWS) > int(before * ROWS):
             probes = self.config.probes
             self._log(probing=probes > 0 and int(after * probes) > int(before * probes))
         if tick is not None:
@@ -331,7 +248,7 @@ class Trainer:
     def _save_if_sound(self) -> bool:
         """Save, unless a parameter is not finite: then it is as if the last step had found that."""
         try:
-            view = self._view_at(max(self.iteration, 1))
+            view = self.pace.view(max(self.iteration, 1))
             self.watchdog.look_at_parameters(self.iteration, view, self.gaussians)
         except NonFinite as error:
             self.watchdog.handle(self, error)
@@ -340,21 +257,11 @@ class Trainer:
         return True
 
     def _log(self, probing: bool) -> None:
-        n = max(self.iteration, 1)
-        row: dict[str, Any] = {
-            "wall_s": round(self.clock.now(), 3),
-            "iteration": self.iteration,
-            "loss": self.loss_sum / max(self.loss_count, 1),
-            "gaussians": len(self.gaussians),
-            "psnr_probe": None,
-        }
-        self.loss_sum, self.loss_count = 0.0, 0
-        row |= {f"ms_{name.replace(' ', '_')}": 1e3 * s / n for name, s in self.clock.parts_s.items()}
+        row = self.timeline.add(self.iteration, len(self.gaussians), self.clock)
         if probing and self.probe is not None:
             spent = dict(self.clock.parts_s)
             row["psnr_probe"] = self.probe(self._probe_image)
             self.clock.parts_s = spent
-        self.timeline.append(row)
 
     def _probe_image(self, camera: Camera) -> Tensor:
         # Rows the optimiser has put off are brought up to date first; it computes what a later step
@@ -371,8 +278,6 @@ class Trainer:
         """Train photos that were all masked at some step and taught nothing then."""
         return sorted(self.data.scene.train[i].name for i in self.skipped)
 
-    # -- state ------------------------------------------------------------------------------------
-
     @property
     def checkpoint_path(self) -> Path:
         return self.folder / "checkpoint" / "last.safetensors"
@@ -380,7 +285,7 @@ class Trainer:
     def save(self) -> None:
         """Write the whole state and the timeline, each atomically."""
         checkpoint.save(self.checkpoint_path, snapshot.take(self))
-        snapshot.write_timeline(self.folder / "timeline.csv", self.timeline)
+        self.timeline.write(self.folder / "timeline.csv")
 
     def resume(self) -> bool:
         """Go on from the last checkpoint, if there is one; returns whether there was."""

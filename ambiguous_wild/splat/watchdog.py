@@ -142,7 +142,7 @@ class Watchdog:
             trainer.resume()
             back = {
                 "iteration": error.finding.iteration,
-                "epoch": trainer.epoch_of(error.finding.iteration),
+                "epoch": trainer.pace.epoch(error.finding.iteration),
                 "view": error.view,
                 "photo": error.finding.view,
                 "what": str(error),

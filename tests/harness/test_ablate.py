@@ -16,8 +16,8 @@ from ambiguous_wild.harness.store import read_runs, write_result
 from ambiguous_wild.methods import MethodEntry, get_method, register, registry
 from ambiguous_wild.methods.ablation import Group, Variant, check_groups, choose_groups
 from ambiguous_wild.splat.density import DensityConfig
+from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.parts import Parts
-from ambiguous_wild.splat.trainer import TrainConfig
 from tests.harness.fake_runs import fake_result
 from tests.tiny_scene import write_tiny_scene
 

@@ -19,7 +19,7 @@ from ambiguous_wild.harness.engines.transfer import receive, run_sent, send_scen
 from ambiguous_wild.harness.grid import cell_folder, plan_cells
 from ambiguous_wild.harness.store import read_result
 from ambiguous_wild.methods import registry
-from ambiguous_wild.splat.trainer import TrainConfig
+from ambiguous_wild.splat.pace import TrainConfig
 from tests.tiny_scene import write_tiny_scene
 
 SHORT = TrainConfig(iterations=40)

@@ -16,7 +16,7 @@ from ambiguous_wild.harness.grid import plan_cells, run_cells
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.methods import registry
 from ambiguous_wild.methods.external import nerfbaselines
-from ambiguous_wild.splat.trainer import TrainConfig
+from ambiguous_wild.splat.pace import TrainConfig
 from tests.tiny_scene import TEST, TRAIN, write_tiny_scene
 
 SHORT = TrainConfig(iterations=5)

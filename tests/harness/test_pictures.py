@@ -22,8 +22,9 @@ from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import get_method
 from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.data import load_train_data
+from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.parts import Parts
-from ambiguous_wild.splat.trainer import TrainConfig, Trainer
+from ambiguous_wild.splat.trainer import Trainer
 from tests.tiny_scene import HEIGHT, TRAIN, WIDTH, write_tiny_scene
 
 ITERATIONS = 120
@@ -124,7 +125,7 @@ def test_pictures_can_be_left_away(scene, tmp_path):
 def test_the_log_of_density_control_adds_up(watched):
     trainer, _, _ = watched
     rounds = trainer.density.log.rounds
-    count = trainer.start_count
+    count = trainer.pace.start
     for r in rounds:
         count += r.cloned + r.split - r.pruned - r.merged
         assert r.count == count

@@ -16,7 +16,7 @@ from ambiguous_wild.harness.planning.file import read_plan
 from ambiguous_wild.harness.planning.probe import Occlusion, summarise, unexplained, with_occlusion
 from ambiguous_wild.io.atomic import write_json
 from ambiguous_wild.methods.registry import get_method
-from ambiguous_wild.splat.trainer import TrainConfig
+from ambiguous_wild.splat.pace import TrainConfig
 from tests.tiny_scene import write_tiny_scene
 
 VIEWS, POINTS, WIDTH, HEIGHT, FOCAL = 12, 150, 160, 90, 200.0

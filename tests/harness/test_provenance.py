@@ -14,7 +14,7 @@ from ambiguous_wild.harness.grid import plan_cells
 from ambiguous_wild.harness.provenance import code_hash, provenance, reproduce
 from ambiguous_wild.methods import registry
 from ambiguous_wild.methods.registry import load_plugin
-from ambiguous_wild.splat.trainer import TrainConfig
+from ambiguous_wild.splat.pace import TrainConfig
 from tests.tiny_scene import write_tiny_scene
 
 

@@ -12,8 +12,8 @@ from ambiguous_wild.harness.grid import cell_folder, plan_cells, run_cells
 from ambiguous_wild.harness.replay import replay
 from ambiguous_wild.harness.store import read_result
 from ambiguous_wild.methods import MethodEntry, register, registry
+from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.parts import MaskPolicy, Parts
-from ambiguous_wild.splat.trainer import TrainConfig
 from tests.tiny_scene import write_tiny_scene
 
 

@@ -17,8 +17,8 @@ from ambiguous_wild.io.ply import read_splat_ply
 from ambiguous_wild.methods import MethodEntry, register, registry
 from ambiguous_wild.metrics.flip import flip
 from ambiguous_wild.metrics.image import psnr
+from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.parts import MaskPolicy, Parts
-from ambiguous_wild.splat.trainer import TrainConfig
 from tests.tiny_scene import TEST, TRAIN, write_tiny_scene
 
 SHORT = TrainConfig(iterations=60, probes=2)

@@ -11,9 +11,10 @@ from ambiguous_wild.core.config import with_options
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import get_method
 from ambiguous_wild.splat.data import load_train_data
+from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.step import Step, TrainData
-from ambiguous_wild.splat.trainer import TrainConfig, Trainer
+from ambiguous_wild.splat.trainer import Trainer
 
 
 def data_of(scene: Path, cache: Path, seed: int = 0) -> TrainData:

@@ -20,8 +20,8 @@ from ambiguous_wild.methods.refinesplat.policy import RefineSplatMask
 from ambiguous_wild.methods.robustsplat.policy import RobustSplatMask
 from ambiguous_wild.methods.truth import TruthMask
 from ambiguous_wild.splat.density import DensityControl
+from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.parts import MaskPolicy, Parts
-from ambiguous_wild.splat.trainer import TrainConfig
 from tests.methods.baselines import bits, parts_of, resumed_equals_whole, trained
 from tests.tiny_scene import write_tiny_scene
 

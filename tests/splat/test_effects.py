@@ -18,11 +18,12 @@ from ambiguous_wild.splat.effects.poses import PoseRefinement, moved
 from ambiguous_wild.splat.effects.smoothing import SmoothingFilter, filter_sizes
 from ambiguous_wild.splat.effects.tracks import photo_gains
 from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.reference import render_reference
 from ambiguous_wild.splat.rendered import Gradients
 from ambiguous_wild.splat.step import TrainData
-from ambiguous_wild.splat.trainer import TrainConfig, Trainer
+from ambiguous_wild.splat.trainer import Trainer
 from tests.splat.scenes import camera as make_camera
 from tests.splat.scenes import gaussians as random_gaussians
 from tests.tiny_scene import write_tiny_scene

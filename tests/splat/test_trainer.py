@@ -19,9 +19,10 @@ from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.cpu import set_threads
 from ambiguous_wild.splat.data import load_train_data, shrink, shrink_keep
 from ambiguous_wild.splat.effects import with_effects
+from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.parts import MaskPolicy, Parts
 from ambiguous_wild.splat.resolution import Level, ceiling_at, coarse_to_fine, divisor_at
-from ambiguous_wild.splat.trainer import TrainConfig, Trainer
+from ambiguous_wild.splat.trainer import Trainer
 from tests.tiny_scene import write_tiny_scene
 
 
@@ -64,7 +65,7 @@ def test_training_learns_the_scene(tmp_path):
         for camera, photo in zip(trainer.data.cameras, trainer.data.photos)
     ]
     assert -10 * np.log10(np.mean(errors)) > 25
-    losses = [row["loss"] for row in trainer.timeline]
+    losses = [row["loss"] for row in trainer.timeline.rows]
     assert losses[-1] < 0.5 * losses[0]
 
 
@@ -104,7 +105,8 @@ from pathlib import Path
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.parts import Parts
-from ambiguous_wild.splat.trainer import TrainConfig, Trainer
+from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.trainer import Trainer
 scene, folder = load_scene(sys.argv[1]), Path(sys.argv[2])
 data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=folder)
 config = TrainConfig(iterations=400, checkpoint_every_s=0.05, probes=0)
@@ -175,7 +177,7 @@ def test_probing_changes_nothing_and_costs_no_training_time(scene, tmp_path, fak
     without = trained(scene, tmp_path / "a", probes=0)
     probed = trained(scene, tmp_path / "b", probes=4, probe=slow_probe)
     assert bits(without) == bits(probed)
-    values = [row["psnr_probe"] for row in probed.timeline if row["psnr_probe"] is not None]
+    values = [row["psnr_probe"] for row in probed.timeline.rows if row["psnr_probe"] is not None]
     assert values == [12.5] * 4
     assert probed.clock.now() == pytest.approx(without.clock.now())
 
@@ -194,8 +196,8 @@ def test_under_a_budget_probes_take_no_iteration_from_the_run(scene, tmp_path, f
     assert bits(without) == bits(probed)
     assert probed.clock.now() == without.clock.now()
     assert probed.clock.parts_s == without.clock.parts_s
-    assert [row["wall_s"] for row in probed.timeline] == [row["wall_s"] for row in without.timeline]
-    assert sum(row["psnr_probe"] is not None for row in probed.timeline) == 8
+    assert [row["wall_s"] for row in probed.timeline.rows] == [row["wall_s"] for row in without.timeline.rows]
+    assert sum(row["psnr_probe"] is not None for row in probed.timeline.rows) == 8
 
 
 def test_the_timeline_is_a_table(scene, tmp_path):
@@ -260,12 +262,14 @@ def test_a_budget_scales_the_schedule_and_is_kept(scene, tmp_path, fake_time):
     assert 1.5 <= trainer.clock.now() < 1.5 + 2 * per_iteration
     # SH grows by nominal time: a budgeted run of any length ends at the full degree
     assert trainer.render(trainer.data.cameras[0]).image.shape == trainer.data.photos[0].shape
-    assert [row["wall_s"] for row in trainer.timeline] == sorted(row["wall_s"] for row in trainer.timeline)
+    assert [row["wall_s"] for row in trainer.timeline.rows] == sorted(
+        row["wall_s"] for row in trainer.timeline.rows
+    )
 
 
 def test_every_view_once_an_epoch(scene, tmp_path):
     trainer = trainer_for(scene, tmp_path)
-    order = [trainer._view_at(i) for i in range(1, 13)]
+    order = [trainer.pace.view(i) for i in range(1, 13)]
     assert sorted(order[:6]) == sorted(order[6:]) == list(range(6))
 
 
@@ -293,9 +297,9 @@ def test_the_count_ceiling_rises_with_the_resolution():
 
 def test_a_short_run_grows_no_more_than_a_gaussian_a_pixel(scene, tmp_path):
     pixels = 64 * 48
-    assert trainer_for(scene, tmp_path, iterations=100)._most_gaussians() == pixels
-    assert trainer_for(scene, tmp_path, iterations=30_000)._most_gaussians() == 1_000_000
-    assert trainer_for(scene, tmp_path, iterations=100, max_gaussians=500)._most_gaussians() == 500
+    assert trainer_for(scene, tmp_path, iterations=100).pace.most == pixels
+    assert trainer_for(scene, tmp_path, iterations=30_000).pace.most == 1_000_000
+    assert trainer_for(scene, tmp_path, iterations=100, max_gaussians=500).pace.most == 500
 
 
 def test_shrinking_averages_photos_and_keeps_only_whole_blocks():

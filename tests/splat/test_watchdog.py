@@ -10,8 +10,8 @@ import torch
 from ambiguous_wild.harness.grid import plan_cells
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat import checkpoint
+from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.parts import MaskPolicy, Parts
-from ambiguous_wild.splat.trainer import TrainConfig
 from ambiguous_wild.splat.watchdog import FOLDER, GOOD, MOST_ROLLBACKS, REPORT, STEP, NonFinite, Watchdog
 from tests.splat.test_trainer import bits, parts_of, trained, trainer_for
 from tests.tiny_scene import write_tiny_scene
@@ -42,7 +42,7 @@ def poisoned(scene, folder, poison, **config):
 
 def test_a_gradient_is_named_and_kept_for_replay(scene, tmp_path):
     trainer = poisoned(scene, tmp_path / "run", Poison([17]))
-    view = scene.train[trainer._view_at(17)].name
+    view = scene.train[trainer.pace.view(17)].name
     with pytest.raises(
         NonFinite, match=rf"gradient of .*means.* iteration 17, view {view}.*--replay"
     ) as info:
@@ -59,7 +59,7 @@ def test_a_gradient_is_named_and_kept_for_replay(scene, tmp_path):
     seen = checkpoint.load(where / STEP)
     rows = ~torch.isfinite(seen["d_means"]).all(1)
     assert rows.nonzero()[:10, 0].tolist() == list(finding.rows)
-    assert torch.equal(seen["photo"], trainer.data.photos[trainer._view_at(17)])
+    assert torch.equal(seen["photo"], trainer.data.photos[trainer.pace.view(17)])
 
 
 @pytest.mark.parametrize("name", ["means", "sh_rest"])
@@ -92,7 +92,7 @@ def test_a_rollback_goes_on_as_if_the_photo_had_been_left_out(scene, tmp_path):
     )
     trainer.train()
     other = poisoned(scene, tmp_path / "b", Poison())
-    left_out = {(other.epoch_of(i), other._view_at(i)) for i in (17, 40)}
+    left_out = {(other.pace.epoch(i), other.pace.view(i)) for i in (17, 40)}
     other.watchdog.skips = lambda epoch, view: (epoch, view) in left_out
     other.train()
     assert bits(trainer) == bits(other)
@@ -100,7 +100,7 @@ def test_a_rollback_goes_on_as_if_the_photo_had_been_left_out(scene, tmp_path):
     assert [row["iteration"] for row in facts] == [17, 40]
     assert [row["to"] for row in facts] == [0, 0]
     assert len(list((tmp_path / "a" / FOLDER).iterdir())) == 2
-    assert math.isfinite(trainer.timeline[-1]["loss"])
+    assert math.isfinite(trainer.timeline.rows[-1]["loss"])
     again = poisoned(scene, tmp_path / "a", Poison([17, 40]), on_nonfinite="rollback")
     again.resume()
     assert again.watchdog.facts() == trainer.watchdog.facts()

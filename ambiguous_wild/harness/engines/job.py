@@ -29,7 +29,7 @@ from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.graft import split_graft
 from ambiguous_wild.methods.references import load_reference, reference_file, with_file
 from ambiguous_wild.methods.registry import get_method, load_plugin
-from ambiguous_wild.splat.trainer import TrainConfig
+from ambiguous_wild.splat.pace import TrainConfig
 
 # A node that is lost keeps its lock until the file server forgets it (NFS: 90 s by default).
 LOCK_WAIT_S = 150.0

@@ -21,9 +21,10 @@ from ambiguous_wild.core import Scene
 from ambiguous_wild.harness.planning.decide import Decision, Plan, answer
 from ambiguous_wild.splat.data import load_train_data, shrink_keep
 from ambiguous_wild.splat.effects import ALL, with_effects
+from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.step import TrainData
-from ambiguous_wild.splat.trainer import TrainConfig, Trainer
+from ambiguous_wild.splat.trainer import Trainer
 
 LONGEST = 160  # px of the probe's photos
 ITERATIONS = 300

@@ -1,4 +1,4 @@
-"""Identities, density control and the mask policy's state, on a scene made on the spot."""
+"""The mask policy and its state, on a scene made on the spot."""
 
 import dataclasses
 from pathlib import Path
@@ -9,17 +9,14 @@ import numpy as np
 import pytest
 import torch
 
-from ambiguous_wild.core import AwError, Camera, Points, Scene, View
+from ambiguous_wild.core import Camera, Points, Scene, View
 from ambiguous_wild.core.config import from_plain, to_plain
-from ambiguous_wild.methods.refinesplat.association import associate
 from ambiguous_wild.methods.refinesplat.config import MaskConfig, RefineSplatConfig
-from ambiguous_wild.methods.refinesplat.density import EntropyAwareDensity, EntropyDensityConfig
-from ambiguous_wild.methods.refinesplat.identity import PsiConfig, train_psi
-from ambiguous_wild.methods.refinesplat.inputs import static_instances
+from ambiguous_wild.methods.refinesplat.density import EntropyAwareDensity
+from ambiguous_wild.methods.refinesplat.identity import PsiConfig
 from ambiguous_wild.methods.refinesplat.policy import RefineSplatMask
 from ambiguous_wild.methods.refinesplat.recipe import build
 from ambiguous_wild.splat.checkpoint import load, save
-from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.step import Step, TrainData
 
 HEIGHT, WIDTH, VIEWS = 72, 128, 4
@@ -329,144 +326,6 @@ def test_cotangent_comes_every_kth_iteration_and_weighs_k_times(scene):
         off = policy.cotangent(step_of(scene.data, 0, blurred(scene.clean[0], 0), iteration=103), None)
         assert (off is None) == (k == 3)
     assert torch.allclose(every[3], 3 * every[1])
-
-
-# -- identities ---------------------------------------------------------------------------------------
-
-
-def test_tracks_join_instances_and_one_photo_keeps_them_apart():
-    labels = np.repeat(np.repeat(np.array([[1, 2], [3, 4]], np.int32), 10, 0), 10, 1)
-    other = np.array([0, 4, 1, 2, 3], np.int32)[labels]  # the same quadrants under other names
-    rng = np.random.default_rng(0)
-    xy = rng.uniform(0, 20, (200, 2))
-    point = np.tile(np.arange(200), 2)
-    photo = np.repeat([0, 1], 200)
-    zeros = [np.zeros((4, 2))] * 2
-    found = associate([labels, other], zeros, (point, photo, np.concatenate([xy, xy])))
-    assert found.count == 4
-    assert np.array_equal(found.of_instance[0][labels], found.of_instance[1][other])
-    assert (found.photos_of == 2).all()
-    for ids in found.of_instance:
-        assert len(set(ids[1:])) == 4
-
-
-def test_features_join_what_no_track_does_and_the_number_is_bounded():
-    labels = [
-        np.array([[1, 2, 2]], np.int32),
-        np.array([[2, 1, 0]], np.int32),
-        np.array([[-1, 5, 0]], np.int32),
-    ]
-    a, b = np.array([1.0, 0.0]), np.array([0.0, 1.0])
-    means = [np.stack([a, b]), np.stack([b, a]), np.stack([a * 0, a * 0, a * 0, a * 0, a])]
-    nothing = (np.zeros(0, np.int64), np.zeros(0, np.int32), np.zeros((0, 2)))
-    found = associate(labels, means, nothing)
-    assert found.of_instance[0][1] == found.of_instance[1][2] == found.of_instance[2][5] == 1
-    assert found.of_instance[0][2] == found.of_instance[1][1] == 2
-    assert found.count == 2
-    assert associate(labels, means, nothing, most=1).count == 1
-    empty = associate([np.zeros((2, 2), np.int32)], [np.zeros((0, 2))], nothing)
-    assert empty.count == 0
-
-
-def test_sfm_vouches_for_what_it_saw_often():
-    labels = [np.repeat(np.array([[1, 2]], np.int32), 10, axis=1).repeat(10, axis=0)]
-    rng = np.random.default_rng(0)
-    left = np.stack([rng.uniform(0, 10, 190), rng.uniform(0, 10, 190)], 1)
-    right = left[:6] + np.array([10.0, 0.0])  # a few wrong matches
-    xy = np.concatenate([left, right])
-    point = np.arange(len(xy))
-    # each point is seen in three views, of which only photo 0 is asked about
-    tracks = (np.tile(point, 3), np.repeat([0, 1, 2], len(xy)), np.tile(xy, (3, 1)))
-    blank = [np.zeros((10, 20), np.int32)] * 2
-    found = static_instances(labels + blank, [2, 0, 0], tracks, share=0.35)
-    assert found[0].tolist() == [True, False]
-    assert not static_instances(labels, [2], tracks, share=0.0)[0].any()
-    pairs = (np.tile(point, 2), np.repeat([0, 1], len(xy)), np.tile(xy, (2, 1)))
-    assert not static_instances(labels, [2], pairs, share=0.35)[0].any()  # two views are no evidence
-
-
-def test_psi_learns_and_repeats():
-    generator = torch.Generator().manual_seed(0)
-    ids = torch.randint(0, 4, (800,), generator=generator)
-    features = torch.nn.functional.one_hot(ids, 4) + 0.1 * torch.randn(800, 4, generator=generator)
-    for variant in ("sigmoid", "softmax"):
-        config = PsiConfig(hidden=16, steps=200, batch=256)
-        psi = train_psi(features, ids, 3, config, variant, 1)
-        again = train_psi(features, ids, 3, config, variant, 1)
-        assert torch.equal(psi(features), again(features))
-        some = ids > 0
-        assert float((psi(features)[some].argmax(1) + 1 == ids[some]).float().mean()) > 0.97
-        assert not any(p.requires_grad for p in psi.parameters())
-    with pytest.raises(AwError, match="identities"):
-        train_psi(features, torch.zeros(800, dtype=torch.long), 3, PsiConfig(), "sigmoid", 1)
-
-
-# -- density control and recipe -----------------------------------------------------------------------
-
-
-def test_the_deciding_gradient_is_selectable():
-    screen, extra = torch.tensor([[1.0, 2.0]]), torch.tensor([[10.0, -2.0]])
-    gradients = SimpleNamespace(screen=screen, screen_extra=extra)
-    plain = SimpleNamespace(screen=screen, screen_extra=None)
-
-    def control(decides):
-        return EntropyAwareDensity(EntropyDensityConfig(decides=decides), 1.0, 0)
-
-    assert torch.equal(control("total").statistic(gradients), screen + extra)
-    assert torch.equal(control("photometric").statistic(gradients), screen)
-    assert torch.equal(control("entropy").statistic(gradients), extra)
-    assert torch.equal(control("total").statistic(plain), screen)
-    assert not control("entropy").statistic(plain).any()
-    assert [control(d).wants_extra() for d in ("total", "photometric", "entropy")] == [True, False, True]
-    with pytest.raises(AwError, match="total"):
-        control("totl")
-
-
-def test_clones_go_downhill_and_stay_inside():
-    n = 6
-    g = torch.Generator().manual_seed(0)
-    gaussians = Gaussians(
-        torch.zeros(n, 3),
-        torch.randn(n, 4, generator=g),
-        torch.randn(n, 3, generator=g) - 3,
-        torch.zeros(n),
-        torch.zeros(n, 3),
-        torch.zeros(n, 0, 3),
-    )
-    control = EntropyAwareDensity(EntropyDensityConfig(clone_shift=0.5), 1.0, 0)
-    control.downhill = torch.randn(n, 3, generator=g)
-    control.downhill[5] = 0.0
-    rows = torch.arange(n)
-    offset = control.clone_offset(gaussians, rows)
-    assert ((offset * control.downhill).sum(1)[:5] > 0).all()
-    assert (offset.norm(dim=1) <= 0.5 * gaussians.log_scales.exp().amax(1) + 1e-7).all()
-    assert not offset[5].any()
-    still = EntropyAwareDensity(EntropyDensityConfig(clone_shift=0.0), 1.0, 0)
-    assert still.clone_offset(gaussians, rows) is None
-
-
-def test_merging_removes_quiet_twins_and_keeps_statistics_in_step():
-    base = Gaussians.from_points(np.random.default_rng(0).random((20, 3)) * 50, np.zeros((20, 3), np.uint8))
-    base.log_scales -= 4.0  # nobody reaches its neighbour
-    gaussians = base.cat(base)  # every Gaussian twice
-    calls = []
-    optimiser = SimpleNamespace(select=lambda rows: calls.append(int(rows.sum())), append=calls.append)
-    control = EntropyAwareDensity(EntropyDensityConfig(), 1.0, 0)
-    control._match(gaussians)
-    control.seen += 1
-    control.grad_sum[:] = 0.0
-    control.grad_sum[:5] = 1.0  # busy ones stay as they are
-    step = SimpleNamespace(nominal=12_000.0)
-    merged = control.after_growth(step, gaussians, optimiser)
-    assert len(merged) == 25
-    assert control.merged == 15
-    assert calls == [10, 15]
-    assert len(control.seen) == len(control.downhill) == 25
-    assert control.after_growth(step, merged, optimiser) is merged  # not due again
-    other = EntropyAwareDensity(EntropyDensityConfig(), 1.0, 0)
-    other.load_state_dict(control.state_dict())
-    assert other.merged == 15
-    assert other.last_merge == 12_000.0
 
 
 def test_recipe_and_config_round_trip():

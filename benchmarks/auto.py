@@ -23,7 +23,7 @@ from typing import Any
 from presets import Stopped, aw, check_presets, mean_psnr, save
 
 from ambiguous_wild.harness.environment import environment
-from ambiguous_wild.harness.store import RESULT, read_result
+from ambiguous_wild.harness.result_file import RESULT, read_result
 from ambiguous_wild.simulate.presets import PRESETS
 
 RESULTS = Path(__file__).parent / "results" / "auto"

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from ambiguous_wild.harness.environment import environment
-from ambiguous_wild.harness.store import RESULT, read_result
+from ambiguous_wild.harness.result_file import RESULT, read_result
 from ambiguous_wild.io.atomic import write_json, write_text
 from ambiguous_wild.metrics import stats
 from ambiguous_wild.simulate.presets import PRESETS

@@ -1,14 +1,12 @@
 """What `aw doctor` looks at: each check says what it found and, where something lacks, what brings it.
 
-Nothing heavy is imported with this module. What may crash or hang (torch, torchvision, pycolmap) is tried in a process
-of its own, all of them at the same time.
+Nothing heavy is imported with this module: what may crash or hang is tried by `probes`, all at the same time.
 """
 
 from __future__ import annotations
 
 import importlib.metadata
 import importlib.util
-import json
 import os
 import platform
 import shlex
@@ -19,47 +17,18 @@ from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
+from ambiguous_wild.cli.probes import PROBES, Probe, probe
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.extras import install_command
 from ambiguous_wild.harness.environment import installed
 
 PACKAGE = Path(__file__).resolve().parent.parent
 DISTRIBUTION = "ambiguous-wild"
-PROBE_TIMEOUT_S = 60
 SMALL_MEMORY_GB = 2.0  # below it COLMAP and a training of 100 000 Gaussians do not fit
 UNUSED = "not used by this version yet"
 SMALL_DISK_GB = 1.0  # photos, features and one run
-
-# What is tried in a process of its own; each prints one line of JSON.
-PROBES = {
-    "torch": """
-import torch
-cuda = torch.cuda.is_available()
-names = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())] if cuda else []
-print(json.dumps({"version": torch.__version__, "built": torch.version.cuda, "cuda": cuda, "names": names}))
-""",
-    "torchvision": "import torchvision; print(json.dumps({'version': torchvision.__version__}))",
-    "numba": """
-import numba
-threads = numba.get_num_threads()  # starts the threading layer
-print(json.dumps({"threads": threads, "layer": numba.threading_layer()}))
-""",
-    "OpenImageIO": "import OpenImageIO; print(json.dumps({'version': OpenImageIO.VERSION_STRING}))",
-    "pycolmap": """
-import tempfile, pathlib
-from ambiguous_wild.io.safe_pycolmap import pycolmap
-import numpy as np
-from ambiguous_wild.io.images import read_png_rgb, write_png
-image = np.arange(48 * 64 * 3, dtype=np.uint8).reshape(48, 64, 3)
-with tempfile.TemporaryDirectory() as folder:
-    path = pathlib.Path(folder) / "probe.png"
-    write_png(path, image)
-    assert (read_png_rgb(path) == image).all(), "the PNG read back differs from the one written"
-print(json.dumps({"version": pycolmap.__version__}))
-""",
-}
 
 
 @dataclass(frozen=True)
@@ -71,14 +40,6 @@ class Check:
     ok: bool
     detail: str  # what was found
     fix: str = ""  # the command that brings it; empty where nothing lacks or nothing is gained
-
-
-@dataclass(frozen=True)
-class Probe:
-    """What a process said: its facts, or why there are none."""
-
-    facts: dict[str, Any] | None
-    error: str = ""
 
 
 def all_checks() -> list[Check]:
@@ -101,26 +62,6 @@ def all_checks() -> list[Check]:
         *_extras(),
         *_planned(),
     ]
-
-
-def probe(name: str) -> Probe:
-    """Run one of `PROBES` in a process of its own."""
-    code = "import json\n" + PROBES[name]
-    try:
-        done = subprocess.run(
-            [sys.executable, "-c", code], capture_output=True, text=True, timeout=PROBE_TIMEOUT_S, check=False
-        )
-    except subprocess.TimeoutExpired:
-        return Probe(None, f"no answer within {PROBE_TIMEOUT_S} s")
-    if done.returncode < 0:
-        return Probe(None, f"the process crashed (signal {-done.returncode})")
-    lines = done.stderr.strip().splitlines()
-    if done.returncode:
-        return Probe(None, lines[-1] if lines else f"exit code {done.returncode}")
-    try:
-        return Probe(json.loads(done.stdout.strip().splitlines()[-1]))
-    except (IndexError, ValueError):
-        return Probe(None, f"unexpected output {done.stdout[-200:]!r}")
 
 
 def _machine() -> list[Check]:

@@ -12,8 +12,8 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash, with_options
 from ambiguous_wild.harness.cell import Cell
 from ambiguous_wild.harness.grid import cell_folder, plan_cells
+from ambiguous_wild.harness.result_file import read_result
 from ambiguous_wild.harness.run import FAILED, RESULT
-from ambiguous_wild.harness.store import read_result
 from ambiguous_wild.methods.ablation import DEFAULT, Group, Variant, choose_groups, folder_name
 from ambiguous_wild.methods.registry import MethodEntry, get_method
 from ambiguous_wild.splat.pace import TrainConfig

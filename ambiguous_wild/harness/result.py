@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from ambiguous_wild import __version__
 from ambiguous_wild.core.config import to_plain
-from ambiguous_wild.harness.store import SCHEMA
+from ambiguous_wild.harness.result_file import SCHEMA
 
 if TYPE_CHECKING:
     from ambiguous_wild.harness.cell import Cell

@@ -24,7 +24,7 @@ from ambiguous_wild.harness.identity import scene_identity as scene_identity  # 
 from ambiguous_wild.harness.memory import peak_memory, reset_peak
 from ambiguous_wild.harness.provenance import provenance
 from ambiguous_wild.harness.result import result_of
-from ambiguous_wild.harness.store import read_result, write_result
+from ambiguous_wild.harness.result_file import read_result, write_result
 from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.atomic import sweep, write_json, write_text
 from ambiguous_wild.io.lock import folder_lock

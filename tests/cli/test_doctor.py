@@ -12,8 +12,9 @@ import pytest
 from click.testing import CliRunner
 
 from ambiguous_wild.cli import checks
-from ambiguous_wild.cli.checks import Check, Probe, all_checks, other_versions, probe, unmet
+from ambiguous_wild.cli.checks import Check, all_checks, other_versions, unmet
 from ambiguous_wild.cli.doctor import command
+from ambiguous_wild.cli.probes import PROBES, Probe, probe
 from ambiguous_wild.core import AwError
 
 
@@ -134,7 +135,7 @@ def test_versions_other_than_the_tested_are_named(tmp_path: Path) -> None:
     ],
 )
 def test_a_probe_that_fails_says_how(code: str, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(checks.PROBES, "broken", code)
+    monkeypatch.setitem(PROBES, "broken", code)
     found = probe("broken")
     assert found.facts is None and words in found.error
 

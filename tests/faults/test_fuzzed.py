@@ -17,7 +17,8 @@ import torch
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.planning.decide import SCHEMA
 from ambiguous_wild.harness.planning.file import read_plan
-from ambiguous_wild.harness.store import read_config, read_result
+from ambiguous_wild.harness.result_file import read_result
+from ambiguous_wild.harness.store import read_config
 from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.image_header import header_size
 from ambiguous_wild.io.images import read_png_rgb, write_png

@@ -17,7 +17,7 @@ from ambiguous_wild.harness.engines.processes import run_in_processes
 from ambiguous_wild.harness.engines.ray_cluster import RayOptions
 from ambiguous_wild.harness.engines.transfer import receive, run_sent, send_scene, stays
 from ambiguous_wild.harness.grid import cell_folder, plan_cells
-from ambiguous_wild.harness.store import read_result
+from ambiguous_wild.harness.result_file import read_result
 from ambiguous_wild.methods import registry
 from ambiguous_wild.splat.pace import TrainConfig
 from tests.tiny_scene import write_tiny_scene

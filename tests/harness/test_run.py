@@ -10,7 +10,7 @@ import yaml
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.grid import cell_folder, plan_cells, run_cells
-from ambiguous_wild.harness.store import read_result
+from ambiguous_wild.harness.result_file import read_result
 from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.lock import folder_lock
 from ambiguous_wild.io.ply import read_splat_ply

@@ -14,7 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.store import read_result, read_runs, write_result
+from ambiguous_wild.harness.result_file import read_result, write_result
+from ambiguous_wild.harness.store import read_runs
 from tests.harness.fake_runs import failed, fake_result, save, start
 
 

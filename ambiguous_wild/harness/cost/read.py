@@ -16,7 +16,8 @@ from typing import Any
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash, flatten
-from ambiguous_wild.harness.store import FAILED, RESULT, read_config, read_result, run_folders
+from ambiguous_wild.harness.result_file import FAILED, RESULT, read_result
+from ambiguous_wild.harness.store import read_config, run_folders
 from ambiguous_wild.metrics import stats
 
 # of the training: they change how a run is kept and watched, not its result

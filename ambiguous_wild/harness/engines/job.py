@@ -22,8 +22,8 @@ from ambiguous_wild.harness.cell import Cell, CellReport, Overwrite, Protocol
 from ambiguous_wild.harness.choosing import Chosen
 from ambiguous_wild.harness.grid import run_isolated
 from ambiguous_wild.harness.provenance import code_hash
+from ambiguous_wild.harness.result_file import write_result
 from ambiguous_wild.harness.run import FAILED, RESULT, error_line, failed_result, scene_identity
-from ambiguous_wild.harness.store import write_result
 from ambiguous_wild.io.lock import Busy, folder_lock, patient_lock
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.graft import split_graft

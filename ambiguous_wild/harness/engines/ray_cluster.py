@@ -17,8 +17,8 @@ from ambiguous_wild.core.extras import install_command
 from ambiguous_wild.harness.cell import CellReport
 from ambiguous_wild.harness.engines.job import Job, run_job
 from ambiguous_wild.harness.engines.transfer import Sent, receive, run_sent, send_scene, stays
+from ambiguous_wild.harness.result_file import read_result
 from ambiguous_wild.harness.run import RESULT, error_line, is_finished
-from ambiguous_wild.harness.store import read_result
 
 Transfer = Literal["shared", "store"]
 HEARTBEAT_S = 60.0

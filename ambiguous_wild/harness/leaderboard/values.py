@@ -8,7 +8,8 @@ from typing import Any, NoReturn
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist
-from ambiguous_wild.harness.store import MASK_SCORES, RESULT
+from ambiguous_wild.harness.result_file import RESULT
+from ambiguous_wild.harness.store import MASK_SCORES
 from ambiguous_wild.metrics.image import METRICS
 
 # Lowest and highest value by the first word of a metric's name; PSNR of pictures in [0, 1] is not negative.
@@ -26,7 +27,7 @@ def check_values(run: Path, result: dict[str, Any], *, photos: bool) -> None:
 
     Args:
         run: the run folder, for messages.
-        result: as `store.read_result` gives it.
+        result: as `result_file.read_result` gives it.
         photos: the test photos are at hand, and tell whether an infinite PSNR is right.
 
     Raises:

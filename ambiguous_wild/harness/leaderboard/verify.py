@@ -19,7 +19,8 @@ from ambiguous_wild.harness.leaderboard.settings import command, hardware, optio
 from ambiguous_wild.harness.leaderboard.sheet import check_text
 from ambiguous_wild.harness.leaderboard.values import check_values
 from ambiguous_wild.harness.measures import PARTIAL
-from ambiguous_wild.harness.store import FAILED, MASK_SCORES, RESULT, read_config, read_result
+from ambiguous_wild.harness.result_file import FAILED, RESULT, read_result
+from ambiguous_wild.harness.store import MASK_SCORES, read_config
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.metrics import stats

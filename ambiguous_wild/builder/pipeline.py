@@ -98,8 +98,9 @@ def build_scene(
             if not keep_work:  # of a call that was killed after its last rename
                 shutil.rmtree(work_root, ignore_errors=True)
             return BuildResult(target, known, True, time.perf_counter() - started)
+        earlier = work_root.exists()
         work = Workspace(work_root)
-        _run(stages, work, target, started, keep_work)
+        _run(stages, work, target, started, keep_work, earlier)
     info = json.loads((target / "scene.json").read_text(encoding="utf-8"))
     reused = tuple(r.name for r in work.results if r.reused)
     return BuildResult(target, info, False, time.perf_counter() - started, reused)
@@ -124,6 +125,7 @@ def _existing(target: Path, stages: Stages, overwrite: bool) -> dict[str, Any] |
         except AwError:
             if not overwrite:
                 raise
+            _refuse_strangers(target, info)
             return None
         return info
     if not overwrite:
@@ -132,10 +134,25 @@ def _existing(target: Path, stages: Stages, overwrite: bool) -> dict[str, Any] |
             f"{target} exists, built from other {changed}; pass --overwrite to replace it, or "
             "choose another -o"
         )
+    _refuse_strangers(target, info)
     return None
 
 
-def _run(stages: Stages, work: Workspace, target: Path, started: float, keep_work: bool) -> None:
+def _refuse_strangers(target: Path, info: dict[str, Any]) -> None:
+    """Raise AwError where the scene's folder holds what no build made: replacing it would lose that."""
+    ours = {"scene.json", *map(str, info.get("files", {}))}
+    for path in sorted(target.rglob("*")):
+        name = path.relative_to(target).as_posix()
+        if (path.is_file() or path.is_symlink()) and name not in ours:
+            raise AwError(
+                f"{target} also holds {name}, which --overwrite would remove with the scene: move it "
+                "elsewhere, or choose another -o"
+            )
+
+
+def _run(
+    stages: Stages, work: Workspace, target: Path, started: float, keep_work: bool, earlier: bool
+) -> None:
     try:
         _publish(stages.run(work, time.perf_counter() - started), target, work)
     except SfmCrash:
@@ -149,8 +166,9 @@ def _run(stages: Stages, work: Workspace, target: Path, started: float, keep_wor
             "the same command again: it goes on from the last finished stage"
         ) from error
     except AwError:
-        # What the user must mend first leaves nothing behind; a kill or a crash keeps the work.
-        if not keep_work:
+        # What the user must mend first leaves nothing behind; a kill or a crash keeps the work, and a
+        # mistyped option of the next call does not cost it.
+        if not keep_work and not earlier:
             work.remove()
         raise
     finally:

@@ -12,6 +12,9 @@ Matcher = Literal["auto", "exhaustive", "sequential"]
 Mapper = Literal["incremental", "global"]
 
 
+MOST_FEATURES = 100_000  # a photo; SIFT finds fewer in any
+
+
 @dataclass(frozen=True)
 class BuildSettings:
     """Settings of `build_scene`; nothing here changes with the machine."""
@@ -31,7 +34,10 @@ class BuildSettings:
     def __post_init__(self) -> None:
         if self.factor is not None and not 1 <= self.factor <= 64:
             raise AwError(f"--factor must be between 1 and 64, got {self.factor}")
-        if self.max_features < 100:
-            raise AwError(f"--max-features must be at least 100 to match anything, got {self.max_features}")
+        if not 100 <= self.max_features <= MOST_FEATURES:
+            raise AwError(
+                f"--max-features must be between 100, to match anything, and {MOST_FEATURES}, "
+                f"got {self.max_features}"
+            )
         if not 0 <= self.seed < 2**31:
             raise AwError(f"--seed must be between 0 and 2147483647, got {self.seed}")

@@ -14,6 +14,7 @@ from ambiguous_wild.cli.options import training_options
 from ambiguous_wild.cli.progress import Progress, finish
 from ambiguous_wild.core.errors import AwError
 
+LONGEST_S = 366 * 24 * 3600.0
 _UNITS = {"s": 1, "m": 60, "min": 60, "h": 3600}
 
 
@@ -26,7 +27,10 @@ def parse_budget(text: str) -> float:
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*(s|m|min|h)\s*", text)
     if not match or float(match[1]) <= 0:
         raise AwError(f"budget {text!r} is no duration above zero: write 90s, 10m or 1.5h")
-    return float(match[1]) * _UNITS[match[2]]
+    seconds = float(match[1]) * _UNITS[match[2]]
+    if seconds > LONGEST_S:
+        raise AwError(f"budget {text[:40]!r} is above a year: write 90s, 10m or 1.5h")
+    return seconds
 
 
 @click.command(name="bench")

@@ -38,7 +38,13 @@ class TestPhoto:
 
 
 def load_test_photos(scene: Scene) -> list[TestPhoto]:
-    """The test views' photos as 8-bit RGB."""
+    """The test views' photos as 8-bit RGB.
+
+    Raises:
+        AwError: one is too small to be measured; said here, before anything is trained.
+    """
+    for view in scene.test:
+        image_metrics.check_size(view.camera.height, view.camera.width)
     return [TestPhoto(view, read_png_rgb(view.image_path)) for view in scene.test]
 
 

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ambiguous_wild.core import Scene
 from ambiguous_wild.core.config import config_hash
+from ambiguous_wild.io.hashing import sha256_file
 
 # Keys of config.yaml that do not decide the result: how often it is saved and probed, what is done about
 # values that are not finite (the result says so where there were any), where the scene lies.
@@ -47,7 +51,34 @@ def scene_identity(scene: Scene) -> str:
     )
     split = [(v.name, v.split, v.camera.width, v.camera.height) for v in scene.views]
     if not known:
-        # A plain COLMAP scene lists no hashes: cameras and points stand for it.
-        poses = np.concatenate([v.camera.cam_from_world.ravel() for v in scene.views])
-        known = {"poses": poses.round(9).tolist(), "points": len(scene.points)}
+        known = _of_plain(scene)
+    # masks that were put into the folder later are in no list
+    for view in scene.views:
+        if view.keep_path is not None:
+            known.setdefault(view.keep_path.relative_to(scene.root).as_posix(), _digest(view.keep_path))
     return config_hash({"files": known, "split": split})
+
+
+def _of_plain(scene: Scene) -> dict[str, Any]:
+    """What stands for a plain COLMAP scene, which lists no hashes: cameras, points and photos."""
+    cameras = [v.camera for v in scene.views]
+    lenses = [(c.fx, c.fy, c.cx, c.cy) for c in cameras]
+    return {
+        "poses": np.concatenate([c.cam_from_world.ravel() for c in cameras]).round(9).tolist(),
+        "lenses": np.array(lenses).round(9).tolist(),
+        "points": hashlib.sha256(
+            scene.points.xyz.round(9).astype("<f8").tobytes() + scene.points.rgb.tobytes()
+        ).hexdigest(),
+        "photos": [_digest(v.image_path) for v in scene.views],
+    }
+
+
+def _digest(path: Path) -> str:
+    """sha256 of a file, computed once for each state of it."""
+    state = path.stat()
+    return _digest_of(path, state.st_size, state.st_mtime_ns)
+
+
+@lru_cache(maxsize=16_384)
+def _digest_of(path: Path, size: int, mtime_ns: int) -> str:
+    return sha256_file(path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import shutil
 import time
 import traceback
@@ -66,6 +67,7 @@ def run_cell(
     Raises:
         AwError: the folder holds a run of another configuration, or is in use.
     """
+    folder = Path(os.path.realpath(folder))  # one lock and one place, whatever links lead to it
     if folder.exists() and overwrite == "never":
         return CellReport(folder, "skipped")
     with folder_lock(folder, f"aw bench --method {cell.method.name}"):
@@ -92,10 +94,10 @@ def run_cell(
                 result = run_program(cell, folder)
             else:
                 result = _train_and_measure(cell, folder, cache_dir, tick, pictures)
+            write_result(folder / RESULT, result | provenance(cell))
         except Exception as error:
             _record_failure(cell, folder, error)
             raise
-        write_result(folder / RESULT, result | provenance(cell))
     return CellReport(folder, "trained", result=result)
 
 
@@ -132,8 +134,20 @@ def refuse_strange_folder(folder: Path) -> None:
     if not folder.is_dir():
         raise AwError(f"{folder} is a file, not a run folder; choose another -o")
     names = {p.name for p in folder.iterdir() if not p.name.startswith(".")}
-    if names and not names & {"config.yaml", RESULT, FAILED, TRACEBACK}:
-        raise AwError(f"{folder} is not empty and no run of ours (no config.yaml); choose another -o")
+    if names and not names & {RESULT, FAILED, TRACEBACK} and not _is_our_config(folder / "config.yaml"):
+        raise AwError(
+            f"{folder} is not empty and no run of ours (no config.yaml with a config_hash); choose another -o"
+        )
+
+
+def _is_our_config(path: Path) -> bool:
+    """Whether it is the settings of a run; a damaged one counts, one of somebody else's does not."""
+    if not path.is_file():
+        return False
+    try:
+        return "config_hash" in plain_yaml.read_mapping(path)
+    except AwError:
+        return True
 
 
 def refuse_other_config(folder: Path, cell: Cell) -> None:

@@ -57,8 +57,11 @@ def _named(error: OSError, target: Path) -> OSError:
 
 @contextmanager
 def atomic_dir(path: Path | str) -> Iterator[Path]:
-    """Yield a temporary folder beside `path`; rename it to `path` on success, replacing what was there."""
-    target = Path(path)
+    """Yield a temporary folder beside `path`; rename it to `path` on success, replacing what was there.
+
+    Where `path` is a link, what it leads to is replaced, not the link.
+    """
+    target = Path(os.path.realpath(path))
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}.tmp-", dir=target.parent))
     umask = os.umask(0)
@@ -102,6 +105,8 @@ def check_output(path: Path | str) -> None:
     Raises:
         AwError: a parent is a file, or nothing can be written there.
     """
+    if os.path.islink(path) and not os.path.exists(path):
+        raise AwError(f"cannot write {path}: it is a link to nowhere; remove it or choose another -o")
     folder = Path(os.path.abspath(path)).parent
     for part in (folder, *folder.parents):
         if part.exists() and not part.is_dir():

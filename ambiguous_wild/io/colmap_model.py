@@ -28,6 +28,9 @@ MODELS = {
     "THIN_PRISM_FISHEYE": (10, 12),
 }
 LARGEST_SIDE = 1_000_000  # px
+LARGEST_COORDINATE = 1e18  # world units; squares of it are still numbers in float32
+FOCAL_RANGE = (1e-3, 1e6)  # focal length over the longer side
+_TWO_FOCALS = {"PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE"}
 _BY_ID = {number: (name, count) for name, (number, count) in MODELS.items()}
 
 
@@ -140,18 +143,37 @@ def read_model(folder: Path | str) -> Model:
     )
     for camera in model.cameras.values():
         _check_camera(root, camera)
+    names: set[str] = set()
     for image in model.images.values():
         if not PurePosixPath(image.name).name or "\0" in image.name:
             raise AwError(f"{root}: image {image.image_id} has no name: the model is damaged; build it again")
         if image.camera_id not in model.cameras:
             raise AwError(f"{root}: image {image.name!r} names camera {image.camera_id}, which is not there")
+        if not (np.abs(image.tvec) < LARGEST_COORDINATE).all():
+            raise AwError(
+                f"{root}: image {image.name!r} has the translation {image.tvec.tolist()}: the model is "
+                "damaged; build it again"
+            )
+        if image.name in names:
+            raise AwError(
+                f"{root}: image {image.name!r} is there twice: the model is damaged; build it again"
+            )
+        names.add(image.name)
+    odd = np.flatnonzero(~(np.abs(model.points.xyz) < LARGEST_COORDINATE).all(axis=1))
+    if len(odd):
+        raise AwError(
+            f"{root}: {len(odd)} points are nowhere, the first is {model.points.ids[odd[0]]} at "
+            f"{model.points.xyz[odd[0]].tolist()}: the model is damaged; build it again or take them out"
+        )
     return model
 
 
 def _check_camera(root: Path, camera: ModelCamera) -> None:
     """Raise AwError for a camera that no lens has; its size is divided by, and allocated."""
     size = (camera.width, camera.height)
-    if not all(0 < side <= LARGEST_SIDE for side in size) or not np.isfinite(camera.params).all():
+    whole = all(0 < side <= LARGEST_SIDE for side in size) and bool(np.isfinite(camera.params).all())
+    focal = camera.params[:2] if camera.model in _TWO_FOCALS else camera.params[:1]
+    if not whole or not all(FOCAL_RANGE[0] <= f / max(size) <= FOCAL_RANGE[1] for f in focal):
         raise AwError(
             f"{root}: camera {camera.camera_id} is {size[0]}x{size[1]} px with the parameters "
             f"{list(camera.params)}: the model is damaged; copy or build it again"

@@ -75,6 +75,7 @@ def load_scene(
         for image in sorted(model.images.values(), key=lambda i: i.name)
         if image.name in split
     )
+    _refuse_same_stems(root, views)
     if not any(v.split == "train" for v in views):
         raise AwError(f"{root} has no training photo: none of train_list.txt is in the model")
     return Scene(root, name, views, _points(model, views), info)
@@ -168,7 +169,8 @@ def verify_files(root: Path | str, info: dict[str, Any], *, quick: bool = False)
 
 def read_list(path: Path) -> list[str]:
     """Names of a split list, one a line; empty lines are skipped."""
-    lines = path.read_text(encoding="utf-8", errors="surrogateescape").splitlines()
+    # some editors begin a file with a byte order mark, which is no part of the first name
+    lines = path.read_text(encoding="utf-8-sig", errors="surrogateescape").splitlines()
     return [line.strip() for line in lines if line.strip()]
 
 
@@ -235,6 +237,19 @@ def _split(root: Path, registered: list[str]) -> tuple[dict[str, Split], dict[st
             elif split.setdefault(match, side) != side:
                 raise AwError(f"{root}: {name!r} is in train_list.txt and in test_list.txt; keep it in one")
     return split, missing
+
+
+def _refuse_same_stems(root: Path, views: tuple[View, ...]) -> None:
+    """Raise AwError where two photos differ in their extension alone: their renders would be one PNG."""
+    seen: dict[tuple[str, str], str] = {}
+    for view in views:
+        key = (view.split, str(PurePosixPath(view.name).with_suffix("")))
+        if key in seen:
+            raise AwError(
+                f"{root}: photos {seen[key]!r} and {view.name!r} differ in their extension alone, so their "
+                "renders would be one file; rename one before the model is made"
+            )
+        seen[key] = view.name
 
 
 def _view(root: Path, folder: Path, model: Model, image: ModelImage, side: Split) -> View:

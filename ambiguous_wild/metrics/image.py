@@ -74,14 +74,18 @@ def ssim(a: np.ndarray, b: np.ndarray) -> float:
         AwError: a side shorter than the window, or see `checked_pair`.
     """
     left, right = checked_pair(a, b)
-    height, width = left.shape[:2]
+    check_size(*left.shape[:2])
+    edge = WINDOW // 2
+    return float(_ssim_map(left, right)[edge:-edge, edge:-edge].mean())
+
+
+def check_size(height: int, width: int) -> None:
+    """Raise AwError for a picture that `ssim` cannot measure."""
     if min(height, width) < WINDOW:
         raise AwError(
             f"picture of {width}x{height} px is smaller than SSIM's {WINDOW}x{WINDOW} window; "
             "measure at a larger size"
         )
-    edge = WINDOW // 2
-    return float(_ssim_map(left, right)[edge:-edge, edge:-edge].mean())
 
 
 def ssim_inria(a: np.ndarray, b: np.ndarray) -> float:

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ambiguous_wild.builder import report
+from ambiguous_wild.builder import report, stages
 from ambiguous_wild.builder.pipeline import build_scene
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError
@@ -232,3 +232,31 @@ def test_a_full_disk_keeps_what_is_done_and_goes_on(raw, scene, tmp_path, monkey
     result = build_scene(raw, tmp_path / "scene", SETTINGS)
     assert set(result.reused) == {"screen", "features", "matches", "mapping", "undistort"}
     assert hashes(result.scene) == hashes(scene)
+
+
+def test_a_mistyped_option_does_not_cost_the_work_of_a_stopped_build(raw, tmp_path, monkeypatch):
+    out = tmp_path / "scene"
+
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(stages, "match", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            build_scene(raw, out, SETTINGS)
+    (tmp_path / "typo.txt").write_text("nobody.png\n")
+    with pytest.raises(AwError, match=r"nobody\.png"):
+        build_scene(raw, out, SETTINGS, test_list=tmp_path / "typo.txt")
+    assert "features" in build_scene(raw, out, SETTINGS).reused
+
+
+def test_what_lies_in_a_scene_and_is_not_the_builds_is_never_removed(raw, tmp_path):
+    out = tmp_path / "scene"
+    build_scene(raw, out, SETTINGS)
+    (out / "runs").mkdir()
+    (out / "runs" / "notes.txt").write_text("mine")
+    other = BuildSettings(**{**vars(SETTINGS), "factor": 4})
+    before = hashes(out)
+    with pytest.raises(AwError, match=r"also holds runs/notes\.txt"):
+        build_scene(raw, out, other, overwrite=True)
+    assert hashes(out) == before

@@ -95,6 +95,20 @@ def test_what_is_not_a_page_of_ours_is_not_replaced(board: Path, tmp_path: Path)
     assert content(tmp_path) == {"thesis.txt": b"mine"}
 
 
+def test_files_that_no_publish_wrote_are_not_removed(board: Path, tmp_path: Path) -> None:
+    publishing.publish(board, tmp_path / "site")
+    (tmp_path / "site/data/mine.csv").write_text("mine")
+    with pytest.raises(publishing.AwError, match=r"also holds data/mine\.csv"):
+        publishing.publish(board, tmp_path / "site")
+    (tmp_path / "site/data/mine.csv").unlink()
+    (tmp_path / "link").symlink_to(tmp_path / "site")
+    publishing.publish(board, tmp_path / "link", title="by a link")
+    assert (tmp_path / "link").is_symlink() and b"by a link" in content(tmp_path / "site")["index.html"]
+    (tmp_path / "nowhere").symlink_to(tmp_path / "gone")
+    with pytest.raises(publishing.AwError, match="link to nowhere"):
+        publishing.publish(board, tmp_path / "nowhere")
+
+
 def test_a_changed_picture_is_not_published(board: Path, tmp_path: Path) -> None:
     shutil.copytree(board, tmp_path / "board")
     next((tmp_path / "board").rglob("*.jpg")).write_bytes(b"x")

@@ -12,6 +12,7 @@ from ambiguous_wild.harness.grid import cell_folder, plan_cells, run_cells
 from ambiguous_wild.harness.replay import replay
 from ambiguous_wild.harness.result_file import read_result
 from ambiguous_wild.methods import MethodEntry, register, registry
+from ambiguous_wild.splat.density import DensityControl
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.parts import MaskPolicy, Parts
 from tests.tiny_scene import write_tiny_scene
@@ -28,9 +29,9 @@ def run(tmp_path, monkeypatch):
     register(MethodEntry("poison", "a NaN at iteration 9", lambda options: Parts(mask=Poison())))
     scene = write_tiny_scene(tmp_path / "scene")
 
-    def go(action):
+    def go(action, method="poison"):
         train = TrainConfig(iterations=12, probes=0, on_nonfinite=action)
-        (cell,) = plan_cells(["poison"], [scene], [0], train)
+        (cell,) = plan_cells([method], [scene], [0], train)
         (report,) = run_cells([cell], tmp_path / "runs")
         return cell_folder(tmp_path / "runs", cell), report
 
@@ -69,3 +70,19 @@ def test_a_damaged_report_is_named(run):
     (folder / "nonfinite" / "000009" / "report.json").write_text("[]")
     with pytest.raises(AwError, match="is damaged"):
         replay(folder)
+
+
+def test_a_parameter_found_before_saving_is_found_again(run):
+    class Late(DensityControl):
+        def refine(self, step, gaussians, optimiser):
+            gaussians, events = super().refine(step, gaussians, optimiser)
+            if step.iteration == 12:
+                gaussians.log_scales[3, 1] = math.nan  # no step comes after that would meet it
+            return gaussians, events
+
+    register(MethodEntry("late", "a NaN in a parameter", lambda options: Parts(density=Late)))
+    folder, report = run("stop", "late")
+    assert report.outcome == "failed"
+    assert "parameter of log_scales" in report.error
+    again = replay(folder)
+    assert again.same, again

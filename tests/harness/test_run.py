@@ -3,6 +3,7 @@
 import dataclasses
 import json
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -195,3 +196,32 @@ def test_scenes_of_one_name_are_refused(scene, tmp_path):
     other = write_tiny_scene(tmp_path / "scene")
     with pytest.raises(AwError, match="two scenes are called scene"):
         plan_cells(["3dgs"], [scene, other], [0], SHORT)
+
+
+def test_settings_of_somebody_elses_program_do_not_make_a_folder_ours(scene, tmp_path):
+    folder = tmp_path / "scene" / "3dgs" / "seed0"
+    folder.mkdir(parents=True)
+    (folder / "config.yaml").write_text("a: 1\n")
+    with pytest.raises(AwError, match="no run of ours"):
+        bench(scene, tmp_path, "3dgs", overwrite="always")
+    assert (folder / "config.yaml").read_text() == "a: 1\n"
+
+
+def test_a_run_folder_that_is_a_link_is_trained_where_it_leads(scene, tmp_path):
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "runs/scene/3dgs").mkdir(parents=True)
+    (tmp_path / "runs/scene/3dgs/seed0").symlink_to(tmp_path / "disk")
+    for overwrite in ("missing", "always"):
+        _, (report,) = bench(scene, tmp_path / "runs", "3dgs", overwrite=overwrite)
+        assert report.outcome == "trained", report.error
+        assert (tmp_path / "disk/metrics.json").is_file()
+    assert (tmp_path / "runs/scene/3dgs/seed0").is_symlink()
+
+
+def test_photos_too_small_to_be_measured_are_said_before_training(scene, tmp_path):
+    small = write_tiny_scene(tmp_path / "small")
+    for path in (small / "images").iterdir():
+        cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path)), (12, 9)))
+    _, (report,) = bench(small, tmp_path / "runs", "3dgs")
+    assert "smaller than SSIM" in report.error
+    assert not list((tmp_path / "runs").rglob("last.safetensors"))

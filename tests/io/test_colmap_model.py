@@ -116,3 +116,36 @@ def test_text_image_without_observations(tmp_path):
 def test_no_model_at_all(tmp_path):
     with pytest.raises(AwError, match="holds no COLMAP model"):
         read_model(tmp_path)
+
+
+def _first(rows):
+    return rows[min(rows)]
+
+
+def _same_name(model):
+    last = max(model.images)
+    model.images[last] = dataclasses.replace(model.images[last], name=_first(model.images).name)
+
+
+def _no_lens(model):
+    camera = _first(model.cameras)
+    model.cameras[camera.camera_id] = dataclasses.replace(camera, params=(1e-300, 1.0, 3.0, 3.0))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda m: _first(m.images).tvec.__setitem__(0, np.nan), "translation"),
+        (lambda m: _first(m.images).tvec.__setitem__(2, 1e20), "translation"),
+        (lambda m: m.points.xyz.__setitem__((3, 1), np.inf), "1 points are nowhere, the first is"),
+        (lambda m: m.points.xyz.__setitem__((slice(2, 4), 1), 1e200), "2 points are nowhere"),
+        (_same_name, "there twice"),
+        (_no_lens, "parameters"),
+    ],
+)
+def test_what_no_mapper_writes_is_named_when_the_model_is_read(tmp_path, spoil, said):
+    model = make_model(NAMES)
+    spoil(model)
+    write_binary(tmp_path, model)
+    with pytest.raises(AwError, match=said):
+        read_model(tmp_path)

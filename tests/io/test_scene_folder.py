@@ -11,6 +11,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.io.images import write_png
 from ambiguous_wild.io.scene_folder import load_scene, verify_files, without_keep
 from tests.io.model_maker import HEIGHT, WIDTH, make_model, write_binary, write_scene
+from tests.tiny_scene import write_tiny_scene
 
 NAMES = [f"p{i}.png" for i in range(10)]
 
@@ -263,3 +264,21 @@ def test_training_side_needs_neither_pycolmap_nor_openimageio(tmp_path):
         [sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, check=False
     )
     assert done.stdout.split() == ["10", "(48,", "64,", "3)"], done.stderr
+
+
+def test_a_list_that_begins_with_a_byte_order_mark_loses_no_photo(tmp_path):
+    root = write_tiny_scene(tmp_path / "scene")
+    for name in ("train_list.txt", "test_list.txt"):
+        (root / name).write_bytes(b"\xef\xbb\xbf" + (root / name).read_bytes())
+    scene = load_scene(root)
+    assert (len(scene.train), len(scene.test)) == (6, 2)
+    assert not scene.info["warnings"]
+
+
+def test_photos_whose_renders_would_be_one_file_are_refused(tmp_path):
+    root = write_tiny_scene(tmp_path / "scene")
+    (root / "images" / "test_1.png").rename(root / "images" / "test_0.jpg")
+    for name in ("sparse/0/images.txt", "test_list.txt"):
+        (root / name).write_text((root / name).read_text().replace("test_1.png", "test_0.jpg"))
+    with pytest.raises(AwError, match=r"'test_0\.jpg' and 'test_0\.png' differ in their extension alone"):
+        load_scene(root)

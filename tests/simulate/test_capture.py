@@ -283,3 +283,12 @@ def test_a_sheet_that_came_later_changes_no_earlier_bit(monkeypatch: pytest.Monk
                 count = atlas.width[t, level] * atlas.height[t, level]
                 texels.append(atlas.texels[atlas.offset[t, level] :][:count])
             assert np.array_equal(*texels), name
+
+
+def test_overwrite_removes_nothing_of_the_users(tmp_path: Path) -> None:
+    spec = replace(SMALL, train_views=3, test_views=2, width=64, height=36, distractors=())
+    capture.simulate(spec, tmp_path / "raw")
+    (tmp_path / "raw/train/mine.jpg").write_bytes(b"x")
+    with pytest.raises(AwError, match=r"also holds train/mine\.jpg"):
+        capture.simulate(spec, tmp_path / "raw", seed=1, overwrite=True)
+    assert (tmp_path / "raw/train/mine.jpg").read_bytes() == b"x"

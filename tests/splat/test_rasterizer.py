@@ -347,3 +347,20 @@ def test_warming_up_says_so_only_where_kernels_are_missing(tmp_path):
         text=True,
     )
     assert done.stdout.strip() == "False", done.stderr
+
+
+@pytest.mark.parametrize("far", [1e18, 1e20, 1e30, 1e38])
+@pytest.mark.parametrize("log_scale", [0.0, 30.0, 60.0])
+def test_gaussians_farther_out_than_any_whole_number_of_pixels_are_culled(far, log_scale):
+    good, cam = gaussians(7, n=20), camera()
+    bad = gaussians(8, n=5)
+    forward = torch.from_numpy(cam.cam_from_world[2, :3].astype(np.float32))
+    sideways = torch.from_numpy(cam.cam_from_world[0, :3].astype(np.float32))
+    upwards = torch.from_numpy(cam.cam_from_world[1, :3].astype(np.float32))
+    for row, way in enumerate((sideways, -sideways, upwards, -upwards, sideways + upwards)):
+        bad.means[row] = 4.0 * forward + far * way
+    bad.log_scales[:] = log_scale
+    rendered = render_cpu(good.cat(bad), cam)
+    assert torch.isfinite(rendered.image).all()
+    if log_scale == 0.0:
+        assert torch.equal(rendered.image, render_cpu(good, cam).image)

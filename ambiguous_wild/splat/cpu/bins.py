@@ -84,10 +84,23 @@ def depth_order(slots, records):
 
 
 @kernel
+def first_pixel(border, size):
+    """First pixel whose centre is not before `border`; at least 0, and past the end where there is none."""
+    # bounded before it is a whole number: of a centre far out, centre - extent is rounded to anything
+    return math.ceil(min(max(border - 0.5 - _SLACK, 0.0), size + TILE))
+
+
+@kernel
+def last_pixel(border, size):
+    """Last pixel whose centre is not behind `border`; at most size - 1, and negative where there is none."""
+    return math.floor(max(min(border - 0.5 + _SLACK, size - 1.0), -1.0))
+
+
+@kernel
 def tile_rows(record, height):
     """First and last row of tiles that hold a pixel centre within the contour's y extent."""
-    low = math.ceil(max(record[MY] - record[EXTENT_Y] - 0.5 - _SLACK, 0.0))
-    high = math.floor(min(record[MY] + record[EXTENT_Y] - 0.5 + _SLACK, height - 1.0))
+    low = first_pixel(record[MY] - record[EXTENT_Y], height)
+    high = last_pixel(record[MY] + record[EXTENT_Y], height)
     return int(low) // TILE, int(high) // TILE
 
 
@@ -98,8 +111,8 @@ def tile_span(record, row, width):
     Over a band of y the right border of an ellipse is largest at its rightmost point if that lies in
     the band, else at the band's edge nearest to it; the left border is its mirror image.
     """
-    low = math.ceil(max(record[MX] - record[EXTENT_X] - 0.5 - _SLACK, 0.0))
-    high = math.floor(min(record[MX] + record[EXTENT_X] - 0.5 + _SLACK, width - 1.0))
+    low = first_pixel(record[MX] - record[EXTENT_X], width)
+    high = last_pixel(record[MX] + record[EXTENT_X], width)
     if low > high:
         return 1, 0
     if int(low) // TILE == int(high) // TILE:  # nothing to be narrowed
@@ -119,8 +132,8 @@ def tile_span(record, row, width):
         dy = min(max(-tilt, top), bottom)
         rest = max(1.0 - (dy / ey) * (dy / ey), 0.0)
         left = record[SLANT] * dy - record[HALF_WIDTH] * math.sqrt(rest)
-    low = math.ceil(max(record[MX] + left - 0.5 - _SLACK, 0.0))
-    high = math.floor(min(record[MX] + right - 0.5 + _SLACK, width - 1.0))
+    low = first_pixel(record[MX] + left, width)
+    high = last_pixel(record[MX] + right, width)
     if low > high:
         return 1, 0
     return int(low) // TILE, int(high) // TILE

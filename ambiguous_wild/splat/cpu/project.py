@@ -30,6 +30,7 @@ MX, MY, SLANT, CURVE_X, CURVE_Y, LOG2_OPACITY, RED, GREEN, BLUE, DEPTH = range(1
 EXTENT_X, EXTENT_Y, VARIANCE_Y, VARIANCE_X, HALF_WIDTH, OPACITY = range(10, 16)
 
 _LOG2E = 1.4426950408889634
+_FAR_PX = 1e15  # a centre so far out is no place in float32 any more
 _HUGE = 1e30
 _SHORT = 1e-30  # norm of a quaternion: its gradient is divided by it, and float32 ends at 3e38
 
@@ -130,6 +131,11 @@ def _project_chunk(first, means, quats, log_scales, opacity_logits, cam, antiali
         tau = 2.0 * math.log(255.0 * opacity)
         ex = math.sqrt(tau * sxx)
         ey = math.sqrt(tau * syy)
+        # in floats first: a pixel far out has no whole number (compiled ceil and floor give int64)
+        if not (abs(u) < _FAR_PX and abs(v) < _FAR_PX):
+            continue
+        if not (u - ex < cam[16] and u + ex > 0.0 and v - ey < cam[17] and v + ey > 0.0):
+            continue
         if not (
             math.ceil(max(u - ex - 0.5, 0.0)) <= math.floor(min(u + ex, cam[16]) - 0.5)
             and math.ceil(max(v - ey - 0.5, 0.0)) <= math.floor(min(v + ey, cam[17]) - 0.5)

@@ -38,6 +38,7 @@ COLUMNS = (
     ("setup_s", "setup s", 1),
     ("ms_per_iteration", "ms/it", 1),
 )
+TIMES = ("train_s", "setup_s", "ms_per_iteration")
 
 BOOK = ["capture", "method", "seed", "config_hash", "threads", *(key for key, _, _ in COLUMNS)]
 
@@ -113,7 +114,10 @@ def merged(old: pd.DataFrame, new: pd.DataFrame) -> pd.DataFrame:
 def tabulate(
     book: pd.DataFrame, scenes: Sequence[str], methods: Sequence[str], seeds: Sequence[int]
 ) -> list[Row]:
-    """A row a capture and method: mean and sample deviation over the seeds, None where one is missing."""
+    """A row a capture and method: mean and sample deviation over the seeds, None where one is missing.
+
+    Times are those of the runs that have any: of a run on a shared machine the book keeps none.
+    """
     rows = []
     for scene in scenes:
         for method in methods:
@@ -122,6 +126,8 @@ def tabulate(
             complete = len(here) == len(set(seeds))
             for key, _, _ in COLUMNS:
                 values = [float(x) for x in here[key]] if complete else []
+                if key in TIMES:
+                    values = [x for x in values if not math.isnan(x)]
                 row[key] = _plain(stats.mean(values))
                 row[f"{key}_sd"] = _plain(stats.spread(values))
             rows.append(row)
@@ -234,7 +240,7 @@ def to_markdown(data: dict[str, Any]) -> str:
         f"run: {' or '.join(map(str, data['threads']))}; {data['environment']['cpu']}. Mean +- sample "
         "deviation over the seeds; a cell that is `-` is missing. IoU, precision and recall are of masked "
         "pixels, counted over all train photos. Setup is what a method prepares before its first step, less "
-        "what an earlier run left in the cache.",
+        "what an earlier run left in the cache. Times are of the runs that had the machine to themselves.",
     ]
     for capture in data["captures"]:
         share = capture["distractor_share"]

@@ -3,6 +3,7 @@
 import csv
 import importlib
 import json
+import math
 import shutil
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pandas as pd
 import pytest
 
 from tests.tiny_scene import write_tiny_scene
@@ -65,6 +67,17 @@ def test_a_missing_run_is_missing_and_not_zero(report):
     assert got["best"] == "3dgs"
     assert got["iou_beats_both"] == []
     assert got["gaussians_ratio"]["a"] is None
+
+
+def test_times_are_of_the_runs_that_have_any(report):
+    book = pd.DataFrame(
+        [{"capture": "a", "method": "3dgs", "seed": seed, "psnr": 20.0 + seed, "train_s": time}
+         for seed, time in ((0, 60.0), (1, math.nan))]
+    ).reindex(columns=report.BOOK)  # fmt: skip
+    (made,) = report.tabulate(book, ["a"], ["3dgs"], [0, 1])
+    assert (made["psnr"], made["train_s"], made["ms_per_iteration"]) == (20.5, 60.0, None)
+    (made,) = report.tabulate(book, ["a"], ["3dgs"], [0, 1, 2])  # a run is missing
+    assert made["psnr"] is None and made["train_s"] is None
 
 
 def test_an_unknown_gap_makes_the_mean_of_gaps_missing(report):

@@ -85,7 +85,7 @@ def _read(path: Path) -> dict[str, Any]:
         return plain_yaml.read_mapping(path)
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise AwError(f"cannot read {path}: {error}") from None
     if not isinstance(found, dict):
         raise AwError(f"{path} is damaged: a mapping was expected")

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
+import numpy as np
+
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.harness.measures import Measure
 from ambiguous_wild.harness.store import Runs
@@ -90,10 +92,11 @@ def _not_comparable(runs: Runs, columns: Sequence[Measure]) -> list[str]:
         images = runs.images[runs.images["scene"] == scene].groupby(["method", "seed"])["image"]
         if len({frozenset(names) for _, names in images}) > 1:
             lines.append(f"not comparable: methods were measured on different test images of {scene}")
-    if "iterations" in ok and len(ok) and ok["iterations"].notna().any():
-        longest = ok.groupby("method")["iterations"].max().astype(int)
-        if longest.max() > LENGTHS_DIFFER * longest.min():
-            each = shortlist((f"{m} {n}" for m, n in longest.items()), limit=12)
+    if "iterations" in ok:
+        lengths = ok["iterations"].astype(float)
+        longest = lengths[np.isfinite(lengths)].groupby(ok["method"]).max()
+        if len(longest) and longest.max() > LENGTHS_DIFFER * longest.min():
+            each = shortlist((f"{m} {n:.10g}" for m, n in longest.items()), limit=12)
             lines.append(f"trainings differ in length (iterations): {each}")
     shows_cost = any(not c.quality for c in columns)
     if shows_cost and "device" in ok and ok["device"].nunique() > 1:

@@ -198,7 +198,7 @@ def _earlier(out: Path, identity: str, overwrite: bool) -> dict[str, Any] | None
         files = {str(n): h for n, h in facts["files"].items()}
         if any(PurePosixPath(n).is_absolute() or ".." in PurePosixPath(n).parts for n in files):
             raise ValueError("a file outside the capture")
-    except (ValueError, KeyError, TypeError, AttributeError):
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         facts, same, made, files = {}, False, "an unreadable truth/capture.json", {}
     if same and all((out / n).is_file() and sha256_file(out / n) == h for n, h in files.items()):
         return dict(facts)

@@ -197,6 +197,14 @@ def test_a_null_without_a_reason_is_noted(tmp_path: Path) -> None:
     assert "missing: ssim, no reason given, for 1.png (a on yard)" in table.notes
 
 
+@pytest.mark.parametrize("length", [math.inf, None, 1e300])
+def test_a_length_that_is_no_number_of_iterations_is_no_crash(tmp_path: Path, length: float | None) -> None:
+    odd = fake_result("b")
+    odd["cost"]["iterations"] = length
+    notes = table_of(tmp_path, fake_result("a"), odd).notes
+    assert any("differ in length" in note for note in notes) == (length == 1e300)
+
+
 def test_what_cannot_be_compared_is_said(tmp_path: Path) -> None:
     other = fake_result("c", psnr=(1.0, 2.0, 3.0), scene_hash="other", version="0.2.0")
     other["cost"] |= {"device": "cuda", "iterations": 30_000}

@@ -285,6 +285,13 @@ def test_a_sheet_that_came_later_changes_no_earlier_bit(monkeypatch: pytest.Monk
             assert np.array_equal(*texels), name
 
 
+def test_a_record_nested_without_end_is_named(tmp_path: Path) -> None:
+    (tmp_path / "raw/truth").mkdir(parents=True)
+    (tmp_path / "raw/truth/capture.json").write_text("[" * 100_000)
+    with pytest.raises(AwError, match="unreadable truth/capture.json"):
+        capture.simulate(SMALL, tmp_path / "raw")
+
+
 def test_overwrite_removes_nothing_of_the_users(tmp_path: Path) -> None:
     spec = replace(SMALL, train_views=3, test_views=2, width=64, height=36, distractors=())
     capture.simulate(spec, tmp_path / "raw")

@@ -143,7 +143,7 @@ def _published(out: Path) -> set[str] | None:
     """What the last publish wrote there; None for a page of before it kept a list."""
     try:
         found = json.loads((out / MANIFEST).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
     return {MANIFEST, *map(str, found)} if isinstance(found, list) else None
 

@@ -76,7 +76,7 @@ class CommandProgram:
         """Whether something lies there that `resume` may take over: left by the same command."""
         try:
             begun = json.loads((task.work / BEGUN).read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+        except (OSError, ValueError, RecursionError):
             return False
         same = begun == list(self.train)
         return bool(self.resume) and same and output.is_dir() and any(output.iterdir())
@@ -173,7 +173,7 @@ def _read(state: Path) -> dict[str, float]:
     try:
         data = json.loads(state.read_text(encoding="utf-8"))
         return {key: float(data[key]) for key in ("train_s", "render_s") if key in data}
-    except (OSError, ValueError, TypeError):
+    except (OSError, ValueError, TypeError, RecursionError):
         return {}
 
 

@@ -126,7 +126,7 @@ def _end_recorded(record: Path) -> None:
     try:
         left = json.loads(record.read_text(encoding="utf-8"))
         group, host, start = int(left["group"]), left["host"], left["start"]
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return
     # Numbers of processes are used again: the time it began tells whether it is still the same.
     if host == platform.node() and start is not None and start == _start(group):

@@ -188,6 +188,12 @@ def study(folder: Path) -> Path:
 
 def test_an_ablation_is_a_table_a_group(tmp_path: Path) -> None:
     (layout,) = ablation(study(tmp_path))
+    one = json.loads((tmp_path / "ablation.json").read_text())
+    assert layout.spread_over == "seeds"
+    one["scenes"] = [*one["scenes"], "another"]
+    (tmp_path / "two").mkdir()
+    (tmp_path / "two" / "ablation.json").write_text(json.dumps(one))
+    assert ablation(tmp_path / "two")[0].spread_over == "scenes and seeds"
     assert layout.title == "refinesplat, masks: parts of the mask (paper: Tab. 4)"
     assert [entry(layout, m, "").rank for m in ("default", "local", "dino")] == [1, 2, None]
     assert entry(layout, "dino", "").state == "missing" and "dino missing: no weights" in layout.notes

@@ -54,7 +54,8 @@ def _group(group: dict[str, Any], rows: list[Any], columns: list[Measure], data:
     notes.append(f"{', '.join(data['scenes'])}; seeds {', '.join(map(str, data['seeds']))}")
     notes += [f"runs made by: {data['made_by']}"] if data["made_by"] else []
     title = f"{data['method']}, {group['name']}: {group['title']}{source}"
-    return Layout(title, tuple(Column("", c) for c in columns), tuple(lines), tuple(notes))
+    over = "seeds" if len(data["scenes"]) == 1 else "scenes and seeds"
+    return Layout(title, tuple(Column("", c) for c in columns), tuple(lines), tuple(notes), over)
 
 
 def _entry(row: Any, column: Measure, rank: int | None) -> Entry:

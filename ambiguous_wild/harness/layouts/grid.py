@@ -75,6 +75,7 @@ class Layout:
     columns: tuple[Column, ...]
     lines: tuple[Line, ...]  # measured first, then reported
     notes: tuple[str, ...] = ()
+    spread_over: str = "seeds"  # what the deviations are over
 
     def with_notes(self, *notes: str) -> Layout:
         return replace(self, notes=(*self.notes, *notes))
@@ -102,7 +103,7 @@ class Layout:
             )
         shown = [e for line in self.lines for c, e in zip(self.columns, line.entries) if c.measure.quality]
         if any(not math.isnan(entry.spread) for entry in shown):
-            lines.append("±: sample standard deviation over seeds")
+            lines.append(f"±: sample standard deviation over {self.spread_over}")
         if any(line.kind == "reported" for line in self.lines):
             lines.append(
                 "reported: printed in a paper, not measured here; neither ranked nor part of any mean; of "

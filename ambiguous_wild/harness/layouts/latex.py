@@ -68,7 +68,7 @@ def _caption(layout: Layout) -> str:
     if any(entry.tie for entry in entries):
         text += " $\\approx$: not significantly different from the best (paired bootstrap, 95\\,\\%)."
     if any("\u00b1" in rest for rest in layout.legend):
-        text += " $\\pm$: sample standard deviation over seeds."
+        text += f" $\\pm$: sample standard deviation over {layout.spread_over}."
     if any(" / " in entry.printed for entry in entries):
         text += " a / b: tables that contradict each other."
     return text

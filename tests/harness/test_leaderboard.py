@@ -172,7 +172,7 @@ SPOILT: dict[str, tuple[Callable[[Path], object], str]] = {
     "seed": (lambda r: change_config(r, lambda c: c["train"].update(seed=4), hashed=True), "seed is '4'"),
     "no config": (lambda r: (r / "config.yaml").unlink(), "config.yaml is absent"),
     "code": (anonymous, "has no hash of its code"),
-    "photo": (retouch_photo, "was changed: psnr of test_0.png"),
+    "photo": (retouch_photo, "name the right one with --scenes"),
     "path": (lambda r: change_result(r, outside), "outside itself"),
     "failed": (fail, "a failed run has no numbers"),
     "unfinished": (lambda r: (r / "metrics.json").unlink(), "has no metrics.json"),

@@ -40,9 +40,11 @@ function cell(s, key, rank, low, high, many) {
   if (Number.isNaN(s.value)) return h("td", { class: "none" }, "–");
   const quality = !COSTS.includes(key);
   const title = s.seeds.length > 1 ? `seeds: ${s.seeds.map((v) => shown(v, digits)).join(", ")}` : null;
-  const deviation = quality && !Number.isNaN(s.spread) ? h("small", {}, ` ±${shown(s.spread, digits)}`) : null;
+  const deviation = quality && !Number.isNaN(s.spread) ? h("small", {}, `±${shown(s.spread, digits)}`) : null;
   const place = rank ? h("sup", { "aria-label": `, rank ${rank}` }, String(rank)) : null;
-  return h("td", { title, "data-rank": rank }, shown(s.value, digits), deviation, place, quality && many && s.seeds.length > 1 ? dots(s.seeds, low, high) : null);
+  const marks = quality && many && s.seeds.length > 1 ? dots(s.seeds, low, high) : null;
+  const below = deviation || marks ? h("div", { class: "spread" }, deviation, marks) : null;
+  return h("td", { title, "data-rank": rank }, shown(s.value, digits), place, below);
 }
 
 function measuredColumns(runs, scenes) {

@@ -23,6 +23,7 @@ from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.names import check_name
 from ambiguous_wild.io.atomic import check_output
 from ambiguous_wild.io.scene_folder import read_scene_json, verify_files
+from ambiguous_wild.io.strangers import refuse_strangers
 
 # Full disk, quota, rights, read-only disk, broken disk: the user's to mend.
 _USERS_DISK = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EIO}
@@ -125,7 +126,7 @@ def _existing(target: Path, stages: Stages, overwrite: bool) -> dict[str, Any] |
         except AwError:
             if not overwrite:
                 raise
-            _refuse_strangers(target, info)
+            refuse_strangers(target, {"scene.json", *info.get("files", {})})
             return None
         return info
     if not overwrite:
@@ -134,20 +135,8 @@ def _existing(target: Path, stages: Stages, overwrite: bool) -> dict[str, Any] |
             f"{target} exists, built from other {changed}; pass --overwrite to replace it, or "
             "choose another -o"
         )
-    _refuse_strangers(target, info)
+    refuse_strangers(target, {"scene.json", *info.get("files", {})})
     return None
-
-
-def _refuse_strangers(target: Path, info: dict[str, Any]) -> None:
-    """Raise AwError where the scene's folder holds what no build made: replacing it would lose that."""
-    ours = {"scene.json", *map(str, info.get("files", {}))}
-    for path in sorted(target.rglob("*")):
-        name = path.relative_to(target).as_posix()
-        if (path.is_file() or path.is_symlink()) and name not in ours:
-            raise AwError(
-                f"{target} also holds {name}, which --overwrite would remove with the scene: move it "
-                "elsewhere, or choose another -o"
-            )
 
 
 def _run(

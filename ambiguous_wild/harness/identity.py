@@ -55,7 +55,9 @@ def scene_identity(scene: Scene) -> str:
     # masks that were put into the folder later are in no list
     for view in scene.views:
         if view.keep_path is not None:
-            known.setdefault(view.keep_path.relative_to(scene.root).as_posix(), _digest(view.keep_path))
+            name = view.keep_path.relative_to(scene.root).as_posix()
+            if name not in known:
+                known[name] = _digest(view.keep_path)
     return config_hash({"files": known, "split": split})
 
 

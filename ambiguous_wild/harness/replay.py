@@ -72,9 +72,7 @@ def replay(run: Path) -> Replay:
         try:
             while trainer.iteration < last:
                 trainer.step()
-            # what the loop looks at before it saves
-            view = trainer.pace.view(max(trainer.iteration, 1))
-            trainer.watchdog.look_at_parameters(trainer.iteration, view, trainer.gaussians)
+            trainer.check_parameters()  # as the loop does before it saves
         except NonFinite as error:
             return Replay(message, str(error), start)
     return Replay(message, "", start)

@@ -29,6 +29,7 @@ from ambiguous_wild.core.config import config_hash, to_plain
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.atomic import atomic_dir, write_json
 from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.io.strangers import refuse_strangers
 from ambiguous_wild.simulate.develop import Developed, Shot, depth_m, develop
 from ambiguous_wild.simulate.distractors import lay_out
 from ambiguous_wild.simulate.effects.moment import Moment
@@ -203,13 +204,8 @@ def _earlier(out: Path, identity: str, overwrite: bool) -> dict[str, Any] | None
     if same and all((out / n).is_file() and sha256_file(out / n) == h for n, h in files.items()):
         return dict(facts)
     if overwrite:
-        for path in sorted(out.rglob("*")):
-            name = path.relative_to(out).as_posix()
-            if files and (path.is_file() or path.is_symlink()) and name not in files and path != record:
-                raise AwError(
-                    f"{out} also holds {name}, which --overwrite would remove with the capture: move it "
-                    "elsewhere, or choose another -o"
-                )
+        if files:
+            refuse_strangers(out, {record.relative_to(out).as_posix(), *files})
         return None
     why = "with files changed since" if same else "of other settings or another version"
     raise AwError(f"{out} holds a capture ({made}) {why}; add --overwrite to replace it or choose another -o")

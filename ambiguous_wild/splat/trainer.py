@@ -245,11 +245,15 @@ class Trainer:
         if tick is not None:
             tick(self)
 
+    def check_parameters(self) -> None:
+        """Raise NonFinite, as of the last step, where a parameter is not finite."""
+        view = self.pace.view(max(self.iteration, 1))
+        self.watchdog.look_at_parameters(self.iteration, view, self.gaussians)
+
     def _save_if_sound(self) -> bool:
         """Save, unless a parameter is not finite: then it is as if the last step had found that."""
         try:
-            view = self.pace.view(max(self.iteration, 1))
-            self.watchdog.look_at_parameters(self.iteration, view, self.gaussians)
+            self.check_parameters()
         except NonFinite as error:
             self.watchdog.handle(self, error)
             return False

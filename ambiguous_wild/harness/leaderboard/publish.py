@@ -22,9 +22,10 @@ from ambiguous_wild.harness.leaderboard.entry import Entry, in_order
 from ambiguous_wild.harness.leaderboard.reported import SOURCE, Printed, read_reported, reported_csv
 from ambiguous_wild.harness.leaderboard.sheet import to_number
 from ambiguous_wild.harness.measures import measure
-from ambiguous_wild.io.atomic import atomic_dir, sweep_siblings, write_json
+from ambiguous_wild.io.atomic import atomic_dir, check_output, sweep_siblings, write_json
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.lock import folder_lock
+from ambiguous_wild.io.strangers import list_names, refuse_strangers
 from ambiguous_wild.methods.registry import knows_truth
 
 GENERATOR = '<meta name="generator" content="aw leaderboard publish">'
@@ -74,8 +75,7 @@ def publish(
             f"no folder of reported numbers {reported_from}: give one with *.csv, see docs/audit.md"
         )
     source = board / SOURCE if reported and reported_from is None else reported_from
-    if out.is_symlink() and not out.exists():
-        raise AwError(f"{out} is a link to nowhere; remove it or choose another -o")
+    check_output(out)
     out = Path(os.path.realpath(out))
     with folder_lock(out, "aw leaderboard publish"):
         _restore(out)
@@ -91,7 +91,7 @@ def publish(
                 )
             text = page(title, _facts(entries, index, printed, names))
             (folder / "index.html").write_text(text, encoding="utf-8")
-            write_json(folder / MANIFEST, sorted(list_names(folder)))
+            write_json(folder / MANIFEST, list_names(folder))
     return Published(
         runs=len(entries),
         datasets=len({e.dataset for e in entries}),
@@ -124,19 +124,9 @@ def _check_folder(out: Path) -> None:
     if names and (not made or names - OURS):
         odd = sorted(names - OURS)[0] if names - OURS else "another page"
         raise AwError(f"{out} holds something else than a published board ({odd}); choose another -o")
-    if names:
-        known = _published(out)
-        strange = [] if known is None else sorted(set(list_names(out)) - known)
-        if strange:
-            raise AwError(
-                f"{out} also holds {strange[0]}, which no publish wrote and this one would remove: move it "
-                "elsewhere, or choose another -o"
-            )
-
-
-def list_names(folder: Path) -> list[str]:
-    """Files below a folder, as paths relative to it with slashes."""
-    return [path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir()]
+    known = _published(out)
+    if known is not None:
+        refuse_strangers(out, known)
 
 
 def _published(out: Path) -> set[str] | None:

@@ -1,0 +1,24 @@
+"""Files of somebody else in a folder that is about to be replaced."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+
+from ambiguous_wild.core.errors import AwError
+
+
+def list_names(folder: Path) -> list[str]:
+    """Files and links below a folder, sorted, as paths relative to it with slashes."""
+    found = (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
+    return sorted(path.relative_to(folder).as_posix() for path in found)
+
+
+def refuse_strangers(folder: Path, ours: Collection[str]) -> None:
+    """Raise AwError where the folder holds a file that is none of `ours`: replacing it would lose that."""
+    for name in list_names(folder):
+        if name not in ours:
+            raise AwError(
+                f"{folder} also holds {name}, which was not made with the rest and would be removed with it: "
+                "move it elsewhere, or choose another -o"
+            )

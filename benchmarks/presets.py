@@ -1,6 +1,6 @@
 """Every preset, from the spec to a trained model: is it built whole, told apart, and given what it calls for?
 
-    python benchmarks/presets.py --work DIR [--presets NAME ...] [--width 480] [--iterations 600]
+    python benchmarks/presets.py --work DIR [--presets NAME ...] [--width 480] [--factor 2] [--iterations 600]
 
 For each preset: `aw simulate`, `aw build-scene`, `aw ambiguity-report`, `aw plan` and a short `aw bench` of
 3dgs, each command as a user types it. Writes benchmarks/results/presets.json and .md: photos registered,
@@ -52,17 +52,18 @@ def aw(*words: str) -> tuple[str, float]:
     return done.stdout, time.perf_counter() - begin
 
 
-def measure(preset: str, work: Path, width: int, iterations: int) -> dict[str, Any]:
+def measure(preset: str, args: argparse.Namespace) -> dict[str, Any]:
     """All there is to say of one preset.
 
     Raises:
         Stopped: a command failed.
     """
-    raw, scene, runs = work / "raw" / preset, work / "scenes" / preset, work / "runs"
+    raw, scene, runs = args.work / "raw" / preset, args.work / "scenes" / preset, args.work / "runs"
     seconds: dict[str, float] = {}
     if not (raw / "truth" / "capture.json").is_file():
-        _, seconds["simulate"] = aw("simulate", preset, "-o", str(raw), "--width", str(width))
-    _, seconds["build-scene"] = aw("build-scene", str(raw), "-o", str(scene), "--name", preset)
+        _, seconds["simulate"] = aw("simulate", preset, "-o", str(raw), "--width", str(args.width))
+    size = ("--factor", str(args.factor))
+    _, seconds["build-scene"] = aw("build-scene", str(raw), "-o", str(scene), "--name", preset, *size)
     info = json.loads((scene / "scene.json").read_text(encoding="utf-8"))
     row: dict[str, Any] = {
         "preset": preset,
@@ -77,7 +78,7 @@ def measure(preset: str, work: Path, width: int, iterations: int) -> dict[str, A
     text, seconds["plan"] = aw("plan", str(scene), "--json")
     plan = json.loads(text)
     row["plan"] = {d["effect"]: [d["value"], d["decision"]] for d in plan["decisions"]}
-    words = ("--method", "3dgs", "--iterations", str(iterations), "--effects", "none", "--no-pictures")
+    words = ("--method", "3dgs", "--iterations", str(args.iterations), "--effects", "none", "--no-pictures")
     _, seconds["bench"] = aw("bench", *words, "--scene", str(scene), "-o", str(runs))
     row["psnr_3dgs"] = mean_psnr(read_result(runs / preset / "3dgs" / "seed0" / RESULT))
     return row | {"seconds": {name: round(s, 1) for name, s in seconds.items()}}
@@ -125,7 +126,8 @@ def to_markdown(data: dict[str, Any]) -> str:
     lines = [
         "# Presets: built, told apart, planned",
         "",
-        f"{data['width']} px wide, 3dgs {data['iterations']} iterations, seed 0; `{data['command']}`",
+        f"{data['width']} px wide, images_{data['factor']}, 3dgs {data['iterations']} iterations, seed 0; "
+        f"`{data['command']}`",
         "",
         "| preset | placed | 3dgs, dB | designed | reported | colour | cosine | covers | plan: on | wrong |",
         "|---|---:|---:|---|---|---:|---:|---:|---|---|",
@@ -166,6 +168,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--work", type=Path, required=True, metavar="DIR")
     parser.add_argument("--presets", nargs="+", default=[n for n in PRESETS if n != "tiny"])
     parser.add_argument("--width", type=int, default=480)
+    parser.add_argument("--factor", type=int, default=2, help="what is looked at and trained is 1/N of that")
     parser.add_argument("--iterations", type=int, default=600)
     parser.add_argument("--results", type=Path, default=RESULTS)
     args = parser.parse_args(argv)
@@ -177,18 +180,20 @@ def main(argv: Sequence[str] | None = None) -> int:
             rows.append(json.loads(kept.read_text(encoding="utf-8")))
             continue
         try:
-            row = measure(preset, args.work, args.width, args.iterations)
+            row = measure(preset, args)
             write_json(kept, row)
         except Stopped as error:
             row = {"preset": preset, "error": str(error)}
         rows.append(row)
         shown = row.get("error") or f"{row['registered']} of {row['photos']}, {row['seconds']}"
         print(f"[{k}/{len(args.presets)}] {preset}: {shown}", flush=True)
-    command = f"python benchmarks/presets.py --work DIR --width {args.width} --iterations {args.iterations}"
+    command = "python benchmarks/presets.py --work DIR"
+    command += f" --width {args.width} --factor {args.factor} --iterations {args.iterations}"
     data = {
         "environment": environment("cpu"),
         "command": command,
         "width": args.width,
+        "factor": args.factor,
         "iterations": args.iterations,
         "presets": rows,
     }

@@ -87,7 +87,7 @@ def take_video(video: Path, out: Path, *, frames: int, bar: Bar | None = None) -
     """
     check_free(out)
     bar = bar or Bar(False)
-    total = _count(video, bar)
+    total, announced = _count(video, bar)
     if total < frames:
         raise AwError(f"{video} has {total} frames, {frames} were asked for; pass --frames {total} or fewer")
     bar.start("frames", total)
@@ -99,7 +99,7 @@ def take_video(video: Path, out: Path, *, frames: int, bar: Bar | None = None) -
             raise AwError(
                 f"{video} broke off: {len(photos)} of {frames} frames could be read; repair or convert it"
             )
-        return _record(folder, "video", video.name, photos, [], frames_read=total)
+        return _record(folder, "video", video.name, photos, [], frames_read=total, frames_announced=announced)
 
 
 def take_camera(
@@ -180,8 +180,7 @@ def check_free(out: Path) -> None:
 def _open(source: Path | int) -> cv2.VideoCapture:
     # OpenCV and FFmpeg print their own lines about what is no video; ours is the one that counts.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    if hasattr(cv2, "setLogLevel"):
-        cv2.setLogLevel(0)
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     return (
         cv2.VideoCapture(source) if isinstance(source, int) else cv2.VideoCapture(str(source), cv2.CAP_FFMPEG)
     )
@@ -201,9 +200,10 @@ def _opened(video: Path) -> cv2.VideoCapture:
     return reader
 
 
-def _count(video: Path, bar: Bar) -> int:
-    """Frames that can be grabbed; what a header announces is often wrong."""
+def _count(video: Path, bar: Bar) -> tuple[int, int | None]:
+    """Frames that can be grabbed, and what the header announces, which is often wrong."""
     reader = _opened(video)
+    announced = reader.get(cv2.CAP_PROP_FRAME_COUNT)
     bar.start("counting frames", None)
     count = 0
     while reader.grab():
@@ -213,7 +213,7 @@ def _count(video: Path, bar: Bar) -> int:
     bar.finish()
     if count == 0:
         raise AwError(f"{video} is no video that can be read (no frame in it)")
-    return count
+    return count, round(announced) if math.isfinite(announced) and 0 < announced < 1e9 else None
 
 
 def _read(video: Path, bar: Bar) -> Iterator[tuple[int, float, np.ndarray]]:

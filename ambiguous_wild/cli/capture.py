@@ -9,6 +9,8 @@ from pathlib import Path
 
 import click
 
+BROKEN_BELOW = 0.9  # of the frames that a video announces; headers are often wrong by a few
+
 
 @click.command("capture")
 @click.argument("source")
@@ -40,6 +42,8 @@ def command(source: str, output: Path, frames: int, every: float, jobs: int | No
     from ambiguous_wild.builder.progress import Bar
     from ambiguous_wild.core.errors import AwError
 
+    if not source.strip():
+        raise AwError("SOURCE is empty: give a video, a folder of photos, or 'camera'")
     bar = Bar(not as_json)
     path = Path(source)
     camera = re.fullmatch(r"camera(?::(\d{1,3}))?", source)
@@ -53,6 +57,13 @@ def command(source: str, output: Path, frames: int, every: float, jobs: int | No
         raise AwError(f"unknown camera {source!r}: write 'camera' or 'camera:1'")
     else:
         raise AwError(f"{source} does not exist: give a video, a folder of photos, or 'camera'")
+    announced = facts.get("frames_announced")
+    if announced and facts["frames_read"] < BROKEN_BELOW * announced:
+        click.echo(
+            f"warning: {source} announces {announced} frames, {facts['frames_read']} could be read: "
+            "it may be cut short or damaged",
+            err=True,
+        )
     if as_json:
         click.echo(json.dumps({**facts, "capture": str(output)}, indent=2, ensure_ascii=False))
         return

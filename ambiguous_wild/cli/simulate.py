@@ -6,7 +6,7 @@ import json
 import shlex
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     "--seed", type=click.IntRange(0), default=0, show_default=True, help="World, walk and distractors."
 )
 @click.option("--views", type=int, help="Train photos; test photos in proportion.")
-@click.option("--width", type=int, help="Width of a photo in px, 16:9.")
+@click.option("--width", type=int, help="Width of a photo in px; its shape stays.")
 @click.option("--depth", is_flag=True, help="Also write depth maps of the static scene.")
 @click.option("--overwrite", is_flag=True, help="Replace an earlier capture in this folder.")
 @click.option(
@@ -48,7 +48,7 @@ def command(
     NAME is one of --list; SPEC.yaml says world, walk, distractors and effects (docs/simulation.md). What it
     leaves out is as in the courtyard.
     """
-    from ambiguous_wild.core.errors import AwError
+    from ambiguous_wild.core.errors import AwError, counted
     from ambiguous_wild.simulate.presets import PRESETS, preset, resized
     from ambiguous_wild.simulate.spec_file import dump_spec, is_spec_file, plain_spec, read_spec
 
@@ -81,13 +81,21 @@ def command(
             from ambiguous_wild.harness.capture_sheet import write_capture_sheet
 
             write_capture_sheet(out)
+    outside = _outside(spec, facts["photos"])
+    if outside:
+        click.echo(
+            f"warning: in {outside} of {spec.train_views} train photos distractors cover less or more than "
+            f"occlusion [{spec.occlusion[0]:g}, {spec.occlusion[1]:g}] asks for; other sizes, distances or "
+            "numbers of them would reach it",
+            err=True,
+        )
     if as_json:
         click.echo(json.dumps({k: v for k, v in facts.items() if k not in ("files", "photos")}, indent=2))
         return
     share = facts["occlusion"]
     state = "already there, unchanged" if facts["reused"] else "wrote"
     who = (
-        f"{len(spec.distractors)} distractors cover {100 * share['min']:.0f} to {100 * share['max']:.0f} % "
+        f"{counted(len(spec.distractors), 'distractor')} cover{'s' if len(spec.distractors) == 1 else ''} {100 * share['min']:.0f} to {100 * share['max']:.0f} % "
         f"(mean {100 * share['mean']:.1f} %) of a train photo"
     )
     click.echo(
@@ -101,6 +109,15 @@ def command(
         click.echo(f"look at: {out / 'truth' / 'sheet.jpg'}")
     scene = out.parent / f"{out.name}-scene"
     click.echo(f"next: aw build-scene {shlex.quote(str(out))} -o {shlex.quote(str(scene))}")
+
+
+def _outside(spec: CaptureSpec, photos: dict[str, Any]) -> int:
+    """Train photos whose share of distractors is clearly outside the band that was asked for."""
+    low, high = spec.occlusion
+    if not spec.distractors or all(d.path == "walk" for d in spec.distractors):
+        return 0  # who walks is where the walk leads
+    slack = 0.02 + 0.1 * (high - low)  # shares were chosen in a small preview
+    return sum(not low - slack <= photo["occlusion"] <= high + slack for photo in photos.values())
 
 
 def _print_list(specs: Iterable[CaptureSpec], as_json: bool) -> None:

@@ -93,6 +93,7 @@ def make_command(
     from tqdm import tqdm
 
     from ambiguous_wild.core.errors import AwError
+    from ambiguous_wild.core.names import is_text
     from ambiguous_wild.io.atomic import check_output
     from ambiguous_wild.study.make import Settings, make
     from ambiguous_wild.study.questions import Question, pairs_of_runs, photos_of_scene
@@ -105,6 +106,11 @@ def make_command(
         raise AwError(
             f"the page must be called *.html, so that browsers open it: -o {out.with_suffix('.html')}"
         )
+    if not is_text(title):
+        raise AwError(f"--title {title!a} holds half a character: the terminal's encoding is not UTF-8")
+    same = [scene for k, scene in enumerate(scenes) if scene.resolve() in [s.resolve() for s in scenes[:k]]]
+    if same:
+        raise AwError(f"--scene {same[0]} is given twice: each photo would count twice; name it once")
     key = out.with_suffix(".key.json")
     check_output(out)
     there = [str(p) for p in (out, key) if p.exists()]
@@ -148,19 +154,19 @@ def make_command(
 @click.option("--json", "as_json", is_flag=True, help="Print the scores as JSON.")
 def score_command(answers: tuple[Path, ...], key: Path, out: Path | None, seed: int, as_json: bool) -> None:
     """Score ANSWERS: files (JSON or CSV) that raters saved, or folders of them."""
-    from ambiguous_wild.core.errors import AwError
-    from ambiguous_wild.io.atomic import check_output
+    from ambiguous_wild.io.atomic import check_output, refuse_file
+    from ambiguous_wild.io.strangers import refuse_strangers
     from ambiguous_wild.study.answers import read_answers
     from ambiguous_wild.study.key import read_key
-    from ambiguous_wild.study.report import to_markdown, write_scores
+    from ambiguous_wild.study.report import SCORE_FILES, to_markdown, write_scores
     from ambiguous_wild.study.scores import score
 
     known = read_key(key)
-    raters = read_answers(answers, known)
+    raters = read_answers(answers, known, lambda text: click.echo(f"warning: {text}", err=True))
     folder = out or key.with_name(key.name.removesuffix(".json").removesuffix(".key") + "-scores")
-    stray = [p.name for p in folder.iterdir() if not p.name.startswith("scores.")] if folder.is_dir() else []
-    if stray:
-        raise AwError(f"{folder} holds other files ({stray[0]}): choose another -o, it is written anew")
+    if folder.is_dir():
+        refuse_strangers(folder, SCORE_FILES)
+    refuse_file(folder)
     check_output(folder)
     scores = score(known, raters, seed)
     write_scores(scores, folder)

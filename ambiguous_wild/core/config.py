@@ -48,7 +48,8 @@ def from_plain(cls: type[T], data: Mapping[str, Any], where: str = "config") -> 
     """Build the dataclass from plain data; an unknown key or a wrong type is an error that names it.
 
     Raises:
-        AwError: unknown key (with the nearest known one), or a value of the wrong type.
+        AwError: unknown key (with the nearest known one), a value of the wrong type, or a key that is needed
+            and absent.
     """
     hints = typing.get_type_hints(cls)
     names = [f.name for f in dataclasses.fields(cls)]  # type: ignore[arg-type]
@@ -57,6 +58,10 @@ def from_plain(cls: type[T], data: Mapping[str, Any], where: str = "config") -> 
         if key not in names:
             raise unknown(f"key in {where}", str(key), names)
         values[key] = _coerce(hints[key], value, f"{where}.{key}")
+    for f in dataclasses.fields(cls):  # type: ignore[arg-type]
+        needed = f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
+        if needed and f.name not in values:
+            raise AwError(f"{where} lacks {f.name!r}")
     return cls(**values)
 
 
@@ -125,9 +130,11 @@ def _coerce(hint: Any, value: Any, where: str) -> Any:
         args = typing.get_args(hint)
         items = value if isinstance(value, (list, tuple)) else [value]
         if len(args) == 2 and args[1] is Ellipsis:
-            return tuple(_coerce(args[0], v, where) for v in items)
+            if items is not value:
+                return (_coerce(args[0], value, where),)
+            return tuple(_coerce(args[0], v, f"{where}[{k}]") for k, v in enumerate(items))
         if len(args) != len(items):
-            raise _wrong(hint, value, where)
+            raise AwError(f"{where}: expected {len(args)} values, got {value!r}")
         return tuple(_coerce(a, v, where) for a, v in zip(args, items))
     if origin in (dict, Mapping) or hint in (dict, Any):
         return value

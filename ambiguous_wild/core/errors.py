@@ -43,6 +43,11 @@ def unknown(kind: str, name: str, choices: Iterable[str], hint: str = "") -> AwE
     return AwError(f"unknown {kind} {name!r}: {tail}" + (f" ({hint})" if hint else ""))
 
 
+def counted(number: int, noun: str) -> str:
+    """``"1 rater"``, ``"3 raters"``."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
 def shortlist(names: Iterable[str], limit: int = 5) -> str:
     """``"a.jpg, b.jpg and 3 more"``: names for a message that must stay one line."""
     listed = [str(n) for n in names]

@@ -34,6 +34,11 @@ def check_name(kind: str, name: str) -> str:
     return stripped
 
 
+def is_text(value: str) -> bool:
+    """Whether it can be written: JSON and command lines may hold halves of characters (lone surrogates)."""
+    return not any("\ud800" <= c <= "\udfff" for c in value)
+
+
 def _unprintable(char: str) -> bool:
     """Control, format and surrogate characters, and line and paragraph separators."""
     return unicodedata.category(char) in ("Cc", "Cf", "Cs", "Zl", "Zp")

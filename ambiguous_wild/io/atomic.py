@@ -60,8 +60,12 @@ def atomic_dir(path: Path | str) -> Iterator[Path]:
     """Yield a temporary folder beside `path`; rename it to `path` on success, replacing what was there.
 
     Where `path` is a link, what it leads to is replaced, not the link.
+
+    Raises:
+        AwError: `path` is a file: whosever it is, it is no folder of an earlier call.
     """
     target = Path(os.path.realpath(path))
+    refuse_file(path)
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}.tmp-", dir=target.parent))
     umask = os.umask(0)
@@ -79,6 +83,12 @@ def atomic_dir(path: Path | str) -> Iterator[Path]:
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
+
+
+def refuse_file(path: Path | str) -> None:
+    """Raise AwError where a file lies at the path of a folder to be made."""
+    if os.path.exists(path) and not os.path.isdir(path):
+        raise AwError(f"cannot make the folder {path}: a file lies there; move it, or choose another -o")
 
 
 def sweep(folder: Path | str) -> None:

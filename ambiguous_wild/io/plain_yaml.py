@@ -10,6 +10,8 @@ import yaml
 from ambiguous_wild.core.errors import AwError
 
 LARGEST = 1_000_000  # bytes; what is read here has a few thousand
+DEEPEST = 50  # nested lists and mappings
+LONGEST_NUMBER = 400  # characters of a whole number; no float is larger
 
 
 class PlainLoader(yaml.SafeLoader):
@@ -18,17 +20,35 @@ class PlainLoader(yaml.SafeLoader):
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.AliasEvent):
             raise AwError(f"line {self.peek_event().start_mark.line + 1}: aliases (*name) are not read")
-        return super().compose_node(parent, index)
+        self._depth = getattr(self, "_depth", 0) + 1
+        if self._depth > DEEPEST:
+            raise AwError(f"line {self.peek_event().start_mark.line + 1}: nested deeper than {DEEPEST}")
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        return node
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
         seen = set()
         for key, _ in node.value:
             if not isinstance(key.value, str):
                 raise AwError(f"not YAML that is read here: no word as key in line {key.start_mark.line + 1}")
+            if key.tag == "tag:yaml.org,2002:merge":
+                raise AwError(f"line {key.start_mark.line + 1}: merged keys (<<) are not read")
             if key.value in seen:
                 raise AwError(f"line {key.start_mark.line + 1}: the key {key.value!r} is there twice")
             seen.add(key.value)
         return super().construct_mapping(node, deep)
+
+    def construct_yaml_int(self, node: Any) -> int:
+        # 0xfff... and 1:59:59... know no limit of Python's own, and what they give cannot be printed
+        if len(node.value) > LONGEST_NUMBER:
+            raise AwError(
+                f"line {node.start_mark.line + 1}: a whole number of {len(node.value)} characters is not read"
+            )
+        return int(super().construct_yaml_int(node))
+
+
+PlainLoader.add_constructor("tag:yaml.org,2002:int", PlainLoader.construct_yaml_int)
 
 
 def parse(text: str) -> Any:

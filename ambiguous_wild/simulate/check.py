@@ -6,16 +6,20 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import fields
 
+import numpy as np
+
 from ambiguous_wild.core.errors import AwError, unknown
-from ambiguous_wild.simulate.effects.settings import Effects
+from ambiguous_wild.simulate.effects.settings import Effects, LensDistortion
 from ambiguous_wild.simulate.ground_plan import SURFACES
-from ambiguous_wild.simulate.spec import CaptureSpec, Distractor, Thing
+from ambiguous_wild.simulate.spec import FULL_FRAME_DIAGONAL_MM, CaptureSpec, Distractor, Thing
 
 # What the courtyard can be painted with; `world.py` bakes them (a test compares the two).
 SHEET_NAMES = ("stone", "foliage", "timber", "clay", "skin", "brick", "gravel", "vivid", "cloth")
 PICTURES = tuple(
     f"poster_{name}" for name in ("coffee", "rocket", "chelsea", "hubble", "coins", "camera", "retina")
 )
+
+MOST = 255  # distractors: the tracer says in a byte whose a pixel is
 
 
 def check_spec(spec: CaptureSpec) -> CaptureSpec:
@@ -39,12 +43,35 @@ def check_spec(spec: CaptureSpec) -> CaptureSpec:
     _range("radius_m", spec.radius_m, 1.5, 7)
     _range("eye_m", spec.eye_m, 0.2, 3.3)
     _range("zoom", spec.zoom, 0.5, 4)
+    if len(spec.distractors) > MOST:
+        raise AwError(f"distractors: at most {MOST}, got {len(spec.distractors)}")
     for k, distractor in enumerate(spec.distractors):
+        if not distractor.name.strip():
+            raise AwError(f"distractors[{k}].name: empty; capture.json tells who stands where by it")
+        if distractor.name in (d.name for d in spec.distractors[:k]):
+            raise AwError(f"distractors[{k}].name: {distractor.name!a} is there twice; give each its own")
+        if distractor.head and distractor.kind != "visitor":
+            raise AwError(f"distractors[{k}].head: only a visitor has one, not a {distractor.kind}")
         _distractor(f"distractors[{k}]", distractor)
     for k, thing in enumerate(spec.world.things):
         _thing(f"world.things[{k}]", thing)
     _effects(spec.effects)
+    if spec.effects.lens_distortion is not None:
+        _lens(spec, spec.effects.lens_distortion)
     return spec
+
+
+def _lens(spec: CaptureSpec, lens: LensDistortion) -> None:
+    """A lens maps every direction of the photo to one place of its own, or it folds the picture over."""
+    corner = 0.5 * FULL_FRAME_DIAGONAL_MM / (spec.focal_35mm * spec.zoom[0])
+    r = np.linspace(0.0, 4.0 * corner, 4001)
+    bent = r * (1 + lens.k1 * r**2 + lens.k2 * r**4)
+    until = int(np.argmax(np.diff(bent) <= 0)) if (np.diff(bent) <= 0).any() else len(r) - 1
+    if bent[until] < 1.02 * corner:  # a hand that shakes looks a little further
+        raise AwError(
+            f"effects.lens_distortion: k1 {lens.k1:g}, k2 {lens.k2:g} fold the picture before its corner at "
+            f"focal_35mm {spec.focal_35mm:g}, zoom {spec.zoom[0]:g}; a longer focal length or smaller numbers"
+        )
 
 
 def _distractor(where: str, d: Distractor) -> None:
@@ -84,7 +111,7 @@ def _effects(effects: Effects) -> None:
         "iso_noise": {"iso": (50, 25600)},
         "vignetting": {"falloff": (0, 0.9)},
         "lens_distortion": {"k1": (-0.3, 0.3), "k2": (-0.1, 0.1)},
-        "motion_blur": {"exposure_s": (0, 0.5), "speed_deg_s": (0, 60)},
+        "motion_blur": {"exposure_s": (1e-5, 0.5), "speed_deg_s": (0, 60)},
         "rolling_shutter": {"readout_s": (0, 0.2), "speed_deg_s": (0, 60)},
         "defocus": {"share": (0, 1), "radius": (0, 0.02)},
         "jpeg": {"quality": (1, 95)},

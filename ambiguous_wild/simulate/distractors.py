@@ -96,7 +96,8 @@ def lay_out(
     """Place the distractors of every train photo.
 
     Positions are drawn until the photo's occlusion (seen in a small preview) lies in ``spec.occlusion``;
-    where no draw does, the nearest one is taken. No distractor returns to one place in more than 15 %
+    where no draw does, the nearest one is taken. So presence is of a draw; where the band starts at 0 it is
+    of the photo, drawn once and kept. No distractor returns to one place in more than 15 %
     of the photos: what stays is part of the scene.
     """
     chosen: list[tuple[Placement, ...]] = []
@@ -113,8 +114,12 @@ def lay_out(
         best: tuple[Placement, ...] = ()
         best_gap = np.inf
         aim = rng.uniform(low, high)  # so that the shares spread over the whole band
+        here = [rng.random() <= d.presence for d in spec.distractors] if low == 0 and tries > 1 else None
+        if here is not None and not any(here):
+            chosen.append(())
+            continue
         for attempt in range(tries):
-            layout = _draw(spec, camera, world, chosen, rng)
+            layout = _draw(spec, camera, world, chosen, rng, here)
             seen = trace(small, static, movers(spec, layout, world), world.atlas, light)
             share = float(np.mean(seen.owner > 0))
             tolerance = (high - low) * (0.1 + 0.4 * attempt / tries)
@@ -133,10 +138,11 @@ def _draw(
     world: World,
     earlier: list[tuple[Placement, ...]],
     rng: np.random.Generator,
+    here: list[bool] | None = None,  # who is in the photo; None: drawn, too
 ) -> tuple[Placement, ...]:
     layout: list[Placement] = []
     for which, distractor in enumerate(spec.distractors):
-        if rng.random() > distractor.presence:
+        if not here[which] if here is not None else rng.random() > distractor.presence:
             continue
         if distractor.path == "walk":
             place = _on_its_way(which, distractor, len(earlier) / max(spec.train_views - 1, 1))

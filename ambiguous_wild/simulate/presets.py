@@ -122,7 +122,7 @@ def preset(name: str) -> CaptureSpec:
 
 
 def resized(spec: CaptureSpec, views: int | None = None, width: int | None = None) -> CaptureSpec:
-    """The spec with another number of train photos or another picture width (16:9, textures to match).
+    """The spec with another number of train photos or another width (shape kept, textures to match).
 
     Raises:
         AwError: fewer than 3 photos, or a width outside 64 to 4096 px.

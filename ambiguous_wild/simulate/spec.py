@@ -24,6 +24,7 @@ Kind = Literal[
 ThingKind = Literal["box", "ball", "column", "board", "figure", "bust", "knot", "hound", "spire"]
 Ambiguity = Literal["colour", "semantic", "none"]
 Colour = tuple[float, float, float]  # linear light
+FULL_FRAME_DIAGONAL_MM = 43.2666  # of 36 x 24 mm, what `focal_35mm` is an equivalent on
 STATUES = ("bust", "knot", "hound", "spire")  # signed-distance shapes, in the world and as distractors
 
 
@@ -46,7 +47,9 @@ class Distractor:
     texture: str  # a sheet of the world (stone, foliage, brick, ...), or for a placard any texture of it
     ambiguity: Ambiguity  # why it is hard: the background's colour, the statue's shape, or not at all
     head: str = ""  # a visitor's head and hands, where they are not of the same sheet
-    presence: float = 0.85  # duty cycle: share of the train photos in which it is put
+    # duty cycle: share of the train photos in which it is put; of one that stands elsewhere in each, of the
+    # layouts drawn, of which `occlusion` chooses, unless that starts at 0
+    presence: float = 0.85
     distance_m: tuple[float, float] = (1.9, 4.5)  # from the camera; of a walker the smallest alone counts
     size: float = 1.0  # times its natural size: figures 1.75 m, ball 0.8 m, pole 2 m, statues 1.6 m
     lift_m: float = 0.0  # how far above the ground it may fly

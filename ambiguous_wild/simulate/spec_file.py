@@ -65,12 +65,7 @@ def parse_spec(text: str) -> CaptureSpec:
 
 
 def _built(data: dict[Any, Any], effects: Effects) -> CaptureSpec:
-    try:
-        spec = from_plain(CaptureSpec, {str(k): v for k, v in data.items()}, "spec")
-    except TypeError as error:  # a distractor without its kind
-        missing = str(error).partition("missing ")[2].partition(": ")[2] or str(error)
-        owner = "distractor" if "Distractor" in str(error) else "thing"
-        raise AwError(f"a {owner} of the spec lacks {missing}") from None
+    spec = from_plain(CaptureSpec, {str(k): v for k, v in data.items()}, "spec")
     return replace(spec, effects=effects)
 
 

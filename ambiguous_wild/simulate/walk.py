@@ -7,15 +7,17 @@ from dataclasses import replace
 import numpy as np
 
 from ambiguous_wild.core.camera import Camera
-from ambiguous_wild.simulate.spec import CaptureSpec
+from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.simulate.ground_plan import BACK_M, HALF_WIDTH_M
+from ambiguous_wild.simulate.spec import FULL_FRAME_DIAGONAL_MM, CaptureSpec
 from ambiguous_wild.simulate.world import World
 
-_FULL_FRAME_DIAGONAL_MM = 43.2666  # of 36 x 24 mm
+_NEAREST_WALL_M = 0.1
 
 
 def focal_px(spec: CaptureSpec) -> float:
     """Focal length in px of the stated 35 mm equivalent: the same angle over the diagonal (CIPA)."""
-    return spec.focal_35mm / _FULL_FRAME_DIAGONAL_MM * float(np.hypot(spec.width, spec.height))
+    return spec.focal_35mm / FULL_FRAME_DIAGONAL_MM * float(np.hypot(spec.width, spec.height))
 
 
 def look_at(eye: np.ndarray, target: np.ndarray, roll_deg: float) -> np.ndarray:
@@ -38,6 +40,9 @@ def plan_cameras(
 
     Test viewpoints lie at other angles than any train photo, between the near and the far, the high and
     the low of the walk, so that they are new but not beyond what was seen.
+
+    Raises:
+        AwError: the walk leads into a wall.
     """
     half = np.deg2rad(spec.arc_deg / 2)
     phase = rng.uniform(0, 2 * np.pi, 2)
@@ -47,6 +52,11 @@ def plan_cameras(
         height = np.interp(rise, (-1, 1), spec.eye_m)
         center = np.array([world.statue[0], world.statue[1] - 0.3])
         eye = np.array([*(center + radius * np.array([np.sin(azimuth), -np.cos(azimuth)])), height])
+        if abs(eye[0]) > HALF_WIDTH_M - _NEAREST_WALL_M or eye[1] > BACK_M - _NEAREST_WALL_M:
+            raise AwError(
+                f"arc_deg {spec.arc_deg:g} and radius_m {spec.radius_m[0]:g} to {spec.radius_m[1]:g} lead "
+                "the camera into a wall of the courtyard; a smaller one of them"
+            )
         target = np.array([*center, 1.25]) + rng.normal(0, 0.16, 3) * shake
         f = focal_px(spec)
         pose = look_at(eye, target, float(rng.normal(0, 1.2)) * shake)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.core.names import is_text
 from ambiguous_wild.study.key import FORMAT as KEY_FORMAT
 from ambiguous_wild.study.key import KIND_PAIR, KIND_PHOTO, Key
 
@@ -38,15 +39,22 @@ class Rater:
     answers: tuple[Answer, ...]
 
 
-def read_answers(paths: Sequence[Path], key: Key) -> list[Rater]:
+def read_answers(
+    paths: Sequence[Path], key: Key, notice: Callable[[str], None] = lambda text: None
+) -> list[Rater]:
     """Read the answer files (JSON or CSV; a folder stands for those in it), ordered by rater.
+
+    Args:
+        paths: files and folders.
+        key: of the study.
+        notice: told what of a folder is not read.
 
     Raises:
         AwError: no file, or one that is empty, malformed, of another study, twice of the same rater, or
             that answers what was not asked; names the file.
     """
     raters: dict[str, Rater] = {}
-    for path in _files(paths):
+    for path in _files(paths, notice):
         rater = _read(path, key)
         if rater.rater in raters:
             raise AwError(
@@ -57,7 +65,7 @@ def read_answers(paths: Sequence[Path], key: Key) -> list[Rater]:
     return [raters[name] for name in sorted(raters)]
 
 
-def _files(paths: Sequence[Path]) -> list[Path]:
+def _files(paths: Sequence[Path], notice: Callable[[str], None]) -> list[Path]:
     found: list[Path] = []
     for path in paths:
         if not path.is_dir():
@@ -74,6 +82,17 @@ def _files(paths: Sequence[Path]) -> list[Path]:
         if not inside:
             raise AwError(f"no answer file (*.json, *.csv) in {path}")
         found += inside
+        ours = (".key.json", ".html", ".htm")
+        left = [
+            p.name
+            for p in sorted(path.iterdir())
+            if p not in inside and not p.name.startswith((".", "scores.")) and not p.name.endswith(ours)
+        ]
+        if left:
+            notice(
+                f"{path}: left out {shortlist(left)}; answers end in .json or .csv "
+                "and lie in the folder itself"
+            )
     twice = {p.resolve() for p in found if sum(p.resolve() == q.resolve() for q in found) > 1}
     if twice:
         raise AwError(f"given twice: {shortlist(sorted(map(str, twice)))}; name each answer file once")
@@ -101,8 +120,14 @@ def _read(path: Path, key: Key) -> Rater:
             "or a page made again since"
         )
     rater, name = data["rater"], data["name"]
+    if isinstance(rater, str):
+        rater = rater.strip()  # a blank more is no second rater
     if not isinstance(rater, str) or not rater.strip() or len(rater) > LONGEST or not isinstance(name, str):
         raise AwError(f"{path} has no fit rater ({_short(rater)}): it was changed by hand; save it again")
+    if not is_text(rater) or not is_text(name):
+        raise AwError(
+            f"{path} has half a character in its rater or name: it was changed by hand; save it again"
+        )
     answers = tuple(_answer(path, row, key) for row in data["answers"])
     if not answers:
         raise AwError(f"{path} holds no answer: leave it out")

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.core.names import is_text
 
 FORMAT, VERSION = "aw-study-key", 1
 KIND_PHOTO, KIND_PAIR = "ambiguity", "preference"
@@ -56,6 +57,8 @@ def read_key(path: Path) -> Key:
     )
     if not whole:
         raise AwError(f"the key {path} is damaged (a field is absent); take the one 'aw study make' wrote")
+    if not is_text(json.dumps(data, ensure_ascii=False)):
+        raise AwError(f"the key {path} is damaged (half a character); take the one 'aw study make' wrote")
     return Key(data["study"], data["title"], data["questions"])
 
 

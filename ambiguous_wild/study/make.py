@@ -73,6 +73,7 @@ def make(
     identity = study_id(settings.title, asked, answers, album.hashes)
     data = {"study": identity, "title": settings.title, "questions": asked, "images": album.images}
     text = page_of(data)
+    write_text(page, text)  # first: a key without its page would be of nothing
     write_json(
         key,
         {
@@ -84,7 +85,6 @@ def make(
             "questions": answers,
         },
     )
-    write_text(page, text)
     size = len(text.encode()) / 1e6
     return Made(page, key, identity, len(photos), len(pairs), len(album.images), size)
 

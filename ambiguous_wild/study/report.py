@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from ambiguous_wild.core.errors import counted
 from ambiguous_wild.harness.render_tables import csv_text, markdown_text
 from ambiguous_wild.io.atomic import atomic_dir, write_json, write_text
 from ambiguous_wild.study.key import KIND_PAIR, KIND_PHOTO
 from ambiguous_wild.study.scores import HARD
 
+SCORE_FILES = ("scores.json", "scores.csv", "scores.md")
 COLUMNS = (
     "kind",
     "level",
@@ -43,7 +46,7 @@ def to_markdown(scores: dict[str, Any]) -> str:
     raters = scores["raters"]
     answers = sum(r["answers"] for r in raters)
     parts = [f"# {markdown_text(scores['title'])}", ""]
-    parts.append(f"Study {scores['study']}, {len(raters)} raters, {answers} answers.")
+    parts.append(f"Study {scores['study']}, {counted(len(raters), 'rater')}, {counted(answers, 'answer')}.")
     if scores[KIND_PAIR] is not None:
         parts += _preference(scores[KIND_PAIR])
     if scores[KIND_PHOTO] is not None:
@@ -97,7 +100,12 @@ def _ambiguity(found: dict[str, Any]) -> list[str]:
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> list[str]:
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    return lines + ["| " + " | ".join(markdown_text(str(c)) for c in row) + " |" for row in rows]
+    return lines + ["| " + " | ".join(_cell(str(c)) for c in row) + " |" for row in rows]
+
+
+def _cell(text: str) -> str:
+    """Numbers as they are, intervals and all; names escaped."""
+    return text if re.fullmatch(r"[-\d.,%\[\]{}— ]*", text) else markdown_text(text)
 
 
 def _share(cell: dict[str, Any]) -> str:

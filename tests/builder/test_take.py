@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -87,6 +89,7 @@ def test_bad_sources_are_one_line_and_leave_nothing(tmp_path: Path) -> None:
     (tmp_path / "nothing").mkdir()
     assert "no video that can be read" in error(tmp_path / "text.mp4", "-o", out)
     assert "is empty" in error(tmp_path / "empty.mp4", "-o", out)
+    assert "SOURCE is empty" in error("", "-o", out)
     assert "holds no photos" in error(tmp_path / "nothing", "-o", out)
     assert "does not exist" in error(tmp_path / "absent", "-o", out)
     assert "unknown camera" in error("camera:front", "-o", out)
@@ -135,3 +138,23 @@ def test_a_camera_that_stops_leaves_nothing(tmp_path: Path, monkeypatch: pytest.
     with pytest.raises(AwError, match="stopped after 4 of 9"):
         take.take_camera(0, tmp_path / "raw", frames=9, every_s=1.0)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["ok"]
+
+
+def test_of_a_broken_video_there_is_one_line_and_it_is_ours(tmp_path: Path) -> None:
+    (tmp_path / "text.mp4").write_text("no video " * 100)
+    words = ["capture", str(tmp_path / "text.mp4"), "-o", str(tmp_path / "raw")]
+    done = subprocess.run(
+        [sys.executable, "-m", "ambiguous_wild.cli.main", *words], capture_output=True, text=True
+    )
+    lines = done.stderr.strip().splitlines()
+    assert done.returncode == 2 and len(lines) == 1 and "no video that can be read" in lines[0]
+
+
+def test_a_video_that_was_cut_short_is_told(tmp_path: Path) -> None:
+    whole = write_video(tmp_path / "v.avi").read_bytes()
+    (tmp_path / "half.avi").write_bytes(whole[: len(whole) // 2])
+    words = [str(tmp_path / "half.avi"), "-o", str(tmp_path / "raw"), "--frames", "3"]
+    done = CliRunner().invoke(command, words, catch_exceptions=False)
+    assert done.exit_code == 0 and f"announces {FRAMES} frames" in done.stderr
+    whole_words = [str(tmp_path / "v.avi"), "-o", str(tmp_path / "b"), "--frames", "3"]
+    assert "warning" not in CliRunner().invoke(command, whole_words, catch_exceptions=False).stderr

@@ -150,6 +150,8 @@ def test_a_folder_that_is_no_report_is_not_replaced(scene: Path, tmp_path: Path)
     (tmp_path / "mine/letter.txt").write_text("dear")
     assert "letter.txt" in error(scene, "-o", tmp_path / "mine")
     assert (tmp_path / "mine/letter.txt").read_text() == "dear"
+    assert "a file lies there" in error(scene, "-o", tmp_path / "mine/letter.txt")
+    assert (tmp_path / "mine/letter.txt").read_text() == "dear"
 
 
 def test_keep_masks_are_the_inverse(scene: Path, tmp_path: Path) -> None:

@@ -107,13 +107,18 @@ def test_points_go_there_and_back() -> None:
 
 
 def test_runs_that_do_not_fit_are_refused(scene: Path, run: Path, tmp_path: Path) -> None:
-    def error() -> str:
-        words = [str(scene), "--run", str(run), "-o", str(tmp_path / "out")]
+    def error(*more: str) -> str:
+        words = [str(scene), "--run", str(run), "-o", str(tmp_path / "out"), *more]
         raised = CliRunner().invoke(command, words).exception
         assert isinstance(raised, AwError), raised
         return str(raised)
 
     (run / "config.yaml").write_text("scene: {sha256: other, name: yard}")
+    assert "'yard'" in error()
+    assert "'yard'" in error("--masks", "run", "--background", "none")
+    (scene / "truth/clean").mkdir()
+    for name in TRAIN:  # with a truth the run is not even read, and is still the wrong one
+        (scene / "truth/clean" / name).write_bytes((scene / "images" / name).read_bytes())
     assert "'yard'" in error()
     (run / "config.yaml").write_text("scene: [")
     assert "damaged" in error()

@@ -115,3 +115,11 @@ def test_what_a_killed_process_left_is_swept_and_nothing_else(tmp_path):
     assert len(list(tmp_path.iterdir())) == 4
     sweep(tmp_path)
     assert sorted(p.name for p in tmp_path.iterdir()) == [".hidden", "mine.txt"]
+
+
+def test_a_file_where_a_folder_is_to_be_made_stays(tmp_path):
+    (tmp_path / "thesis.txt").write_text("mine")
+    with pytest.raises(AwError, match="a file lies there"), atomic_dir(tmp_path / "thesis.txt") as folder:
+        (folder / "a").write_text("b")
+    assert (tmp_path / "thesis.txt").read_text() == "mine"
+    assert [p.name for p in tmp_path.iterdir()] == ["thesis.txt"]

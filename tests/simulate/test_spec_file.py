@@ -9,6 +9,7 @@ from click.testing import CliRunner
 
 from ambiguous_wild.cli.simulate import command
 from ambiguous_wild.core import AwError
+from ambiguous_wild.simulate.capture import plan
 from ambiguous_wild.simulate.check import PICTURES, SHEET_NAMES
 from ambiguous_wild.simulate.presets import PRESETS
 from ambiguous_wild.simulate.spec_file import dump_spec, parse_spec, read_spec
@@ -69,7 +70,7 @@ def test_what_is_left_out_is_as_in_the_courtyard() -> None:
         ("distractors: [{kind: bal, name: a, texture: cloth, ambiguity: none}]", "did you mean 'ball'"),
         (
             "distractors: [{kind: ball, texture: cloth, ambiguity: none}]",
-            "a distractor of the spec lacks 'name'",
+            "spec.distractors[0] lacks 'name'",
         ),
         (f"distractors: [{RED.replace('cloth', 'clohT')}]", "did you mean 'cloth'"),
         (f"distractors: [{RED[:-1]}, size: -1}}]", "distractors[0].size: between 0.02 and 10, got -1"),
@@ -85,6 +86,29 @@ def test_what_is_left_out_is_as_in_the_courtyard() -> None:
         ("- 1", "'key: value' lines"),
         ("", "'key: value' lines"),
         ("? [1, 2]\n: 3", "not YAML"),
+        ("samples: 0x" + "f" * 4000, "line 1: a whole number of 4002 characters"),
+        ("samples: 1" + ":59" * 3000, "a whole number of"),
+        ("world: " + "[" * 200 + "]" * 200, "nested deeper than 50"),
+        ("<<: {width: 100}", "merged keys"),
+        ("effects: {lens_distortion: {k1: -0.3}}", "fold the picture before its corner"),
+        ("focal_35mm: 14\neffects: {lens_distortion: {k1: -0.12}}", "fold the picture"),
+        ("effects: {lens_distortion: {k2: -0.1}}", "fold the picture"),
+        ("effects: {motion_blur: {exposure_s: 0}}", "exposure_s: between 1e-05 and 0.5"),
+        (f"distractors: [{RED}, {RED}]", "distractors[1].name: 'a' is there twice"),
+        (
+            f"distractors: [{RED.replace('name: a', 'name: ~')}]".replace("~", "' '"),
+            "distractors[0].name: empty",
+        ),
+        (
+            "distractors: [{kind: ball, name: a, texture: cloth, ambiguity: none, head: skin}]",
+            "only a visitor has one, not a ball",
+        ),
+        (
+            "distractors: ["
+            + ", ".join(f"{{kind: ball, name: b{k}, texture: cloth, ambiguity: none}}" for k in range(256))
+            + "]",
+            "distractors: at most 255, got 256",
+        ),
     ],
 )
 def test_a_bad_spec_is_said_in_one_line_and_writes_nothing(text: str, expected: str, tmp_path: Path) -> None:
@@ -109,3 +133,41 @@ def test_files_that_are_no_text_are_refused(tmp_path: Path) -> None:
 
 def test_the_names_that_a_spec_may_use_are_those_that_the_world_bakes() -> None:
     assert tuple(SHEETS) == SHEET_NAMES and tuple(f"poster_{p}" for p in POSTERS) == PICTURES
+
+
+def test_a_hand_that_looks_too_far_away_is_refused_before_memory_is_asked_for(tmp_path: Path) -> None:
+    path = tmp_path / "wide.yaml"
+    hand = "{speed_deg_s: 60, %s}"
+    path.write_text(
+        "width: 64\nheight: 36\nfocal_35mm: 10\nzoom: [0.5, 0.5]\ntrain_views: 3\ntest_views: 1\neffects: "
+        f"{{motion_blur: {hand % 'exposure_s: 0.5'}, rolling_shutter: {hand % 'readout_s: 0.2'}}}"
+    )
+    done = CliRunner().invoke(command, [str(path), "-o", str(tmp_path / "raw")])
+    assert isinstance(done.exception, AwError) and "speed_deg_s" in str(done.exception)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_walk_into_a_wall_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(AwError, match="lead the camera into a wall"):
+        plan(parse_spec("radius_m: [7, 7]\narc_deg: 150\ndetail_px_per_m: 5"), 0)
+
+
+@pytest.mark.parametrize(("occlusion", "word"), [("[0.8, 0.9]", "in 3 of 3 train photos"), ("[0, 0.9]", "")])
+def test_shares_that_cannot_be_reached_are_said(occlusion: str, word: str, tmp_path: Path) -> None:
+    path = tmp_path / "one.yaml"
+    path.write_text(
+        "width: 64\nheight: 36\ntrain_views: 3\ntest_views: 1\ndetail_px_per_m: 10\n"
+        f"occlusion: {occlusion}\ndistractors: [{{kind: ball, name: a, texture: cloth, ambiguity: none}}]"
+    )
+    done = CliRunner().invoke(command, [str(path), "-o", str(tmp_path / "raw")], catch_exceptions=False)
+    assert ("warning" in done.stderr) == bool(word) and word in done.stderr
+
+
+def test_presence_is_of_photos_where_the_band_starts_at_nothing() -> None:
+    spec = parse_spec(
+        "train_views: 60\nwidth: 64\nheight: 36\ndetail_px_per_m: 5\nocclusion: [0, 0.9]\n"
+        "distractors: [{kind: ball, name: a, texture: cloth, ambiguity: none, presence: 0.3}]"
+    )
+    shots = [s for s in plan(spec, 1)[1] if s.split == "train"]
+    there = sum(bool(s.placements) for s in shots)
+    assert 10 <= there <= 26  # 18 are expected, 3.5 is a deviation

@@ -178,3 +178,13 @@ def test_a_method_of_any_name_stays_in_the_key(tmp_path: Path) -> None:
     assert {m for p in pairs_of_runs(runs) for m in p.methods} == {"<b>a</b>", "=b"}
     make("--runs", runs, "-o", tmp_path / "s.html")
     assert "<b>a" not in (tmp_path / "s.html").read_text()
+
+
+def test_a_scene_given_twice_and_half_a_character_are_refused(
+    made: tuple[Path, Path], tmp_path: Path
+) -> None:
+    scene, _ = made
+    page = tmp_path / "s.html"
+    assert "given twice" in error("--scene", scene, "--scene", scene / ".", "-o", page)
+    assert "half a character" in error("--scene", scene, "-o", page, "--title", "a\udcff")
+    assert not page.exists()

@@ -172,6 +172,8 @@ BAD: dict[str, tuple[Any, str]] = {
     "version": ({"version": 9}, "version 9"),
     "study": ({"study": "fff"}, "answers study 'fff'"),
     "rater": ({"rater": ""}, "no fit rater"),
+    "half a character": ({"name": "\ud800"}, "half a character"),
+    "half a rater": ({"rater": "\udfff"}, "half a character"),
     "rater type": ({"rater": ["a"]}, "no fit rater"),
     "none": ({"answers": []}, "holds no answer"),
     "unasked": ({"answers": [{"question": "zz", "answer": "x", "ms": 1}]}, "never asked: 'zz'"),
@@ -212,6 +214,9 @@ def test_the_same_rater_twice_and_the_key_as_answers(study: tuple[Path, Path, An
     key, answers, _ = study
     (tmp_path / "copy.json").write_text((answers / "r3.json").read_text())
     assert "both of rater 'r3'" in error(answers, tmp_path / "copy.json", "--key", key)
+    again = json.loads((answers / "r3.json").read_text())
+    (tmp_path / "blank.json").write_text(json.dumps({**again, "rater": again["rater"] + " "}))
+    assert "both of rater 'r3'" in error(answers, tmp_path / "blank.json", "--key", key)
     assert "given twice" in error(answers, answers / "r3.json", "--key", key)
     assert "give it with --key" in error(key, "--key", key)
     assert "is no key" in error(answers, "--key", answers / "r3.json")
@@ -222,6 +227,16 @@ def test_the_same_rater_twice_and_the_key_as_answers(study: tuple[Path, Path, An
         '{"format": "aw-study-key", "version": 1, "study": "s", "title": "t", "questions": {"a": {}}}'
     )
     assert "damaged" in error(answers, "--key", key)
+    entry = {"kind": "ambiguity", "scene": "s", "view": "v"}
+    half = {
+        "format": "aw-study-key",
+        "version": 1,
+        "study": "s",
+        "title": "\ud800",
+        "questions": {"a": entry},
+    }
+    key.write_text(json.dumps(half))
+    assert "half a character" in error(answers, "--key", key)
 
 
 def test_names_of_people_and_methods_stay_text(tmp_path: Path) -> None:
@@ -241,3 +256,20 @@ def test_a_folder_with_other_files_is_not_replaced(study: tuple[Path, Path, Any]
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/thesis.tex").write_text("x")
     assert "thesis.tex" in error(study[1], "--key", study[0], "-o", tmp_path / "mine")
+    score(study[1], "--key", study[0], "-o", tmp_path / "out")
+    (tmp_path / "out/scores.mine").mkdir()
+    (tmp_path / "out/scores.mine/notes.txt").write_text("x")
+    assert "notes.txt" in error(study[1], "--key", study[0], "-o", tmp_path / "out")
+    assert (tmp_path / "out/scores.mine/notes.txt").read_text() == "x"
+
+
+def test_what_a_folder_of_answers_holds_besides_is_named(
+    study: tuple[Path, Path, Any], tmp_path: Path
+) -> None:
+    key, answers, files = study
+    (answers / "answers-anna.json.txt").write_text("{}")
+    (answers / "bob").mkdir()
+    words = ["score", str(answers), "--key", str(key), "-o", str(tmp_path / "out")]
+    done = CliRunner().invoke(command, words, catch_exceptions=False)
+    assert f"{len(files)} raters" in done.stdout
+    assert "left out answers-anna.json.txt, bob" in done.stderr

@@ -17,7 +17,7 @@ from ambiguous_wild.harness.ambiguity.measure import Look, Measured, load_photo
 from ambiguous_wild.harness.ambiguity.sources import Background, Masks
 from ambiguous_wild.harness.ambiguity.summary import describe, row, semantic_metric
 from ambiguous_wild.harness.render_tables import csv_text
-from ambiguous_wild.io.atomic import atomic_dir, write_json, write_text
+from ambiguous_wild.io.atomic import atomic_dir, refuse_file, write_json, write_text
 from ambiguous_wild.metrics import ambiguity as am
 
 FILES = ("ambiguity.json", "ambiguity.png", "index.html", "photos.csv")
@@ -26,7 +26,8 @@ WIDTH = 420  # px of a picture on the page
 
 
 def check_folder(folder: Path) -> None:
-    """Raise AwError where the folder holds something else than a report: it would be lost."""
+    """Raise AwError where the folder is a file or holds something else than a report: it would be lost."""
+    refuse_file(folder)
     if not folder.is_dir() or not any(folder.iterdir()):
         return
     strange = sorted(p.name for p in folder.iterdir() if p.name not in FILES)

@@ -81,7 +81,8 @@ def check_run(scene: Scene, run: Path) -> None:
     path = run / "config.yaml"
     if not path.is_file() or not (run / "point_cloud.ply").is_file():
         raise AwError(
-            f"{run} is no finished run (config.yaml and point_cloud.ply); give RUNS/.../seed_0 of 'aw bench'"
+            f"{run} is no finished run (config.yaml and point_cloud.ply); give a folder of 'aw bench', "
+            "RUNS/SCENE/METHOD/seed0"
         )
     try:
         config = plain_yaml.read_mapping(path)

@@ -14,6 +14,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ambiguous_wild.core.camera import Camera
+from ambiguous_wild.core.errors import AwError
+
+_MOST_BORDER = 2  # times the photo's longer side that lens and hand may look beyond it
 
 
 def fine_points(camera: Camera, fine: int) -> np.ndarray:
@@ -35,6 +38,11 @@ def turned(points: np.ndarray, turns: np.ndarray) -> np.ndarray:
     """
     rays = np.concatenate([points, np.ones((*points.shape[:2], 1))], axis=-1)
     rays = rays @ Rotation.from_rotvec(turns).as_matrix().transpose(0, 2, 1)
+    if not (rays[..., 2] > 0).all():
+        raise AwError(
+            "the hand turns the edge of the photo behind the camera: a longer focal_35mm, or a lower "
+            "speed_deg_s of motion_blur and rolling_shutter"
+        )
     return rays[..., :2] / rays[..., 2:]
 
 
@@ -48,6 +56,11 @@ def enlarged(camera: Camera, sources: list[np.ndarray], fine: int) -> tuple[Came
     low = min(float(s.min()) for s in sources)
     high = max(float((s - (camera.width, camera.height)).max()) for s in sources)
     border = int(np.ceil(max(-low, high, 0.0))) + 1
+    if border > _MOST_BORDER * max(camera.width, camera.height):
+        raise AwError(
+            f"lens and hand look {border} px beyond a photo of {camera.width} x {camera.height} px: "
+            "a longer focal_35mm, a weaker lens_distortion, or a lower speed_deg_s"
+        )
     width, height = camera.width + 2 * border, camera.height + 2 * border
     shifted = replace(camera, width=width, height=height, cx=camera.cx + border, cy=camera.cy + border)
     return shifted.resized(width * fine, height * fine), border

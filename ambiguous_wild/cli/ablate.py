@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import shlex
 import sys
@@ -51,7 +52,8 @@ def command(
 ) -> None:
     """Train the variants of METHOD's ablations on SCENEs and write ablation.csv, .json, .md and .png to OUTPUT.
 
-    What is finished is kept: after an interruption the same command goes on, and another group joins.
+    What is finished is kept: after an interruption the same command goes on, and another group of the same
+    scenes, seeds and length joins what OUTPUT holds.
 
     \b
     aw ablate --list
@@ -75,7 +77,7 @@ def command(
     from ambiguous_wild.cli.bench import parse_budget
     from ambiguous_wild.cli.devices import choose_device, prepare_cpu
     from ambiguous_wild.cli.progress import Progress
-    from ambiguous_wild.harness.ablate import plan_study
+    from ambiguous_wild.harness.ablate import earlier_groups, plan_study
     from ambiguous_wild.harness.ablation_report import report, to_markdown, write_report
     from ambiguous_wild.harness.grid import run_cells
     from ambiguous_wild.io.atomic import check_output
@@ -87,9 +89,15 @@ def command(
         budget_s=None if budget is None else parse_budget(budget),
         max_gaussians=max_gaussians,
     )
-    study = plan_study(
-        method, scenes, seeds, train, groups=groups, settings=settings, device=on, factor=factor
+    settings = tuple(text.removeprefix(f"{method}.") for text in settings)  # as `aw bench` wants them
+    plan = functools.partial(
+        plan_study, method, scenes, seeds, train, settings=settings, device=on, factor=factor
     )
+    study = plan(groups=groups)
+    before = earlier_groups(study, output)
+    if before:
+        study = plan(groups=[*groups, *before])
+        click.echo(f"with what {output} holds already: {', '.join(before)}", err=True)
     check_output(output / "run")
     if on == "cpu":
         prepare_cpu(threads)
@@ -101,7 +109,8 @@ def command(
         cells, output, overwrite=overwrite, cache_dir=cache, tick=progress.tick, pictures=pictures,  # type: ignore[arg-type]
         on_start=progress.start, on_end=progress.end,
     )  # fmt: skip
-    data = report(study, output, made_by=shlex.join(["aw", *sys.argv[1:]]))
+    words = ["aw", *sys.argv[1:], *(word for name in before for word in ("--group", name))]
+    data = report(study, output, made_by=shlex.join(words))
     written = write_report(data, output)
     click.echo(json.dumps(data, indent=2) if as_json else to_markdown(data))
     click.echo("wrote " + ", ".join(str(path) for path in written), err=True)

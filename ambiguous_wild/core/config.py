@@ -71,23 +71,47 @@ def with_options(config: T, options: Mapping[str, str], where: str = "option") -
     Raises:
         AwError: unknown key, or a value that does not parse as the key's type.
     """
+    names = [f.name for f in dataclasses.fields(config)]  # type: ignore[arg-type]
+    hints = typing.get_type_hints(type(config))
+    values: dict[str, Any] = {}
+    nested: dict[str, dict[str, str]] = {}
     for key, text in options.items():
-        config = _with_option(config, key, text, where)
-    return config
-
-
-def _with_option(config: Any, key: str, text: str, where: str) -> Any:
-    head, _, rest = key.partition(".")
-    names = [f.name for f in dataclasses.fields(config)]
-    if head not in names:
-        raise unknown(where, key, names)
-    if rest:
+        head, _, rest = key.partition(".")
+        if head not in names:
+            raise unknown(where, key, names)
+        if rest:
+            nested.setdefault(head, {})[rest] = text
+            continue
+        # a word stays what it is: back ends have commas in their names, and 1e3 may be one's name
+        value = text.strip() if hints[head] is str and text.strip() else _parse(text)
+        values[head] = _coerce(hints[head], value, f"{where} {key}")
+    for head, inside in nested.items():
         inner = getattr(config, head)
         if not dataclasses.is_dataclass(inner):
+            key = f"{head}.{next(iter(inside))}"
             raise AwError(f"{where} {key!r}: {head!r} has no keys of its own")
-        return dataclasses.replace(config, **{head: _with_option(inner, rest, text, f"{where} {head}")})
-    hint = typing.get_type_hints(type(config))[head]
-    return dataclasses.replace(config, **{head: _coerce(hint, _parse(text), f"{where} {key}")})
+        values[head] = with_options(inner, inside, f"{where} {head}")
+    # all at once: what two options must be to each other holds of what comes out, not on the way
+    return dataclasses.replace(config, **values)  # type: ignore[type-var]
+
+
+def check_limits(config: Any, where: str, **limits: tuple[float, float]) -> None:
+    """Refuse numbers out of their range; of a tuple every one, and None is no number.
+
+    Args:
+        config: the dataclass instance.
+        where: what its keys are called before the dot, e.g. ``"refinesplat.mask"``.
+        limits: per field the lowest and the highest value, both allowed; the highest may be infinite.
+
+    Raises:
+        AwError: the first number outside, with what it may be.
+    """
+    for name, (low, high) in limits.items():
+        value = getattr(config, name)
+        for number in value if isinstance(value, tuple) else () if value is None else (value,):
+            if not low <= number <= high:
+                span = f"at least {low:g}" if math.isinf(high) else f"from {low:g} to {high:g}"
+                raise AwError(f"{where}.{name} is {span}, got {number:g}")
 
 
 def _parse(text: str) -> Any:

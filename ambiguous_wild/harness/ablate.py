@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.core.config import config_hash, with_options
+from ambiguous_wild.core.config import config_hash, to_plain, with_options
 from ambiguous_wild.harness.cell import Cell
 from ambiguous_wild.harness.grid import cell_folder, plan_cells
 from ambiguous_wild.harness.result_file import read_result
@@ -17,6 +18,8 @@ from ambiguous_wild.harness.run import FAILED, RESULT
 from ambiguous_wild.methods.ablation import DEFAULT, Group, Variant, choose_groups, folder_name
 from ambiguous_wild.methods.registry import MethodEntry, get_method
 from ambiguous_wild.splat.pace import TrainConfig
+
+REPORT = "ablation.json"
 
 
 @dataclass(frozen=True)
@@ -43,6 +46,16 @@ class Study:
     settings: tuple[str, ...]  # on top of the defaults, in every row
     default: tuple[Cell, ...]
     rows: tuple[Planned, ...]  # in the order of the groups; each group begins with the default
+
+    def facts(self) -> dict[str, Any]:
+        """What two studies must share to stand in one report, as plain data."""
+        return {
+            "method": self.method,
+            "settings": list(self.settings),
+            "train": to_plain(self.default[0].train) | {"seed": None},
+            "scenes": list(dict.fromkeys(cell.scene.name for cell in self.default)),
+            "seeds": list(dict.fromkeys(cell.train.seed for cell in self.default)),
+        }
 
     @property
     def cells(self) -> list[Cell]:
@@ -109,6 +122,21 @@ def plan_study(
             same = "" if name == own_name else DEFAULT if name == method else name.partition("@")[2]
             rows.append(Planned(group.name, variant, tuple(cells), same_as=same))
     return Study(method, chosen, tuple(settings), default, tuple(rows))
+
+
+def earlier_groups(study: Study, output: Path) -> list[str]:
+    """Groups that the study's folder has a report of, made with all else the same, and that it lacks.
+
+    A report that cannot be read, or of another scene, seed, length or setting, has none.
+    """
+    try:
+        known = json.loads((output / REPORT).read_text(encoding="utf-8"))
+        same = all(known[key] == value for key, value in study.facts().items())
+        names = [str(group["name"]) for group in known["groups"]] if same else []
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return []
+    there = {group.name for group in get_method(study.method).ablation_groups()}
+    return [n for n in names if n in there and n not in {group.name for group in study.groups}]
 
 
 class _Names:

@@ -13,7 +13,6 @@ import math
 from pathlib import Path
 from typing import Any
 
-from ambiguous_wild.core.config import to_plain
 from ambiguous_wild.harness.ablate import DIFFERENCES, METRICS, Outcome, Planned, Study, read_outcomes
 from ambiguous_wild.io.atomic import atomic_path, write_json, write_text
 from ambiguous_wild.metrics import stats
@@ -29,15 +28,10 @@ def report(study: Study, output: Path, made_by: str = "") -> dict[str, Any]:
     """
     default = read_outcomes(study.default, output)
     rows = [_row(row, read_outcomes(row.cells, output), default) for row in study.rows]
-    train = to_plain(study.default[0].train) | {"seed": None}
     return {
         "schema": 1,
-        "method": study.method,
         "made_by": made_by,
-        "settings": list(study.settings),
-        "train": train,
-        "scenes": list(dict.fromkeys(cell.scene.name for cell in study.default)),
-        "seeds": list(dict.fromkeys(cell.train.seed for cell in study.default)),
+        **study.facts(),
         "groups": [{"name": g.name, "title": g.title, "source": g.source} for g in study.groups],
         "rows": rows,
     }

@@ -23,7 +23,7 @@ from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.losses import ssim_map
 from ambiguous_wild.splat.parts import MaskPolicy, Parts, State
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData
-from ambiguous_wild.vision.backends import make_instances
+from ambiguous_wild.vision.backends import check_instances, make_instances
 from ambiguous_wild.vision.stage import instance_labels
 
 
@@ -40,6 +40,7 @@ class DroneSplatConfig:
     weight_l1: float = 4.0  # in the residual, beside 1 for 1 - SSIM
 
     def __post_init__(self) -> None:
+        check_instances(self.instances)
         if self.weight_l1 < 0:
             raise AwError(f"dronesplat.weight_l1 cannot be negative, got {self.weight_l1}")
 

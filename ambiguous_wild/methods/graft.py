@@ -42,10 +42,17 @@ def graft_name(host: str, donors: Mapping[str, str | None]) -> str:
 
 
 def split_graft(name: str) -> tuple[str, str]:
-    """(host, what stands after its @); a host may be a reference, whose path may hold an @ too."""
+    """(host, what stands after its @); a host may be a reference, whose path may hold an @ too.
+
+    Raises:
+        AwError: nothing after the @, or two of them.
+    """
     if is_reference(name) or "@" not in name:
         return name, ""
     host, _, rest = name.rpartition("@")
+    if not rest or ("@" in host and not is_reference(host)):
+        first = host.partition("@")[0]
+        raise AwError(f"method {name!r}: write {first}@mask=METHOD,density=METHOD, with one @")
     return host, rest
 
 

@@ -56,8 +56,22 @@ class MethodEntry:
     given_as: str = ""
 
     def options(self) -> Any:
-        """The method's options at their defaults (a frozen dataclass instance)."""
+        """The method's options at their defaults (a frozen dataclass instance).
+
+        Raises:
+            AwError: an option without a default.
+        """
         cls = resolve(self.config) if self.config else NoOptions
+        missing = [
+            f.name
+            for f in (dataclasses.fields(cls) if dataclasses.is_dataclass(cls) else ())
+            if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
+        ]
+        if missing:
+            raise AwError(
+                f"options of {self.name} need a default each, {', '.join(missing)} of "
+                f"{getattr(cls, '__name__', 'them')} has none: write {missing[0]}: ... = VALUE"
+            )
         return cls()
 
     def option_keys(self, method: str, key: str) -> list[str]:
@@ -141,9 +155,13 @@ _registered: dict[str, MethodEntry] = {}
 def knows_truth(name: str) -> bool:
     """Whether a method of this name is shown what no capture in the wild has: exact masks, or clean photos.
 
-    Such a row says what is possible; tables do not rank it among the others.
+    Such a row says what is possible; tables do not rank it among the others. Of a graft: its photos and,
+    unless another's replace them, its masks are the host's.
     """
-    return name in ("3dgs+truth", "3dgs-clean") or "mask=truth" in name.partition("@")[2].split(",")
+    host, _, rest = name.rpartition("@") if "@" in name else (name, "", "")
+    masks = [part.partition("=")[2] for part in rest.split(",") if part.partition("=")[0] == "mask"]
+    known = [donor in ("truth", "3dgs+truth") for donor in masks] or [host == "3dgs+truth"]
+    return host == "3dgs-clean" or known[-1]
 
 
 def register(entry: MethodEntry) -> MethodEntry:

@@ -61,7 +61,10 @@ def _split(value: Any, key: str, tensors: dict[str, torch.Tensor]) -> Any:
     if isinstance(value, Mapping):
         for name in value:
             if not isinstance(name, str) or "/" in name:
-                raise TypeError(f"checkpoint keys are strings without '/', got {name!r} under {key!r}")
+                raise TypeError(
+                    f"checkpoint keys are strings without '/', got {name!r} under {key!r}: write str(...) "
+                    "in the state_dict() that gives it"
+                )
         return {name: _split(item, f"{key}/{name}", tensors) for name, item in value.items()}
     if isinstance(value, np.ndarray):
         value = torch.from_numpy(np.ascontiguousarray(value))

@@ -5,6 +5,7 @@ Source: 3D Gaussian Splatting (Kerbl et al. 2023), section 5; constants as in gs
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.splat.density_log import DensityLog
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.rendered import Gradients
@@ -41,6 +43,17 @@ class DensityConfig:
     prune_scale: float = 0.1  # of the scene extent, applied after the first reset
     reset_opacity: float = 0.01
     max_gaussians: int = 1_000_000  # growth stops here unless the run says otherwise: largest gradients first
+
+    def __post_init__(self) -> None:
+        check_limits(
+            self, "density",
+            every=(1e-6, math.inf), min_every=(1, math.inf), max_gaussians=(1, math.inf),
+            prune_opacity=(0, 1), reset_opacity=(1e-6, 1),
+            **dict.fromkeys(
+                ("start", "stop", "resets", "min_reset_spacing", "min_reset_rest", "grow_grad", "grow_scale",
+                 "prune_scale"), (0, math.inf),
+            ),
+        )  # fmt: skip
 
 
 class DensityControl:

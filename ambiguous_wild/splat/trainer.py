@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from ambiguous_wild.core import Camera
+from ambiguous_wild.core import AwError, Camera
 from ambiguous_wild.splat import checkpoint, snapshot
 from ambiguous_wild.splat.clock import Clock
 from ambiguous_wild.splat.data import shrink, shrink_camera, shrink_keep
@@ -142,7 +142,16 @@ class Trainer:
         )
 
     def combine_user_keep(self, step: Step, keep: Tensor | None) -> Tensor | None:
-        """The policy's keep map times the capture's own mask, where there is one."""
+        """The policy's keep map times the capture's own mask, where there is one.
+
+        Raises:
+            AwError: the policy's is no tensor.
+        """
+        if keep is not None and not isinstance(keep, Tensor):
+            raise AwError(
+                f"keep(step) of the method's mask policy gave a {type(keep).__name__}; it must give a torch "
+                "tensor [H, W], or None (docs/add-a-method.md)"
+            )
         user = self.data.user_keep[step.view]
         if user is None:
             return keep

@@ -72,6 +72,24 @@ def parse(text: str) -> Spec:
     return Spec(name.strip(), int(size) if at else None, argument.strip(), dict(reversed(options.items())))
 
 
+def check_features(spec: str) -> None:
+    """Refuse features that do not exist, by their name alone: nothing is loaded.
+
+    Raises:
+        AwError: an unknown name (names the nearest), or a spec that cannot be taken apart.
+    """
+    found = parse(spec)
+    if found.name not in FEATURES:
+        raise unknown("features", found.name, FEATURES)
+
+
+def check_instances(spec: str) -> None:
+    """`check_features`, of instances."""
+    found = parse(spec)
+    if found.name not in INSTANCES:
+        raise unknown("instances", found.name, INSTANCES)
+
+
 def make_features(spec: str) -> Features:
     """Features by name.
 
@@ -82,9 +100,8 @@ def make_features(spec: str) -> Features:
     Raises:
         AwError: unknown name (names the nearest) or option; the weights are not here.
     """
+    check_features(spec)
     found = parse(spec)
-    if found.name not in FEATURES:
-        raise unknown("features", found.name, FEATURES)
     if found.argument:
         raise AwError(f"features {spec!r}: {found.name} takes nothing after a colon")
     if found.name == "labhog":
@@ -118,9 +135,8 @@ def make_instances(spec: str) -> Instances:
     Raises:
         AwError: unknown name (names the nearest) or option; the weights or the folder are not here.
     """
+    check_instances(spec)
     found = parse(spec)
-    if found.name not in INSTANCES:
-        raise unknown("instances", found.name, INSTANCES)
     if found.argument and found.name not in ("grounded", "grounded-video", "labels"):
         raise AwError(f"instances {spec!r}: {found.name} takes nothing after a colon")
     return _MAKERS.get(found.name, _sam)(found, spec)

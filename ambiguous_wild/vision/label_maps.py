@@ -156,6 +156,8 @@ def _read_array(f: BinaryIO, size: int) -> np.ndarray:
 def _checked(array: np.ndarray, path: Path) -> np.ndarray:
     if array.ndim != 2 or array.size == 0 or array.dtype.kind not in "bui":
         raise AwError(f"label map {path} is {array.dtype} {list(array.shape)}; integers [H, W] are needed")
+    if array.dtype == np.uint64 and int(array.max()) > np.iinfo(np.int64).max:
+        raise AwError(f"label map {path} holds ids of 2^63 and more; number its instances from 1")
     return np.maximum(array.astype(np.int64), 0)
 
 

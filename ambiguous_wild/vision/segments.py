@@ -10,7 +10,7 @@ import numpy as np
 from torch import Tensor
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.core.config import config_hash
+from ambiguous_wild.core.config import check_limits, config_hash
 
 _REFERENCE_PIXELS = 240 * 135  # k and min_size are stated for this size and grow with the pixel count
 
@@ -29,17 +29,24 @@ class SegmentConfig:
     most: int = 140  # and at most
     tries: int = 3  # steps of the bisection on k; the closest one is kept
 
+    def __post_init__(self) -> None:
+        check_limits(
+            self,
+            "segments",
+            sigma=(0, math.inf),
+            k=(1e-6, math.inf),
+            min_size=(1, math.inf),
+            tries=(1, math.inf),
+        )
+        if not 1 <= self.fewest <= self.most:
+            raise AwError(f"segments: need 1 <= fewest <= most, got {self.fewest} and {self.most}")
+
 
 class GraphSegments:
     """Many small segments a photo. None is a whole object: residuals and features vote and merge."""
 
     def __init__(self, config: SegmentConfig | None = None) -> None:
         self.config = config or SegmentConfig()
-        if not 1 <= self.config.fewest <= self.config.most or self.config.tries < 1:
-            raise AwError(
-                f"segments: need 1 <= fewest <= most and tries >= 1, got {self.config.fewest}, "
-                f"{self.config.most}, {self.config.tries}"
-            )
         own = self.config != SegmentConfig()
         self.name = "graph-lab-1" + (f"-{config_hash(self.config)[:8]}" if own else "")
 

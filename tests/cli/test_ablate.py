@@ -21,7 +21,7 @@ register(MethodEntry(
     "mine", "3dgs", lambda options: Parts(density_config=options), config=DensityConfig,
     ablations=(Group("size", "how large", (
         Variant("few", ("max_gaussians=450",)), Variant("peer", method="not-here"),
-    )),),
+    )), Group("length", "how long it grows", (Variant("brief", ("stop=600.0",)),)),),
 ))
 """
 
@@ -84,6 +84,7 @@ def test_mistakes_get_one_line_and_exit_code_2(scene, tmp_path, arguments, messa
 
 def test_a_study_is_trained_once_and_tabulated(scene, plugin, tmp_path):
     words = ["--method", "mine", "--plugin", plugin, "--scene", scene, "--iterations", "20", "-o", tmp_path]
+    words += ["--group", "size"]
     first = aw(*words)
     assert first.returncode == 0, first.stderr
     assert (tmp_path / "scene" / "mine@size-few" / "seed0" / "metrics.json").is_file()
@@ -95,3 +96,13 @@ def test_a_study_is_trained_once_and_tabulated(scene, plugin, tmp_path):
     again = aw(*words)
     assert again.stderr.count("finished before, kept") == 2
     assert list(csv.DictReader((tmp_path / "ablation.csv").open())) == list(rows.values())
+    joined = aw(*words[:-1], "length")
+    assert joined.returncode == 0 and "with what" in joined.stderr, joined.stderr
+    together = list(csv.DictReader((tmp_path / "ablation.csv").open()))
+    assert [(row["group"], row["variant"]) for row in together] == [
+        ("size", "default"), ("size", "few"), ("size", "peer"), ("length", "default"), ("length", "brief"),
+    ]  # fmt: skip
+    made_by = json.loads((tmp_path / "ablation.json").read_text())["made_by"]
+    assert made_by.endswith("--group length --group size")
+    other = aw(*words[:-1], "length", "--set", "mine.stop=700")  # of other settings: a report of its own
+    assert "with what" not in other.stderr

@@ -1,11 +1,12 @@
 """Configs refuse what they do not know and survive the trip through plain data."""
 
+import math
 from dataclasses import dataclass, field
 from typing import Literal
 
 import pytest
 
-from ambiguous_wild.core.config import config_hash, from_plain, to_plain, with_options
+from ambiguous_wild.core.config import check_limits, config_hash, from_plain, to_plain, with_options
 from ambiguous_wild.core.errors import AwError
 
 
@@ -46,6 +47,9 @@ def test_hash_depends_on_every_value_and_on_nothing_else():
         ({"inner.width": "9"}, Outer(inner=Inner(width=9))),
         ({"inner.sizes": "4,5.5"}, Outer(inner=Inner(sizes=(4.0, 5.5)))),
         ({"mode": "mean"}, Outer(mode="mean")),
+        ({"name": "dinov2-small@504,normalise=raw"}, Outer(name="dinov2-small@504,normalise=raw")),
+        ({"name": "1e3"}, Outer(name="1e3")),
+        ({"inner.width": "9", "rate": "2", "inner.sizes": "4"}, Outer(rate=2.0, inner=Inner(9, (4.0,)))),
     ],
 )
 def test_options_of_the_command_line(options, expected):
@@ -72,3 +76,36 @@ def test_what_does_not_fit_is_named(options, message):
 def test_unknown_key_of_a_file_names_the_nearest():
     with pytest.raises(AwError, match="did you mean 'inner'"):
         from_plain(Outer, {"iner": {}})
+
+
+@dataclass(frozen=True)
+class Ordered:
+    low: float = 1.0
+    high: float = 2.0
+    share: tuple[float, ...] = (0.5,)
+    some: float | None = None
+
+    def __post_init__(self) -> None:
+        check_limits(self, "it", low=(0, math.inf), share=(0, 1), some=(1, 3))
+        if self.low > self.high:
+            raise AwError("low above high")
+
+
+def test_options_are_judged_together():
+    assert with_options(Ordered(), {"low": "5", "high": "7"}) == Ordered(5.0, 7.0)
+    assert with_options(Ordered(), {"high": "7", "low": "5"}) == Ordered(5.0, 7.0)
+    with pytest.raises(AwError, match="low above high"):
+        with_options(Ordered(), {"low": "5"})
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"low": "-1"}, "it.low is at least 0, got -1"),
+        ({"share": "0.5,1.5"}, "it.share is from 0 to 1, got 1.5"),
+        ({"some": "4"}, "it.some is from 1 to 3, got 4"),
+    ],
+)
+def test_numbers_keep_to_their_range(options, message):
+    with pytest.raises(AwError, match=message):
+        with_options(Ordered(), options)

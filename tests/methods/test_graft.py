@@ -58,6 +58,7 @@ def test_one_graft_has_one_name():
         ("3dgs@mask", "write 3dgs@mask=METHOD"),
         ("3dgs@mask=", "write 3dgs@mask=METHOD"),
         ("3dgs@", "write 3dgs@mask=METHOD"),
+        ("3dgs@mask=none@mask=truth", "with one @"),
         ("3dgs@mask=truth,mask=none", "given twice"),
     ],
 )

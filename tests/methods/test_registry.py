@@ -2,6 +2,7 @@
 
 import pytest
 
+from ambiguous_wild.core.config import with_options
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.methods import MethodEntry, all_methods, get_method, load_plugin, register, registry
 
@@ -71,3 +72,75 @@ def test_a_changed_plugin_is_another_configuration(tmp_path):
         hashes.append(get_method("mine").source_hash)
     assert len(set(hashes)) == 2
     assert get_method("3dgs").source_hash == ""
+
+
+@pytest.mark.parametrize(
+    ("name", "known"),
+    [
+        ("3dgs", False),
+        ("refinesplat", False),
+        ("3dgs@mask=refinesplat", False),
+        ("3dgs+truth", True),
+        ("3dgs-clean", True),
+        ("refinesplat@mask=truth", True),
+        ("3dgs@mask=3dgs+truth,density=refinesplat", True),
+        ("3dgs+truth@density=refinesplat", True),
+        ("3dgs-clean@mask=refinesplat", True),
+        ("3dgs+truth@mask=refinesplat", False),  # nothing of the truth is left
+        ("3dgs@density=3dgs+truth", False),  # its density control is 3DGS's
+    ],
+)
+def test_who_is_shown_the_truth(name, known):
+    get_method(name)
+    assert registry.knows_truth(name) is known
+
+
+def test_an_option_without_a_default_is_named(tmp_path):
+    path = tmp_path / "bare.py"
+    path.write_text(
+        "from dataclasses import dataclass\nfrom ambiguous_wild.methods import MethodEntry, register\n"
+        "@dataclass(frozen=True)\nclass Config:\n    factor: float\n    near: float = 1.0\n"
+        "register(MethodEntry('bare', '', lambda options: None, config=Config))\n"
+    )
+    load_plugin(path)
+    with pytest.raises(AwError, match="factor of Config has none: write factor"):
+        get_method("bare").options()
+
+
+@pytest.mark.parametrize(
+    ("method", "option", "message"),
+    [
+        ("refinesplat", "features=dinov2-smal", "did you mean 'dinov2-small'"),
+        ("refinesplat", "instances=grahp", "did you mean 'graph'"),
+        ("robustsplat", "features=dinov2-smal@504,normalise=raw", "did you mean 'dinov2-small"),
+        ("dronesplat", "instances=sam3", "did you mean 'sam"),
+        ("3dgs@mask=refinesplat", "mask.features=labhogg", "did you mean 'labhog'"),
+        ("refinesplat", "density.support.every=0", "refinesplat.density.support.every is at least 1, got 0"),
+        ("refinesplat", "density.merge.neighbours=0", "neighbours is at least 1"),
+        ("refinesplat", "density.merge.most=1", "at least 2, got 1"),
+        ("refinesplat", "density.every=-1", "density.every is at least"),
+        ("refinesplat", "density.decides=entropy", "both entropy losses are off"),
+        ("refinesplat", "mask.box=0", "refinesplat.mask.box is at least 1, got 0"),
+        ("refinesplat", "mask.dilation=4", "refinesplat.mask.dilation is an odd number, got 4"),
+        ("refinesplat", "mask.w2=2", "refinesplat.mask.w2 is from 0 to 1, got 2"),
+        ("refinesplat", "mask.memory=2", "mask.memory is from 0 to 1"),
+        ("refinesplat", "mask.multiview.quantile=2", "multiview.quantile is from 0 to 1, got 2"),
+        ("refinesplat", "first_look.quantile=2", "first_look.quantile is from 0 to 1, got 2"),
+        ("refinesplat", "psi.hidden=0", "psi.hidden is at least 1"),
+        ("refinesplat", "psi.rate=-1", "psi.rate is at least"),
+        ("refinesplat", "segments.k=0", "segments.k is at least"),
+        ("refinesplat", "per_pixel_short=-1", "per_pixel_short is at least"),
+        ("robustsplat", "density.max_gaussians=0", "density.max_gaussians is at least 1"),
+    ],
+)
+def test_options_that_mean_nothing_are_refused_before_anything_trains(method, option, message):
+    key, _, value = option.partition("=")
+    with pytest.raises(AwError, match=message):
+        with_options(get_method(method).options(), {key: value})
+
+
+def test_back_ends_with_options_of_their_own_are_options():
+    spec = "dinov2-small-registers@504,normalise=raw"
+    assert with_options(get_method("robustsplat").options(), {"features": spec}).features == spec
+    labels = "labels:masks/ids,scene_wide=true"
+    assert with_options(get_method("refinesplat").options(), {"instances": labels}).instances == labels

@@ -83,6 +83,7 @@ def test_what_is_no_label_map_is_refused_by_name(tmp_path):
     (tmp_path / "empty.png").write_bytes(b"")
     (tmp_path / "pickle.npy").write_bytes(b"nonsense")
     np.save(tmp_path / "float.npy", np.ones((3, 3), np.float32))
+    np.save(tmp_path / "huge.npy", np.full((3, 3), 2**63, np.uint64))
     np.save(tmp_path / "cube.npy", np.ones((3, 3, 3), np.int32))
     np.save(tmp_path / "object.npy", np.array([{}], dtype=object))
     png(tmp_path / "deep.png", np.ones((3, 3, 3), np.uint16))

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Literal
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.methods.refinesplat.density import EntropyDensityConfig
 from ambiguous_wild.methods.refinesplat.entropy import Statistic, Variant
 from ambiguous_wild.methods.refinesplat.first_look import FirstLookConfig
@@ -13,7 +15,10 @@ from ambiguous_wild.methods.refinesplat.identity import PsiConfig
 from ambiguous_wild.methods.refinesplat.masking import Spread
 from ambiguous_wild.methods.refinesplat.multiview import MultiViewConfig
 from ambiguous_wild.methods.refinesplat.threshold import Form
+from ambiguous_wild.vision.backends import check_features, check_instances
 from ambiguous_wild.vision.segments import SegmentConfig
+
+_ANY = math.inf
 
 
 @dataclass(frozen=True)
@@ -61,6 +66,20 @@ class MaskConfig:
     most: float = 0.7  # of a photo is masked at most: the surest pixels go first
     w2: float | None = None  # fixed weight of T_ent's lower subset; None = learnt
 
+    def __post_init__(self) -> None:
+        check_limits(
+            self, "refinesplat.mask",
+            hold=(0.01, 1), fill=(0, 1), base=(0, 1), memory=(0, 1), entropy_weight=(0, 1), most=(0, 1),
+            least_alpha=(0, 1), w2=(0, 1), normal_units=(1e-6, _ANY), box=(1, _ANY), dilation=(1, _ANY),
+            **dict.fromkeys(
+                ("hard", "gate", "least", "disagree", "disagree_units", "ceiling", "static_tracks",
+                 "global_gate", "global_units"), (0, _ANY),
+            ),
+        )  # fmt: skip
+        for name in ("box", "dilation"):
+            if getattr(self, name) % 2 == 0:
+                raise AwError(f"refinesplat.mask.{name} is an odd number, got {getattr(self, name)}")
+
     @property
     def floor(self) -> float:
         """`least` in the unit of the statistic."""
@@ -104,15 +123,20 @@ class RefineSplatConfig:
     identity_similarity: float = 0.8  # cosine of mean features where no tracks run
 
     def __post_init__(self) -> None:
-        for name in ("mask_every", "entropy_every"):
-            if getattr(self, name) < 1:
-                raise AwError(
-                    f"refinesplat.{name} counts visits or iterations: at least 1, got {getattr(self, name)}"
-                )
-        for name in ("lambda_id", "lambda_cr", "mask_start", "reset_pause"):
-            if getattr(self, name) < 0:
-                raise AwError(f"refinesplat.{name} cannot be negative, got {getattr(self, name)}")
-        if not 0 <= self.lambda_dssim <= 1:
-            raise AwError(f"refinesplat.lambda_dssim is a share from 0 to 1, got {self.lambda_dssim}")
-        if not 1 <= self.identities <= 255:
-            raise AwError(f"refinesplat.identities is from 1 to 255, got {self.identities}")
+        check_limits(
+            self, "refinesplat",
+            mask_every=(1, _ANY), entropy_every=(1, _ANY), lambda_dssim=(0, 1), identities=(1, 255),
+            identity_tracks=(1, _ANY), identity_share=(0, 1), identity_similarity=(-1, 1),
+            per_pixel_short=(1e-3, _ANY),
+            **dict.fromkeys(
+                ("mask_start", "min_mask_start", "reset_pause", "min_reset_pause", "lambda_id", "lambda_cr"),
+                (0, _ANY),
+            ),
+        )  # fmt: skip
+        check_features(self.features)
+        check_instances(self.instances)
+        if self.density.decides == "entropy" and not (self.lambda_id or self.lambda_cr):
+            raise AwError(
+                "refinesplat.density.decides=entropy: both entropy losses are off, so nothing would ever "
+                "grow; add --set refinesplat.lambda_cr=0.2, or decide by total"
+            )

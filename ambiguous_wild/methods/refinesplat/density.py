@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -9,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.methods.refinesplat.merging import MergeConfig, clusters, merge_members, merge_pairs
 from ambiguous_wild.methods.refinesplat.support import Support, SupportConfig
@@ -42,6 +44,12 @@ class EntropyDensityConfig(DensityConfig):
     merge_grad: float = 5e-5  # tau_e: only Gaussians whose mean statistic is below it may merge
     merge: MergeConfig = field(default_factory=MergeConfig)
     support: SupportConfig = field(default_factory=SupportConfig)  # what masks hide in every photo goes
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_limits(
+            self, "density", **dict.fromkeys(("clone_shift", "merge_every", "merge_grad"), (0, math.inf))
+        )
 
 
 class EntropyAwareDensity(DensityControl):
@@ -126,6 +134,8 @@ class EntropyAwareDensity(DensityControl):
             return gaussians
         cluster = clusters(len(gaussians), pairs, config.merge.most)
         joined = np.bincount(cluster, minlength=len(cluster))[cluster] > 1
+        if not joined.any():
+            return gaussians
         rows = torch.from_numpy(np.flatnonzero(joined)).to(gaussians.device)
         new = merge_members(gaussians.select(rows), cluster[joined])
         gaussians = self.keep_rows(gaussians, optimiser, torch.from_numpy(~joined).to(gaussians.device))

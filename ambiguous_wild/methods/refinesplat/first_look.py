@@ -10,6 +10,7 @@ between the least and the greatest around the place. What no sparse points surro
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -17,6 +18,7 @@ import cv2
 import numpy as np
 
 from ambiguous_wild.core import Camera
+from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.methods.refinesplat.multiview import common_offset, nearest_views, quantile_of
 from ambiguous_wild.vision.sparse_surface import BEHIND, in_map, inverse_depth, some_points, world_points
 
@@ -34,6 +36,13 @@ class FirstLookConfig:
     normal: float = 3.0  # and above this many times what is normal in the photo
     known_by: int = 3  # seen by fewer others, a surface is not judged
     least: float = 0.1  # of a photo: where less would wait, nothing does; a start can bear that much
+
+    def __post_init__(self) -> None:
+        check_limits(
+            self, "refinesplat.first_look",
+            views=(1, math.inf), quantile=(0, 1), threshold=(0, math.inf), normal=(0, math.inf),
+            known_by=(1, math.inf), least=(0, 1),
+        )  # fmt: skip
 
 
 def first_keep(

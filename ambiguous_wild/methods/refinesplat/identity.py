@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.methods.refinesplat.entropy import Variant
 
 
@@ -21,6 +23,10 @@ class PsiConfig:
     steps: int = 1000  # Adam steps
     batch: int = 1024  # cells a step
     rate: float = 3e-3  # Adam's, decayed to a tenth by a cosine
+
+    def __post_init__(self) -> None:
+        whole = (1, math.inf)
+        check_limits(self, "refinesplat.psi", hidden=whole, steps=whole, batch=whole, rate=(1e-9, math.inf))
 
 
 class Psi(nn.Module):

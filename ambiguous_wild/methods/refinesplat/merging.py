@@ -20,6 +20,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from ambiguous_wild.core import AwError
+from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.splat.density import rotation_matrices
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
@@ -37,6 +39,15 @@ class MergeConfig:
     overlap: float = 0.3  # smallest overlap
     form: Overlap = "normalised"  # `literal` is the printed density
     most: int = 2  # members of a cluster, the most overlapping pairs first; 0 = whole connected components
+
+    def __post_init__(self) -> None:
+        positive = (0, math.inf)
+        check_limits(
+            self, "refinesplat.density.merge",
+            neighbours=(1, math.inf), colour=positive, overlap=positive, most=positive,
+        )  # fmt: skip
+        if self.most == 1:
+            raise AwError("refinesplat.density.merge.most is 0 (any number) or at least 2, got 1")
 
 
 def covariances(gaussians: Gaussians) -> np.ndarray:

@@ -12,6 +12,7 @@ evidence everywhere, and without that condition views would excuse each other's 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -19,6 +20,7 @@ import cv2
 import numpy as np
 
 from ambiguous_wild.core import Camera
+from ambiguous_wild.core.config import check_limits
 
 _SPREAD = 9  # px, box over a view's evidence before others read it: depth is off by a few pixels
 _BLUR = 5  # px, box over photos before their colours are compared, for the same reason
@@ -40,6 +42,13 @@ class MultiViewConfig:
     )
     agreeing: float = 0.35  # share of the views asked that must show the same for their word to count whole
     known_by: int = 3  # seen by fewer others, a surface is discounted whatever their photos show
+
+    def __post_init__(self) -> None:
+        check_limits(
+            self, "refinesplat.mask.multiview",
+            views=(1, math.inf), quantile=(0, 1), agreeing=(1e-6, 1), known_by=(1, math.inf),
+            **dict.fromkeys(("strength", "depth", "free", "agree"), (0, math.inf)),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)

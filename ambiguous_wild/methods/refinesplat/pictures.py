@@ -84,11 +84,14 @@ def draw_entropies(policy: RefineSplatMask, folder: Path) -> list[Path]:
     left.set_yscale("symlog", linthresh=10)
     left.set_ylabel("instances")
     size = 4 + 60 * np.sqrt(areas / max(float(areas.max()), 1.0))
+    # `structure` is itself how far photo and render are apart: beside it stands how large an instance is
+    features = policy.config.mask.statistic != "structure"
+    beside = distances if features else areas
     for chosen, colour in ((~above, kept), (above, masked)):
-        right.scatter(clipped[chosen], distances[chosen], size[chosen], color=colour, alpha=0.5, lw=0)
+        right.scatter(clipped[chosen], beside[chosen], size[chosen], color=colour, alpha=0.5, lw=0)
     right.set_yscale("symlog", linthresh=1)
     right.set_ylim(bottom=0)
-    right.set_ylabel("distance (units of blur and noise)")
+    right.set_ylabel("distance (units of blur and noise)" if features else "area (px)")
     finite = cuts[np.isfinite(cuts)]
     for axes in (left, right):
         for cut in finite:
@@ -100,7 +103,8 @@ def draw_entropies(policy: RefineSplatMask, folder: Path) -> list[Path]:
         axes.set_xlim(0, end)
     left.legend(fontsize=8, loc="upper right")
     left.set_title(f"{len(values)} instances of {len(views)} photos, w2 = {policy.w2:.2f}", fontsize=10)
-    right.set_title("photo against render: each instance, its size by its area", fontsize=10)
+    what = "photo against render" if features else "what stands out, and how large it is"
+    right.set_title(f"{what}: each instance, its size by its area", fontsize=10)
     path = folder / "entropies.png"
     with atomic_path(path) as temporary:
         figure.savefig(temporary, metadata={"Software": None})

@@ -61,7 +61,7 @@ class RefineSplatMask(MaskPolicy):
         self.data = data
         self.inputs = FrozenInputs(data, self.features, self.instances, self.config)
         config = self.config
-        if config.mask.needs_identities or self.regularises():
+        if self._reads_identities:
             _ = self.inputs.semantics  # part of what the method costs before its first step
         photos = [photo.cpu().numpy() for photo in data.photos]
         self.pixels = PixelEvidence(
@@ -141,8 +141,14 @@ class RefineSplatMask(MaskPolicy):
             "masked_share_global": float(mean[2]),
             "t_ent_mean": float(finite.mean()) if len(finite) else None,
             "w2": self.w2,
-            "identities": self.inputs.semantics.found.count if self.inputs.has_semantics else None,
+            # pictures look at identities that the training never read
+            "identities": self.inputs.semantics.found.count if self._reads_identities else None,
         }
+
+    @property
+    def _reads_identities(self) -> bool:
+        """Whether masks or losses do; pictures do anyway."""
+        return self.config.mask.needs_identities or self.regularises()
 
     @property
     def w2(self) -> float:

@@ -8,6 +8,7 @@ is learnt anew.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +16,7 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import Camera
+from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.splat.density import rotation_matrices
 from ambiguous_wild.splat.gaussians import Gaussians
 
@@ -26,6 +28,10 @@ class SupportConfig:
     least_share: float = 0.1  # of the looks it must reach a kept pixel; 0 = never removed (printed)
     looks: int = 8  # with its centre in the frame before it is judged
     every: int = 4  # iterations between looks
+
+    def __post_init__(self) -> None:
+        whole = (1, math.inf)
+        check_limits(self, "refinesplat.density.support", least_share=(0, 1), looks=whole, every=whole)
 
 
 class Support:

@@ -7,6 +7,7 @@ from typing import Literal
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.splat.density import NO_SIZE_PRUNING, DensityConfig
+from ambiguous_wild.vision.backends import check_features
 
 
 def _delayed_growth() -> DensityConfig:
@@ -60,6 +61,9 @@ class RobustSplatConfig:
     min_reset_pause: int = 200
 
     def __post_init__(self) -> None:
+        for spec in (self.features, self.coarse_features):
+            if spec:
+                check_features(spec)
         if not 0 < self.lower <= self.upper <= 1:
             raise AwError(f"robustsplat: need 0 < lower <= upper <= 1, got {self.lower} and {self.upper}")
         if not 0 < self.coarse_share <= 1:

@@ -5,6 +5,10 @@ similarity of distractors and static objects exceeds 0.7. Here a region's featur
 pixels, a distractor is compared with every static region of the *other* photos, the best counts, and a
 photo's score is that of its most similar distractor. Two anchors say what the number means with the features
 at hand: what a static region scores against itself in another photo, and what unrelated regions score.
+
+Features without pretrained meaning see looks, and the paper's limit says nothing of their cosines. Of these
+the question is put so that no limit on a cosine is needed: is a distractor as like something static in
+another photo as the static scene's own regions are like each other?
 """
 
 from __future__ import annotations
@@ -18,6 +22,8 @@ import numpy as np
 from ambiguous_wild.core.errors import AwError
 
 AMBIGUOUS_ABOVE = 0.7  # cosine; stated by the paper for DINOv2 features
+LOOKALIKE_ABOVE = 0.25  # share of distractor pixels, of weight-free features; see docs/ambiguity.md
+USUAL = 0.05  # quantile of static regions' best matches from which a match is as good as usual
 MIN_SHARE = 0.002  # of a photo's pixels; a smaller region says nothing
 _ANCHOR_REGIONS = 2000  # static regions the anchors rest on at most, evenly chosen
 
@@ -33,9 +39,9 @@ class Regions:
     def __len__(self) -> int:
         return len(self.labels)
 
-    def standardised(self, mean: np.ndarray, spread: np.ndarray) -> Regions:
-        """The regions with each channel's mean [C] taken off and divided by its spread [C]."""
-        return replace(self, means=(self.means - mean) / spread)
+    def whitened(self, mean: np.ndarray, whiten: np.ndarray) -> Regions:
+        """The regions with each channel's mean [C] taken off, and multiplied by a matrix [C, C]."""
+        return replace(self, means=(self.means - mean) @ whiten)
 
 
 @dataclass(frozen=True)
@@ -63,31 +69,40 @@ class Anchors:
 
 
 class ChannelStatistics:
-    """Mean and spread of each channel over all photos, distractors included, from running sums.
+    """Mean and covariance of the channels over all photos, distractors included, from running sums.
 
-    Features whose mean is far from zero have cosines near 1 whatever they show. Taking the mean off first
-    makes 0 the similarity of two unrelated regions. Over static cells alone it is worse: distractors in
-    colours that nothing else has then all lie in the same far direction (0.82 instead of 0.68 on a preset).
+    Features whose mean is far from zero have cosines near 1 whatever they show, and channels that say the
+    same count several times. Taking the mean off and whitening makes 0 the similarity of two unrelated
+    regions. Statistics of static cells alone are worse: distractors in colours that nothing else has then
+    all lie in the same far direction.
     """
 
     def __init__(self) -> None:
         self.count = 0
         self.sum: np.ndarray | float = 0.0
-        self.squares: np.ndarray | float = 0.0
+        self.products: np.ndarray | float = 0.0
 
     def add(self, features: np.ndarray) -> None:  # [h, w, C]
         """Count one photo's features in."""
         flat = features.reshape(-1, features.shape[2]).astype(np.float64)
         self.count += len(flat)
-        self.sum, self.squares = self.sum + flat.sum(0), self.squares + (flat * flat).sum(0)
+        self.sum, self.products = self.sum + flat.sum(0), self.products + flat.T @ flat
 
-    def mean_and_spread(self) -> tuple[np.ndarray, np.ndarray]:  # ([C], [C]) float64
-        """Per channel; one without spread gets 1, so that it stays 0."""
+    def whitening(self) -> tuple[np.ndarray, np.ndarray]:  # ([C], [C, C]) float64
+        """The mean, and what to multiply deviations from it by; a channel without spread becomes 0.
+
+        Channels are given unit spread first; directions with less than a thousandth of the largest variance
+        are rounding and noise, and are not blown up further than that.
+        """
         mean = np.asarray(self.sum) / max(self.count, 1)
-        variance = np.maximum(np.asarray(self.squares) / max(self.count, 1) - mean * mean, 0.0)
+        covariance = np.asarray(self.products) / max(self.count, 1) - np.outer(mean, mean)
+        variance = np.maximum(np.diag(covariance), 0.0)
         # A constant channel's variance is rounding: relative to its square, as sums of squares round.
         still = variance <= 1e-10 * np.maximum(mean * mean, 1e-12)
-        return mean, np.where(still, 1.0, np.sqrt(variance))
+        scale = np.where(still, 0.0, 1.0 / np.sqrt(np.where(still, 1.0, variance)))
+        values, vectors = np.linalg.eigh(covariance * np.outer(scale, scale))
+        values = np.maximum(values, 1e-3 * max(float(values.max()), 1e-12))
+        return mean, scale[:, None] * vectors / np.sqrt(values)
 
 
 def region_means(
@@ -151,6 +166,16 @@ def anchors(
         same.append((units @ units[k])[photo != photo[k]].max())
         different.append((others @ units[k])[other_photo != photo[k]].mean())
     return Anchors(float(np.mean(same)), float(np.mean(different)))
+
+
+def usual_match(statics: Sequence[Regions]) -> float:
+    """The cosine that 95 % of static regions reach against their best match in another photo; NaN without."""
+    units, photo, _ = _stacked(statics)
+    if len(np.unique(photo)) < 2:
+        return math.nan
+    step = max(len(units) // _ANCHOR_REGIONS, 1)
+    best = [(units @ units[k])[photo != photo[k]].max() for k in range(0, len(units), step)]
+    return float(np.quantile(best, USUAL))
 
 
 def photo_cosine(found: Sequence[RegionMatch]) -> float:

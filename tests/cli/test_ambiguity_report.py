@@ -21,7 +21,7 @@ from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.metrics.ambiguity import COLOUR_METRIC
 from tests.tiny_scene import TRAIN, write_tiny_scene
 
-SEMANTIC_METRIC = "semantic_cosine_labhog"
+SEMANTIC_METRIC = "semantic_lookalike_labhog"
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def test_scores_are_those_of_the_files(scene: Path, tmp_path: Path) -> None:
     assert facts["occlusion"]["value"] == pytest.approx(np.mean([m.mean() for m in masks.values()]), abs=1e-6)
     assert facts[COLOUR_METRIC]["value"] == pytest.approx((np.concatenate(away) < 0.3).mean(), abs=1e-6)
     assert facts[COLOUR_METRIC]["mean_residual"] == pytest.approx(np.concatenate(away).mean(), abs=1e-5)
-    assert facts[COLOUR_METRIC]["ambiguous"] is False and -1 <= facts[SEMANTIC_METRIC]["value"] <= 1
+    assert facts[COLOUR_METRIC]["ambiguous"] is False and 0 <= facts[SEMANTIC_METRIC]["value"] <= 1
     rows = list(csv.DictReader((tmp_path / "out/photos.csv").open()))
     assert [r["photo"] for r in rows] == TRAIN
     assert float(rows[0]["occlusion"]) == pytest.approx(masks[TRAIN[0]].mean(), abs=1e-6)
@@ -204,5 +204,7 @@ def test_an_output_that_cannot_be_is_found_before_the_work(
 
 def test_a_cosine_near_its_limit_is_told_apart_from_it(scene: Path, tmp_path: Path) -> None:
     summary = report(scene, "-o", tmp_path / "out")
-    summary[SEMANTIC_METRIC] |= {"value": 0.6964, "low": 0.6951, "high": 0.7049}
-    assert "cosine 0.696 [0.695, 0.705]" in "\n".join(describe(summary))
+    look = summary[SEMANTIC_METRIC] | {"value": 0.6964, "low": 0.6951, "high": 0.7049}
+    real = summary | {"features": "dinov2-small", "semantic_cosine_dinov2_small": look}
+    assert "cosine 0.696 [0.695, 0.705]" in "\n".join(describe(real))
+    assert "] of the distractor pixels are as like" in "\n".join(describe(summary))

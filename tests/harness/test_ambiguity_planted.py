@@ -17,11 +17,12 @@ from ambiguous_wild.metrics.ambiguity import COLOUR_METRIC
 from ambiguous_wild.simulate.capture import simulate
 from ambiguous_wild.simulate.presets import preset
 from ambiguous_wild.vision.labhog import LabHog
+from ambiguous_wild.vision.segments import GraphSegments
 from tests.tiny_scene import TRAIN, write_tiny_scene
 
 W, H = 160, 120
 OBJECT = (slice(70, 110), slice(10, 50))  # the static thing, in every photo at its place
-SEMANTIC = "semantic_cosine_labhog"
+SEMANTIC = "semantic_lookalike_labhog"
 
 
 def stripes(h: int, w: int) -> np.ndarray:
@@ -127,29 +128,60 @@ def test_scores_equal_a_direct_computation_from_the_truth(simulated: Path) -> No
     assert facts[COLOUR_METRIC]["distractor_px"] == total
 
 
-def test_the_cosine_equals_a_direct_computation(tmp_path: Path) -> None:
+@pytest.mark.parametrize("named", [True, False])
+def test_cosines_and_the_share_equal_a_direct_computation(named: bool, tmp_path: Path) -> None:
     root, objects = plant(tmp_path / "scene", "both")
-    facts = report(root, objects)
+    compare(root, objects if named else None)
+
+
+def test_of_a_simulated_capture_they_do_too(simulated: Path) -> None:
+    compare(simulated, None)
+
+
+def compare(root: Path, objects: Path | None) -> None:
+    """The report's semantic numbers against loops over pixels and regions."""
+    facts = report(root, objects)[SEMANTIC]
+    names = sorted(p.name for p in (root / "truth/distractor").iterdir())
     photos = [
         torch.from_numpy((cv2.imread(str(root / "images" / n))[:, :, ::-1] / 255).astype(np.float32))
-        for n in TRAIN
+        for n in names
     ]
-    features = LabHog()
+    features, segments = LabHog(), GraphSegments()
     features.fit(photos)
     grids = np.stack([features(p).numpy() for p in photos]).astype(float)
-    grids = (grids - grids.mean((0, 1, 2))) / grids.std((0, 1, 2))
+    flat = grids.reshape(-1, grids.shape[-1])
+    scale = np.where(flat.std(0) > 1e-9, flat.std(0), np.inf)
+    values, vectors = np.linalg.eigh(np.cov((flat / scale).T, bias=True))
+    matrix = vectors / np.sqrt(np.maximum(values, values.max() / 1000))
+    grids = ((grids - flat.mean(0)) / scale) @ matrix
 
     def mean(k: int, mask: np.ndarray) -> np.ndarray:
-        big = grids[k].repeat(4, 0).repeat(4, 1)  # cells of 4 px
-        return big[mask].mean(0) / np.linalg.norm(big[mask].mean(0))
+        h, w = mask.shape
+        rows, columns = np.nonzero(mask)
+        cells = grids[k][rows * grids.shape[1] // h, columns * grids.shape[2] // w]
+        return cells.mean(0) / np.linalg.norm(cells.mean(0))
 
-    still = [cv2.imread(str(objects / n), 0) > 127 for n in TRAIN]
-    things = [mean(k, still[k]) for k in range(len(TRAIN))]
-    best = []
-    for k, name in enumerate(TRAIN):
-        regions, count = ndimage.label(cv2.imread(str(root / "truth/distractor" / name), 0) > 127)
-        cosines = [
-            mean(k, regions == r) @ t for r in range(1, count + 1) for j, t in enumerate(things) if j != k
-        ]
-        best.append(max(cosines))
-    assert facts[SEMANTIC]["value"] == pytest.approx(np.mean(best), abs=1e-4)
+    def parts(k: int, labels: np.ndarray) -> list[tuple[int, np.ndarray]]:
+        masks = [labels == r for r in range(1, labels.max() + 1)]
+        return [(m.sum(), mean(k, m)) for m in masks if m.sum() >= 0.002 * labels.size]
+
+    moving, still, every = [], [], []
+    for k, name in enumerate(names):
+        distractor = cv2.imread(str(root / "truth/distractor" / name), 0) > 127
+        moving.append(parts(k, ndimage.label(distractor)[0]))
+        every.append(parts(k, np.where(distractor, 0, segments.labels(photos[k]))))
+        if objects is not None:
+            things = (cv2.imread(str(objects / name), 0) > 127) & ~distractor
+            still.append(parts(k, ndimage.label(things)[0]))
+
+    def best(k: int, unit: np.ndarray, statics: list) -> float:
+        return max(unit @ u for j, other in enumerate(statics) if j != k for _, u in other)
+
+    usual = np.quantile([best(k, u, every) for k, of in enumerate(every) for _, u in of], 0.05)
+    found = [[(px, best(k, u, still or every)) for px, u in of] for k, of in enumerate(moving)]
+    alike = sum(px for of in found for px, cosine in of if cosine >= usual)
+    total = sum(px for of in found for px, _ in of)
+    assert facts["usual_match"] == pytest.approx(usual, abs=1e-4)
+    assert facts["value"] == pytest.approx(alike / total, abs=1e-6)
+    tops = [max(cosine for _, cosine in of) for of in found if of]
+    assert facts["cosine_most_similar"] == pytest.approx(np.mean(tops), abs=1e-4)

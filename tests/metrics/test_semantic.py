@@ -83,19 +83,44 @@ def test_anchors_are_the_means_over_other_photos() -> None:
     assert math.isnan(sem.Anchors(0.5, 0.5).calibrated(0.5))
 
 
-def test_standardised_channels_have_mean_zero_and_spread_one() -> None:
+def test_whitened_channels_have_mean_zero_and_no_correlation() -> None:
     rng = np.random.default_rng(1)
-    grids = [rng.normal([5.0, -3.0, 2.0], [2.0, 0.1, 0.0], (6, 5, 3)) for _ in range(3)]
+    mix = np.array([[2.0, 1.5, 0.0, 0.0], [0.0, 0.1, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 7.0]])
+    grids = [np.array([5.0, -3.0, 2.0, 1.0]) + rng.normal(size=(6, 5, 4)) @ mix for _ in range(30)]
     statistics = sem.ChannelStatistics()
     for grid in grids:
         statistics.add(grid)
-    mean, spread = statistics.mean_and_spread()
-    flat = np.concatenate([(g - mean).reshape(-1, 3) / spread for g in grids])
+    mean, whiten = statistics.whitening()
+    flat = np.concatenate([(g - mean).reshape(-1, 4) @ whiten for g in grids])
     np.testing.assert_allclose(flat.mean(0), 0, atol=1e-9)
-    np.testing.assert_allclose(flat.std(0), [1, 1, 0], atol=1e-6)
-    # Means are linear: standardising regions is standardising features.
+    covariance = np.cov(flat.T, bias=True)
+    # the third channel is constant, and stays out of every direction
+    np.testing.assert_allclose(np.sort(np.diag(covariance)), [0, 1, 1, 1], atol=1e-6)
+    np.testing.assert_allclose(covariance, np.diag(np.diag(covariance)), atol=1e-6)
+    assert not whiten[2].any()
+    # Means are linear: whitening regions is whitening features.
     labels = rng.integers(0, 3, (6, 5))
-    one = sem.region_means(grids[0], labels).standardised(mean, spread)
+    one = sem.region_means(grids[0], labels).whitened(mean, whiten)
     np.testing.assert_allclose(
-        one.means, sem.region_means((grids[0] - mean) / spread, labels).means, atol=1e-9
+        one.means, sem.region_means((grids[0] - mean) @ whiten, labels).means, atol=1e-9
     )
+
+
+def test_noise_is_not_blown_up() -> None:
+    rng = np.random.default_rng(3)
+    base = rng.normal(size=(200, 1))
+    statistics = sem.ChannelStatistics()
+    statistics.add(np.hstack([base, base + 1e-6 * rng.normal(size=(200, 1))])[None])
+    _, whiten = statistics.whitening()
+    assert np.abs(whiten).max() < 1e2
+
+
+def test_the_usual_match_is_the_twentieth_of_static_regions() -> None:
+    rng = np.random.default_rng(4)
+    statics = [regions(*rng.normal(size=(5, 3)).tolist()) for _ in range(4)]
+    units = [[m / np.linalg.norm(m) for m in s.means] for s in statics]
+    best = [
+        max(a @ b for j, v in enumerate(units) if j != k for b in v) for k, u in enumerate(units) for a in u
+    ]
+    assert sem.usual_match(statics) == pytest.approx(np.quantile(best, 0.05))
+    assert math.isnan(sem.usual_match(statics[:1]))

@@ -90,7 +90,7 @@ def write_figure(
         span = slice(12 * column // len(picks), 12 * (column + 1) // len(picks))
         for line, (picture, caption) in enumerate(zip(pictures, captions)):
             _panel(figure.add_subplot(grid[line, span]), picture, caption)
-    _histograms(figure, grid, measured)
+    _histograms(figure, grid, measured, look)
     _legend(figure)
     with atomic_path(path) as temporary:
         figure.savefig(temporary, metadata={"Software": None})
@@ -131,7 +131,7 @@ def _legend(figure: Any) -> None:
     )
 
 
-def _histograms(figure: Any, grid: Any, measured: list[Measured]) -> None:
+def _histograms(figure: Any, grid: Any, measured: list[Measured], seen: Look) -> None:
     colour, cover, look = (figure.add_subplot(grid[3, s]) for s in (slice(0, 4), slice(4, 8), slice(8, 12)))
     counts = np.sum([m.histogram for m in measured], axis=0)
     colour.stairs(counts / max(counts.sum(), 1), BINS, fill=True, color=plot_colour(ADDED))
@@ -142,8 +142,11 @@ def _histograms(figure: Any, grid: Any, measured: list[Measured]) -> None:
     cover.set_xlabel("% of a photo covered", fontsize=9)
     cosines = [c for m in measured if not math.isnan(c := sem.photo_cosine(m.matches))]
     look.hist(cosines, bins=24, range=(-0.2, 1.0), color=plot_colour(NEUTRAL))
-    look.axvline(sem.AMBIGUOUS_ABOVE, color="k", ls="--", lw=1)
-    look.set_xlabel(f"cosine of the most similar distractor (limit {sem.AMBIGUOUS_ABOVE})", fontsize=9)
+    limit = seen.usual if seen.whitened else sem.AMBIGUOUS_ABOVE
+    if not math.isnan(limit):
+        look.axvline(limit, color="k", ls="--", lw=1)
+    what = "the scene is as like itself from" if seen.whitened else "limit"
+    look.set_xlabel(f"cosine of the most similar distractor ({what} {limit:.2f})", fontsize=9)
     for axes in (cover, look):
         axes.set_ylabel("photos", fontsize=9)
     for axes in (colour, cover, look):

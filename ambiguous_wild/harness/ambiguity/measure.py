@@ -36,12 +36,13 @@ class Look:
     """The features of a measurement, for maps: what was taken off, and every distractor's feature."""
 
     features: Any
-    standardise: bool
+    whitened: bool
     mean: np.ndarray  # [C]
-    spread: np.ndarray  # [C]
-    distractors: list[sem.Regions]  # per photo, standardised where the features are
+    whiten: np.ndarray  # [C, C]
+    distractors: list[sem.Regions]  # per photo, whitened where the features are
     statics: list[sem.Regions]
     anchors: sem.Anchors
+    usual: float  # the cosine from which a match is as good as those within the static scene; NaN unknown
     objects: bool  # compared with static objects that the user named, not with every static region
 
 
@@ -53,7 +54,7 @@ def feature_family(spec: str) -> str:
 
 
 def weight_free(spec: str) -> bool:
-    """Whether the features carry no pretrained meaning: their channels are standardised over the scene."""
+    """Whether the features carry no pretrained meaning: they are whitened over the scene."""
     from ambiguous_wild.vision.backends import DINO
 
     return feature_family(spec) not in DINO
@@ -112,16 +113,15 @@ def measure(
             things = _objects(named, view, distractor)
             static[-1] = sem.region_means(grid, things, sem.MIN_SHARE)
         scores.append((view.name, counts, np.histogram(residual, BINS)[0]))
-    mean, spread = statistics.mean_and_spread()
-    standardise = weight_free(features)
-    if standardise:
-        moving = [r.standardised(mean, spread) for r in moving]
-        static = [r.standardised(mean, spread) for r in static]
-        every = [r.standardised(mean, spread) for r in every]
+    mean, whiten = statistics.whitening()
+    whitened = weight_free(features)
+    if whitened:
+        moving = [r.whitened(mean, whiten) for r in moving]
+        static = [r.whitened(mean, whiten) for r in static]
+        every = [r.whitened(mean, whiten) for r in every]
     found = sem.matches(moving, static)
-    look = Look(
-        backend, standardise, mean, spread, moving, static, sem.anchors(static, every), objects is not None
-    )
+    anchors, usual = sem.anchors(static, every), sem.usual_match(every)
+    look = Look(backend, whitened, mean, whiten, moving, static, anchors, usual, objects is not None)
     return [Measured(*score, matches) for score, matches in zip(scores, found)], look
 
 
@@ -159,8 +159,8 @@ def cosine_map(look: Look, index: int, photo: np.ndarray) -> np.ndarray | None: 
     direction = regions.means[which] / max(float(np.linalg.norm(regions.means[which])), 1e-12)
     with torch.no_grad():
         grid = look.features(torch.from_numpy(photo)).numpy().astype(np.float64)
-    if look.standardise:
-        grid = (grid - look.mean) / look.spread
+    if look.whitened:
+        grid = (grid - look.mean) @ look.whiten
     return grid @ direction / np.maximum(np.linalg.norm(grid, axis=2), 1e-12)
 
 

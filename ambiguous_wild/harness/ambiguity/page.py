@@ -15,7 +15,7 @@ from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.harness.ambiguity import figure
 from ambiguous_wild.harness.ambiguity.measure import Look, Measured, load_photo
 from ambiguous_wild.harness.ambiguity.sources import Background, Masks
-from ambiguous_wild.harness.ambiguity.summary import describe, row, semantic_metric
+from ambiguous_wild.harness.ambiguity.summary import cosine_column, describe, row
 from ambiguous_wild.harness.render_tables import csv_text
 from ambiguous_wild.io.atomic import atomic_dir, refuse_file, write_json, write_text
 from ambiguous_wild.metrics import ambiguity as am
@@ -48,7 +48,7 @@ def write_report(
     out: Path,
 ) -> None:
     """Write the report into `out`, whole or not at all; an earlier report is replaced."""
-    metric = semantic_metric(summary["features"])
+    metric = cosine_column(summary["features"])
     rows = [row(m, metric) for m in measured]
     with atomic_dir(out) as folder:
         with open(folder / "photos.csv", "w", newline="", encoding="utf-8") as f:

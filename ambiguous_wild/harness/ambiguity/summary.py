@@ -14,16 +14,26 @@ from ambiguous_wild.metrics.stats import Interval
 
 LOOKS = (
     "weight-free features see looks, not meaning: a distractor in the texture of something static counts as "
-    "like it; --objects names the static objects to compare with, --features dinov2-small sees kinds "
-    "of things"
+    "like it, and a statue painted red as unlike a statue of stone; --objects names the static objects to "
+    "compare with, --features dinov2-small sees kinds of things"
 )
 NAMED = "weight-free features see looks, not meaning; compared with the objects named"
 REAL = "raw cosine, as the paper's"
 
 
 def semantic_metric(features: str) -> str:
-    """The score's name with its variant: ``semantic_cosine_labhog``."""
-    return "semantic_cosine_" + re.sub(r"[^a-z0-9]+", "_", feature_family(features).lower())
+    """The score's name with its variant: ``semantic_cosine_dinov2_small``, ``semantic_lookalike_labhog``."""
+    kind = "lookalike" if weight_free(features) else "cosine"
+    return f"semantic_{kind}_{_family(features)}"
+
+
+def cosine_column(features: str) -> str:
+    """The photos' column: the cosine of a photo's most similar distractor."""
+    return f"semantic_cosine_{_family(features)}"
+
+
+def _family(features: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "_", feature_family(features).lower())
 
 
 def summarise(
@@ -84,17 +94,20 @@ def _semantic(measured: list[Measured], look: Look, features: str, seed: int) ->
     photos = [m.matches for m in measured if m.matches]
     # A mean is a ratio to the number of photos; without any it is missing, and not an error.
     best = am.ratio_interval([sem.photo_cosine(p) for p in photos], [1.0] * len(photos), seed=seed)
-    every = [m for p in photos for m in p]
-    alike = [m for m in every if m.cosine > sem.AMBIGUOUS_ABOVE]
-    px = sum(m.pixels for m in every)
-    note = REAL if not weight_free(features) else NAMED if look.objects else LOOKS
+    score, limit = best, sem.AMBIGUOUS_ABOVE
+    if look.whitened:
+        alike = [sum(m.pixels for m in p if m.cosine >= look.usual) for p in photos]
+        known = [sum(m.pixels for m in p) for p in photos] if not math.isnan(look.usual) else []
+        score, limit = am.ratio_interval(alike[: len(known)], known, seed=seed), sem.LOOKALIKE_ABOVE
+    note = REAL if not look.whitened else NAMED if look.objects else LOOKS
     return {
-        **_interval(best),
-        "ambiguous_above": sem.AMBIGUOUS_ABOVE,
-        "ambiguous": am.verdict(best.mean, sem.AMBIGUOUS_ABOVE),
+        **_interval(score),
+        "ambiguous_above": limit,
+        "ambiguous": am.verdict(score.mean, limit),
         "compared_with": "objects" if look.objects else "static segments",
-        "mean_over_distractors": _number(sem.mean_cosine(every)),
-        "share_above": _number(sum(m.pixels for m in alike) / px) if px else None,
+        "cosine_most_similar": _number(best.mean),
+        "cosine_mean": _number(sem.mean_cosine([m for p in photos for m in p])),
+        "usual_match": _number(look.usual),
         "same_surface": _number(look.anchors.same),
         "unrelated": _number(look.anchors.different),
         "calibrated": _number(look.anchors.calibrated(best.mean)),
@@ -126,8 +139,7 @@ def describe(summary: dict[str, Any]) -> list[str]:
         f"{100 * covered['max']:.1f} %",
         f"colour: {_percent(colour)} of the distractor pixels are within {am.COLOUR_THRESHOLD} of their "
         f"background: {_word(colour)} (limit {100 * am.COLOUR_AMBIGUOUS_ABOVE:.0f} %)",
-        f"semantic: cosine {_value(look)} of a photo's most similar distractor to the "
-        f"{look['compared_with']}: {_word(look)} (limit {sem.AMBIGUOUS_ABOVE})",
+        _semantic_line(look, weight_free(summary["features"])),
     ]
     if look["same_surface"] is not None:
         lines.append(
@@ -140,6 +152,19 @@ def describe(summary: dict[str, Any]) -> list[str]:
             f"the background of {share:.0f} % of the distractor pixels is unknown: left out of colour"
         )
     return lines
+
+
+def _semantic_line(look: dict[str, Any], lookalike: bool) -> str:
+    if lookalike:
+        return (
+            f"semantic: {_percent(look)} of the distractor pixels are as like something of the "
+            f"{look['compared_with']} elsewhere as the scene is like itself: {_word(look)} "
+            f"(limit {100 * sem.LOOKALIKE_ABOVE:.0f} %)"
+        )
+    return (
+        f"semantic: cosine {_value(look)} of a photo's most similar distractor to the "
+        f"{look['compared_with']}: {_word(look)} (limit {sem.AMBIGUOUS_ABOVE})"
+    )
 
 
 def _percent(score: dict[str, Any]) -> str:

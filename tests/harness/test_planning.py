@@ -119,7 +119,7 @@ def test_a_plan_survives_its_file(tmp_path):
     write_json(tmp_path / "plan.json", plan.plain())
     again = read_plan(tmp_path / "plan.json")
     assert again.plain() == plan.plain()
-    assert again.effects() == ("antialias", "sh1")
+    assert again.effects() == ("antialias",)  # a lower degree of the harmonics is never decided on
     assert [d.cost_ms for d in again.decisions if d.effect == "antialiasing"] == [0.5]
     for text in (
         "{half",
@@ -167,8 +167,8 @@ def test_a_baseline_stays_what_its_paper_defines_unless_asked():
     by_default = choose("default", scene, methods, plan)
     assert by_default["3dgs"].effects == by_default["refinesplat@mask=truth"].effects == ()
     assert not by_default["3dgs"].asked  # and its folder says nothing
-    assert by_default["refinesplat"].effects == ("exposure", "antialias")  # sh1 is none of its own
-    assert choose("auto", scene, methods, plan)["3dgs"].effects == ("exposure", "antialias", "sh1")
+    assert by_default["refinesplat"].effects == ("exposure", "antialias")
+    assert choose("auto", scene, methods, plan)["3dgs"].effects == ("exposure", "antialias")
     assert choose("none", scene, methods, plan)["refinesplat"].effects == ()
     with pytest.raises(AwError, match="of scene dots, not of other"):
         choose("auto", dataclasses.replace(scene, name="other"), methods, plan)
@@ -196,10 +196,10 @@ def test_a_run_says_what_was_on_and_why_and_ships_the_filtered_model(tiny, tmp_p
     (report,) = run_cells(cells, tmp_path, pictures=False)
     assert report.outcome == "trained", report.error
     said = json.loads((cell_folder(tmp_path, cells[0]) / "effects.json").read_text())
-    assert said["asked"] == "auto" and said["effects"] == ["antialias", "sh1"]
+    assert said["asked"] == "auto" and said["effects"] == ["antialias"]
     assert {d["effect"] for d in said["plan"]["decisions"]} == set(INJECTED)
     facts = report.result["facts"]
-    assert facts["effects"] == ["antialias", "sh1"] and facts["protocol"] == "half"
+    assert facts["effects"] == ["antialias"] and facts["protocol"] == "half"
     assert facts["effect_facts"]["antialias"]["filter_size_median"] > 0
     assert not any(math.isnan(row["psnr"]) for row in report.result["per_image"])
     with pytest.raises(AwError, match="effects was"):

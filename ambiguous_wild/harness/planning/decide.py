@@ -51,7 +51,11 @@ class Plan:
     probed: bool = False
 
     def effects(self, among: Iterable[str] | None = None) -> tuple[str, ...]:
-        """Names for `--effects`: what was decided on, and the lower SH degree, of those allowed."""
+        """Names for `--effects`: what was decided on, of those allowed.
+
+        A lower SH degree is never among them: it saves no time worth mentioning, and on matt scenes too cost
+        a third to half a decibel (docs/effects.md).
+        """
         found = [d.how.removeprefix("--effects ") for d in self.decisions if _adds(d)]
         return tuple(name for name in found if among is None or name in tuple(among))
 
@@ -74,9 +78,8 @@ class Plan:
 
 
 def _adds(decision: Decision) -> bool:
-    # the degree of the harmonics is lowered where the evidence is *off*
-    wanted = "off" if decision.effect == "SH degree" else "on"
-    return decision.how.startswith("--effects ") and decision.decision == wanted
+    own = decision.effect != "SH degree" and decision.how.startswith("--effects ")
+    return own and decision.decision == "on"
 
 
 def answer(value: float, threshold: float) -> Answer:
@@ -120,7 +123,7 @@ def decide(scene: str, found: Evidence) -> Plan:
         Decision(
             "SH degree", "colour that follows the viewing direction", found.view_dependence, VIEW_DEPENDENCE,
             "code values", bent,
-            "degree 3 has work to do" if bent == "on" else "degree 1 is enough", "--effects sh1",
+            "degree 3 has work to do" if bent == "on" else "colours hardly follow the viewing direction", "--effects sh1",
         ),
         Decision(
             "pose refinement", "reprojection error of the sparse model", found.reprojection_px,

@@ -123,7 +123,8 @@ def decide(scene: str, found: Evidence) -> Plan:
         Decision(
             "SH degree", "colour that follows the viewing direction", found.view_dependence, VIEW_DEPENDENCE,
             "code values", bent,
-            "degree 3 has work to do" if bent == "on" else "colours hardly follow the viewing direction", "--effects sh1",
+            "degree 3 has work to do" if bent == "on" else "colours hardly follow the direction",
+            "--effects sh1",
         ),
         Decision(
             "pose refinement", "reprojection error of the sparse model", found.reprojection_px,

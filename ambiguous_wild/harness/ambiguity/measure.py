@@ -17,6 +17,8 @@ from ambiguous_wild.metrics import ambiguity as am
 from ambiguous_wild.metrics import semantic as sem
 
 BINS = np.linspace(0.0, math.sqrt(3.0), 53)  # of the residual; 0.3 is on no edge, so counts are kept apart
+# longer side of the photos that labhog, whose cells are of 4 px, sees: its scores must not hang on the size
+LOOKS_PX = 240
 FIT_PHOTOS = 24  # features look at so many photos, evenly chosen
 Bar = Callable[[list[View]], Iterable[View]]
 
@@ -35,6 +37,7 @@ class Measured:
 class Look:
     """The features of a measurement, for maps: what was taken off, and every distractor's feature."""
 
+    spec: str  # of the features
     features: Any
     whitened: bool
     mean: np.ndarray  # [C]
@@ -101,16 +104,17 @@ def measure(
         counts = am.colour_counts(photo, behind, distractor, known=known)
         use = distractor if known is None else distractor & known
         residual = am.colour_residual(photo, behind)[use] if behind is not None else np.empty(0)
+        seen, hidden = seen_by(features, photo), small_mask(features, distractor)
         with torch.no_grad():
-            grid = backend(torch.from_numpy(photo)).numpy()
+            grid = backend(torch.from_numpy(seen)).numpy()
         statistics.add(grid)
-        regions, _ = ndimage.label(distractor)
-        parts = np.where(distractor, 0, segments.labels(torch.from_numpy(photo)))
+        regions, _ = ndimage.label(hidden)
+        parts = np.where(hidden, 0, segments.labels(torch.from_numpy(seen)))
         moving.append(sem.region_means(grid, regions, sem.MIN_SHARE))
         every.append(sem.region_means(grid, parts, sem.MIN_SHARE))
         static.append(every[-1])
         if named is not None:
-            things = _objects(named, view, distractor)
+            things = _objects(features, named, view, hidden)
             static[-1] = sem.region_means(grid, things, sem.MIN_SHARE)
         scores.append((view.name, counts, np.histogram(residual, BINS)[0]))
     mean, whiten = statistics.whitening()
@@ -121,7 +125,9 @@ def measure(
         every = [r.whitened(mean, whiten) for r in every]
     found = sem.matches(moving, static)
     anchors, usual = sem.anchors(static, every), sem.usual_match(every)
-    look = Look(backend, whitened, mean, whiten, moving, static, anchors, usual, objects is not None)
+    look = Look(
+        features, backend, whitened, mean, whiten, moving, static, anchors, usual, objects is not None
+    )
     return [Measured(*score, matches) for score, matches in zip(scores, found)], look
 
 
@@ -140,11 +146,12 @@ def fitted(scene: Scene, spec: str, cache: Path | None) -> Any:
     backend = make_features(spec)
     views = list(scene.train)
     if isinstance(backend, SceneFeatures):
-        photos = [torch.from_numpy(load_photo(v)) for v in views]
+        photos = [torch.from_numpy(seen_by(spec, load_photo(v))) for v in views]
         backend.fit_scene(photos, train_tracks(scene), cache)
         return backend
+    # fitted to what it will see
     chosen = sorted({round(i) for i in np.linspace(0, len(views) - 1, min(FIT_PHOTOS, len(views)))})
-    backend.fit([torch.from_numpy(load_photo(views[i])) for i in chosen])
+    backend.fit([torch.from_numpy(seen_by(spec, load_photo(views[i]))) for i in chosen])
     return backend
 
 
@@ -158,7 +165,7 @@ def cosine_map(look: Look, index: int, photo: np.ndarray) -> np.ndarray | None: 
     which = int(np.argmax(regions.pixels))
     direction = regions.means[which] / max(float(np.linalg.norm(regions.means[which])), 1e-12)
     with torch.no_grad():
-        grid = look.features(torch.from_numpy(photo)).numpy().astype(np.float64)
+        grid = look.features(torch.from_numpy(seen_by(look.spec, photo))).numpy().astype(np.float64)
     if look.whitened:
         grid = (grid - look.mean) @ look.whiten
     return grid @ direction / np.maximum(np.linalg.norm(grid, axis=2), 1e-12)
@@ -169,13 +176,45 @@ def load_photo(view: View) -> np.ndarray:  # [H, W, 3] float32 in [0, 1]
     return load_image_float(view.image_path)
 
 
-def _objects(named: dict[str, Path], view: View, distractor: np.ndarray) -> np.ndarray:  # [H, W] int
-    """The static objects of a photo from 1, without what distractors hide; 0 throughout without a mask."""
+def seen_by(features: str, photo: np.ndarray) -> np.ndarray:  # [h, w, 3]
+    """The photo as the features see it: labhog no larger than `LOOKS_PX`, others as it is."""
+    import cv2
+
+    size = _size(features, photo.shape)
+    return photo if size is None else cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
+
+
+def small_mask(features: str, mask: np.ndarray) -> np.ndarray:  # [h, w] bool
+    """A mask [H, W] at the size of `seen_by`."""
+    import cv2
+
+    size = _size(features, mask.shape)
+    if size is None:
+        return mask
+    return cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+
+
+def _size(features: str, shape: tuple[int, ...]) -> tuple[int, int] | None:
+    """(width, height) to be made; None: as it is."""
+    scale = LOOKS_PX / max(shape[:2])
+    if feature_family(features) != "labhog" or scale >= 1:
+        return None
+    return max(round(shape[1] * scale), 1), max(round(shape[0] * scale), 1)
+
+
+def _objects(
+    features: str, named: dict[str, Path], view: View, distractor: np.ndarray
+) -> np.ndarray:  # [h, w] int
+    """The static objects of a photo from 1, without what distractors hide; 0 throughout without a mask.
+
+    Distractors and objects are at the size of `seen_by`.
+    """
     from scipy import ndimage
 
     if view.name not in named:
         return np.zeros(distractor.shape, int)
-    return np.asarray(ndimage.label(load_mask(named[view.name], view) & ~distractor)[0])
+    mask = small_mask(features, load_mask(named[view.name], view))
+    return np.asarray(ndimage.label(mask & ~distractor)[0])
 
 
 def _object_masks(folder: Path, views: list[View]) -> dict[str, Path]:

@@ -129,7 +129,8 @@ def to_markdown(data: dict[str, Any]) -> str:
         f"{data['width']} px wide, images_{data['factor']}, 3dgs {data['iterations']} iterations, seed 0; "
         f"`{data['command']}`",
         "",
-        "| preset | placed | 3dgs, dB | designed | reported | colour | cosine | covers | plan: on | wrong |",
+        "| preset | placed | 3dgs, dB | designed | reported | colour | look-alike | covers "
+        "| plan: on | wrong |",
         "|---|---:|---:|---|---|---:|---:|---:|---|---|",
     ]
     confusion = {name: {"has, on": 0, "has, off": 0, "lacks, on": 0, "lacks, off": 0} for name in QUESTIONS}

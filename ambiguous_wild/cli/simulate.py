@@ -94,8 +94,10 @@ def command(
         return
     share = facts["occlusion"]
     state = "already there, unchanged" if facts["reused"] else "wrote"
+    things = counted(len(spec.distractors), "distractor")
+    cover = "covers" if len(spec.distractors) == 1 else "cover"
     who = (
-        f"{counted(len(spec.distractors), 'distractor')} cover{'s' if len(spec.distractors) == 1 else ''} {100 * share['min']:.0f} to {100 * share['max']:.0f} % "
+        f"{things} {cover} {100 * share['min']:.0f} to {100 * share['max']:.0f} % "
         f"(mean {100 * share['mean']:.1f} %) of a train photo"
     )
     click.echo(

@@ -154,7 +154,7 @@ def make_command(
 @click.option("--json", "as_json", is_flag=True, help="Print the scores as JSON.")
 def score_command(answers: tuple[Path, ...], key: Path, out: Path | None, seed: int, as_json: bool) -> None:
     """Score ANSWERS: files (JSON or CSV) that raters saved, or folders of them."""
-    from ambiguous_wild.io.atomic import check_output, refuse_file
+    from ambiguous_wild.io.atomic import check_output
     from ambiguous_wild.io.strangers import refuse_strangers
     from ambiguous_wild.study.answers import read_answers
     from ambiguous_wild.study.key import read_key
@@ -166,7 +166,6 @@ def score_command(answers: tuple[Path, ...], key: Path, out: Path | None, seed: 
     folder = out or key.with_name(key.name.removesuffix(".json").removesuffix(".key") + "-scores")
     if folder.is_dir():
         refuse_strangers(folder, SCORE_FILES)
-    refuse_file(folder)
     check_output(folder)
     scores = score(known, raters, seed)
     write_scores(scores, folder)

@@ -17,10 +17,12 @@ LONGEST_NUMBER = 400  # characters of a whole number; no float is larger
 class PlainLoader(yaml.SafeLoader):
     """YAML's safe loader, which takes a key twice and an alias that grows without end; this one does not."""
 
+    _depth = 0  # of the node being composed
+
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.AliasEvent):
             raise AwError(f"line {self.peek_event().start_mark.line + 1}: aliases (*name) are not read")
-        self._depth = getattr(self, "_depth", 0) + 1
+        self._depth += 1
         if self._depth > DEEPEST:
             raise AwError(f"line {self.peek_event().start_mark.line + 1}: nested deeper than {DEEPEST}")
         node = super().compose_node(parent, index)

@@ -160,11 +160,8 @@ def anchors(
     others, other_photo, _ = _stacked(statics if every is None else every)
     if len(np.unique(photo)) < 2 or len(np.unique(other_photo)) < 2:
         return Anchors(math.nan, math.nan)
-    step = max(len(units) // _ANCHOR_REGIONS, 1)
-    same, different = [], []
-    for k in range(0, len(units), step):
-        same.append((units @ units[k])[photo != photo[k]].max())
-        different.append((others @ units[k])[other_photo != photo[k]].mean())
+    different = [(others @ units[k])[other_photo != photo[k]].mean() for k in _sampled(units)]
+    same = _best_elsewhere(units, photo)
     return Anchors(float(np.mean(same)), float(np.mean(different)))
 
 
@@ -173,9 +170,17 @@ def usual_match(statics: Sequence[Regions]) -> float:
     units, photo, _ = _stacked(statics)
     if len(np.unique(photo)) < 2:
         return math.nan
-    step = max(len(units) // _ANCHOR_REGIONS, 1)
-    best = [(units @ units[k])[photo != photo[k]].max() for k in range(0, len(units), step)]
-    return float(np.quantile(best, USUAL))
+    return float(np.quantile(_best_elsewhere(units, photo), USUAL))
+
+
+def _sampled(units: np.ndarray) -> range:
+    """Rows that the anchors rest on, evenly chosen."""
+    return range(0, len(units), max(len(units) // _ANCHOR_REGIONS, 1))
+
+
+def _best_elsewhere(units: np.ndarray, photo: np.ndarray) -> list[float]:
+    """Of the sampled regions the cosine of the most similar one of another photo."""
+    return [float((units @ units[k])[photo != photo[k]].max()) for k in _sampled(units)]
 
 
 def photo_cosine(found: Sequence[RegionMatch]) -> float:

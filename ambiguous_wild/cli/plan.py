@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 from pathlib import Path
@@ -56,11 +57,11 @@ def command(
     if probe:
         from tqdm import tqdm
 
-        from ambiguous_wild.harness.planning.probe import ITERATIONS, occlusion, with_occlusion
+        from ambiguous_wild.harness.planning.probe import stays, with_occlusion
 
         colour = tuple(e for e in plan.effects(("exposure", "appearance")))
-        with tqdm(total=ITERATIONS, unit="it", desc="probe", disable=as_json or None) as bar:
-            plan = with_occlusion(plan, occlusion(loaded, colour, tick=bar.update))
+        bar = functools.partial(tqdm, unit="it", desc="probe", disable=as_json or None)
+        plan = with_occlusion(plan, stays(loaded, colour, bar=bar))
     if costs:
         from ambiguous_wild.harness.planning.probe import effect_costs
 

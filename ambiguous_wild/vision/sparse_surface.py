@@ -5,8 +5,12 @@ Inverse depth is linear between the points, which is exact on planes.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator
+from scipy.ndimage import distance_transform_edt
 from scipy.spatial import QhullError
 
 from ambiguous_wild.core import Camera
@@ -15,6 +19,7 @@ BEHIND = 1.15  # times the depth of the nearest static surface: behind it
 _PIXELS = 20_000  # of a map at most; what is computed on it is brought to the photo's size
 _CELLS = 32  # a side; of points in one cell or the next, those behind are seen through something
 _LEAST_POINTS = 8
+_FRAME_PIXELS = 1000  # of a map that counts who else has a place in the frame
 _MOST_POINTS = 4000  # drawn at random; more are slow and tell no more (see docs/metrics.md)
 
 
@@ -46,6 +51,48 @@ def inverse_depth(camera: Camera, points: np.ndarray) -> np.ndarray | None:
         return None
     columns, rows = np.meshgrid(np.arange(w), np.arange(h))
     return surface(columns, rows).astype(np.float32)
+
+
+def static_surfaces(cameras: Sequence[Camera], xyz: np.ndarray) -> list[np.ndarray | None]:
+    """`inverse_depth` of every camera, from all sparse points [M, 3] of a scene."""
+    some = some_points(xyz)
+    return [inverse_depth(camera, some) for camera in cameras]
+
+
+def in_frames(cameras: Sequence[Camera], surfaces: Sequence[np.ndarray | None]) -> list[np.ndarray | None]:
+    """How many of the other cameras have a place in their frame, whatever stands before it.
+
+    Outside the sparse points the nearest known depth holds: it is good enough to say who looks that way.
+
+    Args:
+        cameras: of one scene.
+        surfaces: their inverse depths [h, w], from `static_surfaces`.
+
+    Returns:
+        int32 maps of some 1000 pixels of each frame; None where a surface is.
+    """
+    poses = np.stack([c.cam_from_world for c in cameras])
+    focal, centre = (np.array(v) for v in zip(*(((c.fx, c.fy), (c.cx, c.cy)) for c in cameras), strict=True))
+    size = np.array([(c.width, c.height) for c in cameras])
+    counts: list[np.ndarray | None] = []
+    for view, surface in enumerate(surfaces):
+        if surface is None or not np.isfinite(surface).any():
+            counts.append(None)
+            continue
+        unknown = ~np.isfinite(surface)
+        rows, columns = distance_transform_edt(unknown, return_distances=False, return_indices=True)
+        step = max(1, math.ceil(math.sqrt(surface.size / _FRAME_PIXELS)))
+        world = world_points(cameras[view], surface[rows, columns])[step // 2 :: step, step // 2 :: step]
+        found = np.zeros(world.shape[:2], np.int32)
+        for other, pose in enumerate(poses):
+            if other == view:
+                continue
+            local = world @ pose[:3, :3].T + pose[:3, 3]
+            z = local[..., 2]
+            uv = local[..., :2] / np.where(z > 0, z, np.nan)[..., None] * focal[other] + centre[other]
+            found += ((uv >= 0) & (uv < size[other])).all(axis=2)
+        counts.append(found)
+    return counts
 
 
 def world_points(camera: Camera, inverse: np.ndarray) -> np.ndarray:

@@ -1,8 +1,10 @@
 """Evidence on small tracks with an effect injected and without; what `--effects` makes of it."""
 
+import contextlib
 import dataclasses
 import json
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ import pytest
 from ambiguous_wild.core import AwError, Camera, Points, Scene, View
 from ambiguous_wild.harness.choosing import check_wanted, choose
 from ambiguous_wild.harness.grid import cell_folder, plan_cells, run_cells
+from ambiguous_wild.harness.planning import probe
 from ambiguous_wild.harness.planning.decide import Plan, decide, plan_without_training
 from ambiguous_wild.harness.planning.evidence import measure
 from ambiguous_wild.harness.planning.file import read_plan
@@ -150,6 +153,28 @@ def test_what_a_probe_leaves():
 
 
 # -- --effects ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("found", "rounds", "share"),
+    [([0.0005], [300], 0.0005), ([0.02, 0.001], [300, 1200], 0.001), ([0.02, 0.015], [300, 1200], 0.015)],
+)
+def test_what_stands_out_must_stay_when_a_longer_probe_has_learnt_the_rest(monkeypatch, found, rounds, share):
+    told, made, ticks = iter(found), [], []
+
+    def instead(scene, effects, *, iterations, tick):
+        made.append((scene, effects, iterations))
+        tick()
+        return Occlusion(next(told), 0.0, 0.0)
+
+    @contextlib.contextmanager
+    def bar(total):
+        yield SimpleNamespace(update=lambda: ticks.append(total))
+
+    monkeypatch.setattr(probe, "occlusion", instead)
+    assert probe.stays("scene", ("exposure",), bar=bar).share == share
+    assert made == [("scene", ("exposure",), n) for n in rounds]
+    assert ticks == rounds
 
 
 def test_words_and_lists():

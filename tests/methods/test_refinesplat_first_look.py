@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from ambiguous_wild.core import Camera
-from ambiguous_wild.methods.refinesplat.first_look import FirstLookConfig, first_keep
+from ambiguous_wild.methods.refinesplat.first_look import FirstLookConfig, first_look
+from ambiguous_wild.vision.sparse_surface import static_surfaces
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
 VIEWS, DEPTH = 7, 4.0
@@ -44,9 +45,14 @@ def passers(shift: int = 9) -> tuple[list[np.ndarray], list[np.ndarray]]:
     return photos, masks
 
 
-def keeps(photos, config=None, cloud=None):
+def looks(photos, config=None, cloud=None):
     cameras = [camera(view) for view in range(VIEWS)]
-    return first_keep(cameras, photos, points() if cloud is None else cloud, config or JUDGE_ALL)
+    surfaces = static_surfaces(cameras, points() if cloud is None else cloud)
+    return first_look(cameras, photos, surfaces, config or JUDGE_ALL)
+
+
+def keeps(photos, config=None, cloud=None):
+    return [look and look.keep((HEIGHT, WIDTH)) for look in looks(photos, config, cloud)]
 
 
 def share_of(keep: np.ndarray, where: np.ndarray) -> float:
@@ -105,6 +111,19 @@ def test_what_stands_still_before_the_wall_is_no_passer():
         photos.append(np.where(on[..., None], [0.8, 0.3, 0.1], wall(view)))
     found = keeps(photos, cloud=np.concatenate([points(), box]))
     assert np.mean([~keep for keep in found]) < 0.06
+
+
+def test_later_evidence_weighs_more_where_others_show_something_else_and_less_where_they_agree():
+    photos, masks = passers()
+    left = points()[points()[:, 0] < 0]
+    for look, mask in zip(looks(photos), masks):
+        factor = look.factor(1.5, (HEIGHT, WIDTH))
+        assert factor.dtype == np.float32 and factor.shape == (HEIGHT, WIDTH)
+        assert np.median(factor[mask]) == pytest.approx(1.5)
+        assert np.median(factor[~mask]) == pytest.approx(1 / 1.5)
+        assert np.array_equal(look.factor(1.0, (HEIGHT, WIDTH)), np.ones((HEIGHT, WIDTH)))
+    unknown = looks(photos, cloud=left)[VIEWS // 2].factor(2.0, (HEIGHT, WIDTH))
+    assert (unknown[:, WIDTH // 2 + 14 :] == 1.0).all()  # no sparse point of a wall there: nobody could tell
 
 
 @pytest.mark.parametrize("views", [2, 16])

@@ -25,6 +25,7 @@ from ambiguous_wild.methods.refinesplat.structure import (
     unrelated_residual,
 )
 from ambiguous_wild.methods.refinesplat.threshold import t_ent
+from ambiguous_wild.vision.sparse_surface import in_frames
 
 H, W, FOCAL, PLANE = 40, 64, 60.0, 5.0
 
@@ -98,6 +99,62 @@ def test_a_surface_at_another_depth_or_outside_says_nothing():
     far.remember(0, np.ones((H, W)), np.full((H, W), PLANE))
     far.remember(1, np.ones((H, W)), np.full((H, W), PLANE))
     assert np.isnan(far.ask(0).evidence).all()
+
+
+def test_where_the_render_has_no_surface_yet_the_sparse_points_have_one():
+    cameras = [camera(0.1 * i) for i in range(4)]
+    surface = np.full((H // 2, W // 2), 1.0 / PLANE, np.float32)
+    surface[:, :5] = np.nan
+    never = MultiViewConfig(sparse=False)
+    for config, told in ((MultiViewConfig(), True), (never, False)):
+        elsewhere = Elsewhere(cameras, plain(4), config, [surface] * 4)
+        for view in range(4):
+            depth = 3.0 * PLANE if view == 0 else PLANE  # only view 0's render is wrong
+            elsewhere.remember(view, np.full((H, W), 1.0 + view), np.full((H, W), depth))
+        found = elsewhere.ask(0)
+        inside = found.evidence[:, 6:-3]
+        if told:
+            assert np.allclose(inside, 3.0, atol=1e-5)  # the median of 2, 3, 4
+            assert (found.weight[:, 6:-3] == 1.0).all()
+        else:
+            assert np.isnan(inside).all()
+        assert np.isnan(found.evidence[:, :4]).all()  # no point, no surface
+
+
+def test_sparse_surfaces_are_asked_about_only_where_the_render_is_not_seen():
+    cameras = [camera(0.1 * i) for i in range(4)]
+    far = [np.full((H // 2, W // 2), 1.0 / (4 * PLANE), np.float32)] * 4
+    with_, without = (Elsewhere(cameras, plain(4), MultiViewConfig(), s) for s in (far, ()))
+    for view in range(4):
+        for elsewhere in (with_, without):
+            elsewhere.remember(view, noise(view, H, W), np.full((H, W), PLANE))
+    a, b = with_.ask(1), without.ask(1)
+    enough = slice(8, -8)
+    assert np.array_equal(a.evidence[:, enough], b.evidence[:, enough])
+    assert np.array_equal(a.weight[:, enough], b.weight[:, enough])
+
+
+def test_where_nobody_else_looks_nothing_is_evidence():
+    cameras = [camera(x) for x in (0.0, 0.2, 0.4, 20.0)]  # the last sees none of the others' places
+    surfaces = [np.full((H, W), 1.0 / PLANE, np.float32)] * 3 + [None]
+    counts = in_frames(cameras, surfaces)
+    assert counts[3] is None
+    step = round(np.sqrt(H * W / counts[0].size))
+    x = ((np.arange(counts[0].shape[1]) * step + step // 2 + 0.5) - W / 2) / FOCAL * PLANE  # world, of view 0
+    seen = [np.abs((x - c) / PLANE * FOCAL) < W / 2 for c in (0.2, 0.4)]
+    assert np.array_equal(counts[0], np.tile(seen[0].astype(int) + seen[1], (counts[0].shape[0], 1)))
+    photos = [np.full((H, W, 3), 0.5, np.float32) + 0.1 * noise(i, H, W, 3) for i in range(4)]
+    pixels = PixelEvidence(
+        photos, cameras, MultiViewConfig(), base=0.3, least_alpha=0.5, memory=0.0, surfaces=surfaces
+    )
+    found = looked(pixels, 0, noise(9, H, W, 3), remember=True)
+    assert (found[:, :2] == 0.0).all()
+    assert found[:, 8:].min() > 0.0
+    everywhere = MultiViewConfig(seen_by=0)
+    pixels = PixelEvidence(
+        photos, cameras, everywhere, base=0.3, least_alpha=0.5, memory=0.0, surfaces=surfaces
+    )
+    assert looked(pixels, 0, noise(9, H, W, 3), remember=True)[:, :2].min() > 0.0
 
 
 def test_quantiles_are_numpys_without_what_is_missing():
@@ -199,7 +256,11 @@ def test_no_threshold_is_above_the_ceiling():
     )  # fmt: skip
     assert pixels.ceiling(0, 0.0) == np.inf
     looked(pixels, 0, noise(7, H, W, 3), remember=True)
-    assert pixels.ceiling(0, 0.25) == pytest.approx(0.25 * pixels.unrelated / pixels.unit)
+    share = 0.25 * pixels.unrelated / pixels.unit
+    assert pixels.ceiling(0, 0.25) == pytest.approx(share)
+    assert pixels.ceiling(0, 0.25, 0.5 * share) == pytest.approx(share)
+    assert pixels.ceiling(0, 0.25, 2 * share) == pytest.approx(2 * share)
+    assert pixels.ceiling(0, 0.0, 6.0) == np.inf
 
 
 def test_nearest_views_are_near_and_look_the_same_way():

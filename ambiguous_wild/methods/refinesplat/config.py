@@ -52,6 +52,7 @@ class MaskConfig:
     disagree_units: float = 3.0  # F: and at least this many units of what blur and noise make; 0 = printed
     # no threshold above this share of what unrelated content gives (`unrelated_residual`); 0 = printed
     ceiling: float = 0.25  # `structure` only
+    ceiling_least: float = 6.0  # but that is no lower than so many units
     use_local: bool = True  # M_local; off is an ablation row
     use_global: bool = True  # M_global; off is an ablation row
     static_tracks: float = 0.0  # of the photo's mean SfM track density keeps an instance; 0 = printed
@@ -72,7 +73,8 @@ class MaskConfig:
             hold=(0.01, 1), fill=(0, 1), base=(0, 1), memory=(0, 1), entropy_weight=(0, 1), most=(0, 1),
             least_alpha=(0, 1), w2=(0, 1), normal_units=(1e-6, _ANY), box=(1, _ANY), dilation=(1, _ANY),
             **dict.fromkeys(
-                ("hard", "gate", "least", "disagree", "disagree_units", "ceiling", "static_tracks",
+                ("hard", "gate", "least", "disagree", "disagree_units", "ceiling", "ceiling_least",
+                 "static_tracks",
                  "global_gate", "global_units"), (0, _ANY),
             ),
         )  # fmt: skip

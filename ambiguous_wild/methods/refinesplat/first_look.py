@@ -6,6 +6,9 @@ they lie on what several photos saw in one place. So the surface behind every pi
 (`vision/sparse_surface.py`) and looked up in the other photos, and a pixel counts in the first iterations
 only if enough of them show its colour there. Depth is off by a pixel or two, so a colour may lie anywhere
 between the least and the greatest around the place. What no sparse points surround counts.
+
+Later masks are made from renders, but the first look keeps a word in them (`FirstLookConfig.weight`): it is
+the one witness that no training can talk round.
 """
 
 from __future__ import annotations
@@ -20,7 +23,7 @@ import numpy as np
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.methods.refinesplat.multiview import common_offset, nearest_views, quantile_of
-from ambiguous_wild.vision.sparse_surface import BEHIND, in_map, inverse_depth, some_points, world_points
+from ambiguous_wild.vision.sparse_surface import BEHIND, in_map, world_points
 
 _WINDOW = np.ones((3, 3), np.uint8)  # px of the map around the place where a colour may lie
 
@@ -36,38 +39,59 @@ class FirstLookConfig:
     normal: float = 3.0  # and above this many times what is normal in the photo
     known_by: int = 3  # seen by fewer others, a surface is not judged
     least: float = 0.1  # of a photo: where less would wait, nothing does; a start can bear that much
+    weight: float = 1.5  # evidence of later masks is so many times more, or less, as it says; 1 = no word
 
     def __post_init__(self) -> None:
         check_limits(
             self, "refinesplat.first_look",
             views=(1, math.inf), quantile=(0, 1), threshold=(0, math.inf), normal=(0, math.inf),
-            known_by=(1, math.inf), least=(0, 1),
+            known_by=(1, math.inf), least=(0, 1), weight=(1, math.inf),
         )  # fmt: skip
 
 
-def first_keep(
-    cameras: Sequence[Camera], photos: Sequence[np.ndarray], points: np.ndarray, config: FirstLookConfig
-) -> list[np.ndarray | None]:
-    """What to learn from at first, per photo [H, W] bool; None where everything counts.
+@dataclass(frozen=True)
+class FirstLook:
+    """What the other photos say of one photo, on a map [h, w] of its frame."""
+
+    passing: np.ndarray  # float32: 1 = only passing by, 0 = they show it too, 0.5 = nobody could tell
+    least: float
+
+    def keep(self, shape: tuple[int, int]) -> np.ndarray | None:
+        """What to learn from at first, [H, W] bool; None where everything counts."""
+        passing = self.passing > 0.5
+        if passing.mean() < self.least:
+            return None
+        return _resized(passing.astype(np.float32), shape) < 0.5
+
+    def factor(self, weight: float, shape: tuple[int, int]) -> np.ndarray:
+        """Of the evidence of later masks, [H, W] float32 in [1 / weight, weight]."""
+        return np.power(np.float32(weight), 2.0 * _resized(self.passing, shape) - 1.0)
+
+
+def first_look(
+    cameras: Sequence[Camera],
+    photos: Sequence[np.ndarray],
+    surfaces: Sequence[np.ndarray | None],
+    config: FirstLookConfig,
+) -> list[FirstLook | None]:
+    """What the photos say of each other; None where nothing is known of a photo.
 
     Args:
         cameras: of the photos.
         photos: [H, W, 3] in [0, 1].
-        points: sparse points [M, 3], world units.
+        surfaces: inverse depths [h, w] of the sparse points (`static_surfaces`).
         config: how to judge.
     """
-    some = some_points(points)
-    surfaces = [inverse_depth(camera, some) for camera in cameras]
     small = [
         None if inverse is None else _small(photo, inverse.shape)
         for photo, inverse in zip(photos, surfaces, strict=True)
     ]
     ranges = [None if s is None else (cv2.erode(s, _WINDOW), cv2.dilate(s, _WINDOW)) for s in small]
-    keeps: list[np.ndarray | None] = []
+    looks: list[FirstLook | None] = []
     for view, others in enumerate(nearest_views(cameras, config.views)):
         inverse, ours = surfaces[view], small[view]
         if inverse is None or ours is None:
-            keeps.append(None)
+            looks.append(None)
             continue
         world = world_points(cameras[view], inverse)
         told = [
@@ -75,8 +99,8 @@ def first_keep(
             for j in others
             if (surface := surfaces[j]) is not None and (limits := ranges[j]) is not None
         ]
-        keeps.append(_judge(told, photos[view].shape[:2], config))
-    return keeps
+        looks.append(_judge(told, config))
+    return looks
 
 
 def _small(photo: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -105,8 +129,8 @@ def _difference(
     return np.where(sees, outside.mean(axis=2), np.float32(np.nan))
 
 
-def _judge(told: list[np.ndarray], shape: tuple[int, ...], config: FirstLookConfig) -> np.ndarray | None:
-    """The keep map [H, W] bool of a photo from what the others told; None where everything counts."""
+def _judge(told: list[np.ndarray], config: FirstLookConfig) -> FirstLook | None:
+    """From what the others told of a photo; None where they could tell nothing."""
     if not told:
         return None
     stack = np.stack(told)
@@ -116,8 +140,9 @@ def _judge(told: list[np.ndarray], shape: tuple[int, ...], config: FirstLookConf
         return None
     # What is normal: less than half of a photo is behind distractors, or nobody could tell.
     normal = float(np.quantile(evidence[known], 0.4))
-    passing = known & (evidence > max(config.threshold, config.normal * normal))
-    if passing.mean() < config.least:
-        return None
-    full = cv2.resize(passing.astype(np.float32), (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)
-    return full < 0.5
+    passing = evidence > max(config.threshold, config.normal * normal)
+    return FirstLook(np.where(known, passing, 0.5).astype(np.float32), config.least)
+
+
+def _resized(x: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    return cv2.resize(x, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)

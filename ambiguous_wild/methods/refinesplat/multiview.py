@@ -8,6 +8,11 @@ never learnt and stays masked. Simulated courtyard, seeds 21 (distractors) and 3
 
 Their word counts only where their photos show the same colour as this one: before a crowd every view has
 evidence everywhere, and without that condition views would excuse each other's distractors.
+
+What is not learnt yet has no depth either, and whoever is asked there sees another surface. So where fewer
+than `known_by` views see what the render shows, the sparse points say where the surface is. And where fewer
+than `seen_by` others look at all, at the rim of a capture, nothing is masked: nobody else could teach what is
+there.
 """
 
 from __future__ import annotations
@@ -26,6 +31,7 @@ _SPREAD = 9  # px, box over a view's evidence before others read it: depth is of
 _BLUR = 5  # px, box over photos before their colours are compared, for the same reason
 _FAR_MORE = 1.5  # times as many pixels
 _SHRINK = 2  # maps are kept at half the photo's size
+_ROW = 64  # px, pixels that are asked about one by one are put in rows of so many
 
 
 @dataclass(frozen=True)
@@ -42,12 +48,14 @@ class MultiViewConfig:
     )
     agreeing: float = 0.35  # share of the views asked that must show the same for their word to count whole
     known_by: int = 3  # seen by fewer others, a surface is discounted whatever their photos show
+    sparse: bool = True  # where fewer see the render's surface, that of the sparse points is asked about
+    seen_by: int = 2  # others whose frame holds a place; where fewer do, nothing is masked; 0 = asked nowhere
 
     def __post_init__(self) -> None:
         check_limits(
             self, "refinesplat.mask.multiview",
             views=(1, math.inf), quantile=(0, 1), agreeing=(1e-6, 1), known_by=(1, math.inf),
-            **dict.fromkeys(("strength", "depth", "free", "agree"), (0, math.inf)),
+            **dict.fromkeys(("strength", "depth", "free", "agree", "seen_by"), (0, math.inf)),
         )  # fmt: skip
 
 
@@ -63,11 +71,21 @@ class Elsewhere:
     """What every view last said of the surfaces it shows: evidence and depth at half the photo's size."""
 
     def __init__(
-        self, cameras: Sequence[Camera], photos: Sequence[np.ndarray], config: MultiViewConfig
+        self,
+        cameras: Sequence[Camera],
+        photos: Sequence[np.ndarray],
+        config: MultiViewConfig,
+        surfaces: Sequence[np.ndarray | None] = (),  # inverse depths of the sparse points, or none at all
     ) -> None:
         self.cameras, self.config = list(cameras), config
         self.neighbours = nearest_views(cameras, config.views)
         self.colours = [_small(photo, _half(c)) for photo, c in zip(photos, cameras, strict=True)]
+        # view: [h, w] float32 depth of the sparse points' surface, NaN where they say nothing
+        self.static = {
+            view: 1.0 / cv2.resize(inverse, _half(camera), interpolation=cv2.INTER_NEAREST)
+            for view, (camera, inverse) in enumerate(zip(cameras, surfaces))
+            if config.sparse and inverse is not None
+        }
         self.evidence: dict[int, np.ndarray] = {}  # view: [h, w] float32
         self.depth: dict[int, np.ndarray] = {}  # view: [h, w] float32, along the camera's axis
 
@@ -94,15 +112,45 @@ class Elsewhere:
         if not asked or view not in self.depth:
             return None
         xyz = _surface(self.cameras[view], self.depth[view])
-        heard = [self._at(j, xyz, self.colours[view]) for j in asked]
-        evidence = np.stack([h for h, _ in heard])
+        evidence, agree = self._all(asked, xyz, self.colours[view])
+        self._ask_again(view, asked, evidence, agree)
         return Hearsay(
             quantile_of(evidence, self.config.quantile),
-            _weight(np.isfinite(evidence), np.stack([a for _, a in heard]), self.config),
+            _weight(np.isfinite(evidence), agree, self.config),
         )
 
-    def _at(self, view: int, xyz: np.ndarray, colour: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _ask_again(self, view: int, asked: list[int], evidence: np.ndarray, agree: np.ndarray) -> None:
+        """Where too few see the render's surface, fill in what is said of the sparse points' one."""
+        if view not in self.static:
+            return
+        few = np.isfinite(evidence).sum(axis=0) < self.config.known_by
+        at = np.flatnonzero((few & np.isfinite(self.static[view])).ravel())
+        if not len(at):
+            return
+        # as pictures, for OpenCV; the last row's rest repeats the first pixel
+        rows = np.pad(at, (0, -len(at) % _ROW), constant_values=at[0]).reshape(-1, _ROW)
+        xyz = _surface(self.cameras[view], self.static[view]).reshape(-1, 3)[rows]
+        said, same = self._all(asked, xyz, self.colours[view].reshape(-1, 3)[rows], sparse=True)
+        evidence.reshape(len(asked), -1)[:, at] = said.reshape(len(asked), -1)[:, : len(at)]
+        agree.reshape(len(asked), -1)[:, at] = same.reshape(len(asked), -1)[:, : len(at)]
+
+    def _all(
+        self, asked: list[int], xyz: np.ndarray, colour: np.ndarray, *, sparse: bool = False
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """`_at` of each of the n views asked, [n, h, w] each."""
+        heard = [self._at(j, xyz, colour, sparse=sparse) for j in asked]
+        return np.stack([e for e, _ in heard]), np.stack([a for _, a in heard])
+
+    def _at(
+        self, view: int, xyz: np.ndarray, colour: np.ndarray, *, sparse: bool
+    ) -> tuple[np.ndarray, np.ndarray]:
         """A view's word on world points [h, w, 3] that have the colours [h, w, 3] uint8 elsewhere.
+
+        Args:
+            view: who is asked.
+            xyz: the points.
+            colour: theirs in the photo that asks.
+            sparse: they lie on the sparse points' surface, so seeing that is enough.
 
         Returns:
             evidence [h, w], NaN where it sees another surface or none; and bool [h, w], where it sees the
@@ -119,14 +167,20 @@ class Elsewhere:
         y = (local[..., 1] / ahead * camera.fy + camera.cy) * sy - 0.5
         x, y = np.clip(x, -9, depth.shape[1] + 9), np.clip(y, -9, depth.shape[0] + 9)
         x, y = x.astype(np.float32), y.astype(np.float32)
-        there = cv2.remap(depth, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=-1.0)
+        same = self._near(depth, x, y, z)
+        if sparse and view in self.static:
+            same |= self._near(self.static[view], x, y, z)
         evidence = cv2.remap(self.evidence[view], x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        same = (z > 0) & (there > 0) & (np.abs(z - there) < self.config.depth * there)
         heard = np.where(same, evidence, np.float32(np.nan))
         if self.config.agree <= 0:
             return heard, same
         theirs = cv2.remap(self.colours[view], x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return heard, _agree(colour, theirs, same, self.config.agree)
+
+    def _near(self, depth: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+        """Which points of depth z lie on the surface of a depth map, bool; x and y are their places in it."""
+        there = cv2.remap(depth, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=-1.0)
+        return (z > 0) & (there > 0) & (np.abs(z - there) < self.config.depth * there)
 
 
 def _agree(ours: np.ndarray, theirs: np.ndarray, same: np.ndarray, most: float) -> np.ndarray:

@@ -13,6 +13,7 @@ import torch
 from ambiguous_wild.core import Camera
 from ambiguous_wild.methods.refinesplat.multiview import Elsewhere, Hearsay, MultiViewConfig, discount
 from ambiguous_wild.methods.refinesplat.structure import structure_residual, unrelated_residual
+from ambiguous_wild.vision.sparse_surface import in_frames
 
 _STATIC_QUANTILE = 0.25  # of a photo's pixels: static even where distractors cover two thirds of it
 
@@ -29,10 +30,18 @@ class PixelEvidence:
         base: float,
         least_alpha: float,
         memory: float,
+        surfaces: Sequence[np.ndarray | None] = (),  # inverse depths of the sparse points, or none at all
     ) -> None:
         self.photos = list(photos)
         self.config, self.base, self.least_alpha, self.memory = config, base, least_alpha, memory
-        self.elsewhere = Elsewhere(cameras, self.photos, config)
+        self.elsewhere = Elsewhere(cameras, self.photos, config, surfaces)
+        found = in_frames(cameras, surfaces) if config.seen_by > 0 else []
+        # view: [h, w] of any size, where too few others look for anything to be masked
+        self.alone = {
+            view: few
+            for view, count in enumerate(found)
+            if count is not None and (few := (count < config.seen_by).astype(np.uint8)).any()
+        }
         self.unrelated = unrelated_residual(self.photos, base)
         self.normal: dict[int, float] = {}  # view: quantile of its residual that static pixels have
         # view: [H, W], its residual averaged over its visits; half precision, a checkpoint holds all of them
@@ -57,12 +66,14 @@ class PixelEvidence:
         """
         photo = self.photos[view]
         size = (photo.shape[1], photo.shape[0])
-        solid = _resized(alpha, size) >= self.least_alpha
+        judged = _resized(alpha, size) >= self.least_alpha
+        if view in self.alone:
+            judged &= cv2.resize(self.alone[view], size, interpolation=cv2.INTER_NEAREST) == 0
         evidence = structure_residual(photo, _resized(image, size), self.base)
-        evidence[~solid] = 0.0
+        evidence[~judged] = 0.0
         if self.memory > 0 and view in self.before:
             evidence = self.memory * self.before[view].astype(np.float32) + (1.0 - self.memory) * evidence
-        normal = float(np.quantile(evidence[solid], _STATIC_QUANTILE)) if solid.any() else 0.0
+        normal = float(np.quantile(evidence[judged], _STATIC_QUANTILE)) if judged.any() else 0.0
         others = None
         if self.config.strength > 0:
             mean_depth = np.where(alpha > 1e-3, depth / np.maximum(alpha, 1e-3), 0.0)
@@ -74,11 +85,14 @@ class PixelEvidence:
         unit = self._unit(normal)
         return discount(evidence, others, unit, self.config) / unit
 
-    def ceiling(self, view: int, share: float) -> float:
-        """That share of what unrelated content gives, in units, as `look` of the view divided by; 0 = inf."""
+    def ceiling(self, view: int, share: float, least: float = 0.0) -> float:
+        """That share of what unrelated content gives, in units, as `look` of the view divided by; 0 = inf.
+
+        Never below `least`: where hardly anything is learnt, that share is what every pixel has.
+        """
         if share <= 0 or self.unrelated <= 0:
             return math.inf
-        return share * self.unrelated / self._unit(self.normal.get(view, 0.0))
+        return max(share * self.unrelated / self._unit(self.normal.get(view, 0.0)), least)
 
     def _unit(self, normal: float) -> float:
         return max(self.unit or normal, 1e-4)  # a perfect render of a synthetic scene has no noise at all

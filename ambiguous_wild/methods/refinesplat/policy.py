@@ -23,7 +23,7 @@ from ambiguous_wild.methods.refinesplat.evidence import (
     scaled_by,
     silence,
 )
-from ambiguous_wild.methods.refinesplat.first_look import first_keep
+from ambiguous_wild.methods.refinesplat.first_look import FirstLook, first_look
 from ambiguous_wild.methods.refinesplat.inputs import FrozenInputs
 from ambiguous_wild.methods.refinesplat.losses import consistency_loss, identity_loss, instance_matrix
 from ambiguous_wild.methods.refinesplat.pixels import PixelEvidence
@@ -34,6 +34,7 @@ from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.backends import make_features, make_instances
 from ambiguous_wild.vision.protocols import Features, Instances
 from ambiguous_wild.vision.segments import GraphSegments
+from ambiguous_wild.vision.sparse_surface import static_surfaces
 
 
 class RefineSplatMask(MaskPolicy):
@@ -64,6 +65,7 @@ class RefineSplatMask(MaskPolicy):
         if self._reads_identities:
             _ = self.inputs.semantics  # part of what the method costs before its first step
         photos = [photo.cpu().numpy() for photo in data.photos]
+        surfaces = static_surfaces(data.cameras, data.scene.points.xyz)
         self.pixels = PixelEvidence(
             photos,
             data.cameras,
@@ -71,8 +73,18 @@ class RefineSplatMask(MaskPolicy):
             base=config.mask.base,
             least_alpha=config.mask.least_alpha,
             memory=config.mask.memory,
+            surfaces=surfaces,
         )
-        self.first = self._first_look(photos) if config.first_look.on else {}
+        self.looks: dict[int, FirstLook] = {}  # view: what other photos say of it, where they can tell
+        if config.first_look.on:
+            found = first_look(data.cameras, photos, surfaces, config.first_look)
+            self.looks = {view: look for view, look in enumerate(found) if look is not None}
+        # view: what counts before masks begin, [H, W] float32; none where everything does
+        self.first = {
+            view: torch.from_numpy(keep.astype(np.float32)).to(data.device)
+            for view, look in self.looks.items()
+            if (keep := look.keep(photos[view].shape[:2])) is not None
+        }
 
     def keep(self, step: Step) -> Tensor | None:
         if not self._begun(step):
@@ -111,16 +123,6 @@ class RefineSplatMask(MaskPolicy):
 
     def regularises(self) -> bool:
         return self.config.lambda_id > 0 or self.config.lambda_cr > 0
-
-    def _first_look(self, photos: list[np.ndarray]) -> dict[int, Tensor]:
-        """View -> what counts before masks begin, [H, W] float32; none where everything does."""
-        data = self.data
-        found = first_keep(data.cameras, photos, data.scene.points.xyz, self.config.first_look)
-        return {
-            view: torch.from_numpy(keep.astype(np.float32)).to(data.device)
-            for view, keep in enumerate(found)
-            if keep is not None
-        }
 
     def predict(self, step: Step) -> Tensor | None:
         if not self._begun(step):
@@ -184,10 +186,12 @@ class RefineSplatMask(MaskPolicy):
                 rendered.depth.cpu().numpy(),
                 remember=remember,
             )
+            if view in self.looks:
+                evidence *= self.looks[view].factor(self.config.first_look.weight, evidence.shape)
             if mask.entropy_weight > 0:
                 evidence = scaled_by(evidence, self.compare(step).statistic, mask.entropy_weight)
             maps = Maps(evidence, evidence)
-            ceiling = self.pixels.ceiling(view, mask.ceiling)
+            ceiling = self.pixels.ceiling(view, mask.ceiling, mask.ceiling_least)
         else:
             maps = self.compare(step)
         others = [self.judged[v] for v in sorted(self.judged) if v != view]

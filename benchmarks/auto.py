@@ -3,8 +3,9 @@
     python benchmarks/auto.py --scenes DIR --out DIR [--presets NAME ...] [--iterations 1000] [--factor 2]
 
 Scenes are those that benchmarks/presets.py built (its --work DIR/scenes). On each, RefineSplat is trained
-with `auto`, with what the preset was designed for (colour per photo once as exposure, once as appearance;
-with and without SH degree 1 where nothing shines), with nothing and with everything. Writes
+with `auto`, with what the preset was designed for (colour per photo once as exposure, once as appearance),
+with nothing and with everything. A lower degree of the harmonics is left out: docs/effects.md says what it
+costs. Writes
 benchmarks/results/auto.json and .md: test PSNR and seconds of each, and auto against the best other: PSNR
 first, the quicker one within 0.02 dB. Where both are the same set, their times differ by the machine's noise
 alone and are not compared. Seconds are of training; what deciding takes (SfM points, no training) is in the
@@ -40,10 +41,8 @@ def sets_of(preset: str) -> dict[str, str]:
     found = {"auto": "auto", "none": "none", "all": "all"}
     for k in range(max((len(ANSWERS[effect]) for effect in wanted), default=1)):
         picked = [ANSWERS[effect][min(k, len(ANSWERS[effect]) - 1)] for effect in wanted]
-        matt = [] if "sh" in designed else ["sh1"]  # no gloss, no higher harmonics
-        for names in (picked, picked + matt):
-            if names:
-                found["+".join(names)] = ",".join(names)
+        if picked:
+            found["+".join(picked)] = ",".join(picked)
     return found
 
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     "--probe/--no-probe",
     default=True,
     show_default=True,
-    help="Train 3DGS shortly on small photos: masks need it, all others do not.",
+    help="Train 3DGS on small photos, longer where it finds something: masks need it, all others do not.",
 )
 @click.option(
     "--costs/--no-costs", default=False, show_default=True, help="Time every effect on this machine."

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator
 from scipy.ndimage import distance_transform_edt
@@ -59,40 +60,52 @@ def static_surfaces(cameras: Sequence[Camera], xyz: np.ndarray) -> list[np.ndarr
     return [inverse_depth(camera, some) for camera in cameras]
 
 
-def in_frames(cameras: Sequence[Camera], surfaces: Sequence[np.ndarray | None]) -> list[np.ndarray | None]:
-    """How many of the other cameras have a place in their frame, whatever stands before it.
+def seldom_seen(
+    cameras: Sequence[Camera], surfaces: Sequence[np.ndarray | None], least: int
+) -> list[np.ndarray | None]:
+    """Which places fewer than `least` of the other cameras have in their frame, whatever stands before them.
 
     Outside the sparse points the nearest known depth holds: it is good enough to say who looks that way.
 
     Args:
         cameras: of one scene.
         surfaces: their inverse depths [h, w], from `static_surfaces`.
+        least: cameras; no more are asked for than there are others.
 
     Returns:
-        int32 maps of some 1000 pixels of each frame; None where a surface is.
+        bool maps of some 1000 pixels, spread evenly over each frame; None where a surface is.
     """
-    poses = np.stack([c.cam_from_world for c in cameras])
-    focal, centre = (np.array(v) for v in zip(*(((c.fx, c.fy), (c.cx, c.cy)) for c in cameras), strict=True))
-    size = np.array([(c.width, c.height) for c in cameras])
-    counts: list[np.ndarray | None] = []
+    least = min(least, len(cameras) - 1)
+    centres = np.stack([c.center for c in cameras])
+    maps: list[np.ndarray | None] = []
     for view, surface in enumerate(surfaces):
         if surface is None or not np.isfinite(surface).any():
-            counts.append(None)
+            maps.append(None)
             continue
-        unknown = ~np.isfinite(surface)
-        rows, columns = distance_transform_edt(unknown, return_distances=False, return_indices=True)
-        step = max(1, math.ceil(math.sqrt(surface.size / _FRAME_PIXELS)))
-        world = world_points(cameras[view], surface[rows, columns])[step // 2 :: step, step // 2 :: step]
-        found = np.zeros(world.shape[:2], np.int32)
-        for other, pose in enumerate(poses):
-            if other == view:
-                continue
-            local = world @ pose[:3, :3].T + pose[:3, 3]
-            z = local[..., 2]
-            uv = local[..., :2] / np.where(z > 0, z, np.nan)[..., None] * focal[other] + centre[other]
-            found += ((uv >= 0) & (uv < size[other])).all(axis=2)
-        counts.append(found)
-    return counts
+        scale = min(1.0, math.sqrt(_FRAME_PIXELS / surface.size))
+        size = (max(round(surface.shape[1] * scale), 1), max(round(surface.shape[0] * scale), 1))
+        rows, columns = distance_transform_edt(
+            ~np.isfinite(surface), return_distances=False, return_indices=True
+        )
+        inverse = cv2.resize(surface[rows, columns], size, interpolation=cv2.INTER_NEAREST)
+        world = world_points(cameras[view], inverse).reshape(-1, 3)
+        missing = np.full(len(world), least)  # cameras that must still be found
+        # near ones first: most places are settled after a few
+        for other in np.argsort(np.linalg.norm(centres - centres[view], axis=1), kind="stable"):
+            open_ = np.flatnonzero(missing > 0)
+            if not len(open_):
+                break
+            if other != view:
+                missing[open_[_in_frame(cameras[other], world[open_])]] -= 1
+        maps.append((missing > 0).reshape(size[::-1]))
+    return maps
+
+
+def _in_frame(camera: Camera, world: np.ndarray) -> np.ndarray:
+    """Which world points [N, 3] lie in the camera's frame, [N] bool."""
+    local = world @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+    x, y = in_map(camera, local, (camera.height, camera.width))
+    return (x >= -0.5) & (x < camera.width - 0.5) & (y >= -0.5) & (y < camera.height - 0.5)
 
 
 def world_points(camera: Camera, inverse: np.ndarray) -> np.ndarray:

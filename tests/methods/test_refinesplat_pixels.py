@@ -5,17 +5,21 @@ import pytest
 
 from ambiguous_wild.core import AwError, Camera
 from ambiguous_wild.methods.refinesplat import masking
+from ambiguous_wild.methods.refinesplat.agreement import (
+    agree,
+    colour_difference,
+    common_offset,
+    quantile_of,
+    word_weight,
+)
 from ambiguous_wild.methods.refinesplat.config import MaskConfig
 from ambiguous_wild.methods.refinesplat.evidence import Maps, make_masks
 from ambiguous_wild.methods.refinesplat.multiview import (
     Elsewhere,
     Hearsay,
     MultiViewConfig,
-    _agree,
-    _weight,
     discount,
     nearest_views,
-    quantile_of,
 )
 from ambiguous_wild.methods.refinesplat.pixels import PixelEvidence
 from ambiguous_wild.methods.refinesplat.structure import (
@@ -25,7 +29,6 @@ from ambiguous_wild.methods.refinesplat.structure import (
     unrelated_residual,
 )
 from ambiguous_wild.methods.refinesplat.threshold import t_ent
-from ambiguous_wild.vision.sparse_surface import in_frames
 
 H, W, FOCAL, PLANE = 40, 64, 60.0, 5.0
 
@@ -101,62 +104,6 @@ def test_a_surface_at_another_depth_or_outside_says_nothing():
     assert np.isnan(far.ask(0).evidence).all()
 
 
-def test_where_the_render_has_no_surface_yet_the_sparse_points_have_one():
-    cameras = [camera(0.1 * i) for i in range(4)]
-    surface = np.full((H // 2, W // 2), 1.0 / PLANE, np.float32)
-    surface[:, :5] = np.nan
-    never = MultiViewConfig(sparse=False)
-    for config, told in ((MultiViewConfig(), True), (never, False)):
-        elsewhere = Elsewhere(cameras, plain(4), config, [surface] * 4)
-        for view in range(4):
-            depth = 3.0 * PLANE if view == 0 else PLANE  # only view 0's render is wrong
-            elsewhere.remember(view, np.full((H, W), 1.0 + view), np.full((H, W), depth))
-        found = elsewhere.ask(0)
-        inside = found.evidence[:, 6:-3]
-        if told:
-            assert np.allclose(inside, 3.0, atol=1e-5)  # the median of 2, 3, 4
-            assert (found.weight[:, 6:-3] == 1.0).all()
-        else:
-            assert np.isnan(inside).all()
-        assert np.isnan(found.evidence[:, :4]).all()  # no point, no surface
-
-
-def test_sparse_surfaces_are_asked_about_only_where_the_render_is_not_seen():
-    cameras = [camera(0.1 * i) for i in range(4)]
-    far = [np.full((H // 2, W // 2), 1.0 / (4 * PLANE), np.float32)] * 4
-    with_, without = (Elsewhere(cameras, plain(4), MultiViewConfig(), s) for s in (far, ()))
-    for view in range(4):
-        for elsewhere in (with_, without):
-            elsewhere.remember(view, noise(view, H, W), np.full((H, W), PLANE))
-    a, b = with_.ask(1), without.ask(1)
-    enough = slice(8, -8)
-    assert np.array_equal(a.evidence[:, enough], b.evidence[:, enough])
-    assert np.array_equal(a.weight[:, enough], b.weight[:, enough])
-
-
-def test_where_nobody_else_looks_nothing_is_evidence():
-    cameras = [camera(x) for x in (0.0, 0.2, 0.4, 20.0)]  # the last sees none of the others' places
-    surfaces = [np.full((H, W), 1.0 / PLANE, np.float32)] * 3 + [None]
-    counts = in_frames(cameras, surfaces)
-    assert counts[3] is None
-    step = round(np.sqrt(H * W / counts[0].size))
-    x = ((np.arange(counts[0].shape[1]) * step + step // 2 + 0.5) - W / 2) / FOCAL * PLANE  # world, of view 0
-    seen = [np.abs((x - c) / PLANE * FOCAL) < W / 2 for c in (0.2, 0.4)]
-    assert np.array_equal(counts[0], np.tile(seen[0].astype(int) + seen[1], (counts[0].shape[0], 1)))
-    photos = [np.full((H, W, 3), 0.5, np.float32) + 0.1 * noise(i, H, W, 3) for i in range(4)]
-    pixels = PixelEvidence(
-        photos, cameras, MultiViewConfig(), base=0.3, least_alpha=0.5, memory=0.0, surfaces=surfaces
-    )
-    found = looked(pixels, 0, noise(9, H, W, 3), remember=True)
-    assert (found[:, :2] == 0.0).all()
-    assert found[:, 8:].min() > 0.0
-    everywhere = MultiViewConfig(seen_by=0)
-    pixels = PixelEvidence(
-        photos, cameras, everywhere, base=0.3, least_alpha=0.5, memory=0.0, surfaces=surfaces
-    )
-    assert looked(pixels, 0, noise(9, H, W, 3), remember=True)[:, :2].min() > 0.0
-
-
 def test_quantiles_are_numpys_without_what_is_missing():
     stack = noise(4, 7, 5, 6)
     stack[noise(5, 7, 5, 6) < 0.4] = np.nan
@@ -203,9 +150,10 @@ def test_views_that_show_another_colour_have_no_word():
 
 def test_weight_is_the_share_of_those_who_see_it_and_few_are_always_heard():
     seen = np.array([[[True, True, True]]] * 2 + [[[True, True, False]]] * 2)  # 4, 4, 2 views
-    agree = np.array([[[True, False, False]]] + [[[False, False, False]]] * 3)
-    config = MultiViewConfig(agreeing=0.5, known_by=3)
-    assert _weight(seen, agree, config).tolist() == [[0.5, 0.0, 1.0]]
+    agreeing = np.array([[[True, False, False]]] + [[[False, False, False]]] * 3)
+    few = seen.sum(axis=0) < 3
+    assert word_weight(seen, agreeing, 0.5, few).tolist() == [[0.5, 0.0, 1.0]]
+    assert word_weight(seen, agreeing, 0.5, ~few).tolist() == [[1.0, 1.0, 0.0]]
 
 
 def test_exposure_and_white_balance_are_no_other_content():
@@ -213,14 +161,19 @@ def test_exposure_and_white_balance_are_no_other_content():
     brighter = ours + np.array([30, 40, 50], np.uint8)
     brighter[:6, :6] = 255 - brighter[:6, :6]
     everywhere = np.ones(ours.shape[:2], bool)
-    found = _agree(ours, brighter, everywhere, 0.06)
+
+    def alike(theirs, same=everywhere):
+        offset = common_offset(colour_difference(ours, theirs), same)
+        return agree(ours, theirs, same, 0.06, offset)
+
+    found = alike(brighter)
     assert found[8:, 8:].all()
     assert found[:6, :6].mean() < 0.3
-    assert not _agree(ours, brighter, ~everywhere, 0.06).any()  # nobody sees anything
+    assert not alike(brighter, ~everywhere).any()  # nobody sees anything
     # a shift that few have in common is theirs
     half = ours.copy()
     half[:, :14] += np.uint8(60)
-    found = _agree(ours, half, everywhere, 0.06)
+    found = alike(half)
     assert found[:, 14:].all()
     assert not found[:, :14].any()
 

@@ -35,8 +35,7 @@ WINDOW = 1 / 20  # of the longest side: side of the window
 STANDS_OUT = 0.12  # code values of a window's mean residual, in the worst channel
 LARGE = 0.05  # of a photo: a patch above it is more than an instance
 
-# Shares of the photos' pixels. The probe found 0.04 % where nobody is and 0.02 % on real drone photos without
-# movers; of things that cover 6.8 % (thin ones) and 5.4 % it found 0.9 and 2.7 %.
+# Shares of the photos' pixels, see benchmarks/results/presets.md for what the presets give.
 OCCLUSION, LOCAL, GLOBAL, ENTROPY = 0.003, 0.003, 0.05, 0.01
 
 
@@ -177,8 +176,9 @@ def stays(
     *,
     bar: Callable[..., AbstractContextManager[Any]],
 ) -> Occlusion:
-    """What the probe cannot explain, and a longer one cannot either: fine texture is learnt late.
+    """What the probe cannot explain; where that is much, what one of `SETTLED` iterations cannot.
 
+    Fine texture is learnt late, and what stands before one photo not even then.
     Drone photos of fields: 1.5 % after 300 iterations, 0.2 % after 1200; a thin thing before a courtyard 1.5
     and 1.4 %. The longer run is made only where the short one found something.
 

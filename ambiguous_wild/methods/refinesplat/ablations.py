@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from ambiguous_wild.methods.ablation import Group, Variant
 
-_NO_MASKS = ("mask.use_local=false", "mask.use_global=false")
+_NO_MASKS = ("mask.use_local=false", "mask.use_global=false", "first_look.on=false")
 _NO_SUPPORT = ("density.support.least_share=0",)
 _PLAIN_DENSITY = (
     "density.decides=photometric", "density.clone_shift=0", "density.merge_every=0", *_NO_SUPPORT,
@@ -23,8 +23,9 @@ _NO_TRACKS = (*_ON_FEATURES[:2], "mask.static_tracks=0", _ON_FEATURES[3])
 _ALL_PRINTED = (
     "mask.variant=sigmoid", "mask.statistic=entropy", "mask.combine=union", "mask.scope=photo",
     "mask.threshold=literal", *_NO_GATE, *_NO_AGREEMENT, "mask.static_tracks=0", "mask.least_alpha=0",
-    "mask.ceiling=0", "mask.cosine=plain", "mask.spread=var", *_NO_GLOBAL_GATE, "mask.fill=0",
-    "mask.dilation=5", "density.merge.form=literal", "density.merge.most=0", *_NO_SUPPORT, *_PRINTED_LOSSES,
+    "mask.ceiling=0", "first_look.on=false", "mask.cosine=plain", "mask.spread=var", *_NO_GLOBAL_GATE,
+    "mask.fill=0", "mask.dilation=5", "density.merge.form=literal", "density.merge.most=0", *_NO_SUPPORT,
+    *_PRINTED_LOSSES,
 )  # fmt: skip
 
 ABLATIONS = (
@@ -93,7 +94,11 @@ ABLATIONS = (
         "What is judged, and whether other views and visits have a say",
         (
             Variant("structure", ("mask.statistic=structure",), "colour and structure of pixels"),
-            Variant("no-other-views", ("mask.multiview.strength=0",), "each view believes itself"),
+            Variant(
+                "no-other-views",
+                ("mask.multiview.strength=0", "mask.multiview.seen_by=0"),
+                "each view believes itself",
+            ),
             *(
                 Variant(f"strength-{value}", (f"mask.multiview.strength={value}",))
                 for value in ("0.5", "1", "3")
@@ -101,6 +106,13 @@ ABLATIONS = (
             *(Variant(f"views-{value}", (f"mask.multiview.views={value}",)) for value in ("4", "16")),
             Variant("any-photo", ("mask.multiview.agree=0",), "views count whatever their photos show"),
             Variant("no-ceiling", ("mask.ceiling=0",), "thresholds as high as the scene's residuals"),
+            Variant("low-ceiling", ("mask.ceiling_least=0",), "and as low as what is not learnt yet"),
+            Variant(
+                "no-sparse-points", ("mask.multiview.sparse=false",), "what is not learnt has no surface"
+            ),
+            Variant("rims", ("mask.multiview.seen_by=0",), "masks where no other photo looks"),
+            Variant("no-first-look", ("first_look.on=false",), "the first renders alone decide"),
+            Variant("first-look-first", ("first_look.weight=1",), "no word of it in later masks"),
             Variant("no-memory", ("mask.memory=0",), "the present render alone"),
             Variant("no-hold", ("mask.hold=1",), "regions do not grow below the threshold"),
             Variant("identities", ("mask.entropy_weight=0.5",), "scaled by the contrast of identities"),

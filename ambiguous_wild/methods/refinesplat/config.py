@@ -52,7 +52,7 @@ class MaskConfig:
     disagree_units: float = 3.0  # F: and at least this many units of what blur and noise make; 0 = printed
     # no threshold above this share of what unrelated content gives (`unrelated_residual`); 0 = printed
     ceiling: float = 0.25  # `structure` only
-    ceiling_least: float = 6.0  # but that is no lower than so many units
+    ceiling_least: float = 6.0  # `structure` only: but that is no lower than so many units
     use_local: bool = True  # M_local; off is an ablation row
     use_global: bool = True  # M_global; off is an ablation row
     static_tracks: float = 0.0  # of the photo's mean SfM track density keeps an instance; 0 = printed

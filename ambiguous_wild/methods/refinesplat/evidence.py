@@ -116,6 +116,7 @@ def make_masks(
     w2: float,
     config: MaskConfig,
     ceiling: float = math.inf,
+    unseen: np.ndarray | None = None,
 ) -> Masks:
     """M_local, M_global and the keep map of one photo (Eqs. 4-8).
 
@@ -127,7 +128,10 @@ def make_masks(
         w2: weight of T_ent's lower subset.
         config: thresholds.
         ceiling: the threshold is no higher than this, whatever stands apart from what.
+        unseen: [H, W] bool, what is not to be judged: no part of any instance, and never masked.
     """
+    if unseen is not None:
+        labels = np.where(unseen, 0, labels)
     height, width = labels.shape
     count = len(static)
     means, areas = masking.instance_means(maps.statistic, labels, count)
@@ -157,6 +161,8 @@ def make_masks(
         final = masking.hysteresis(both, config.hold * cut.threshold, cut.threshold)
         final &= ~masking.local_mask(labels, static)
     final = masking.dilate(masking.fill_holes(final, config.fill), config.dilation)
+    if unseen is not None:
+        final &= ~unseen
     return Masks(local, global_, masking.keep_map(final, config.most, pixels), judged, cut)
 
 

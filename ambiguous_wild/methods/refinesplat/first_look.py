@@ -22,7 +22,8 @@ import numpy as np
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import check_limits
-from ambiguous_wild.methods.refinesplat.multiview import common_offset, nearest_views, quantile_of
+from ambiguous_wild.methods.refinesplat.agreement import common_offset, quantile_of
+from ambiguous_wild.methods.refinesplat.multiview import nearest_views
 from ambiguous_wild.vision.sparse_surface import BEHIND, in_map, world_points
 
 _WINDOW = np.ones((3, 3), np.uint8)  # px of the map around the place where a colour may lie
@@ -39,7 +40,7 @@ class FirstLookConfig:
     normal: float = 3.0  # and above this many times what is normal in the photo
     known_by: int = 3  # seen by fewer others, a surface is not judged
     least: float = 0.1  # of a photo: where less would wait, nothing does; a start can bear that much
-    weight: float = 1.5  # evidence of later masks is so many times more, or less, as it says; 1 = no word
+    weight: float = 1.5  # `structure`: later evidence is so many times more, or less, as it says; 1 = no word
 
     def __post_init__(self) -> None:
         check_limits(

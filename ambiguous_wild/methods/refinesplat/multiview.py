@@ -26,10 +26,16 @@ import numpy as np
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import check_limits
+from ambiguous_wild.methods.refinesplat.agreement import (
+    agree,
+    colour_difference,
+    common_offset,
+    quantile_of,
+    word_weight,
+)
 
 _SPREAD = 9  # px, box over a view's evidence before others read it: depth is off by a few pixels
 _BLUR = 5  # px, box over photos before their colours are compared, for the same reason
-_FAR_MORE = 1.5  # times as many pixels
 _SHRINK = 2  # maps are kept at half the photo's size
 _ROW = 64  # px, pixels that are asked about one by one are put in rows of so many
 
@@ -47,9 +53,12 @@ class MultiViewConfig:
         0.06  # difference of colour in [0, 1] up to which two photos show the same; 0 = never asked
     )
     agreeing: float = 0.35  # share of the views asked that must show the same for their word to count whole
-    known_by: int = 3  # seen by fewer others, a surface is discounted whatever their photos show
+    # seen by fewer others, a render's surface is discounted whatever their photos show, or looked up again
+    known_by: int = 3
     sparse: bool = True  # where fewer see the render's surface, that of the sparse points is asked about
-    seen_by: int = 2  # others whose frame holds a place; where fewer do, nothing is masked; 0 = asked nowhere
+    seen_by: int = (
+        2  # others whose frame holds a place (all there are, if fewer); else nothing is masked there
+    )
 
     def __post_init__(self) -> None:
         check_limits(
@@ -67,6 +76,15 @@ class Hearsay:
     weight: np.ndarray  # in [0, 1]: how far their photos show what this one shows
 
 
+@dataclass(frozen=True)
+class _Word:
+    """Of one view on points [h, w] of another."""
+
+    evidence: np.ndarray  # [h, w] float32, NaN where it sees another surface or none
+    agree: np.ndarray  # [h, w] bool, where it sees the surface in the same colour
+    offset: np.ndarray  # [3] float32, what its colours differ by everywhere
+
+
 class Elsewhere:
     """What every view last said of the surfaces it shows: evidence and depth at half the photo's size."""
 
@@ -80,12 +98,8 @@ class Elsewhere:
         self.cameras, self.config = list(cameras), config
         self.neighbours = nearest_views(cameras, config.views)
         self.colours = [_small(photo, _half(c)) for photo, c in zip(photos, cameras, strict=True)]
-        # view: [h, w] float32 depth of the sparse points' surface, NaN where they say nothing
-        self.static = {
-            view: 1.0 / cv2.resize(inverse, _half(camera), interpolation=cv2.INTER_NEAREST)
-            for view, (camera, inverse) in enumerate(zip(cameras, surfaces))
-            if config.sparse and inverse is not None
-        }
+        # inverse depths of the sparse points' surface, [h, w] of any size, NaN where they say nothing
+        self.static = list(surfaces) if config.sparse and surfaces else [None] * len(self.cameras)
         self.evidence: dict[int, np.ndarray] = {}  # view: [h, w] float32
         self.depth: dict[int, np.ndarray] = {}  # view: [h, w] float32, along the camera's axis
 
@@ -112,38 +126,69 @@ class Elsewhere:
         if not asked or view not in self.depth:
             return None
         xyz = _surface(self.cameras[view], self.depth[view])
-        evidence, agree = self._all(asked, xyz, self.colours[view])
-        self._ask_again(view, asked, evidence, agree)
+        heard = [self._at(j, xyz, self.colours[view]) for j in asked]
+        evidence, agreeing = np.stack([h.evidence for h in heard]), np.stack([h.agree for h in heard])
+        few = np.isfinite(evidence).sum(axis=0) < self.config.known_by
+        again = self._ask_again(view, asked, few, [h.offset for h in heard], evidence, agreeing)
         return Hearsay(
             quantile_of(evidence, self.config.quantile),
-            _weight(np.isfinite(evidence), agree, self.config),
+            # few who see what the render shows are heard; who sees the sparse points' surface may look past
+            # a distractor at what is behind it
+            word_weight(np.isfinite(evidence), agreeing, self.config.agreeing, few & ~again),
         )
 
-    def _ask_again(self, view: int, asked: list[int], evidence: np.ndarray, agree: np.ndarray) -> None:
-        """Where too few see the render's surface, fill in what is said of the sparse points' one."""
-        if view not in self.static:
-            return
-        few = np.isfinite(evidence).sum(axis=0) < self.config.known_by
-        at = np.flatnonzero((few & np.isfinite(self.static[view])).ravel())
-        if not len(at):
-            return
-        # as pictures, for OpenCV; the last row's rest repeats the first pixel
-        rows = np.pad(at, (0, -len(at) % _ROW), constant_values=at[0]).reshape(-1, _ROW)
-        xyz = _surface(self.cameras[view], self.static[view]).reshape(-1, 3)[rows]
-        said, same = self._all(asked, xyz, self.colours[view].reshape(-1, 3)[rows], sparse=True)
-        evidence.reshape(len(asked), -1)[:, at] = said.reshape(len(asked), -1)[:, : len(at)]
-        agree.reshape(len(asked), -1)[:, at] = same.reshape(len(asked), -1)[:, : len(at)]
+    def _ask_again(
+        self,
+        view: int,
+        asked: list[int],
+        few: np.ndarray,
+        offsets: list[np.ndarray],
+        evidence: np.ndarray,
+        agreeing: np.ndarray,
+    ) -> np.ndarray:
+        """Put in what is said of the sparse points' surface, where few see the render's and more see that.
 
-    def _all(
-        self, asked: list[int], xyz: np.ndarray, colour: np.ndarray, *, sparse: bool = False
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """`_at` of each of the n views asked, [n, h, w] each."""
-        heard = [self._at(j, xyz, colour, sparse=sparse) for j in asked]
-        return np.stack([e for e, _ in heard]), np.stack([a for _, a in heard])
+        Args:
+            view: who asks.
+            asked: the n views.
+            few: [h, w] bool, where to ask.
+            offsets: of colours, from the first time: these pixels alone would take a car for weather.
+            evidence, agreeing: [n, h, w], changed in place.
+
+        Returns:
+            [h, w] bool, where something was put in.
+        """
+        again = np.zeros(few.shape, bool)
+        inverse = self.static[view]
+        if inverse is None:
+            return again
+        depth = 1.0 / cv2.resize(inverse, few.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        at = np.flatnonzero(few & np.isfinite(depth))
+        if not len(at):
+            return again
+        # as pictures, for OpenCV; the last row is filled up with the first pixel
+        rows = np.pad(at, (0, -len(at) % _ROW), constant_values=at[0]).reshape(-1, _ROW)
+        xyz = _surface(self.cameras[view], depth).reshape(-1, 3)[rows]
+        colour = self.colours[view].reshape(-1, 3)[rows]
+        heard = [self._at(j, xyz, colour, sparse=True, offset=o) for j, o in zip(asked, offsets, strict=True)]
+        said = np.stack([h.evidence.ravel()[: len(at)] for h in heard])
+        same = np.stack([h.agree.ravel()[: len(at)] for h in heard])
+        first = evidence.reshape(len(asked), -1)
+        more = np.isfinite(said).sum(axis=0) > np.isfinite(first[:, at]).sum(axis=0)
+        first[:, at[more]] = said[:, more]
+        agreeing.reshape(len(asked), -1)[:, at[more]] = same[:, more]
+        again.ravel()[at[more]] = True
+        return again
 
     def _at(
-        self, view: int, xyz: np.ndarray, colour: np.ndarray, *, sparse: bool
-    ) -> tuple[np.ndarray, np.ndarray]:
+        self,
+        view: int,
+        xyz: np.ndarray,
+        colour: np.ndarray,
+        *,
+        sparse: bool = False,
+        offset: np.ndarray | None = None,
+    ) -> _Word:
         """A view's word on world points [h, w, 3] that have the colours [h, w, 3] uint8 elsewhere.
 
         Args:
@@ -151,72 +196,34 @@ class Elsewhere:
             xyz: the points.
             colour: theirs in the photo that asks.
             sparse: they lie on the sparse points' surface, so seeing that is enough.
-
-        Returns:
-            evidence [h, w], NaN where it sees another surface or none; and bool [h, w], where it sees the
-            surface in the same colour.
+            offset: [3], what the two photos differ by everywhere; None: found from these points.
         """
         camera, depth = self.cameras[view], self.depth[view]
         pose = camera.cam_from_world.astype(np.float32)
         local = xyz @ pose[:3, :3].T + pose[:3, 3]
         z = local[..., 2]
         ahead = np.maximum(z, 1e-6)
-        sx, sy = depth.shape[1] / camera.width, depth.shape[0] / camera.height
-        # pixel centres lie at .5 in our cameras and at whole numbers for OpenCV
-        x = (local[..., 0] / ahead * camera.fx + camera.cx) * sx - 0.5
-        y = (local[..., 1] / ahead * camera.fy + camera.cy) * sy - 0.5
-        x, y = np.clip(x, -9, depth.shape[1] + 9), np.clip(y, -9, depth.shape[0] + 9)
-        x, y = x.astype(np.float32), y.astype(np.float32)
-        same = self._near(depth, x, y, z)
-        if sparse and view in self.static:
-            same |= self._near(self.static[view], x, y, z)
+        # as shares of the frame
+        u = (local[..., 0] / ahead * camera.fx + camera.cx) / camera.width
+        v = (local[..., 1] / ahead * camera.fy + camera.cy) / camera.height
+        x, y = _in_map(u, v, depth.shape)
+        same = self._near(cv2.remap(depth, x, y, cv2.INTER_NEAREST, borderValue=-1.0), z)
+        static = self.static[view]
+        if sparse and static is not None:
+            there = cv2.remap(static, *_in_map(u, v, static.shape), cv2.INTER_NEAREST, borderValue=-1.0)
+            same |= self._near(1.0 / np.where(there > 0, there, np.nan), z)
         evidence = cv2.remap(self.evidence[view], x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         heard = np.where(same, evidence, np.float32(np.nan))
         if self.config.agree <= 0:
-            return heard, same
+            return _Word(heard, same, np.zeros(3, np.float32))
         theirs = cv2.remap(self.colours[view], x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return heard, _agree(colour, theirs, same, self.config.agree)
+        if offset is None:
+            offset = common_offset(colour_difference(colour, theirs), same, self.config.agree)
+        return _Word(heard, agree(colour, theirs, same, self.config.agree, offset), offset)
 
-    def _near(self, depth: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
-        """Which points of depth z lie on the surface of a depth map, bool; x and y are their places in it."""
-        there = cv2.remap(depth, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=-1.0)
+    def _near(self, there: np.ndarray, z: np.ndarray) -> np.ndarray:
+        """Which points of depth z lie where a view sees a surface of depth `there`, NaN or below 0 = none."""
         return (z > 0) & (there > 0) & (np.abs(z - there) < self.config.depth * there)
-
-
-def _agree(ours: np.ndarray, theirs: np.ndarray, same: np.ndarray, most: float) -> np.ndarray:
-    """Where two pictures [h, w, 3] uint8 show the same colour, bool [h, w]: at most `most` (of 1) apart.
-
-    What all of `same` have in common (the median difference of each channel) is exposure or weather and no
-    other content, but only if far more agree without it: before a crowd it is chance.
-    """
-    difference = np.subtract(ours, theirs, dtype=np.float32) / np.float32(255.0)
-    difference -= common_offset(difference, same, most)
-    return same & (np.abs(difference).mean(axis=2) < most)
-
-
-def common_offset(difference: np.ndarray, same: np.ndarray, most: float = 0.06) -> np.ndarray:
-    """What two pictures of the same surfaces differ by everywhere, [3] float32; zeros where that is chance.
-
-    Args:
-        difference: [h, w, 3] of their colours in [0, 1].
-        same: [h, w] bool, where they show the same surface.
-        most: difference up to which two colours are the same.
-    """
-    some = difference[::2, ::2][same[::2, ::2]]
-    if len(some):
-        common = np.median(some, axis=0)
-        as_they_are = np.count_nonzero(np.abs(some).mean(axis=1) < most)
-        if np.count_nonzero(np.abs(some - common).mean(axis=1) < most) > _FAR_MORE * as_they_are:
-            return common.astype(np.float32)
-    return np.zeros(3, np.float32)
-
-
-def _weight(seen: np.ndarray, agree: np.ndarray, config: MultiViewConfig) -> np.ndarray:
-    """How much the word of the others counts, [h, w] float32 in [0, 1], from bool maps [n, h, w]."""
-    count = seen.sum(axis=0)
-    share = agree.sum(axis=0) / np.maximum(count, 1)
-    weight = np.minimum(share / max(config.agreeing, 1e-6), 1.0)
-    return np.where(count < config.known_by, 1.0, weight).astype(np.float32)
 
 
 def discount(
@@ -250,20 +257,12 @@ def _small(photo: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return np.clip(np.rint(small * 255.0), 0, 255).astype(np.uint8)
 
 
-def quantile_of(stack: np.ndarray, quantile: float) -> np.ndarray:
-    """Quantile over the first axis of [n, h, w] of what is not NaN, linear between ranks; NaN where all is.
-
-    One sort: numpy's nanquantile takes fifty times as long on such a stack.
-    """
-    ordered = np.sort(stack, axis=0)  # NaN goes last
-    last = np.maximum((~np.isnan(stack)).sum(axis=0) - 1, 0)
-    rank = quantile * last
-    low = np.floor(rank).astype(np.int64)
-    high = np.minimum(low + 1, last)
-    share = (rank - low).astype(np.float32)
-    below = np.take_along_axis(ordered, low[None], axis=0)[0]
-    above = np.take_along_axis(ordered, high[None], axis=0)[0]
-    return below + share * (above - below)
+def _in_map(u: np.ndarray, v: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Columns and rows float32 in a map of the frame, for OpenCV, of places given as shares of the frame."""
+    # pixel centres lie at .5 in our cameras and at whole numbers for OpenCV
+    x = np.clip(u * shape[1] - 0.5, -9, shape[1] + 9)
+    y = np.clip(v * shape[0] - 0.5, -9, shape[0] + 9)
+    return x.astype(np.float32), y.astype(np.float32)
 
 
 def nearest_views(cameras: Sequence[Camera], count: int) -> list[list[int]]:

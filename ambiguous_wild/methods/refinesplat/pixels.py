@@ -13,7 +13,7 @@ import torch
 from ambiguous_wild.core import Camera
 from ambiguous_wild.methods.refinesplat.multiview import Elsewhere, Hearsay, MultiViewConfig, discount
 from ambiguous_wild.methods.refinesplat.structure import structure_residual, unrelated_residual
-from ambiguous_wild.vision.sparse_surface import in_frames
+from ambiguous_wild.vision.sparse_surface import seldom_seen
 
 _STATIC_QUANTILE = 0.25  # of a photo's pixels: static even where distractors cover two thirds of it
 
@@ -35,12 +35,11 @@ class PixelEvidence:
         self.photos = list(photos)
         self.config, self.base, self.least_alpha, self.memory = config, base, least_alpha, memory
         self.elsewhere = Elsewhere(cameras, self.photos, config, surfaces)
-        found = in_frames(cameras, surfaces) if config.seen_by > 0 else []
-        # view: [h, w] of any size, where too few others look for anything to be masked
+        # view: [h, w] uint8 of any size, 1 where too few others look for anything to be masked
         self.alone = {
-            view: few
-            for view, count in enumerate(found)
-            if count is not None and (few := (count < config.seen_by).astype(np.uint8)).any()
+            view: few.astype(np.uint8)
+            for view, few in enumerate(seldom_seen(cameras, surfaces, config.seen_by))
+            if few is not None and few.any()
         }
         self.unrelated = unrelated_residual(self.photos, base)
         self.normal: dict[int, float] = {}  # view: quantile of its residual that static pixels have
@@ -67,8 +66,9 @@ class PixelEvidence:
         photo = self.photos[view]
         size = (photo.shape[1], photo.shape[0])
         judged = _resized(alpha, size) >= self.least_alpha
-        if view in self.alone:
-            judged &= cv2.resize(self.alone[view], size, interpolation=cv2.INTER_NEAREST) == 0
+        unseen = self.unseen(view)
+        if unseen is not None:
+            judged &= ~unseen
         evidence = structure_residual(photo, _resized(image, size), self.base)
         evidence[~judged] = 0.0
         if self.memory > 0 and view in self.before:
@@ -79,11 +79,19 @@ class PixelEvidence:
             mean_depth = np.where(alpha > 1e-3, depth / np.maximum(alpha, 1e-3), 0.0)
             others = self._others(view, evidence, mean_depth, remember)
         if remember:
-            self.normal[view] = normal
+            if judged.any():
+                self.normal[view] = normal
             if self.memory > 0:
                 self.before[view] = evidence.astype(np.float16)
         unit = self._unit(normal)
         return discount(evidence, others, unit, self.config) / unit
+
+    def unseen(self, view: int) -> np.ndarray | None:
+        """Where too few others look for anything to be masked, [H, W] bool of the photo; None: nowhere."""
+        if view not in self.alone:
+            return None
+        size = self.photos[view].shape[1::-1]
+        return cv2.resize(self.alone[view], size, interpolation=cv2.INTER_NEAREST) > 0
 
     def ceiling(self, view: int, share: float, least: float = 0.0) -> float:
         """That share of what unrelated content gives, in units, as `look` of the view divided by; 0 = inf.

@@ -57,6 +57,7 @@ class RefineSplatMask(MaskPolicy):
         self.shares: dict[int, tuple[float, float, float, float]] = {}  # view: final, local, global, T_ent
         self.judged: dict[int, Judged] = {}  # view: its instances when its mask was last made
         self.last_reset = 0  # iteration, 0 = never
+        self.looks: dict[int, FirstLook] = {}  # view: what other photos say of it, where they can tell
 
     def setup(self, data: TrainData) -> None:
         self.data = data
@@ -75,7 +76,6 @@ class RefineSplatMask(MaskPolicy):
             memory=config.mask.memory,
             surfaces=surfaces,
         )
-        self.looks: dict[int, FirstLook] = {}  # view: what other photos say of it, where they can tell
         if config.first_look.on:
             found = first_look(data.cameras, photos, surfaces, config.first_look)
             self.looks = {view: look for view, look in enumerate(found) if look is not None}
@@ -176,7 +176,7 @@ class RefineSplatMask(MaskPolicy):
             remember: whether other views hear what this one shows; else nothing is kept.
         """
         inputs, view, mask = self.inputs, step.view, self.config.mask
-        ceiling = math.inf
+        ceiling, unseen = math.inf, None
         if mask.statistic == "structure":
             rendered = step.rendered
             evidence = self.pixels.look(
@@ -192,11 +192,12 @@ class RefineSplatMask(MaskPolicy):
                 evidence = scaled_by(evidence, self.compare(step).statistic, mask.entropy_weight)
             maps = Maps(evidence, evidence)
             ceiling = self.pixels.ceiling(view, mask.ceiling, mask.ceiling_least)
+            unseen = self.pixels.unseen(view)
         else:
             maps = self.compare(step)
         others = [self.judged[v] for v in sorted(self.judged) if v != view]
         labels, static = inputs.labels[view], inputs.static[view]
-        return maps, make_masks(maps, labels, static, others, self.w2, mask, ceiling)
+        return maps, make_masks(maps, labels, static, others, self.w2, mask, ceiling, unseen)
 
     @torch.no_grad()
     def compare(self, step: Step) -> Maps:

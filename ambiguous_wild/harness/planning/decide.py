@@ -14,9 +14,9 @@ Answer = Literal["on", "off", "unknown"]
 SCHEMA = 1
 
 # Set on tracks with the effect injected and without (tests/harness/test_planning.py) and on the captures of
-# docs/effects.md; between "on" and "off" there lies a factor of two at least.
+# docs/effects.md, which says how near to them what was measured lies.
 EXPOSURE = 0.05
-APPEARANCE = 0.15
+APPEARANCE = 0.07
 SAMPLING = 2.0
 VIEW_DEPENDENCE = 0.015
 REPROJECTION_PX = 1.0

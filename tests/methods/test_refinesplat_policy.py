@@ -184,6 +184,52 @@ def test_nothing_before_the_warm_up_and_old_masks_during_a_pause(scene):
     assert not torch.equal(after, before)
 
 
+def sparse_wall(scene) -> TrainData:
+    """The scene with its points on a wall before all cameras, which stand side by side."""
+    data = scene.data
+    poses = [np.eye(4) for _ in data.cameras]
+    for view, pose in enumerate(poses):
+        pose[0, 3] = -0.48 * view  # 12 px at a depth of 4
+    cameras = [dataclasses.replace(c, cam_from_world=p) for c, p in zip(data.cameras, poses)]
+    x, y = np.meshgrid(np.linspace(-4, 6, 40), np.linspace(-2, 2, 16))
+    points = Points(
+        xyz=np.stack([x.ravel(), y.ravel(), np.full(x.size, 4.0)], 1),
+        rgb=np.zeros((x.size, 3), np.uint8),
+        error_px=np.zeros(x.size),
+        track_offsets=np.zeros(x.size + 1, np.int64),
+        track_views=np.zeros(0, np.int32),
+        track_xy=np.zeros((0, 2), np.float32),
+    )
+    return dataclasses.replace(data, cameras=cameras, scene=dataclasses.replace(data.scene, points=points))
+
+
+def test_the_first_look_the_ceiling_and_the_sparse_points_reach_the_masks(scene):
+    data = sparse_wall(scene)
+    look = dataclasses.replace(FAST.first_look, least=0.0, threshold=0.1, normal=1.0, known_by=1)
+
+    def examined(**changes):
+        config = dataclasses.replace(FAST, first_look=look)
+        policy = RefineSplatMask(dataclasses.replace(config, **changes))
+        policy.setup(data)
+        step = step_of(data, 1, blurred(scene.clean[1], 3))
+        return policy, *policy.examine(step, remember=True)
+
+    policy, maps, _ = examined()
+    factor = policy.looks[1].factor(look.weight, (HEIGHT, WIDTH))
+    assert factor.max() > 1.4 and factor.min() < 0.7
+    _, alone, _ = examined(first_look=dataclasses.replace(look, weight=1.0))
+    assert np.allclose(maps.statistic, alone.statistic * factor, rtol=1e-5)
+    assert policy.pixels.elsewhere.static[0] is not None and 0 in policy.pixels.alone
+    low = dataclasses.replace(FAST.mask, ceiling=1e-6, least=50.0)
+    for least in (7.0, 9.0):
+        _, _, masks = examined(mask=dataclasses.replace(low, ceiling_least=least))
+        assert masks.cut.threshold == pytest.approx(least)
+    unseen = policy.pixels.unseen(0)
+    step = step_of(data, 0, torch.zeros(HEIGHT, WIDTH, 3))  # nothing of what the photo shows
+    keep = policy.examine(step)[1].keep
+    assert unseen.any() and (keep[unseen] == 1.0).all() and keep.min() == 0.0
+
+
 @BOTH
 def test_a_render_that_shows_nothing_masks_at_most_the_stated_share(scene, config):
     policy = fresh(scene, config)

@@ -15,7 +15,14 @@ import cv2
 import numpy as np
 
 from ambiguous_wild.core import Camera, Scene, View
-from ambiguous_wild.vision.sparse_surface import BEHIND, in_map, inverse_depth, some_points, world_points
+from ambiguous_wild.vision.sparse_surface import (
+    BEHIND,
+    in_map,
+    inside,
+    inverse_depth,
+    some_points,
+    world_points,
+)
 
 COVERED_FROM = 0.5  # share of the train views that look at it
 
@@ -88,8 +95,8 @@ def _seen(
         nearest = _look_up(depth, x, y, ahead)
         sees &= ~(nearest * z > BEHIND)  # NaN: nothing is known to stand before it
     x, y = in_map(camera, local, mask.shape)
-    inside = (x >= -0.5) & (x < mask.shape[1] - 0.5) & (y >= -0.5) & (y < mask.shape[0] - 0.5)
-    return sees & inside, _look_up(mask.astype(np.uint8), x, y, ahead & inside) > 0
+    held = inside(x, y, mask.shape)
+    return sees & held, _look_up(mask.astype(np.uint8), x, y, ahead & held) > 0
 
 
 def _look_up(picture: np.ndarray, x: np.ndarray, y: np.ndarray, where: np.ndarray) -> np.ndarray:

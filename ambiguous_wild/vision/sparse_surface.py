@@ -105,7 +105,7 @@ def _in_frame(camera: Camera, world: np.ndarray) -> np.ndarray:
     """Which world points [N, 3] lie in the camera's frame, [N] bool."""
     local = world @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
     x, y = in_map(camera, local, (camera.height, camera.width))
-    return (x >= -0.5) & (x < camera.width - 0.5) & (y >= -0.5) & (y < camera.height - 0.5)
+    return inside(x, y, (camera.height, camera.width))
 
 
 def world_points(camera: Camera, inverse: np.ndarray) -> np.ndarray:
@@ -125,6 +125,11 @@ def in_map(camera: Camera, local: np.ndarray, shape: tuple[int, ...]) -> tuple[n
     x = (local[..., 0] / z * camera.fx + camera.cx) * (shape[1] / camera.width) - 0.5
     y = (local[..., 1] / z * camera.fy + camera.cy) * (shape[0] / camera.height) - 0.5
     return x, y
+
+
+def inside(x: np.ndarray, y: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Which places of `in_map` the map holds, bool; NaN is nowhere."""
+    return (x >= -0.5) & (x < shape[1] - 0.5) & (y >= -0.5) & (y < shape[0] - 0.5)
 
 
 def _in_front(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:

@@ -163,8 +163,8 @@ def test_exposure_and_white_balance_are_no_other_content():
     everywhere = np.ones(ours.shape[:2], bool)
 
     def alike(theirs, same=everywhere):
-        offset = common_offset(colour_difference(ours, theirs), same)
-        return agree(ours, theirs, same, 0.06, offset)
+        difference = colour_difference(ours, theirs)
+        return agree(difference, same, 0.06, common_offset(difference, same))
 
     found = alike(brighter)
     assert found[8:, 8:].all()

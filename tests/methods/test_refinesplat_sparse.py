@@ -9,19 +9,9 @@ from ambiguous_wild.methods.refinesplat.evidence import Maps, make_masks
 from ambiguous_wild.methods.refinesplat.multiview import Elsewhere, MultiViewConfig
 from ambiguous_wild.methods.refinesplat.pixels import PixelEvidence
 from ambiguous_wild.vision.sparse_surface import seldom_seen, static_surfaces
+from tests.methods.test_refinesplat_pixels import PLANE, H, W, camera, noise
 
-H, W, FOCAL, PLANE = 40, 64, 60.0, 5.0
 CAR = np.s_[12:28, 20:44]
-
-
-def camera(x: float) -> Camera:
-    pose = np.eye(4)
-    pose[0, 3] = -x
-    return Camera(W, H, FOCAL, FOCAL, W / 2, H / 2, pose)
-
-
-def noise(seed: int, *shape: int) -> np.ndarray:
-    return np.random.default_rng(seed).random(shape).astype(np.float32)
 
 
 def slope(cam: Camera, shape: tuple[int, int]) -> np.ndarray:

@@ -7,18 +7,16 @@ import numpy as np
 _FAR_MORE = 1.5  # times as many pixels
 
 
-def agree(
-    ours: np.ndarray, theirs: np.ndarray, same: np.ndarray, most: float, offset: np.ndarray
-) -> np.ndarray:
-    """Where two pictures [h, w, 3] uint8 show the same colour, bool [h, w].
+def agree(difference: np.ndarray, same: np.ndarray, most: float, offset: np.ndarray) -> np.ndarray:
+    """Where two pictures show the same colour, bool [h, w].
 
     Args:
-        ours, theirs: the pictures.
+        difference: [h, w, 3] of their colours (`colour_difference`).
         same: [h, w] bool, where they show the same surface.
         most: difference in [0, 1] up to which two colours are the same.
         offset: [3], what they differ by everywhere (`common_offset`).
     """
-    return same & (np.abs(colour_difference(ours, theirs) - offset).mean(axis=2) < most)
+    return same & (np.abs(difference - offset).mean(axis=2) < most)
 
 
 def colour_difference(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
@@ -54,11 +52,11 @@ def word_weight(
     Args:
         seen: [n, h, w] bool, who sees the surface.
         agreeing: [n, h, w] bool, who sees it in the same colour.
-        enough: share of those who see it that must agree for their word to count whole.
+        enough: above 0, share of those who see it that must agree for their word to count whole.
         heard_anyway: [h, w] bool, where it counts whole whatever they show.
     """
     share = agreeing.sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
-    weight = np.minimum(share / max(enough, 1e-6), 1.0)
+    weight = np.minimum(share / enough, 1.0)
     return np.where(heard_anyway, 1.0, weight).astype(np.float32)
 
 

@@ -217,9 +217,10 @@ class Elsewhere:
         if self.config.agree <= 0:
             return _Word(heard, same, np.zeros(3, np.float32))
         theirs = cv2.remap(self.colours[view], x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        difference = colour_difference(colour, theirs)
         if offset is None:
-            offset = common_offset(colour_difference(colour, theirs), same, self.config.agree)
-        return _Word(heard, agree(colour, theirs, same, self.config.agree, offset), offset)
+            offset = common_offset(difference, same, self.config.agree)
+        return _Word(heard, agree(difference, same, self.config.agree, offset), offset)
 
     def _near(self, there: np.ndarray, z: np.ndarray) -> np.ndarray:
         """Which points of depth z lie where a view sees a surface of depth `there`, NaN or below 0 = none."""

@@ -74,7 +74,7 @@ class _Scene:
     """The place as this photo finds it."""
 
     static: ShapeTable
-    shadowed: ShapeTable | None  # with what throws the moving shadow
+    thrown: ShapeTable | None  # what throws the moving shadow
     light: Light
 
 
@@ -92,11 +92,8 @@ def develop(spec: CaptureSpec, world: World, shot: Shot, moment: Moment) -> Deve
     scene = _lit(wanted, world, moment, done)
     move, camera, light = _optics(wanted, shot.camera, scene.light, moment, done)
     things = movers(spec, shot.placements, world)
-    seen = trace(camera, scene.shadowed or scene.static, things, world.atlas, light)
-    bright = (
-        seen if scene.shadowed is None else trace(camera, scene.static, _nobody(world), world.atlas, light)
-    )
-    distracted, clean, owner, shadow = _moved(move, seen, bright, scene.shadowed is not None)
+    seen = trace(camera, scene.static, things, world.atlas, light, scene.thrown)
+    distracted, clean, owner, shadow = _moved(move, seen)
     expose = _exposure(wanted, shot.camera, moment, done)
     clean_pixels = _to_uint8(expose(clean))
     pixels = clean_pixels if distracted is clean else _to_uint8(expose(distracted))
@@ -123,7 +120,7 @@ def _nobody(world: World) -> ShapeTable:
 
 def _lit(wanted: Effects, world: World, moment: Moment, done: dict[str, Any]) -> _Scene:
     shapes: list[Shape] = list(world.shapes)
-    light, shadowed = world.light, None
+    light, thrown = world.light, None
     if wanted.time_of_day is not None:
         day = wanted.time_of_day
         hour = time_of_day.draw(day, moment)
@@ -136,10 +133,9 @@ def _lit(wanted: Effects, world: World, moment: Moment, done: dict[str, Any]) ->
         done["specular"] = {}
     if wanted.moving_shadow is not None:
         lobes = moving_shadow.draw(wanted.moving_shadow, moment)
-        thrown = moving_shadow.moving_shadow(lobes, light.sun.mean(0))
-        shadowed = shape_table([*shapes, *thrown], world.atlas)
+        thrown = shape_table(moving_shadow.moving_shadow(lobes, light.sun.mean(0)), world.atlas)
         done["moving_shadow"] = {"lobes": [list(lobe) for lobe in lobes]}
-    return _Scene(shape_table(shapes, world.atlas), shadowed, light)
+    return _Scene(shape_table(shapes, world.atlas), thrown, light)
 
 
 def _sky(shape: Shape, gain: np.ndarray) -> Shape:
@@ -207,11 +203,10 @@ def _sources(
 
 
 def _moved(
-    move: Picture | None, seen: Traced, bright: Traced, shadowed: bool
+    move: Picture | None, seen: Traced
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
     """Distracted, clean, owner and shadow on the sensor: equal to the bit where nothing differs."""
-    clean, owner = bright.clean, seen.owner
-    shadow = (seen.clean != bright.clean).any(-1) if shadowed else None
+    clean, owner, shadow = seen.clean, seen.owner, seen.shadow
     if move is None:
         return seen.distracted, clean, owner, shadow
     clean = move(clean)

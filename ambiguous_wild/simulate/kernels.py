@@ -241,8 +241,11 @@ def _gloss(strength, sharpness, n, d, sun, sunlit, light):
 
 @forgiving
 @numba.njit(cache=True, error_model="numpy", inline="never")
-def shade(table, s, t, o, d, spread, atlas, light, sun, blockers, others, use_others):
-    """Colour of shape s at distance t: texture, sun with shadow, sky light from above and below."""
+def shade(table, s, t, o, d, spread, atlas, light, sun, blockers, others, use_others, thrown):
+    """Colour of shape s at distance t: texture, sun with shadow, sky light from above and below.
+
+    Twice: as it is, and as it were without the shadows of `thrown`; the same numbers where none falls.
+    """
     kind, half, mapping, uv, tint = table[0][s], table[3], table[6][s], table[7], table[8]
     lo, ld = _local(table, s, o[0], o[1], o[2], True), _local(table, s, d[0], d[1], d[2], False)
     p = (lo[0] + t * ld[0], lo[1] + t * ld[1], lo[2] + t * ld[2])
@@ -255,7 +258,8 @@ def shade(table, s, t, o, d, spread, atlas, light, sun, blockers, others, use_ot
         v = math.asin(min(max(p[2] / h[2], 0.0), 1.0)) / (0.5 * math.pi)
         lod = math.log2(max(spread * atlas[2][texture, 0] / (2 * math.pi), 1e-6))
         r, g, b = _sample(atlas, texture, u, v, lod)
-        return r * tint[s, 0], g * tint[s, 1], b * tint[s, 2]
+        sky = (r * tint[s, 0], g * tint[s, 1], b * tint[s, 2])
+        return sky, sky
     a, b_ = p[0], p[1]
     if mapping == BY_FACE:
         ax, ay, az = abs(n[0]), abs(n[1]), abs(n[2])
@@ -272,22 +276,36 @@ def shade(table, s, t, o, d, spread, atlas, light, sun, blockers, others, use_ot
     wx = rot[s, 0, 0] * n[0] + rot[s, 1, 0] * n[1] + rot[s, 2, 0] * n[2]
     wy = rot[s, 0, 1] * n[0] + rot[s, 1, 1] * n[1] + rot[s, 2, 1] * n[2]
     wz = rot[s, 0, 2] * n[0] + rot[s, 1, 2] * n[1] + rot[s, 2, 2] * n[2]
-    up = 0.5 + 0.5 * wz
     lit = wx * sun[0] + wy * sun[1] + wz * sun[2]
+    darkened = False
     if lit > 0.0:
         lift = 2e-3
         q = (o[0] + t * d[0] + lift * wx, o[1] + t * d[1] + lift * wy, o[2] + t * d[2] + lift * wz)
         if _shadowed(blockers, q, sun) or (use_others and _shadowed(others, q, sun)):
             lit = 0.0
+        else:
+            darkened = _shadowed(thrown, q, sun)
     else:
         lit = 0.0
+    base, tone, normal = (r, g, b), (tint[s, 0], tint[s, 1], tint[s, 2]), (wx, wy, wz)
+    polish = (table[11][s, 0], table[11][s, 1])
+    bright = _lit(base, tone, polish, normal, d, sun, lit, light)
+    if darkened:
+        return _lit(base, tone, polish, normal, d, sun, 0.0, light), bright
+    return bright, bright
+
+
+@forgiving
+@numba.njit(cache=True, error_model="numpy", inline="never")
+def _lit(base, tone, polish, n, d, sun, lit, light):
+    """A surface of that texture, tint and polish under so much sun and the whole sky."""
+    up = 0.5 + 0.5 * n[2]
     sun_colour, sky, ground = light[1], light[2], light[3]
-    if table[11][s, 0] > 0.0:
-        gr, gg, gb = _gloss(table[11][s, 0], table[11][s, 1], (wx, wy, wz), d, sun, lit > 0.0, light)
-    else:
-        gr, gg, gb = 0.0, 0.0, 0.0
+    gr, gg, gb = 0.0, 0.0, 0.0
+    if polish[0] > 0.0:
+        gr, gg, gb = _gloss(polish[0], polish[1], n, d, sun, lit > 0.0, light)
     return (
-        gr + r * tint[s, 0] * (lit * sun_colour[0] + up * sky[0] + (1 - up) * ground[0]),
-        gg + g * tint[s, 1] * (lit * sun_colour[1] + up * sky[1] + (1 - up) * ground[1]),
-        gb + b * tint[s, 2] * (lit * sun_colour[2] + up * sky[2] + (1 - up) * ground[2]),
+        gr + base[0] * tone[0] * (lit * sun_colour[0] + up * sky[0] + (1 - up) * ground[0]),
+        gg + base[1] * tone[1] * (lit * sun_colour[1] + up * sky[1] + (1 - up) * ground[1]),
+        gb + base[2] * tone[2] * (lit * sun_colour[2] + up * sky[2] + (1 - up) * ground[2]),
     )

@@ -76,22 +76,33 @@ class Traced:
 
     clean: np.ndarray  # [H, W, 3] float32
     distracted: np.ndarray  # [H, W, 3] float32
+    shadow: np.ndarray | None  # [H, W] bool: where `thrown` darkens the static world; None: there was none
     owner: np.ndarray  # [H, W] uint8: the first distractor hit by any sample of the pixel, 0 = none
     depth_m: np.ndarray  # [H, W] float32: z of the static surface, mean over the samples
 
 
-def trace(camera: Camera, static: ShapeTable, movers: ShapeTable, atlas: Atlas, light: Light) -> Traced:
+def trace(
+    camera: Camera,
+    static: ShapeTable,
+    movers: ShapeTable,
+    atlas: Atlas,
+    light: Light,
+    thrown: ShapeTable | None = None,
+) -> Traced:
     """Render static world and movers with as many samples a pixel as the light has sun directions.
 
     Args:
         camera: OpenCV axes; rays start at its centre, pixel centres at +0.5.
         static: the world; movers: what stands in it for this photo only.
         light: ``len(light.sun)`` must be a square number (the samples lie on a regular grid).
+        thrown: nobody sees it; its shadow falls on everything in the distracted picture, on nothing in the
+            clean one.
     """
     side = math.isqrt(len(light.sun))
     shape = (camera.height, camera.width)
     clean, distracted = np.zeros((*shape, 3), np.float32), np.zeros((*shape, 3), np.float32)
     owner, depth = np.zeros(shape, np.uint8), np.zeros(shape, np.float32)
+    darkened = np.zeros(shape, np.bool_)
     _trace(
         (
             np.ascontiguousarray(camera.cam_from_world[:3, :3]),
@@ -101,11 +112,16 @@ def trace(camera: Camera, static: ShapeTable, movers: ShapeTable, atlas: Atlas, 
         ),
         static.columns(),
         movers.columns(),
+        (_none_of(static) if thrown is None else thrown).columns(),
         (atlas.texels, atlas.offset, atlas.width, atlas.height, atlas.levels),
         (light.sun, light.sun_colour, light.sky_colour, light.ground_colour),
-        (clean, distracted, owner, depth),
+        (clean, distracted, owner, depth, darkened),
     )
-    return Traced(clean, distracted, owner, depth)
+    return Traced(clean, distracted, None if thrown is None else darkened, owner, depth)
+
+
+def _none_of(table: ShapeTable) -> ShapeTable:
+    return ShapeTable(*(column[:0] for column in table.columns()))
 
 
 @forgiving
@@ -144,22 +160,22 @@ def _ray(rotation, k, u, v):
 
 @forgiving
 @numba.njit(cache=True, error_model="numpy", parallel=True)
-def _trace(view, static, movers, atlas, light, frame):
+def _trace(view, static, movers, thrown, atlas, light, frame):
     height, width = frame[2].shape
     across = (width + _TILE - 1) // _TILE
     down = (height + _TILE - 1) // _TILE
     for tile in numba.prange(across * down):
         x0, y0 = (tile % across) * _TILE, (tile // across) * _TILE
         x1, y1 = min(x0 + _TILE, width), min(y0 + _TILE, height)
-        _tile(view, (x0, y0, x1, y1), static, movers, atlas, light, frame)
+        _tile(view, (x0, y0, x1, y1), static, movers, thrown, atlas, light, frame)
 
 
 @forgiving
 @numba.njit(cache=True, error_model="numpy", inline="never")
-def _tile(view, box, static, movers, atlas, light, frame):
+def _tile(view, box, static, movers, thrown, atlas, light, frame):
     rotation, eye, k, side = view
     x0, y0, x1, y1 = box
-    clean, distracted, owner, depth = frame
+    clean, distracted, owner, depth, darkened = frame
     o = (eye[0], eye[1], eye[2])
     spread = 1.0 / (k[0] * side)
     share = 1.0 / (side * side)
@@ -176,31 +192,38 @@ def _tile(view, box, static, movers, atlas, light, frame):
     mover_count = _cull(movers, o, axis, cone, near_movers)
     for i in range(y0, y1):
         for j in range(x0, x1):
-            cr, cg, cb, mr, mg, mb, z_sum = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            cr, cg, cb, sr, sg, sb, mr, mg, mb = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            z_sum = 0.0
             who = 0
             for n in range(side * side):
                 u, v = j + (n % side + 0.5) / side, i + (n // side + 0.5) / side
                 d, z = _ray(rotation, k, u, v)
                 sun = (light[0][n, 0], light[0][n, 1], light[0][n, 2])
                 t, s = nearest(static, near_static, static_count, o, d, FAR)
-                r, g, b = 0.0, 0.0, 0.0
+                seen, bright = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
                 if s >= 0:
-                    r, g, b = shade(static, s, t, o, d, spread, atlas, light, sun, static, static, False)
+                    seen, bright = shade(
+                        static, s, t, o, d, spread, atlas, light, sun, static, static, False, thrown
+                    )
                     z_sum += t * z
-                cr, cg, cb = cr + r, cg + g, cb + b
+                cr, cg, cb = cr + bright[0], cg + bright[1], cb + bright[2]
+                sr, sg, sb = sr + seen[0], sg + seen[1], sb + seen[2]
                 if mover_count > 0:
                     tm, m = nearest(movers, near_movers, mover_count, o, d, t)
                     if m >= 0:
-                        r, g, b = shade(movers, m, tm, o, d, spread, atlas, light, sun, static, movers, True)
+                        seen, _ = shade(
+                            movers, m, tm, o, d, spread, atlas, light, sun, static, movers, True, thrown
+                        )
                         who = movers[10][m] if who == 0 else who
-                mr, mg, mb = mr + r, mg + g, mb + b
+                mr, mg, mb = mr + seen[0], mg + seen[1], mb + seen[2]
             clean[i, j, 0], clean[i, j, 1], clean[i, j, 2] = cr * share, cg * share, cb * share
+            # where nobody is, the same float, not one that should be equal
+            distracted[i, j, 0], distracted[i, j, 1] = sr * share, sg * share
+            distracted[i, j, 2] = sb * share
+            for a in range(3):
+                darkened[i, j] |= distracted[i, j, a] != clean[i, j, a]
+            if who > 0:
+                distracted[i, j, 0], distracted[i, j, 1] = mr * share, mg * share
+                distracted[i, j, 2] = mb * share
             depth[i, j] = z_sum * share
             owner[i, j] = who
-            if who > 0:
-                distracted[i, j, 0] = mr * share
-                distracted[i, j, 1] = mg * share
-                distracted[i, j, 2] = mb * share
-            else:  # the same float, not one that should be equal
-                for a in range(3):
-                    distracted[i, j, a] = clean[i, j, a]

@@ -10,7 +10,7 @@ import pytest
 from ambiguous_wild.core import Camera
 from ambiguous_wild.simulate.atlas import build_atlas, linear_to_srgb, srgb_to_linear
 from ambiguous_wild.simulate.kernels import BOX, CAPSULE, CYLINDER, ELLIPSOID, FAR, PLANAR, QUAD, _intersect
-from ambiguous_wild.simulate.shapes import Shape, between, bounding_radius, placed, shape_table
+from ambiguous_wild.simulate.shapes import UNSEEN, Shape, between, bounding_radius, placed, shape_table
 from ambiguous_wild.simulate.tracer import Light, trace
 from ambiguous_wild.simulate.walk import look_at
 
@@ -78,6 +78,24 @@ def test_both_pictures_agree_to_the_bit_where_no_distractor_was_hit() -> None:
     np.testing.assert_array_equal(seen.clean, alone.clean)  # a mover changes nothing of the static scene
     assert (np.abs(seen.distracted - seen.clean)[hit].sum(1) > 1e-4).mean() > 0.99
     assert not alone.owner.any()
+
+
+def test_a_thrown_shadow_in_the_same_pass_is_that_of_a_pass_of_its_own() -> None:
+    static, moving, light, textures = _scene()
+    atlas = build_atlas(textures)
+    nobody, people = shape_table([], atlas), shape_table(moving, atlas)
+    x, y, z = 6.0 * light.sun[0]
+    cloud = Shape(ELLIPSOID, (x + 0.3, y + 0.5, z), (0.9, 0.6, 0.4), "thing", owner=UNSEEN)
+    thrown = shape_table([cloud], atlas)
+    seen = trace(_camera(), shape_table(static, atlas), people, atlas, light, thrown)
+    shaded = trace(_camera(), shape_table([*static, cloud], atlas), people, atlas, light)
+    free = trace(_camera(), shape_table(static, atlas), nobody, atlas, light)
+    np.testing.assert_array_equal(seen.clean, free.clean)
+    np.testing.assert_array_equal(seen.distracted, shaded.distracted)
+    np.testing.assert_array_equal(seen.owner, shaded.owner)
+    np.testing.assert_array_equal(seen.shadow, (shaded.clean != free.clean).any(-1))
+    assert seen.shadow is not None and 0.01 < seen.shadow.mean() < 0.5
+    assert shaded.shadow is None and free.shadow is None
 
 
 def test_a_distractor_behind_a_static_thing_is_not_seen() -> None:

@@ -13,6 +13,7 @@ from ambiguous_wild.core.config import to_plain
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.io.colmap_model import Model
 
+LEAST_PARALLAX_DEG = 1.5  # what COLMAP itself asks of a point
 SFM_STAGES = ("features", "matches", "mapping")
 
 
@@ -75,7 +76,12 @@ def account(
         "models": mapping["models"],
         "lost": lost,
         "skipped": screened["skipped"],
-        "warnings": [*screened["warnings"], *_model_warnings(mapping["models"], best), *warnings],
+        "warnings": [
+            *screened["warnings"],
+            *_model_warnings(mapping["models"], best),
+            *_turned(model),
+            *warnings,
+        ],
         "photos": {f"{f['stem']}.png": _photo(f, sides, features["features"]) for f in facts},
         "masks": masks,
         "truth": truth,
@@ -157,4 +163,16 @@ def _model_warnings(listing: list[dict[str, Any]], best: int) -> list[str]:
         return []
     return [
         f"the capture fell apart into {len(listing)} models; the largest is used, left out: {', '.join(rest)}"
+    ]
+
+
+def _turned(model: Model) -> list[str]:
+    from ambiguous_wild.builder.select_model import parallax_deg
+
+    angle = parallax_deg(model)
+    if not angle < LEAST_PARALLAX_DEG:
+        return []
+    return [
+        f"the camera hardly moved: half of the points are seen under less than {angle:.2f} deg, so their "
+        "depth is a guess and views from aside will be wrong; walk between photos"
     ]

@@ -19,6 +19,7 @@ from ambiguous_wild.io.colmap_model import Model, read_model
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 MIN_SHARE = 0.3  # of the readable photos; below it a scene would not show the place
+MIN_POINTS = 10  # of a placed photo; fewer fix neither the poses nor where surfaces are
 _STRONG_PAIRS = 60  # looked at for the diagnosis
 _MAX_PAIR_ID = 2147483647  # COLMAP: pair id = id1 * this + id2
 
@@ -80,7 +81,7 @@ def check_registered(
     matches: dict[str, Any],
     remarks: Sequence[str] = (),
 ) -> None:
-    """Refuse a reconstruction that holds too few photos to be a scene.
+    """Refuse a reconstruction that holds too few photos or points to be a scene.
 
     Args:
         listing: the models.
@@ -94,18 +95,39 @@ def check_registered(
         AwError: how many of how many, the figures, the likely reason, what to try.
     """
     registered = max((m["images"] for m in listing), default=0)
+    points = max((m["points"] for m in listing if m["images"] == registered), default=0)
     needed = max(MIN_PHOTOS, math.ceil(MIN_SHARE * photos))
-    if registered >= needed:
+    few = points < MIN_POINTS * registered
+    if registered >= needed and not few:
         return
     facts = pair_facts(database, matches["pairs"])
     others = sum(m["images"] for m in listing) - registered
     split = f" ({others} more in {len(listing) - 1} other models)" if len(listing) > 1 else ""
     unread = f", {skipped} were left out" if skipped else ""
+    found = f"{registered} of {photos} photos" + f" with {points} points" * few
+    wanted = f"{needed}" + f" and {MIN_POINTS} points a photo" * few
     raise AwError(
-        f"structure from motion placed {registered} of {photos} photos{split}{unread}; a scene needs "
-        f"{needed}: {facts.sentence()}; likely {facts.reason(photos)}"
-        + "".join(f"; {remark}" for remark in remarks)
+        f"structure from motion placed {found}{split}{unread}; a scene needs {wanted}: "
+        f"{facts.sentence()}; likely {facts.reason(photos)}" + "".join(f"; {remark}" for remark in remarks)
     )
+
+
+def parallax_deg(model: Model) -> float:
+    """Median over points of the widest angle from the first ray that found it; NaN without points."""
+    points = model.points
+    owner = np.repeat(np.arange(len(points.xyz)), np.diff(points.track_offsets))
+    numbers = sorted(model.images)
+    at = {number: k for k, number in enumerate(numbers)}
+    poses = np.array([model.images[n].cam_from_world() for n in numbers]).reshape(-1, 4, 4)
+    centres = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+    rows = np.array([at[int(i)] for i in points.track_image_ids], dtype=np.intp)
+    rays = centres[rows] - points.xyz[owner]
+    rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
+    # the widest of all pairs is at most twice that, and costs the square
+    first = rays[points.track_offsets[owner]]
+    angles = np.zeros(len(points.xyz))
+    np.maximum.at(angles, owner, np.arccos(np.clip((rays * first).sum(axis=1), -1.0, 1.0)))
+    return math.degrees(float(np.median(angles))) if len(angles) else math.nan
 
 
 def pair_facts(database: Path, tried: int) -> PairFacts:

@@ -1,9 +1,17 @@
 import dataclasses
 import sqlite3
 
+import numpy as np
 import pytest
 
-from ambiguous_wild.builder.select_model import PairFacts, check_registered, choose_model, lost_photos
+from ambiguous_wild.builder.report import _turned
+from ambiguous_wild.builder.select_model import (
+    PairFacts,
+    check_registered,
+    choose_model,
+    lost_photos,
+    parallax_deg,
+)
 from ambiguous_wild.core import AwError
 from tests.io.model_maker import make_model, write_binary
 
@@ -86,3 +94,39 @@ def test_enough_photos_pass_and_the_share_counts(tmp_path):
             check_registered(listing(8, 3), 29, 0, tmp_path / "x.db", {"pairs": 45})
         with pytest.raises(AwError, match=r"placed 0 of 4 photos, 2 were left out.*needs 3"):
             check_registered([], 4, 2, tmp_path / "x.db", {"pairs": 6})
+
+
+def test_photos_placed_without_points_are_no_scene(tmp_path):
+    import ambiguous_wild.builder.select_model as module
+
+    empty = [{"model": 0, "images": 4, "points": 0, "error_px": 0.0, "track_length": 0.0}]
+    turned = dataclasses.replace(FACTS, verified=12, degenerate=1.0, angle_deg=0.3)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "pair_facts", lambda *_: turned)
+        with pytest.raises(
+            AwError, match=r"placed 4 of 12 photos with 0 points.*needs 4 and 10 points.*only turned"
+        ):
+            check_registered(empty, 12, 0, tmp_path / "x.db", {"pairs": 66})
+    empty[0]["points"] = 40
+    check_registered(empty, 12, 0, tmp_path / "unused.db", {"pairs": 66})
+
+
+def test_parallax_is_the_angle_under_which_points_are_seen():
+    names = [f"{k}.jpg" for k in range(8)]
+    model = make_model(names, points=300)
+    # cameras 0.7 apart at the most, points 4 to 6 away
+    expected = []
+    centres = {i.image_id: -i.tvec for i in model.images.values()}
+    for k in range(300):
+        ids = model.points.track_image_ids[slice(*model.points.track_offsets[k : k + 2])]
+        rays = [centres[int(i)] - model.points.xyz[k] for i in ids]
+        units = [r / np.linalg.norm(r) for r in rays]
+        expected.append(max(np.degrees(np.arccos(min(float(units[0] @ u), 1.0))) for u in units))
+    assert parallax_deg(model) == pytest.approx(float(np.median(expected)), abs=1e-6)
+    assert 3.0 < parallax_deg(model) < 9.0
+    still = make_model(names, points=300)
+    for image in still.images.values():
+        image.tvec[:] *= 1e-3
+    assert parallax_deg(still) < 0.01
+    assert _turned(model) == [] and "hardly moved" in _turned(still)[0]
+    assert np.isnan(parallax_deg(make_model(names, points=0))) and _turned(make_model(names, points=0)) == []

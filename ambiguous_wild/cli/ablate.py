@@ -11,22 +11,21 @@ from pathlib import Path
 import click
 
 from ambiguous_wild.cli.options import training_options
+from ambiguous_wild.cli.paths import PathName
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.methods.ablation import Group
 
 
 @click.command(name="ablate")
 @click.option("--method", default="refinesplat", show_default=True, help="A method that declares ablations.")
-@click.option(
-    "--scene", "scenes", multiple=True, type=click.Path(path_type=Path), help="A scene folder; repeatable."
-)
+@click.option("--scene", "scenes", multiple=True, type=PathName(), help="A scene folder; repeatable.")
 @click.option("--group", "groups", multiple=True, help="Only this group; repeatable.  [default: all]")
 @training_options
 @click.option("--budget", help="Training time instead: 90s, 10m, 1.5h. Schedules scale with it.")
 @click.option(
     "--set", "settings", multiple=True, metavar="KEY=VALUE", help="An option in every row; repeatable."
 )
-@click.option("-o", "--output", type=click.Path(path_type=Path), default=Path("ablation"), show_default=True)
+@click.option("-o", "--output", type=PathName(), default=Path("ablation"), show_default=True)
 @click.option("--pictures/--no-pictures", default=False, show_default=True, help="Draw every run's pictures.")
 @click.option("--list", "listing", is_flag=True, help="Show groups and variants, train nothing.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")

@@ -7,10 +7,12 @@ from pathlib import Path
 
 import click
 
+from ambiguous_wild.cli.paths import PathName
+
 
 @click.command("ambiguity-report")
-@click.argument("scene", type=click.Path(path_type=Path))
-@click.option("-o", "--out", type=click.Path(path_type=Path), help="Default: SCENE-ambiguity.")
+@click.argument("scene", type=PathName())
+@click.option("-o", "--out", type=PathName(), help="Default: SCENE-ambiguity.")
 @click.option(
     "--masks",
     help="truth, scene (build-scene's masks), run, or a folder of <stem>.png, white = distractor.  [default: the first there is]",
@@ -29,7 +31,7 @@ import click
 )
 @click.option(
     "--run",
-    type=click.Path(path_type=Path, file_okay=False),
+    type=PathName(file_okay=False),
     help="A trained run of this scene: its render, and its masks.",
 )
 @click.option(
@@ -40,7 +42,7 @@ import click
 )
 @click.option(
     "--objects",
-    type=click.Path(path_type=Path, file_okay=False),
+    type=PathName(file_okay=False),
     help="Masks of the static objects to compare with, <stem>.png, white = object.  [default: every static segment]",
 )
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the bootstrap.")

@@ -9,9 +9,11 @@ from pathlib import Path
 
 import click
 
+from ambiguous_wild.cli.paths import PathName
+
 
 @click.command("audit")
-@click.argument("tables", nargs=-1, type=click.Path(path_type=Path))
+@click.argument("tables", nargs=-1, type=PathName())
 @click.option(
     "--format",
     "style",
@@ -19,9 +21,7 @@ import click
     default="text",
     show_default=True,
 )
-@click.option(
-    "-o", "--output", type=click.Path(path_type=Path, dir_okay=False), help="Write to a file instead."
-)
+@click.option("-o", "--output", type=PathName(dir_okay=False), help="Write to a file instead.")
 @click.option("--strict", is_flag=True, help="Exit with 1 where anything is found.")
 def command(tables: tuple[Path, ...], style: str, output: Path | None, strict: bool) -> None:
     """Check TABLES (CSV, or folders of them; default: the reported numbers in this checkout).

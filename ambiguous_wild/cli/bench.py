@@ -11,6 +11,7 @@ import click
 from ambiguous_wild.cli.devices import prepare_cpu
 from ambiguous_wild.cli.engines import Engine, Grid, Session, engine_options
 from ambiguous_wild.cli.options import training_options
+from ambiguous_wild.cli.paths import PathName
 from ambiguous_wild.cli.progress import Progress, finish
 from ambiguous_wild.core.errors import AwError
 
@@ -46,7 +47,7 @@ def parse_budget(text: str) -> float:
     "scenes",
     multiple=True,
     required=True,
-    type=click.Path(path_type=Path),
+    type=PathName(),
     help="A scene folder; repeatable.",
 )
 @training_options
@@ -79,7 +80,7 @@ def parse_budget(text: str) -> float:
 @click.option(
     "--plan",
     "plan_file",
-    type=click.Path(path_type=Path, dir_okay=False),
+    type=PathName(dir_okay=False),
     help="A plan of 'aw plan' instead of a new one.",
 )
 @click.option(
@@ -89,7 +90,7 @@ def parse_budget(text: str) -> float:
     show_default=True,
     help="half: colour effects see the left half of a test photo, the right one is measured (NeRF-W).",
 )
-@click.option("-o", "--output", type=click.Path(path_type=Path), default=Path("runs"), show_default=True)
+@click.option("-o", "--output", type=PathName(), default=Path("runs"), show_default=True)
 @click.option(
     "--probes",
     type=click.IntRange(0, 100),

@@ -7,10 +7,12 @@ from pathlib import Path
 
 import click
 
+from ambiguous_wild.cli.paths import PathName
+
 
 @click.command("build-scene")
-@click.argument("raw", type=click.Path(path_type=Path))
-@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="Scene folder to make.")
+@click.argument("raw", type=PathName())
+@click.option("-o", "--output", required=True, type=PathName(), help="Scene folder to make.")
 @click.option("--factor", type=int, help="Downsampling; default: of 1, 2, 4, 8 what leaves just over 480 px.")
 @click.option(
     "--camera", type=click.Choice(["auto", "single", "per-image"]), default="auto", show_default=True
@@ -24,7 +26,7 @@ import click
 @click.option("--max-features", type=int, default=3000, show_default=True, help="SIFT features a photo.")
 @click.option(
     "--masks",
-    type=click.Path(path_type=Path),
+    type=PathName(),
     help="Folder of keep masks, white = keep, black = ignore: a.png or a.jpg.png.",
 )
 @click.option(
@@ -34,7 +36,7 @@ import click
     show_default=True,
     help="A photo without a mask: refuse, or use it whole.",
 )
-@click.option("--test-list", type=click.Path(path_type=Path), help="File naming the test photos, one a line.")
+@click.option("--test-list", type=PathName(), help="File naming the test photos, one a line.")
 @click.option("--strict", is_flag=True, help="Refuse the capture if one photo cannot be read.")
 @click.option("--jobs", type=click.IntRange(min=1), help="Threads; the result does not depend on it.")
 @click.option("--seed", type=int, default=0, show_default=True)

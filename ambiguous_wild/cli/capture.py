@@ -9,14 +9,14 @@ from pathlib import Path
 
 import click
 
+from ambiguous_wild.cli.paths import PathName
+
 BROKEN_BELOW = 0.9  # of the frames that a video announces; headers are often wrong by a few
 
 
 @click.command("capture")
 @click.argument("source")
-@click.option(
-    "-o", "--output", required=True, type=click.Path(path_type=Path), help="Folder of photos to make."
-)
+@click.option("-o", "--output", required=True, type=PathName(), help="Folder of photos to make.")
 @click.option(
     "--frames",
     type=click.IntRange(3, 5000),

@@ -8,11 +8,13 @@ from pathlib import Path
 
 import click
 
+from ambiguous_wild.cli.paths import PathName
+
 
 @click.command("composite")
-@click.argument("scene", type=click.Path(path_type=Path))
-@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="Scene folder to make.")
-@click.option("--cutouts", type=click.Path(path_type=Path), help="Folder of PNG files; alpha is the mask.")
+@click.argument("scene", type=PathName())
+@click.option("-o", "--output", required=True, type=PathName(), help="Scene folder to make.")
+@click.option("--cutouts", type=PathName(), help="Folder of PNG files; alpha is the mask.")
 @click.option("--patches", is_flag=True, help="Fill the shapes with the scene's own texture: same colours.")
 @click.option("--coverage", type=float, default=0.15, show_default=True, help="Mean share of a train photo.")
 @click.option("--presence", type=float, default=0.8, show_default=True, help="Share of photos a thing is in.")

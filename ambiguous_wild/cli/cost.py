@@ -9,13 +9,14 @@ from pathlib import Path
 
 import click
 
+from ambiguous_wild.cli.paths import PathName
 from ambiguous_wild.core.errors import AwError
 
 
 @click.command(name="cost")
-@click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("runs", nargs=-1, required=True, type=PathName())
 @click.option(
-    "-o", "--output", type=click.Path(path_type=Path, file_okay=False), default=Path("cost"), show_default=True,
+    "-o", "--output", type=PathName(file_okay=False), default=Path("cost"), show_default=True,
     help="For plots, CSV and JSON.",
 )  # fmt: skip
 @click.option(

@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ambiguous_wild.cli.paths import PathName
+
 if TYPE_CHECKING:
     from ambiguous_wild.harness.leaderboard.add import Report
 
 _board = click.option(
     "--board",
-    type=click.Path(path_type=Path, file_okay=False),
+    type=PathName(file_okay=False),
     default=Path("leaderboard"),
     show_default=True,
     help="Folder of the leaderboard.",
@@ -36,14 +38,14 @@ def command() -> None:
 
 
 @command.command("add")
-@click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("runs", nargs=-1, required=True, type=PathName())
 @_board
 @click.option(
     "--dataset", help="Of these runs.  [default: what their scene says; of 'aw simulate': simulated]"
 )
 @click.option(
     "--scenes",
-    type=click.Path(path_type=Path, file_okay=False),
+    type=PathName(file_okay=False),
     help="Where the scenes lie (a scene, or a folder of them).  [default: where the runs say]",
 )
 @click.option(
@@ -158,11 +160,11 @@ def remove_command(
 
 @command.command("publish")
 @_board
-@click.option("-o", "--out", required=True, type=click.Path(path_type=Path), help="Folder of the page.")
+@click.option("-o", "--out", required=True, type=PathName(), help="Folder of the page.")
 @click.option("--reported", is_flag=True, help="Show what papers print beside the measured numbers, marked.")
 @click.option(
     "--reported-from",
-    type=click.Path(path_type=Path, file_okay=False),
+    type=PathName(file_okay=False),
     help="Show those of the *.csv in this folder.  [default: BOARD/reported, with --reported]",
 )
 @click.option("--title", default="Leaderboard", show_default=True, help="Of the page.")

@@ -8,9 +8,11 @@ from pathlib import Path
 
 import click
 
+from ambiguous_wild.cli.paths import PathName
+
 
 @click.command(name="methods")
-@click.option("--plugin", "plugins", multiple=True, type=click.Path(path_type=Path),
+@click.option("--plugin", "plugins", multiple=True, type=PathName(),
               help="A Python file that registers methods of your own; repeatable.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print the list as JSON.")
 def command(plugins: tuple[Path, ...], as_json: bool) -> None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import click
+
+from ambiguous_wild.cli.paths import PathName
 
 _OPTIONS = (
     click.option(
@@ -33,7 +34,7 @@ _OPTIONS = (
         "--plugin",
         "plugins",
         multiple=True,
-        type=click.Path(path_type=Path),
+        type=PathName(),
         help="A Python file that registers methods of your own.",
     ),
     click.option(
@@ -45,7 +46,7 @@ _OPTIONS = (
     ),
     click.option(
         "--cache",
-        type=click.Path(path_type=Path),
+        type=PathName(),
         help="Features and instance masks.  [default: OUTPUT/.cache]",
     ),
 )

@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING
 
 import click
 
+from ambiguous_wild.cli.paths import PathName
+
 if TYPE_CHECKING:
     from ambiguous_wild.harness.planning.decide import Decision, Plan
 
 
 @click.command("plan")
-@click.argument("scene", type=click.Path(path_type=Path))
+@click.argument("scene", type=PathName())
 @click.option(
     "--factor", type=click.IntRange(1), help="Look at images_N.  [default: what the scene was built for]"
 )
@@ -28,9 +30,7 @@ if TYPE_CHECKING:
 @click.option(
     "--costs/--no-costs", default=False, show_default=True, help="Time every effect on this machine."
 )
-@click.option(
-    "-o", "--out", type=click.Path(path_type=Path, dir_okay=False), help="Default: SCENE-plan.json."
-)
+@click.option("-o", "--out", type=PathName(dir_okay=False), help="Default: SCENE-plan.json.")
 @click.option("--json", "as_json", is_flag=True, help="Print the plan as JSON.")
 def command(
     scene: Path, factor: int | None, probe: bool, costs: bool, out: Path | None, as_json: bool

@@ -8,11 +8,13 @@ from pathlib import Path
 
 import click
 
+from ambiguous_wild.cli.paths import PathName
+
 _WORDS = {"ok": ("ok", "green"), "warning": ("WARNING", "red"), "unknown": ("unknown", "yellow")}
 
 
 @click.command("screen")
-@click.argument("raw", type=click.Path(path_type=Path))
+@click.argument("raw", type=PathName())
 @click.option("--strict", is_flag=True, help="Refuse the capture (exit code 2) if a check fails.")
 @click.option("--jobs", type=click.IntRange(min=1), help="Threads; the result does not depend on it.")
 @click.option("--json", "as_json", is_flag=True, help="Print the same facts as JSON.")

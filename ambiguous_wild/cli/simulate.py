@@ -10,13 +10,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ambiguous_wild.cli.paths import PathName
+
 if TYPE_CHECKING:
     from ambiguous_wild.simulate.spec import CaptureSpec
 
 
 @click.command("simulate")
 @click.argument("name", metavar="NAME|SPEC.yaml", required=False)
-@click.option("-o", "--out", type=click.Path(path_type=Path, file_okay=False), help="Folder to write.")
+@click.option("-o", "--out", type=PathName(file_okay=False), help="Folder to write.")
 @click.option(
     "--seed", type=click.IntRange(0), default=0, show_default=True, help="World, walk and distractors."
 )

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import click
 
+from ambiguous_wild.cli.paths import PathName
+
 
 @click.command("stress")
 @click.option("--only", multiple=True, metavar="CASE", help="A row (4), a name or a part of one; repeatable.")
@@ -27,13 +29,11 @@ import click
     show_default=True,
 )
 @click.option("--json", "as_json", is_flag=True, help="Short for --format json.")
-@click.option(
-    "-o", "--output", type=click.Path(path_type=Path, dir_okay=False), help="Write to a file instead."
-)
+@click.option("-o", "--output", type=PathName(dir_okay=False), help="Write to a file instead.")
 @click.option(
     "--replay",
     "run",
-    type=click.Path(path_type=Path, file_okay=False),
+    type=PathName(file_okay=False),
     help="A run folder whose training met a value that is not finite: run up to it again.",
 )
 def command(

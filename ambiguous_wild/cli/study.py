@@ -7,6 +7,8 @@ from pathlib import Path
 
 import click
 
+from ambiguous_wild.cli.paths import PathName
+
 
 @click.group("study")
 def command() -> None:
@@ -23,19 +25,19 @@ def command() -> None:
     "--scene",
     "scenes",
     multiple=True,
-    type=click.Path(path_type=Path),
+    type=PathName(),
     help="Ask about the train photos of this scene folder; repeatable.",
 )
 @click.option(
     "--runs",
-    type=click.Path(path_type=Path),
+    type=PathName(),
     help="Ask about the test renders below this folder of 'aw bench'.",
 )
 @click.option(
     "-o",
     "--out",
     required=True,
-    type=click.Path(path_type=Path, dir_okay=False),
+    type=PathName(dir_okay=False),
     help="The page, *.html; the key goes beside it.",
 )
 @click.option(
@@ -135,17 +137,17 @@ def make_command(
 
 
 @command.command("score")
-@click.argument("answers", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("answers", nargs=-1, required=True, type=PathName())
 @click.option(
     "--key",
     required=True,
-    type=click.Path(path_type=Path),
+    type=PathName(),
     help="What 'aw study make' wrote beside the page.",
 )
 @click.option(
     "-o",
     "--out",
-    type=click.Path(path_type=Path, file_okay=False),
+    type=PathName(file_okay=False),
     help="Folder for scores.md, .csv and .json.  [default: KEY-scores]",
 )
 @click.option(

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from ambiguous_wild.cli.paths import PathName
 from ambiguous_wild.core.errors import AwError
 
 if TYPE_CHECKING:
@@ -22,15 +23,13 @@ LAYOUTS = ("blocks", "paper", "means", "memory", "ablation")
 
 
 @click.command(name="table")
-@click.argument("runs", type=click.Path(path_type=Path))
+@click.argument("runs", type=PathName())
 @click.option("--format", "style", type=click.Choice(STYLES), default="text", show_default=True)
 @click.option(
     "--layout", type=click.Choice(LAYOUTS), default="blocks", show_default=True,
     help="blocks: a table a scene; paper: scenes side by side; means: over each dataset; memory: MB by scene; ablation: of 'aw ablate -o RUNS'.",
 )  # fmt: skip
-@click.option(
-    "-o", "--output", type=click.Path(path_type=Path, dir_okay=False), help="Write to a file instead."
-)
+@click.option("-o", "--output", type=PathName(dir_okay=False), help="Write to a file instead.")
 @click.option(
     "--metric", "metrics", multiple=True, help="Only this column; repeatable.  [default: all measured]"
 )
@@ -41,12 +40,12 @@ LAYOUTS = ("blocks", "paper", "means", "memory", "ablation")
 )  # fmt: skip
 @click.option("--reported", is_flag=True, help="Show what papers print below, in rows of their own.")
 @click.option(
-    "--reported-from", type=click.Path(path_type=Path, exists=True),
+    "--reported-from", type=PathName(exists=True),
     help="Their tables, as 'aw audit' reads them.  [default: leaderboard/reported]",
 )  # fmt: skip
 @click.option(
     "--sheet",
-    type=click.Path(path_type=Path, dir_okay=False),
+    type=PathName(dir_okay=False),
     help="Also write a PNG or JPG: test renders side by side, and what each method masks.",
 )
 def command(

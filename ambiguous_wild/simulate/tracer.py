@@ -2,7 +2,7 @@
 
 A tile of the picture keeps the list of shapes whose bounding sphere its cone of rays can touch; each
 sample then tests a handful of shapes. The clean and the distracted picture differ only where a mover
-was hit: elsewhere the same number is written to both.
+was hit or a thrown shadow falls: elsewhere the same number is written to both.
 """
 
 from __future__ import annotations

@@ -214,18 +214,24 @@ def _panel(axes: Any, group: dict[str, str], points: list[tuple[str, float, floa
 
 
 def _labels(axes: Any, points: list[tuple[str, float, float, float]]) -> None:
-    """Name every point: from below upwards, each at least a line above the last."""
+    """Name every point, each at least a line from the next and all of them inside the frame."""
     axes.margins(0.12)
     low, high = axes.get_ylim()
-    middle, line, last = sum(axes.get_xlim()) / 2, 0.05 * (high - low), -math.inf
+    middle, line = sum(axes.get_xlim()) / 2, 0.05 * (high - low)
     width = axes.get_xlim()[1] - axes.get_xlim()[0]
-    for index, (name, ms, psnr, _) in sorted(enumerate(points), key=lambda item: item[1][2]):
-        last = max(psnr, last + line)
+    order = sorted(range(len(points)), key=lambda index: points[index][2])
+    heights, last = {}, -math.inf
+    for index in order:
+        last = heights[index] = max(points[index][2], last + line)
+    above = high + 0.4 * line
+    for index in reversed(order):  # what was pushed over the top comes down again
+        above = heights[index] = min(heights[index], above - line)
+    for index, (name, ms, psnr, _) in enumerate(points):
         left = ms <= middle
         axes.annotate(
             name,
             (ms, psnr),
-            xytext=(ms + (0.03 if left else -0.03) * width, last),
+            xytext=(ms + (0.03 if left else -0.03) * width, heights[index]),
             fontsize=7,
             color="k" if name.split(" = ")[0] == "default" else f"C{index % 10}",
             ha="left" if left else "right",

@@ -49,6 +49,7 @@ def command(
     if path.resolve().is_relative_to(scene.resolve()):
         raise AwError(f"{path} lies inside {scene}, and would change the scene; choose another -o")
     check_output(path)
+    _refuse_loss(path, probe)
     plan = plan_without_training(loaded)
     if probe or costs:
         from ambiguous_wild.cli.devices import prepare_cpu
@@ -73,6 +74,23 @@ def command(
     for line in table(plan):
         click.echo(line)
     click.echo(f"wrote {path}")
+
+
+def _refuse_loss(path: Path, probe: bool) -> None:
+    """A plan may be made again in the place of an earlier one, and of nothing else."""
+    from ambiguous_wild.core.errors import AwError
+    from ambiguous_wild.harness.planning.file import read_plan
+
+    if not path.exists():
+        return
+    try:
+        earlier = read_plan(path)
+    except AwError:
+        raise AwError(f"{path} is there already and is no plan of 'aw plan'; choose another -o") from None
+    if earlier.probed and not probe:
+        raise AwError(
+            f"{path} holds what a probe found, which a plan without one would replace; choose another -o"
+        )
 
 
 def table(plan: Plan) -> list[str]:

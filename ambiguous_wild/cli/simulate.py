@@ -91,6 +91,12 @@ def command(
             "numbers of them would reach it",
             err=True,
         )
+    for name in _never_seen(spec, facts["photos"]):
+        click.echo(
+            f"warning: distractor {name!a} is in none of the train photos; other waypoints, laps, distances or "
+            "a larger size would bring it in",
+            err=True,
+        )
     if as_json:
         click.echo(json.dumps({k: v for k, v in facts.items() if k not in ("files", "photos")}, indent=2))
         return
@@ -122,6 +128,12 @@ def _outside(spec: CaptureSpec, photos: dict[str, Any]) -> int:
         return 0  # who walks is where the walk leads
     slack = 0.02 + 0.1 * (high - low)  # shares were chosen in a small preview
     return sum(not low - slack <= photo["occlusion"] <= high + slack for photo in photos.values())
+
+
+def _never_seen(spec: CaptureSpec, photos: dict[str, Any]) -> list[str]:
+    """Names of distractors that were to be seen and that no train photo shows."""
+    seen = {d["distractor"] for photo in photos.values() for d in photo["distractors"] if d["occlusion"] > 0}
+    return [d.name for d in spec.distractors if d.name not in seen and d.presence > 0]
 
 
 def _print_list(specs: Iterable[CaptureSpec], as_json: bool) -> None:

@@ -118,7 +118,7 @@ def make_command(
     there = [str(p) for p in (out, key) if p.exists()]
     if there and not force:
         raise AwError(
-            f"{' and '.join(there)} exists: answers to another page cannot be scored; choose another -o or --force"
+            f"{' and '.join(there)} {'exist' if len(there) > 1 else 'exists'}: answers to another page cannot be scored; choose another -o or --force"
         )
     asked: list[Question] = [q for scene in scenes for q in photos_of_scene(scene, outline=outline)]
     if runs is not None:

@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import json
 import math
+import re
 import types
 import typing
 from collections.abc import Mapping
@@ -14,6 +15,7 @@ from typing import Any, TypeVar
 from ambiguous_wild.core.errors import AwError, unknown
 
 T = TypeVar("T")
+_POWER_OF_TEN = re.compile(r"[-+]?[0-9]+[eE][-+]?[0-9]+")
 
 
 def to_plain(config: Any) -> Any:
@@ -162,6 +164,8 @@ def _coerce(hint: Any, value: Any, where: str) -> Any:
         return tuple(_coerce(a, v, where) for a, v in zip(args, items))
     if origin in (dict, Mapping) or hint in (dict, Any):
         return value
+    if hint is float and isinstance(value, str) and _POWER_OF_TEN.fullmatch(value):
+        value = float(value)  # YAML 1.1 reads 1e-3 as text: it wants a dot
     if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
         try:
             number = float(value)

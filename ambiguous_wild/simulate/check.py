@@ -89,6 +89,8 @@ def _distractor(where: str, d: Distractor) -> None:
         raise AwError(f"{where}.waypoints: a walk needs two corners or more, [[x, y], [x, y]] in metres")
     if d.path == "elsewhere" and d.waypoints:
         raise AwError(f"{where}.waypoints: only read with 'path: walk'; add that or leave them out")
+    if d.path == "elsewhere" and d.laps != Distractor.laps:
+        raise AwError(f"{where}.laps: only read with 'path: walk'; add that or leave it out")
     for x, y in d.waypoints:
         _between(f"{where}.waypoints x", x, -5, 5)
         _between(f"{where}.waypoints y", y, -6, 4)
@@ -101,6 +103,7 @@ def _thing(where: str, thing: Thing) -> None:
         _between(f"{where}.size_m", value, 0.01, 12)
     for axis, value, low, high in zip("xyz", thing.at_m, (-5.5, -6, 0), (5.5, 4.2, 4)):
         _between(f"{where}.at_m {axis}", value, low, high)
+    _between(f"{where}.yaw_deg", thing.yaw_deg, -360, 360)
     _colour(f"{where}.tint", thing.tint)
 
 

@@ -81,6 +81,9 @@ def _lists(data: dict[Any, Any]) -> None:
     designed = data.get("designed", {})
     if not isinstance(designed, Mapping):
         raise AwError(f"designed: the keys ambiguity and effects, got {designed!r}")
+    wanted = designed.get("effects", [])
+    if not isinstance(wanted, list) or len({str(name) for name in wanted}) < len(wanted):
+        raise AwError(f"designed.effects: a list that names each effect once, got {wanted!r}")
 
 
 def _effects(named: Any) -> Effects:

@@ -190,7 +190,7 @@ def _answer(path: Path, row: Any, key: Key) -> Answer:
     if left not in (("x", "y") if entry["kind"] == KIND_PAIR else ("",)):
         raise AwError(f"{path} says {_short(left)} stood on the left of {question}: it was changed by hand")
     try:
-        seconds = float(row.get("ms")) / 1000  # type: ignore[arg-type]
+        seconds = -1.0 if isinstance(row.get("ms"), bool) else float(row.get("ms")) / 1000  # type: ignore[arg-type]
     except (TypeError, ValueError, OverflowError):
         seconds = -1.0
     if not 0 <= seconds < 1e7:

@@ -86,7 +86,7 @@ def test_without_a_background_colour_is_refused_or_left_out_on_request(scene: Pa
     assert "--background none" in error(scene, "-o", tmp_path / "out") and not (tmp_path / "out").exists()
     words = [str(scene), "-o", str(tmp_path / "out"), "--background", "none"]
     done = CliRunner().invoke(command, words, catch_exceptions=False)
-    assert "colour: missing" in done.stdout and "no verdict" in done.stdout
+    assert "colour: no verdict, for no distractor's background is known" in done.stdout
     assert "100 % of the distractor pixels is unknown" in done.stdout
     assert json.loads((tmp_path / "out/ambiguity.json").read_text())["class"] in (
         "unknown",
@@ -102,6 +102,17 @@ def test_no_distractor_pixels_give_no_verdict(scene: Path, tmp_path: Path) -> No
         facts = report(scene, "-o", tmp_path / "out")
     assert facts["occlusion"]["value"] == 0
     assert facts[COLOUR_METRIC]["value"] is None and facts[SEMANTIC_METRIC]["ambiguous"] is None
+    assert facts["class"] == "nobody there"
+    done = CliRunner().invoke(command, [str(scene), "-o", str(tmp_path / "again")], catch_exceptions=False)
+    assert "photos are empty" in done.stdout and "missing" not in done.stdout
+    assert "nobody there" in (tmp_path / "again/index.html").read_text()
+
+
+def test_what_white_means_is_asked_of_a_folder_alone(scene: Path, tmp_path: Path) -> None:
+    for more in ((), ("--masks", "truth")):
+        assert "of a folder given with --masks" in error(
+            scene, "-o", tmp_path / "out", "--masks-white", "keep", *more
+        )
 
 
 def test_own_masks_and_what_is_said_where_there_are_none(scene: Path, tmp_path: Path) -> None:

@@ -41,6 +41,21 @@ def test_a_plan_is_a_table_and_a_file_and_leaves_the_scene_alone(scene, tmp_path
     assert isinstance(found["antialiasing"]["cost_ms"], float)
     assert found["masks"]["cost_ms"] is None
     assert files(scene) == before
+    # made again without a probe it would lose what the probe found
+    kept = (tmp_path / "plan.json").read_bytes()
+    done = aw("plan", scene, "-o", tmp_path / "plan.json", "--no-probe")
+    assert done.returncode == 2 and "what a probe found" in done.stderr
+    assert (tmp_path / "plan.json").read_bytes() == kept
+
+
+def test_a_file_that_is_no_plan_is_not_replaced(scene, tmp_path):
+    photo = tmp_path / "photo.jpg"
+    photo.write_bytes(b"\xff\xd8 mine")
+    done = aw("plan", scene, "-o", photo, "--no-probe")
+    assert done.returncode == 2 and "is no plan of 'aw plan'; choose another -o" in done.stderr
+    assert photo.read_bytes() == b"\xff\xd8 mine"
+    for _ in range(2):  # an earlier plan is
+        assert aw("plan", scene, "-o", tmp_path / "plan.json", "--no-probe").returncode == 0
 
 
 @pytest.mark.parametrize(

@@ -75,9 +75,17 @@ def test_what_is_left_out_is_as_in_the_courtyard() -> None:
         (f"distractors: [{RED.replace('cloth', 'clohT')}]", "did you mean 'cloth'"),
         (f"distractors: [{RED[:-1]}, size: -1}}]", "distractors[0].size: between 0.02 and 10, got -1"),
         (f"distractors: [{RED[:-1]}, path: walk}}]", "a walk needs two corners"),
+        (f"distractors: [{RED[:-1]}, laps: 3}}]", "laps: only read with 'path: walk'"),
         (f"distractors: [{RED[:-1]}, path: wlak}}]", "did you mean 'walk'"),
         ("world: {things: [{kind: box, texture: stone, at_m: [0, 0, 0], size_m: [1, -1, 1]}]}", "size_m"),
         ("world: {things: [{kind: box, texture: marble, at_m: [0, 0, 0]}]}", "unknown texture"),
+        (
+            "world: {things: [{kind: box, texture: stone, at_m: [0, 0, 0], yaw_deg: 1e300}]}",
+            "yaw_deg: between -360 and 360",
+        ),
+        ("designed: {effects: masks}", "designed.effects: a list"),
+        ("designed: {effects: [masks, masks]}", "names each effect once"),
+        ("effects: {motion_blur: {exposure_s: 1e-9}}", "exposure_s: between 1e-05 and 0.5"),
         ("world: {furnitur: false}", "did you mean 'furniture'"),
         ("designed: {effects: [maks]}", "did you mean 'masks'"),
         ("a: &x [1]\nb: *x", "line 2: aliases"),
@@ -119,6 +127,24 @@ def test_a_bad_spec_is_said_in_one_line_and_writes_nothing(text: str, expected: 
     message = str(done.exception)
     assert expected in message and "\n" not in message and str(path) in message
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_powers_of_ten_need_no_dot() -> None:
+    blur = parse_spec("effects: {motion_blur: {exposure_s: 4e-3}}").effects.motion_blur
+    assert blur is not None and blur.exposure_s == 0.004
+    assert parse_spec("name: 1e3").name == "1e3"
+
+
+def test_a_distractor_that_no_photo_shows_is_said(tmp_path: Path) -> None:
+    spec = tmp_path / "spec.yaml"
+    walk = "path: walk, waypoints: [[0, -6], [0.5, -6]]"
+    spec.write_text(
+        "train_views: 3\ntest_views: 2\nwidth: 64\nheight: 36\ndetail_px_per_m: 20\n"
+        f"distractors: [{{kind: ball, name: ghost, size: 0.1, texture: cloth, ambiguity: none, {walk}}}]\n"
+    )
+    done = CliRunner().invoke(command, [str(spec), "-o", str(tmp_path / "raw"), "--no-sheet"])
+    assert done.exit_code == 0, done.output
+    assert "warning: distractor 'ghost' is in none of the train photos" in done.output
 
 
 def test_files_that_are_no_text_are_refused(tmp_path: Path) -> None:

@@ -182,6 +182,7 @@ BAD: dict[str, tuple[Any, str]] = {
     "choice": ({"answers": [{"question": "p0", "answer": "z", "left": "x", "ms": 1}]}, "there is: x, y, tie"),
     "left": ({"answers": [{"question": "p0", "answer": "x", "left": "q", "ms": 1}]}, "stood on the left"),
     "time": ({"answers": [{"question": "k0", "answer": "3", "ms": "nan"}]}, "no fit time"),
+    "time is no number": ({"answers": [{"question": "k0", "answer": "3", "ms": True}]}, "no fit time"),
     "twice": ({"answers": [{"question": "k0", "answer": "3", "ms": 1}] * 2}, "twice"),
     "deep": ("[" * 100_000, "malformed"),
     "bytes": (b"\xff\xfe\x00", "no text in UTF-8"),

@@ -15,7 +15,7 @@ from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.harness.ambiguity import figure
 from ambiguous_wild.harness.ambiguity.measure import Look, Measured, load_photo
 from ambiguous_wild.harness.ambiguity.sources import Background, Masks
-from ambiguous_wild.harness.ambiguity.summary import cosine_column, describe, row
+from ambiguous_wild.harness.ambiguity.summary import NOBODY, cosine_column, describe, row
 from ambiguous_wild.harness.render_tables import csv_text
 from ambiguous_wild.io.atomic import atomic_dir, refuse_file, write_json, write_text
 from ambiguous_wild.metrics import ambiguity as am
@@ -106,6 +106,7 @@ _CLASSES = {
     "colour": "ambiguous in colour",
     "semantic": "semantically ambiguous",
     "neither": "neither ambiguous in colour nor semantically",
+    NOBODY: "nobody there",
 }
 _HEADS = {
     "photo": "photo",

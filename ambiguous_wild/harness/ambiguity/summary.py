@@ -18,6 +18,7 @@ LOOKS = (
     "compare with, --features dinov2-small sees kinds of things"
 )
 NAMED = "weight-free features see looks, not meaning; compared with the objects named"
+NOBODY = "nobody there"  # the class of a scene whose masks are empty
 REAL = "raw cosine, as the paper's"
 
 
@@ -58,7 +59,7 @@ def summarise(
         "background": background,
         "features": features,
         "seed": seed,
-        "class": classify(colour["ambiguous"], semantic["ambiguous"]),
+        "class": classify(colour["ambiguous"], semantic["ambiguous"]) if covered.mean else NOBODY,
         "occlusion": {**_interval(covered), "min": min(shares), "max": max(shares)},
         am.COLOUR_METRIC: colour,
         semantic_metric(features): semantic,
@@ -133,12 +134,16 @@ def row(m: Measured, metric: str) -> dict[str, Any]:
 def describe(summary: dict[str, Any]) -> list[str]:
     """The scores as sentences, for the terminal and the page."""
     colour, covered = summary[am.COLOUR_METRIC], summary["occlusion"]
+    if summary["class"] == NOBODY:
+        return [
+            f"the masks of all {summary['photos']} photos are empty: no distractor, so nothing that could be "
+            "ambiguous"
+        ]
     look = summary[semantic_metric(summary["features"])]
     lines = [
         f"occlusion: {_percent(covered)} of a train photo, from {100 * covered['min']:.1f} to "
         f"{100 * covered['max']:.1f} %",
-        f"colour: {_percent(colour)} of the distractor pixels are within {am.COLOUR_THRESHOLD} of their "
-        f"background: {_word(colour)} (limit {100 * am.COLOUR_AMBIGUOUS_ABOVE:.0f} %)",
+        _colour_line(colour),
         _semantic_line(look, weight_free(summary["features"])),
     ]
     if look["same_surface"] is not None:
@@ -154,7 +159,18 @@ def describe(summary: dict[str, Any]) -> list[str]:
     return lines
 
 
+def _colour_line(colour: dict[str, Any]) -> str:
+    if colour["value"] is None:
+        return "colour: no verdict, for no distractor's background is known"
+    return (
+        f"colour: {_percent(colour)} of the distractor pixels are within {am.COLOUR_THRESHOLD} of their "
+        f"background: {_word(colour)} (limit {100 * am.COLOUR_AMBIGUOUS_ABOVE:.0f} %)"
+    )
+
+
 def _semantic_line(look: dict[str, Any], lookalike: bool) -> str:
+    if look["value"] is None:
+        return f"semantic: no verdict, for no distractor could be compared with the {look['compared_with']}"
     if lookalike:
         return (
             f"semantic: {_percent(look)} of the distractor pixels are as like something of the "

@@ -16,11 +16,11 @@ SCHEMA = 1
 # Set on tracks with the effect injected and without (tests/harness/test_planning.py) and on the captures of
 # docs/effects.md, which says how near to them what was measured lies.
 EXPOSURE = 0.05
-APPEARANCE = 0.07
+APPEARANCE = 0.043
 # A highlight is not linear in the direction: what is left of it, times its linear part (1.7 at the strongest
 # that the tests inject), is no light that differs by place.
 OF_SHINE = 1.7
-SAMPLING = 2.0
+SAMPLING = 1.5
 VIEW_DEPENDENCE = 0.015
 REPROJECTION_PX = 1.0
 

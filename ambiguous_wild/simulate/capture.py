@@ -14,10 +14,12 @@ RAW/truth/capture.json            spec, seed, versions, what it was designed as;
 from __future__ import annotations
 
 import json
+from collections import deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict
 from importlib.metadata import version
+from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -30,12 +32,13 @@ from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.atomic import atomic_dir, write_json
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.strangers import refuse_strangers
-from ambiguous_wild.simulate.develop import Developed, Shot, depth_m, develop
+from ambiguous_wild.simulate.develop import Developed, Exposure, Shot, depth_m, expose, finish, prepare
 from ambiguous_wild.simulate.distractors import lay_out
 from ambiguous_wild.simulate.effects.moment import Moment
 from ambiguous_wild.simulate.phone import write_photo, write_png
 from ambiguous_wild.simulate.spec import CaptureSpec
 from ambiguous_wild.simulate.spec_file import plain_spec
+from ambiguous_wild.simulate.tracer import Traced
 from ambiguous_wild.simulate.walk import plan_cameras
 from ambiguous_wild.simulate.world import World, courtyard
 
@@ -104,37 +107,46 @@ def _render(
     progress: Progress,
 ) -> dict[str, Any]:
     photos: dict[str, Any] = {}
-    pending: list[Future[None]] = []
-    with ThreadPoolExecutor(2) as writers:  # encoders leave the interpreter free: they run beside the rays
+    moments = [Moment(seed, k, k / max(spec.train_views - 1, 1)) for k in range(len(shots))]
+
+    def complete(number: int, exposure: Exposure, seen: Traced, metres: np.ndarray | None) -> None:
+        shot = shots[number]
+        made = finish(shot, moments[number], exposure, seen)
+        write_photo(folder / shot.split / shot.name, made.photo, spec, shot.camera, number, made.effects)
+        for part, pixels in _truth(shot, made, metres):
+            write_png(folder / "truth" / part / f"{Path(shot.name).stem}.png", pixels)
+        if shot.split == "train":
+            photos[shot.name] = _photo_facts(spec, shot, made)
+
+    # Lens, noise and encoders run beside the rays of the photos before and after; each photo draws from a
+    # moment of its own, so who is first changes nothing.
+    with ThreadPoolExecutor(2) as beside:
+        ahead: deque[Future[Exposure]] = deque()
+        pending: deque[Future[None]] = deque()
+        waiting = iter(range(len(shots)))
         for number, shot in enumerate(progress(shots)):
-            moment = Moment(seed, number, number / max(spec.train_views - 1, 1))
-            made = develop(spec, world, shot, moment)
-            path, truth = folder / shot.split / shot.name, folder / "truth"
-            pending.append(
-                writers.submit(write_photo, path, made.photo, spec, shot.camera, number, made.effects)
-            )
-            for part, pixels in _truth(world, shot, made, depth):
-                pending.append(
-                    writers.submit(write_png, truth / part / f"{Path(shot.name).stem}.png", pixels)
-                )
-            if shot.split == "train":
-                photos[shot.name] = _photo_facts(spec, shot, made)
-            while len(pending) > 12:
-                pending.pop(0).result()
+            for k in islice(waiting, 2 - len(ahead)):
+                ahead.append(beside.submit(prepare, spec, world, shots[k], moments[k]))
+            exposure = ahead.popleft().result()
+            seen = expose(world, exposure)
+            metres = depth_m(world, shot.camera) if depth else None
+            pending.append(beside.submit(complete, number, exposure, seen, metres))
+            while len(pending) > 2:
+                pending.popleft().result()
         for task in pending:
             task.result()
-    return photos
+    return {shot.name: photos[shot.name] for shot in shots if shot.name in photos}
 
 
-def _truth(world: World, shot: Shot, made: Developed, depth: bool) -> Iterable[tuple[str, np.ndarray]]:
+def _truth(shot: Shot, made: Developed, metres: np.ndarray | None) -> Iterable[tuple[str, np.ndarray]]:
     """The folder and the pixels of every truth picture of the shot."""
     if shot.split == "train":
         yield "distractor", np.where(made.owner > 0, 255, 0).astype(np.uint8)
         yield "clean", made.clean
         if made.shadow is not None:
             yield "shadow", np.where(made.shadow, 255, 0).astype(np.uint8)
-    if depth:
-        millimetres = np.round(1000 * depth_m(world, shot.camera))
+    if metres is not None:
+        millimetres = np.round(1000 * metres)
         yield "depth", np.clip(millimetres, 0, 65535).astype(np.uint16)
 
 

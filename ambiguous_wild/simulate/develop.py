@@ -78,8 +78,20 @@ class _Scene:
     light: Light
 
 
+@dataclass(frozen=True)
+class Exposure:
+    """A photo about to be taken: what the rays meet, and what the sensor makes of it."""
+
+    wanted: Effects
+    scene: _Scene
+    camera: Camera  # of the rays; finer and larger than the photo's where pixels move
+    things: ShapeTable
+    move: Picture | None
+    done: dict[str, Any]  # what was drawn so far, by effect
+
+
 def develop(spec: CaptureSpec, world: World, shot: Shot, moment: Moment) -> Developed:
-    """Take one photo.
+    """Take one photo: `prepare`, `expose` and `finish`.
 
     Args:
         spec: names the effects.
@@ -87,16 +99,33 @@ def develop(spec: CaptureSpec, world: World, shot: Shot, moment: Moment) -> Deve
         shot: the camera and who stands where.
         moment: where the effects' random numbers come from.
     """
+    exposure = prepare(spec, world, shot, moment)
+    return finish(shot, moment, exposure, expose(world, exposure))
+
+
+def prepare(spec: CaptureSpec, world: World, shot: Shot, moment: Moment) -> Exposure:
+    """All that comes before the rays."""
     wanted = spec.effects if shot.split == "train" else _lasting(spec.effects)
     done: dict[str, Any] = {}
     scene = _lit(wanted, world, moment, done)
     move, camera, light = _optics(wanted, shot.camera, scene.light, moment, done)
     things = movers(spec, shot.placements, world)
-    seen = trace(camera, scene.static, things, world.atlas, light, scene.thrown)
-    distracted, clean, owner, shadow = _moved(move, seen)
-    expose = _exposure(wanted, shot.camera, moment, done)
-    clean_pixels = _to_uint8(expose(clean))
-    pixels = clean_pixels if distracted is clean else _to_uint8(expose(distracted))
+    return Exposure(wanted, replace(scene, light=light), camera, things, move, done)
+
+
+def expose(world: World, exposure: Exposure) -> Traced:
+    """The rays. They take all cores: one photo at a time."""
+    scene = exposure.scene
+    return trace(exposure.camera, scene.static, exposure.things, world.atlas, scene.light, scene.thrown)
+
+
+def finish(shot: Shot, moment: Moment, exposure: Exposure, seen: Traced) -> Developed:
+    """All that comes after the rays."""
+    wanted, done = exposure.wanted, exposure.done
+    distracted, clean, owner, shadow = _moved(exposure.move, seen)
+    sensor = _exposure(wanted, shot.camera, moment, done)
+    clean_pixels = _to_uint8(sensor(clean))
+    pixels = clean_pixels if distracted is clean else _to_uint8(sensor(distracted))
     if wanted.jpeg is not None:
         quality = jpeg.draw(wanted.jpeg, moment)
         pixels = jpeg.jpeg(pixels, quality)

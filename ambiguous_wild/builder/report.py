@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 from pathlib import Path
 from typing import Any
@@ -101,6 +102,24 @@ def point_checks(model: Model, names: dict[str, str], test: set[str]) -> tuple[i
     return int((trained == 0).sum()), int((lengths == 2).sum())
 
 
+def parallax_deg(model: Model) -> float:
+    """Median over points of the widest angle from the first ray that found it; NaN without points."""
+    points = model.points
+    owner = np.repeat(np.arange(len(points.xyz)), np.diff(points.track_offsets))
+    numbers = sorted(model.images)
+    at = {number: k for k, number in enumerate(numbers)}
+    poses = np.array([model.images[n].cam_from_world() for n in numbers]).reshape(-1, 4, 4)
+    centres = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+    rows = np.array([at[int(i)] for i in points.track_image_ids], dtype=np.intp)
+    rays = centres[rows] - points.xyz[owner]
+    rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
+    # the widest of all pairs is at most twice that, and costs the square
+    first = rays[points.track_offsets[owner]]
+    angles = np.zeros(len(points.xyz))
+    np.maximum.at(angles, owner, np.arccos(np.clip((rays * first).sum(axis=1), -1.0, 1.0)))
+    return math.degrees(float(np.median(angles))) if len(angles) else math.nan
+
+
 def verdict(info: dict[str, Any], size: tuple[int, int], scene: Path) -> str:
     """One line: what came out, and the next command."""
     counts = info["counts"]
@@ -167,8 +186,6 @@ def _model_warnings(listing: list[dict[str, Any]], best: int) -> list[str]:
 
 
 def _turned(model: Model) -> list[str]:
-    from ambiguous_wild.builder.select_model import parallax_deg
-
     angle = parallax_deg(model)
     if not angle < LEAST_PARALLAX_DEG:
         return []

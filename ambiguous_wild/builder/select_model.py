@@ -112,24 +112,6 @@ def check_registered(
     )
 
 
-def parallax_deg(model: Model) -> float:
-    """Median over points of the widest angle from the first ray that found it; NaN without points."""
-    points = model.points
-    owner = np.repeat(np.arange(len(points.xyz)), np.diff(points.track_offsets))
-    numbers = sorted(model.images)
-    at = {number: k for k, number in enumerate(numbers)}
-    poses = np.array([model.images[n].cam_from_world() for n in numbers]).reshape(-1, 4, 4)
-    centres = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
-    rows = np.array([at[int(i)] for i in points.track_image_ids], dtype=np.intp)
-    rays = centres[rows] - points.xyz[owner]
-    rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
-    # the widest of all pairs is at most twice that, and costs the square
-    first = rays[points.track_offsets[owner]]
-    angles = np.zeros(len(points.xyz))
-    np.maximum.at(angles, owner, np.arccos(np.clip((rays * first).sum(axis=1), -1.0, 1.0)))
-    return math.degrees(float(np.median(angles))) if len(angles) else math.nan
-
-
 def pair_facts(database: Path, tried: int) -> PairFacts:
     """Measure features, matches and motion between the strongest pairs."""
     with closing(sqlite3.connect(database)) as db:

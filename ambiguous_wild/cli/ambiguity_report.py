@@ -71,10 +71,6 @@ def command(
     from ambiguous_wild.io.scene_folder import load_scene, read_scene_json
 
     loaded = load_scene(scene)
-    if masks_white == "keep" and masks in (None, "truth", "scene", "run"):
-        raise AwError(
-            "--masks-white keep is of a folder given with --masks; all other masks say it themselves"
-        )
     if run is not None:
         check_run(loaded, run)
     found = sources.find_masks(loaded, masks, run, keep=masks_white == "keep")

@@ -4,13 +4,12 @@ import sqlite3
 import numpy as np
 import pytest
 
-from ambiguous_wild.builder.report import _turned
+from ambiguous_wild.builder.report import _turned, parallax_deg
 from ambiguous_wild.builder.select_model import (
     PairFacts,
     check_registered,
     choose_model,
     lost_photos,
-    parallax_deg,
 )
 from ambiguous_wild.core import AwError
 from tests.io.model_maker import make_model, write_binary

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
+from click.testing import CliRunner, Result
 
 from ambiguous_wild.cli.simulate import command
 from ambiguous_wild.core import AwError
@@ -46,6 +46,13 @@ def test_what_is_left_out_is_as_in_the_courtyard() -> None:
     assert spec.radius_m == PRESETS["courtyard"].radius_m and spec.distractors == ()
     assert spec.effects.jpeg is not None and spec.effects.jpeg.quality == (30, 55)
     assert spec.effects.defocus is None and spec.designed.ambiguity == "unstated"
+
+
+def simulated(folder: Path, text: str) -> Result:
+    """`aw simulate` of a spec in the folder."""
+    path = folder / "spec.yaml"
+    path.write_text(text)
+    return CliRunner().invoke(command, [str(path), "-o", str(folder / "raw"), "--no-sheet"])
 
 
 @pytest.mark.parametrize(
@@ -120,9 +127,8 @@ def test_what_is_left_out_is_as_in_the_courtyard() -> None:
     ],
 )
 def test_a_bad_spec_is_said_in_one_line_and_writes_nothing(text: str, expected: str, tmp_path: Path) -> None:
-    path = tmp_path / "bad.yaml"
-    path.write_text(text)
-    done = CliRunner().invoke(command, [str(path), "-o", str(tmp_path / "raw")])
+    path = tmp_path / "spec.yaml"
+    done = simulated(tmp_path, text)
     assert isinstance(done.exception, AwError) and done.exception.exit_code == 2
     message = str(done.exception)
     assert expected in message and "\n" not in message and str(path) in message
@@ -136,13 +142,12 @@ def test_powers_of_ten_need_no_dot() -> None:
 
 
 def test_a_distractor_that_no_photo_shows_is_said(tmp_path: Path) -> None:
-    spec = tmp_path / "spec.yaml"
     walk = "path: walk, waypoints: [[0, -6], [0.5, -6]]"
-    spec.write_text(
+    done = simulated(
+        tmp_path,
         "train_views: 3\ntest_views: 2\nwidth: 64\nheight: 36\ndetail_px_per_m: 20\n"
-        f"distractors: [{{kind: ball, name: ghost, size: 0.1, texture: cloth, ambiguity: none, {walk}}}]\n"
+        f"distractors: [{{kind: ball, name: ghost, size: 0.1, texture: cloth, ambiguity: none, {walk}}}]\n",
     )
-    done = CliRunner().invoke(command, [str(spec), "-o", str(tmp_path / "raw"), "--no-sheet"])
     assert done.exit_code == 0, done.output
     assert "warning: distractor 'ghost' is in none of the train photos" in done.output
 
@@ -162,13 +167,13 @@ def test_the_names_that_a_spec_may_use_are_those_that_the_world_bakes() -> None:
 
 
 def test_a_hand_that_looks_too_far_away_is_refused_before_memory_is_asked_for(tmp_path: Path) -> None:
-    path = tmp_path / "wide.yaml"
+    path = tmp_path / "spec.yaml"
     hand = "{speed_deg_s: 60, %s}"
-    path.write_text(
+    done = simulated(
+        tmp_path,
         "width: 64\nheight: 36\nfocal_35mm: 10\nzoom: [0.5, 0.5]\ntrain_views: 3\ntest_views: 1\neffects: "
-        f"{{motion_blur: {hand % 'exposure_s: 0.5'}, rolling_shutter: {hand % 'readout_s: 0.2'}}}"
+        f"{{motion_blur: {hand % 'exposure_s: 0.5'}, rolling_shutter: {hand % 'readout_s: 0.2'}}}",
     )
-    done = CliRunner().invoke(command, [str(path), "-o", str(tmp_path / "raw")])
     assert isinstance(done.exception, AwError) and "speed_deg_s" in str(done.exception)
     assert list(tmp_path.iterdir()) == [path]
 

@@ -42,8 +42,12 @@ def find_masks(scene: Scene, choice: str | None, run: Path | None, keep: bool = 
         keep: white means keep in a folder of the user's; by default white means distractor.
 
     Raises:
-        AwError: there is none, or photos lack theirs.
+        AwError: there is none, photos lack theirs, or `keep` is said of others than a folder's.
     """
+    if keep and choice in (None, "truth", "scene", "run"):
+        raise AwError(
+            "--masks-white keep is of a folder given with --masks; all other masks say it themselves"
+        )
     truth = scene.root / "truth" / "distractor"
     if choice is None:
         if truth.is_dir():

@@ -1,0 +1,15 @@
+"""Where tensors are computed with: the CPU's own kernels, or torch and gsplat on an accelerator.
+
+Everything that differs between the two asks here, so that the accelerator's path can be run on the CPU by
+tests: as numbers by saying yes to every device, and without numbers on torch's `meta` device, where whatever
+would make the host wait raises.
+"""
+
+from __future__ import annotations
+
+import torch
+
+
+def accelerated(device: torch.device | str) -> bool:
+    """Whether what lies there is left to torch and gsplat; reading it back makes the host wait."""
+    return torch.device(device).type != "cpu"

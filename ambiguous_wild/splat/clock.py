@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+
+SAMPLED = 16  # on a GPU the parts of every so many-th step are timed: an event costs a launch
 
 
-@dataclass
 class Clock:
     """Seconds of training so far, and of each of its parts."""
 
-    elapsed_s: float = 0.0
-    parts_s: dict[str, float] = field(default_factory=dict)
-    _since: float | None = None
+    def __init__(self, elapsed_s: float = 0.0, parts_s: dict[str, float] | None = None) -> None:
+        self.elapsed_s = elapsed_s
+        self.parts_s = {} if parts_s is None else parts_s
+        self._since: float | None = None
 
     def start(self) -> None:
         self._since = time.perf_counter()
@@ -35,3 +39,53 @@ class Clock:
             yield
         finally:
             self.parts_s[name] = self.parts_s.get(name, 0.0) + time.perf_counter() - begin
+
+    def settle(self) -> None:
+        """Wait for what was started but not finished; call it before the clock is stopped to be read."""
+
+
+class GpuClock(Clock):
+    """Parts by the GPU's own events: the host is done with a step long before the GPU is."""
+
+    def __init__(
+        self,
+        elapsed_s: float = 0.0,
+        parts_s: dict[str, float] | None = None,
+        *,
+        event: Callable[[], Any] | None = None,  # with record, synchronize, elapsed_time in ms
+    ) -> None:
+        super().__init__(elapsed_s, parts_s)
+        self._event = event or (lambda: torch.cuda.Event(enable_timing=True))
+        self._steps = 0
+        self._open: list[tuple[str, Any, Any]] = []
+
+    def start(self) -> None:
+        super().start()
+        self._steps += 1
+
+    @contextmanager
+    def part(self, name: str) -> Iterator[None]:
+        if self._since is None or self._steps % SAMPLED:
+            yield
+            return
+        begin, end = self._event(), self._event()
+        begin.record()
+        try:
+            yield
+        finally:
+            end.record()
+            self._open.append((name, begin, end))
+
+    def settle(self) -> None:
+        last = self._event()
+        last.record()
+        last.synchronize()
+        for name, begin, end in self._open:
+            spent = SAMPLED * begin.elapsed_time(end) / 1e3
+            self.parts_s[name] = self.parts_s.get(name, 0.0) + spent
+        self._open = []
+
+
+def clock_for(device: torch.device, elapsed_s: float = 0.0, parts_s: dict[str, float] | None = None) -> Clock:
+    """The clock of a run there."""
+    return (GpuClock if device.type == "cuda" else Clock)(elapsed_s, parts_s)

@@ -1,52 +1,83 @@
 """The `render` call on an NVIDIA GPU, through gsplat (extra `[cuda]`).
 
-gsplat differs from our conventions in one constant of its release 1.5.3: alpha is clamped at 0.999 there,
-at 0.99 here and on gsplat's main branch. The version is written into every run's env.json.
+A picture is made in two stages with a cut between them: Gaussians to splats, splats to pixels. A second
+cotangent goes back through the pixels alone; both meet at the cut and go back to the Gaussians together.
+Nothing here reads a tensor's values: the host waits once a picture, in gsplat, for the number of tiles.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from collections import OrderedDict
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from ambiguous_wild.core import AwError, Camera
-from ambiguous_wild.core.extras import install_command
-from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.core import Camera
+from ambiguous_wild.splat import gsplat_seam as seam
+from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
 from ambiguous_wild.splat.rendered import Gradients
 
-NEAR = 0.01  # world units, as on the CPU
-BLUR = 0.3  # px^2, as on the CPU
+_REMEMBERED = 8192  # cameras; a thousand photos at three sizes, and their test views
 
 
-def _gsplat() -> Any:
-    try:
-        import gsplat
-    except ImportError:
-        raise AwError(
-            f"the Gaussians are on a GPU and gsplat is not installed: {install_command('cuda')}, "
-            "or run with --device cpu"
-        ) from None
-    return gsplat
+@dataclass(frozen=True)
+class _OnDevice:
+    """A camera as gsplat wants it."""
+
+    viewmat: Tensor  # [1, 4, 4]
+    intrinsics: Tensor  # [1, 3, 3]
+    centre: Tensor  # [3]
+
+
+_cameras: OrderedDict[tuple[int, torch.device], tuple[Camera, _OnDevice]] = OrderedDict()
+_backgrounds: dict[tuple[tuple[float, float, float], torch.device], Tensor] = {}
 
 
 class RenderedCuda:
-    """Pictures and gsplat's graph; `backward` may be called once."""
+    """Pictures of one camera and the way back to the parameters; see `render.Rendered`.
+
+    Under `torch.no_grad` there is no way back and less to do.
+    """
 
     def __init__(
-        self, leaves: dict[str, Tensor], colours: Tensor, alphas: Tensor, meta: dict[str, Any]
+        self,
+        leaves: dict[str, Tensor],
+        splats: seam.Splats,
+        colours: Tensor,
+        tiles: seam.Tiles,
+        background: Tensor,
+        size: tuple[int, int],
     ) -> None:
-        self._leaves, self._colours, self._alphas = leaves, colours, alphas
-        self._means2d = meta["means2d"]
-        radii = meta["radii"][0]
-        # 1.5.3 gives a radius per axis; a row is visible where both are positive.
-        radii = radii if radii.dim() == 2 else radii[:, None]
-        self.image = colours[0, ..., :3].detach()
-        self.depth = colours[0, ..., 3].detach()
-        self.alpha = alphas[0, ..., 0].detach()
-        self.visible = (radii > 0).all(dim=1)
-        self.radii = torch.where(self.visible, radii.amax(dim=1), 0).float()
+        """
+        Args:
+            leaves: raw parameters that gradients are asked for.
+            splats, colours: made of them.
+            tiles: of the splats.
+            background: [1, 3].
+            size: width and height in px.
+        """
+        self._leaves, self._splats, self._colours = leaves, splats, colours
+        self._tiles, self._background, self._size = tiles, background, size
+        self._graph = torch.is_grad_enabled()
+        self._cut = self._leaves_of_the_cut()
+        self._image, self._alpha, _ = self._blend(self._cut)
+        self._depth: Tensor | None = None
+        self.image, self.alpha = self._image.detach(), self._alpha.detach()
+        self.visible = (splats.radii > 0).all(dim=1)
+        self.radii = torch.where(self.visible, splats.radii.amax(dim=1), 0).to(torch.float32)
+
+    @property
+    def depth(self) -> Tensor:
+        """[H, W], sum of weight times z; blended when it is first asked for."""
+        if self._depth is None:
+            with torch.no_grad():
+                s = self._splats
+                picture, _, _ = seam.blend(
+                    s.means2d, s.conics, s.depths[:, None], s.opacities, self._tiles, *self._size
+                )
+            self._depth = picture[..., 0]
+        return self._depth
 
     def backward(
         self,
@@ -57,39 +88,71 @@ class RenderedCuda:
         d_depth: Tensor | None = None,
         absolute: bool = False,
     ) -> Gradients:
-        """As `Rendered.backward`; a second cotangent is a second traversal of gsplat's graph."""
-        depth = torch.zeros_like(self.depth) if d_depth is None else d_depth
-        colours = torch.cat([d_image, depth[..., None]], dim=-1)[None]
-        alphas = None if d_alpha is None else d_alpha[None, ..., None]
-        extra = None
-        screen_abs = None
-        first = self._pull(colours, alphas, keep_graph=d_image_extra is not None)
+        """As `Rendered.backward`; once.
+
+        Raises:
+            RuntimeError: the picture was drawn under `torch.no_grad`.
+        """
+        if not self._graph:
+            raise RuntimeError("drawn under torch.no_grad: there is no way back")
+        cut, image, alpha, batch = self._cut, self._image, self._alpha, None
         if absolute:
-            screen_abs = self._means2d.absgrad[0].clone()
+            # gsplat wants to know before it draws; who asks pays for a second drawing
+            with torch.enable_grad():
+                cut = self._leaves_of_the_cut()
+                image, alpha, batch = self._blend(cut, absolute=True)
+        found = _pull(image, alpha, cut, d_image, d_alpha, keep=d_image_extra is not None)
+        screen = found[0]
+        screen_abs = None if batch is None else seam.absolute_gradient(batch)
+        depths = None
+        if d_depth is not None:
+            *through, depths = self._depth_gradients(d_depth)
+            found = _add(found, [through[0], through[1], None, through[2]])
+            screen = found[0]
+        screen_extra = None
         if d_image_extra is not None:
-            zeros = torch.zeros_like(depth)[..., None]
-            extra = self._pull(torch.cat([d_image_extra, zeros], dim=-1)[None], None, keep_graph=False)
-        total = {
-            name: g if extra is None else g + extra[name] for name, g in first.items() if name != "screen"
-        }
+            second = _pull(image, alpha, cut, d_image_extra, None, keep=False)
+            screen_extra = second[0]
+            found = _add(found, second)
         return Gradients(
-            **total,
-            screen=first["screen"],
-            screen_extra=None if extra is None else extra["screen"],
+            **self._to_parameters(found, depths),
+            screen=screen,
+            screen_extra=screen_extra,
             screen_abs=screen_abs,
         )
 
-    def _pull(self, colours: Tensor, alphas: Tensor | None, *, keep_graph: bool) -> dict[str, Tensor]:
-        outputs, cotangents = [self._colours], [colours]
-        if alphas is not None:
-            outputs.append(self._alphas)
-            cotangents.append(alphas)
-        inputs = [*self._leaves.values(), self._means2d]
-        found = torch.autograd.grad(
-            outputs, inputs, cotangents, retain_graph=keep_graph, allow_unused=True, materialize_grads=True
+    def _leaves_of_the_cut(self) -> list[Tensor]:
+        s = self._splats
+        values = (s.means2d, s.conics, self._colours, s.opacities)
+        return [value.detach().requires_grad_(self._graph) for value in values]
+
+    def _blend(self, cut: list[Tensor], *, absolute: bool = False) -> tuple[Tensor, Tensor, Tensor]:
+        means2d, conics, colours, opacities = cut
+        return seam.blend(
+            means2d, conics, colours, opacities, self._tiles, *self._size,
+            background=self._background, absolute=absolute,
+        )  # fmt: skip
+
+    def _depth_gradients(self, d_depth: Tensor) -> tuple[Tensor, ...]:
+        """Of means2d, conics, opacities and depths."""
+        s = self._splats
+        leaves = [v.detach().requires_grad_(True) for v in (s.means2d, s.conics, s.opacities, s.depths)]
+        with torch.enable_grad():
+            picture, _, _ = seam.blend(
+                leaves[0], leaves[1], leaves[3][:, None], leaves[2], self._tiles, *self._size
+            )
+        return torch.autograd.grad(picture, leaves, d_depth[..., None])
+
+    def _to_parameters(self, found: list[Tensor], depths: Tensor | None) -> dict[str, Tensor]:
+        s = self._splats
+        outputs, cotangents = [s.means2d, s.conics, self._colours, s.opacities], list(found)
+        if depths is not None:
+            outputs.append(s.depths)
+            cotangents.append(depths)
+        gradients = torch.autograd.grad(
+            outputs, list(self._leaves.values()), cotangents, allow_unused=True, materialize_grads=True
         )
-        gradients = dict(zip(self._leaves, found[:-1]))
-        return gradients | {"screen": found[-1][0]}
+        return dict(zip(self._leaves, gradients, strict=True))
 
 
 def render_cuda(
@@ -105,27 +168,73 @@ def render_cuda(
     Raises:
         AwError: gsplat is missing; says the command that installs it.
     """
-    gsplat = _gsplat()
-    device = gaussians.device
-    leaves = {name: tensor.detach().requires_grad_(True) for name, tensor in gaussians.items()}
-    with torch.enable_grad():
-        colours, alphas, meta = gsplat.rasterization(
-            means=leaves["means"],
-            quats=leaves["quats"],
-            scales=leaves["log_scales"].exp(),
-            opacities=torch.sigmoid(leaves["opacity_logits"]),
-            colors=torch.cat([leaves["sh0"][:, None], leaves["sh_rest"]], dim=1),
-            viewmats=torch.as_tensor(camera.cam_from_world.copy(), dtype=torch.float32, device=device)[None],
-            Ks=torch.as_tensor(camera.intrinsics, dtype=torch.float32, device=device)[None],
-            width=camera.width,
-            height=camera.height,
-            near_plane=NEAR,
-            eps2d=BLUR,
-            sh_degree=sh_degree,
-            packed=False,
-            backgrounds=torch.tensor([background], dtype=torch.float32, device=device),
-            render_mode="RGB+D",
-            absgrad=True,
-            rasterize_mode="antialiased" if antialias else "classic",
-        )
-    return RenderedCuda(leaves, colours, alphas, meta)
+    seam.gsplat()
+    cam = on_device(camera, gaussians.device)
+    graph = torch.is_grad_enabled()
+    leaves = {name: tensor.detach().requires_grad_(graph) for name, tensor in gaussians.items()}
+    splats = seam.project(
+        leaves["means"],
+        leaves["quats"],
+        leaves["log_scales"].exp(),
+        torch.sigmoid(leaves["opacity_logits"]),
+        cam.viewmat,
+        cam.intrinsics,
+        camera.width,
+        camera.height,
+        antialias=antialias,
+    )
+    colours = _colours(leaves, splats, cam.centre, min(sh_degree, gaussians.sh_degree))
+    size = (camera.width, camera.height)
+    tiles = seam.sort(splats, *size)
+    return RenderedCuda(leaves, splats, colours, tiles, _on_device(background, gaussians.device), size)
+
+
+def _colours(leaves: dict[str, Tensor], splats: seam.Splats, centre: Tensor, degree: int) -> Tensor:
+    """[N, 3], max(SH + 0.5, 0)."""
+    if degree == 0:
+        return (leaves["sh0"] * SH_C0 + 0.5).clamp(min=0.0)
+    active = leaves["sh_rest"][:, : (degree + 1) ** 2 - 1]
+    coefficients = torch.cat([leaves["sh0"][:, None], active], dim=1)
+    visible = (splats.radii > 0).all(dim=1)
+    shade = seam.shade(degree, leaves["means"] - centre, coefficients, visible)
+    return (shade + 0.5).clamp(min=0.0)
+
+
+def on_device(camera: Camera, device: torch.device) -> _OnDevice:
+    """The camera's matrices there, copied once: a copy from the host in every step would make it wait."""
+    key = (id(camera), device)
+    if key in _cameras:
+        _cameras.move_to_end(key)
+        return _cameras[key][1]
+    pose = torch.from_numpy(camera.cam_from_world.astype("float32"))
+    found = _OnDevice(
+        pose[None].to(device),
+        torch.from_numpy(camera.intrinsics.astype("float32"))[None].to(device),
+        torch.from_numpy(camera.center.astype("float32")).to(device),
+    )
+    _cameras[key] = (camera, found)  # the camera itself too: as long as it lives, its id is its own
+    while len(_cameras) > _REMEMBERED:
+        _cameras.popitem(last=False)
+    return found
+
+
+def _on_device(background: tuple[float, float, float], device: torch.device) -> Tensor:
+    key = (background, device)
+    if key not in _backgrounds:
+        _backgrounds[key] = torch.tensor([background], dtype=torch.float32).to(device)
+    return _backgrounds[key]
+
+
+def _pull(
+    image: Tensor, alpha: Tensor, cut: list[Tensor], d_image: Tensor, d_alpha: Tensor | None, *, keep: bool
+) -> list[Tensor]:
+    """Gradients of what lies at the cut."""
+    outputs, cotangents = [image], [d_image]
+    if d_alpha is not None:
+        outputs.append(alpha)
+        cotangents.append(d_alpha)
+    return list(torch.autograd.grad(outputs, cut, cotangents, retain_graph=keep))
+
+
+def _add(a: list[Tensor], b: list[Tensor | None] | list[Tensor]) -> list[Tensor]:
+    return [x if y is None else x + y for x, y in zip(a, b, strict=True)]

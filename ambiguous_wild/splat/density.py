@@ -72,6 +72,7 @@ class DensityControl:
         self.last_reset = 0  # iteration
         self.resets_done = 0
         self.log = DensityLog()  # for pictures; decides nothing
+        self._halves: dict[tuple[int, int], Tensor] = {}
 
     def statistic(self, gradients: Gradients) -> Tensor:
         """The screen-space gradient [N, 2] in 1/px that decides growth."""
@@ -93,7 +94,7 @@ class DensityControl:
         if step.nominal > self.config.stop:
             return
         self._match(step.gaussians)
-        scale = self.statistic(gradients).new_tensor([step.camera.width / 2, step.camera.height / 2])
+        scale = self._half(step.camera.width, step.camera.height, gradients.screen.device)
         visible = step.rendered.visible
         norms = torch.linalg.vector_norm(self.statistic(gradients) * scale, dim=1)
         self.grad_sum += torch.where(visible, norms, torch.zeros_like(norms))
@@ -137,6 +138,12 @@ class DensityControl:
     def clone_offset(self, gaussians: Gaussians, rows: Tensor) -> Tensor | None:
         """Hook: where copies go relative to their originals, [len(rows), 3]; None = the same place."""
         return None
+
+    def _half(self, width: int, height: int, device: torch.device) -> Tensor:
+        """[2] half a picture's size, copied once: a copy from the host in every step makes it wait."""
+        if (width, height) not in self._halves:
+            self._halves[width, height] = torch.tensor([width / 2, height / 2]).to(device)
+        return self._halves[width, height]
 
     def _crossed(self, step: Step, every: float) -> bool:
         # `every` nominal iterations since the last round; in short runs `min_every` dominates.

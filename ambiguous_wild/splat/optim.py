@@ -3,7 +3,8 @@
 Culling reads means, quats, scales and opacity (and every view reads sh0): these 14 floats a Gaussian step
 at once, seen or not. The harmonics above the constant, 45 floats, are read only when a Gaussian is drawn:
 a row nobody sees is put off and takes its steps with gradient zero when the renderer is about to draw it
-(`Gaussians.before_colours`), or at `flush`.
+(`Gaussians.before_colours`), or at `flush`. On an accelerator torch's fused kernel steps every row, one
+launch a tensor, and a flag there can call the step off without the host's knowing.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import unknown
+from ambiguous_wild.splat import device
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.rendered import Gradients
 
@@ -41,12 +43,14 @@ class SplatAdam:
         lazy: bool = True,  # False steps every row of sh_rest at once: the same bits, more memory traffic
     ) -> None:
         self.betas, self.eps = betas, eps
-        self.steps = 0
+        self._accelerated = device.accelerated(gaussians.device)
+        self.steps = 0  # an accelerator counts for itself, see `_count`
+        self._count = torch.zeros((), device=gaussians.device)
         self._rates: dict[str, float] = {}
         self._moments = {
             name: (torch.zeros_like(tensor), torch.zeros_like(tensor)) for name, tensor in gaussians.items()
         }
-        self._lazy = lazy and gaussians.device.type == "cpu"
+        self._lazy = lazy and not self._accelerated
         self._taken = np.zeros(len(gaussians), np.int64)  # steps each row of sh_rest has taken
         self._history = np.zeros((2, 256), np.float32)  # a step's lr / bias1 of sh_rest, and 1 / sqrt(bias2)
         self._rows = len(gaussians)
@@ -134,6 +138,8 @@ class SplatAdam:
         grads: Gradients,
         visible: Tensor,  # [N] bool; rows of sh_rest outside have gradient zero
         learning_rates: Mapping[str, float] | None = None,  # for this step and on; None keeps the last
+        *,
+        called_off: Tensor | None = None,  # on an accelerator, [1] float32 there: 1 = change nothing
     ) -> None:
         """One step of every row.
 
@@ -143,14 +149,14 @@ class SplatAdam:
         if learning_rates is not None:
             self._set_rates(learning_rates)
         gaussians = self.gaussians
+        if self._accelerated:
+            self._step_fused(gaussians, grads, called_off)
+            return
         now, self.steps = self.steps, self.steps + 1
         bias1 = 1 - self.betas[0] ** self.steps
         root = (1 - self.betas[1] ** self.steps) ** -0.5
         steps = {name: rate / bias1 for name, rate in self._rates.items()}
-        if gaussians.device.type == "cpu":
-            self._step_cpu(gaussians, grads, visible, now, steps, root)
-        else:
-            self._step_torch(gaussians, grads, steps, root)
+        self._step_cpu(gaussians, grads, visible, now, steps, root)
 
     def catch_up(self, rows: np.ndarray | None = None) -> None:
         """Let these rows of sh_rest (indices; None: all) take the steps they were put off."""
@@ -220,21 +226,20 @@ class SplatAdam:
             )  # fmt: skip
 
     @torch.no_grad()
-    def _step_torch(
-        self, gaussians: Gaussians, grads: Gradients, steps: dict[str, float], root: float
-    ) -> None:
-        names = [name for name, _ in gaussians.items()]
-        gradients = [getattr(grads, name) for name in names]
-        means, squares = zip(*(self._moments[name] for name in names), strict=True)
-        torch._foreach_lerp_(means, gradients, 1 - self.betas[0])
-        torch._foreach_mul_(squares, self.betas[1])
-        torch._foreach_addcmul_(squares, gradients, gradients, 1 - self.betas[1])
-        below = torch._foreach_sqrt(squares)
-        torch._foreach_mul_(below, root)
-        torch._foreach_add_(below, self.eps)
-        torch._foreach_addcdiv_(
-            [getattr(gaussians, name) for name in names], means, below, [-steps[name] for name in names]
-        )
+    def _step_fused(self, gaussians: Gaussians, grads: Gradients, called_off: Tensor | None) -> None:
+        self._count += 1
+        for name, tensor in gaussians.items():
+            if tensor.numel() == 0:
+                continue
+            gradient = getattr(grads, name).detach().to(torch.float32).contiguous()
+            mean, square = self._moments[name]
+            torch._fused_adam_(
+                [tensor], [gradient], [mean], [square], [], [self._count],
+                lr=self._rates[name], beta1=self.betas[0], beta2=self.betas[1], weight_decay=0.0,
+                eps=self.eps, amsgrad=False, maximize=False, grad_scale=None, found_inf=called_off,
+            )  # fmt: skip
+        if called_off is not None:
+            self._count -= called_off.reshape(())
 
     def _set_rates(self, rates: Mapping[str, float]) -> None:
         for name in rates:
@@ -251,7 +256,7 @@ class SplatAdam:
         """Steps and moments as plain tensors, every row up to date; the parameters are the caller's."""
         self.flush()
         return {
-            "steps": self.steps,
+            "steps": int(self._count) if self._accelerated else self.steps,
             "rates": dict(self._rates),
             "first": {name: m for name, (m, _) in self._moments.items()},
             "second": {name: v for name, (_, v) in self._moments.items()},
@@ -276,6 +281,7 @@ class SplatAdam:
             moments[name] = pair
         self._moments = moments
         self.steps = int(state["steps"])
+        self._count.fill_(self.steps)
         self._rates = {name: float(rate) for name, rate in state["rates"].items()}
         self._taken = np.full(len(gaussians), self.steps, np.int64)
         size = 256

@@ -1,4 +1,4 @@
-"""The judge: the renderer in plain float64 torch, every pixel against every Gaussian, gradients by autograd.
+"""The judge: renderer and loss in plain float64 torch, every pixel against every Gaussian, by autograd.
 
 Slow on purpose: nothing is tiled, sorted twice, approximated or written backwards. Same conventions as
 `render.render`; tests measure both back ends against it.
@@ -39,6 +39,7 @@ class Reference:
     alpha: Tensor  # [H, W]
     depth: Tensor  # [H, W]
     visible: Tensor  # [N] bool
+    conic: Tensor  # [N, 2, 2] inverse of the blurred covariance in the image
     screen: (
         Tensor  # [N, 2] projected means; a leaf of the graph's middle, so that its gradient can be asked for
     )
@@ -89,6 +90,7 @@ def render_reference(
     sh_degree: int = 3,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     antialias: bool = False,
+    max_alpha: float = 0.99,  # the clamp; 0.999 judges gsplat up to 1.5.3
 ) -> Reference:
     """Render with autograd. Memory is H * W * N doubles a tensor: tens of Gaussians, tens of pixels."""
     pose = torch.tensor(camera.cam_from_world)
@@ -146,7 +148,7 @@ def render_reference(
         power = power + conic[i, 0, 1] * d[..., 0] * d[..., 1]
         e = opacity[i] * torch.exp(-power)
         # detach where clamped: min() would already do so, written out because it is the convention.
-        alpha = torch.where(e > 0.99, torch.full_like(e, 0.99), e)
+        alpha = torch.where(e > max_alpha, torch.full_like(e, max_alpha), e)
         alpha = torch.where(alpha < 1 / 255, torch.zeros_like(alpha), alpha)
         touched[i] = bool((alpha > 0).any())
         stopped = stopped | (through * (1 - alpha) <= _STOP)
@@ -156,4 +158,41 @@ def render_reference(
         depth = depth + weight * local[i, 2]
         through = through * (1 - alpha)
     image = image + through[..., None] * torch.tensor(background, dtype=torch.float64)
-    return Reference(image, 1 - through, depth, touched, screen)
+    return Reference(image, 1 - through, depth, touched, conic, screen)
+
+
+def ssim_map_reference(a: Tensor, b: Tensor) -> Tensor:
+    """SSIM of every pixel and channel as `losses.ssim_map`, differentiable, any device and float type."""
+    taps = torch.exp(-((torch.arange(11, dtype=torch.float64) - 5.0) ** 2) / (2 * 1.5**2))
+    taps = (taps / taps.sum()).to(a)
+
+    def blur(x: Tensor) -> Tensor:
+        x = torch.nn.functional.conv2d(
+            x, taps.view(1, 1, 11, 1).expand(15, 1, 11, 1), padding=(5, 0), groups=15
+        )
+        return torch.nn.functional.conv2d(
+            x, taps.view(1, 1, 1, 11).expand(15, 1, 1, 11), padding=(0, 5), groups=15
+        )
+
+    stack = torch.cat([a, b, a * a, b * b, a * b], 2).permute(2, 0, 1)[None]
+    mean_a, mean_b, aa, bb, ab = blur(stack)[0].permute(1, 2, 0).split(3, 2)
+    numerator = (2 * mean_a * mean_b + 0.01**2) * (2 * (ab - mean_a * mean_b) + 0.03**2)
+    spread = (aa - mean_a**2) + (bb - mean_b**2) + 0.03**2
+    return numerator / ((mean_a**2 + mean_b**2 + 0.01**2) * spread)
+
+
+def photometric_reference(
+    render: Tensor, photo: Tensor, keep: Tensor | None, lambda_dssim: float, weighting: str
+) -> tuple[float, float, Tensor]:
+    """L1, 1 - SSIM and the gradient of their mix as `losses.photometric`, by autograd, any float type."""
+    with torch.enable_grad():
+        x = render.detach().requires_grad_(True)
+        y = photo
+        weight = torch.ones_like(x[..., :1]) if keep is None else keep.to(x)[..., None]
+        l1 = (weight * (x - y).abs()).mean()
+        if weighting == "images":
+            dssim = (1 - ssim_map_reference(weight * x, weight * y)).mean()
+        else:
+            dssim = (weight * (1 - ssim_map_reference(x, y))).mean()
+        (gradient,) = torch.autograd.grad((1 - lambda_dssim) * l1 + lambda_dssim * dssim, x)
+    return float(l1.detach()), float(dssim.detach()), gradient

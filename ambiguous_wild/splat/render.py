@@ -9,6 +9,7 @@ screen-space statistic is kept apart, which is what entropy-aware density contro
 from __future__ import annotations
 
 from ambiguous_wild.core import Camera
+from ambiguous_wild.splat import device
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.rendered import Rendered
 
@@ -23,13 +24,14 @@ def render(
 ) -> Rendered:
     """Render the Gaussians for one camera on the device they live on.
 
-    Conventions of both back ends: near plane 0.01, blur +0.3 px^2, alpha clamped at 0.99, alpha below
-    1/255 skipped, a pixel stops before transmittance reaches 1e-4, colours max(SH + 0.5, 0).
+    Conventions of both back ends: near plane 0.01, blur +0.3 px^2, alpha clamped at 0.99 (at 0.999 by
+    gsplat up to 1.5.3, see gsplat_seam.py), alpha below 1/255 skipped, a pixel stops before transmittance
+    reaches 1e-4, colours max(SH + 0.5, 0).
 
     Raises:
         AwError: the Gaussians are on a GPU and gsplat is not installed.
     """
-    if gaussians.device.type == "cpu":
+    if not device.accelerated(gaussians.device):
         from ambiguous_wild.splat.cpu.render import render_cpu
 
         return render_cpu(gaussians, camera, sh_degree=sh_degree, background=background, antialias=antialias)

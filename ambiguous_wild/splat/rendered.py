@@ -33,9 +33,13 @@ class Rendered(Protocol):
 
     image: Tensor  # [H, W, 3] float32, background included, not clamped
     alpha: Tensor  # [H, W] float32 in [0, 1]
-    depth: Tensor  # [H, W] float32, sum of weight times z; divide by alpha for the expected depth
     visible: Tensor  # [N] bool, passed every cull
     radii: Tensor  # [N] float32 px, largest half extent of the 1/255 contour; 0 where not visible
+
+    @property
+    def depth(self) -> Tensor:
+        """[H, W] float32, sum of weight times z; divide by alpha for the expected depth."""
+        ...
 
     def backward(
         self,

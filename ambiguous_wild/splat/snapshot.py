@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.splat.clock import Clock
+from ambiguous_wild.splat.clock import clock_for
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.optim import SplatAdam
 
@@ -28,7 +28,7 @@ def take(trainer: Trainer) -> dict[str, Any]:
         "mask": trainer.parts.mask.state_dict(),
         **({} if trainer.effects is None else {"effects": trainer.effects.state_dict()}),
         "timeline": trainer.timeline.rows,
-        "loss": [trainer.timeline.loss_sum, trainer.timeline.loss_count],
+        "loss": [float(trainer.timeline.loss_sum), trainer.timeline.loss_count],
         "skipped": sorted(trainer.skipped),
         **({"rollbacks": rollbacks} if rollbacks else {}),
     }
@@ -50,10 +50,10 @@ def restore(trainer: Trainer, state: dict[str, Any], path: Path) -> None:
             trainer.effects.load_state_dict(state["effects"])
         trainer.iteration = state["iteration"]
         trainer.setup_s = state["setup_s"]
-        trainer.clock = Clock(state["elapsed_s"], dict(state["parts_s"]))
+        trainer.clock = clock_for(trainer.data.device, state["elapsed_s"], dict(state["parts_s"]))
         trainer.timeline.rows = list(state["timeline"])
         trainer.timeline.loss_sum, trainer.timeline.loss_count = state["loss"]
-        trainer.skipped = set(state["skipped"])
+        trainer.note_skipped(state["skipped"])
         trainer.watchdog.load_state_dict(state.get("rollbacks", []))
     except (KeyError, TypeError) as error:
         raise AwError(f"checkpoint {path} lacks {error}; train again with --overwrite always") from None

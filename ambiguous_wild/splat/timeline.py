@@ -8,6 +8,8 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from torch import Tensor
+
 from ambiguous_wild.io.atomic import write_text
 
 if TYPE_CHECKING:
@@ -21,11 +23,15 @@ class Timeline:
 
     def __init__(self) -> None:
         self.rows: list[dict[str, Any]] = []
-        self.loss_sum, self.loss_count = 0.0, 0  # since the last row
+        self.loss_sum: float | Tensor = 0.0  # since the last row
+        self.loss_count = 0
 
-    def loss(self, value: float) -> None:
-        """Take the loss of one iteration; NaN (a photo left out) does not count."""
-        if not math.isnan(value):
+    def loss(self, value: float | Tensor) -> None:
+        """Take the loss of one iteration; NaN (a photo left out) does not count.
+
+        A tensor is added up where it is: nobody waits for it.
+        """
+        if isinstance(value, Tensor) or not math.isnan(value):
             self.loss_sum, self.loss_count = self.loss_sum + value, self.loss_count + 1
 
     def add(self, iteration: int, gaussians: int, clock: Clock) -> dict[str, Any]:
@@ -33,7 +39,7 @@ class Timeline:
         row: dict[str, Any] = {
             "wall_s": round(clock.now(), 3),
             "iteration": iteration,
-            "loss": self.loss_sum / max(self.loss_count, 1),
+            "loss": float(self.loss_sum) / max(self.loss_count, 1),
             "gaussians": gaussians,
             "psnr_probe": None,
         }

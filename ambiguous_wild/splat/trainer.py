@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
 
@@ -12,17 +12,18 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError, Camera
-from ambiguous_wild.splat import checkpoint, snapshot
-from ambiguous_wild.splat.clock import Clock
+from ambiguous_wild.splat import checkpoint, device, snapshot
+from ambiguous_wild.splat.clock import clock_for
 from ambiguous_wild.splat.data import shrink, shrink_camera, shrink_keep
 from ambiguous_wild.splat.effects.chain import Chain
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.losses import photometric
+from ambiguous_wild.splat.losses import PhotometricLoss, photometric
 from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.pace import Pace, TrainConfig
 from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.render import render
 from ambiguous_wild.splat.rendered import Rendered
+from ambiguous_wild.splat.sentinel import Sentinel
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData
 from ambiguous_wild.splat.timeline import ROWS, Timeline
 from ambiguous_wild.splat.watchdog import NonFinite, Watchdog
@@ -55,12 +56,17 @@ class Trainer:
         self.probe = probe
         names = [view.name for view in data.scene.train]
         self.watchdog = Watchdog(folder, config.on_nonfinite, config.seed, names)
-        self.clock = Clock()
+        self.clock = clock_for(data.device)
         self.setup_s = 0.0  # seconds before the first step, of the process that began the run
         self.iteration = 0
         self.timeline = Timeline()
-        self.skipped: set[int] = set()  # views that were all masked at some step
+        self._skipped: set[int] = set()  # views that were all masked at some step
         self._pyramid: dict[tuple[int, int], Tensor] = {}
+        self._cameras: dict[tuple[int, int], Camera] = {}
+        # where the host must not wait, what would make it wait is written down there and looked at later
+        on = device.accelerated(data.device)
+        self.sentinel = Sentinel(data.device, len(data.photos)) if on else None
+        self._prefetch = getattr(data.photos, "prefetch", None)
 
         points = data.scene.points
         self.gaussians = Gaussians.from_points(
@@ -88,6 +94,12 @@ class Trainer:
         if key not in self._pyramid:
             self._pyramid[key] = shrink(self.data.photos[view], divisor)
         return self._pyramid[key]
+
+    def _camera(self, view: int, divisor: int) -> Camera:
+        """Made once: what a back end keeps of a camera it finds again by the object."""
+        if (view, divisor) not in self._cameras:
+            self._cameras[view, divisor] = shrink_camera(self.data.cameras[view], divisor)
+        return self._cameras[view, divisor]
 
     def render(self, camera: Camera, nominal: float | None = None, view: int | None = None) -> Rendered:
         """The model as it stands, for one camera; `view` says which train photo's effects apply."""
@@ -122,7 +134,7 @@ class Trainer:
         """Render a train view as the loop does; also used to predict masks afterwards."""
         progress = self.progress(iteration)
         divisor = self.pace.divisor(progress) if divisor is None else divisor
-        camera = shrink_camera(self.data.cameras[view], divisor)
+        camera = self._camera(view, divisor)
         if self.effects is not None:
             camera = self.effects.camera(view, camera)
         nominal = progress * NOMINAL_ITERATIONS
@@ -139,6 +151,15 @@ class Trainer:
             camera=camera,
             rendered=rendered,
             gaussians=self.gaussians,
+        )
+
+    def _photometric(self, step: Step, keep: Tensor | None) -> PhotometricLoss:
+        return photometric(
+            step.rendered.image,
+            step.photo,
+            keep,
+            lambda_dssim=self.parts.lambda_dssim,
+            weighting=self.parts.weighting,
         )
 
     def combine_user_keep(self, step: Step, keep: Tensor | None) -> Tensor | None:
@@ -158,8 +179,10 @@ class Trainer:
         user = shrink_keep(user, step.divisor)
         return user if keep is None else keep * user
 
-    def step(self) -> float:
+    def step(self) -> float | Tensor:
         """One iteration; returns the photometric loss, NaN where the photo is left out after a rollback.
+
+        On an accelerator the loss is a tensor there, and nothing is waited for but the number of tiles.
 
         Raises:
             NonFinite: names view, iteration and parameters.
@@ -174,28 +197,30 @@ class Trainer:
         with part("mask"):
             keep = self.combine_user_keep(step, self.parts.mask.keep(step))
         with part("loss"):
-            loss = photometric(
-                step.rendered.image,
-                step.photo,
-                keep,
-                lambda_dssim=self.parts.lambda_dssim,
-                weighting=self.parts.weighting,
-            )
-        self.watchdog.look_at_loss(step, keep, loss)
+            loss = self._photometric(step, keep)
+        if self.sentinel is None:
+            self.watchdog.look_at_loss(step, keep, loss)
         with part("mask loss"):
             extra = self.parts.mask.cotangent(step, keep)
-        if keep is not None and not bool(keep.any()):
+        if self.sentinel is None and keep is not None and not bool(keep.any()):
             # Nothing to learn from: moving on Adam's momentum alone would drift away from the scene.
-            self.skipped.add(step.view)
+            self._skipped.add(step.view)
             self.iteration = iteration
             return loss.value
         with part("backward"):
             gradients = step.rendered.backward(loss.d_image, d_image_extra=extra)
+        called_off = None
         with part("watchdog"):
-            self.watchdog.look_at_gradients(step, keep, loss, gradients)
+            if self.sentinel is None:
+                self.watchdog.look_at_gradients(step, keep, loss, gradients)
+            else:
+                looked_at = list(self.watchdog.looked_at(gradients).values())
+                called_off = self.sentinel.watch(
+                    iteration, view, torch.as_tensor(loss.value), looked_at, keep
+                )
         with part("optimiser"):
             rates = self.pace.learning_rates(self.progress(iteration))
-            self.optimiser.step(gradients, step.rendered.visible, rates)
+            self.optimiser.step(gradients, step.rendered.visible, rates, called_off=called_off)
         with part("density"):
             self.density.observe(step, gradients, keep)
             self.gaussians, events = self.density.refine(step, self.gaussians, self.optimiser)
@@ -207,11 +232,32 @@ class Trainer:
                     self.effects.rows_changed()
         if "reset" in events:
             self.parts.mask.on_opacity_reset(step)
+        if self._prefetch is not None:
+            self._prefetch(self.pace.view(iteration + 1))
         if events or self.watchdog.due(iteration):
             with part("watchdog"):
+                self._look_back()
                 self.watchdog.look_at_parameters(iteration, view, self.gaussians)
         self.iteration = iteration
         return loss.value
+
+    def _look_back(self) -> None:
+        """What the sentinel wrote down since the last look: the step is made again, to show what was wrong.
+
+        Raises:
+            NonFinite: as the step would have raised it, had anybody waited for it.
+        """
+        iteration = None if self.sentinel is None else self.sentinel.first_broken()
+        if iteration is None:
+            return
+        step = self.make_step(iteration, self.pace.view(iteration))
+        keep = self.combine_user_keep(step, self.parts.mask.predict(step))
+        loss = self._photometric(step, keep)
+        self.watchdog.look_at_loss(step, keep, loss)
+        extra = self.parts.mask.cotangent(step, keep)
+        gradients = step.rendered.backward(loss.d_image, d_image_extra=extra)
+        self.watchdog.look_at_gradients(step, keep, loss, gradients)
+        raise self.watchdog.not_seen_again(step, keep, loss)
 
     def train(self, *, tick: Callable[[Trainer], None] | None = None) -> None:
         """Run to the end; saves as it goes, probes on schedule.
@@ -245,10 +291,13 @@ class Trainer:
             self.clock.stop()
             self.watchdog.handle(self, error)
             return
+        after = self.progress(self.iteration)
+        due = int(after * ROWS) > int(before * ROWS)
+        if due:
+            self.clock.settle()
         self.clock.stop()
         self.timeline.loss(loss)
-        after = self.progress(self.iteration)
-        if int(after * ROWS) > int(before * ROWS):
+        if due:
             probes = self.config.probes
             self._log(probing=probes > 0 and int(after * probes) > int(before * probes))
         if tick is not None:
@@ -256,6 +305,7 @@ class Trainer:
 
     def check_parameters(self) -> None:
         """Raise NonFinite, as of the last step, where a parameter is not finite."""
+        self._look_back()
         view = self.pace.view(max(self.iteration, 1))
         self.watchdog.look_at_parameters(self.iteration, view, self.gaussians)
 
@@ -276,6 +326,7 @@ class Trainer:
             row["psnr_probe"] = self.probe(self._probe_image)
             self.clock.parts_s = spent
 
+    @torch.no_grad()
     def _probe_image(self, camera: Camera) -> Tensor:
         # Rows the optimiser has put off are brought up to date first; it computes what a later step
         # would have computed, so that probing changes nothing (a test compares the bits).
@@ -292,6 +343,15 @@ class Trainer:
         return sorted(self.data.scene.train[i].name for i in self.skipped)
 
     @property
+    def skipped(self) -> set[int]:
+        """Those photos' indices."""
+        return self._skipped | (self.sentinel.empty_views() if self.sentinel is not None else set())
+
+    def note_skipped(self, views: Iterable[int]) -> None:
+        """Of the part of the run before it was resumed."""
+        self._skipped = set(views)
+
+    @property
     def checkpoint_path(self) -> Path:
         return self.folder / "checkpoint" / "last.safetensors"
 
@@ -305,4 +365,6 @@ class Trainer:
         if not self.checkpoint_path.exists():
             return False
         snapshot.restore(self, checkpoint.load(self.checkpoint_path), self.checkpoint_path)
+        if self.sentinel is not None:
+            self.sentinel.reset()
         return True

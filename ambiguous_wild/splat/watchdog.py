@@ -22,8 +22,7 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.atomic import atomic_path, write_json
-from ambiguous_wild.splat import checkpoint
-from ambiguous_wild.splat.cpu.finite import all_finite
+from ambiguous_wild.splat import checkpoint, device
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.losses import PhotometricLoss
 from ambiguous_wild.splat.rendered import Gradients
@@ -87,7 +86,7 @@ class Watchdog:
 
     def look_at_loss(self, step: Step, keep: Tensor | None, loss: PhotometricLoss) -> None:
         """Raise NonFinite if the loss of this step is not finite."""
-        if not math.isfinite(loss.value):
+        if not math.isfinite(float(loss.value)):
             raise self._found("loss", step.iteration, step.view, {}, _seen(step, keep, loss))
 
     def look_at_gradients(
@@ -97,12 +96,20 @@ class Watchdog:
 
         Adam would not show it: its kernel takes a moment that is NaN for one too small to count.
         """
-        named = {name: getattr(gradients, name) for name in _LOOKED_AT}
+        named = self.looked_at(gradients)
         if not _finite(named):
             bad = _bad_rows(named)
             if bad:
                 found = {f"d_{name}": getattr(gradients, name) for name in bad}
                 raise self._found("gradient", step.iteration, step.view, bad, _seen(step, keep, loss) | found)
+
+    def looked_at(self, gradients: Gradients) -> dict[str, Tensor]:
+        """Those that are looked at in every step."""
+        return {name: getattr(gradients, name) for name in _LOOKED_AT}
+
+    def not_seen_again(self, step: Step, keep: Tensor | None, loss: PhotometricLoss) -> NonFinite:
+        """A finding that the step did not show when it was made again: sums come in another order there."""
+        return self._found("gradient", step.iteration, step.view, {}, _seen(step, keep, loss))
 
     def due(self, iteration: int) -> bool:
         """Whether parameters are looked at after this iteration, whatever happened in it."""
@@ -196,7 +203,9 @@ class Watchdog:
 
 def _finite(named: Mapping[str, Tensor]) -> bool:
     tensors = list(named.values())
-    if tensors[0].device.type == "cpu":
+    if not device.accelerated(tensors[0].device):
+        from ambiguous_wild.splat.cpu.finite import all_finite
+
         return all_finite(tensors)
     # On a GPU a sum each: several times as fast as isfinite().all(), which writes a tensor of its own. A
     # large but sound one may overflow; the rows tell.

@@ -4,6 +4,11 @@ Rounding every raw parameter by one unit in float64 moves the result by `conditi
 can be asked for less. A stable one adds a constant times the length of its chain (Higham, Accuracy and
 Stability of Numerical Algorithms, ch. 1): about 16 operations from parameters to a pixel's exponent, three a
 Gaussian that lies over it, and for gradients as many again backwards, plus the sums over a tile.
+
+A GPU's path is gsplat's, which is built for speed (`-use_fast_math`): an exponential is right to 2 + |1.2 x|
+units, 8 down to the cut at 1/255, a quotient to 2; and it inverts the blurred covariance by its determinant,
+a difference that leaves (a c - b^2) / (a c) of the digits. Its bound is wider by both. It is judged with its
+own alpha clamp (`gsplat_seam.max_alpha`).
 """
 
 from __future__ import annotations
@@ -15,37 +20,67 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import Camera
+from ambiguous_wild.splat import device as splat_device
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.reference import render_reference
 from ambiguous_wild.splat.render import render
 from ambiguous_wild.stress.case import UNIT, Measured
 
 _DRAWS = 2  # roundings tried; the largest change counts
+FAST_MATH = 8  # units a GPU's exponential is off by at most
+
+
+def clamp_of(device: str) -> dict[str, float]:
+    """The alpha clamp of a device's back end, as an argument of `judge`."""
+    if not splat_device.accelerated(device):
+        return {}
+    from ambiguous_wild.splat.gsplat_seam import max_alpha
+
+    return {"max_alpha": max_alpha()}
 
 
 def picture_and_gradients(
-    g: Gaussians, camera: Camera, device: str, d_image: Tensor, **options: Any
+    g: Gaussians,
+    camera: Camera,
+    device: str,
+    d_image: Tensor,
+    d_alpha: Tensor | None = None,
+    d_depth: Tensor | None = None,
+    **options: Any,
 ) -> dict[str, Tensor]:
-    """Image and gradient of every parameter as the back end of `device` gives them, float64 on the CPU."""
+    """Pictures and gradient of every parameter as the back end of `device` gives them, float64 on the CPU."""
     rendered = render(g.to(device), camera, **options)
-    grads = rendered.backward(d_image.to(device))
-    found = {f"d_{name}": getattr(grads, name) for name, _ in g.items()} | {"image": rendered.image}
+    more = {"d_alpha": d_alpha, "d_depth": d_depth}
+    grads = rendered.backward(
+        d_image.to(device), **{name: d.to(device) for name, d in more.items() if d is not None}
+    )
+    found = {f"d_{name}": getattr(grads, name) for name, _ in g.items()}
+    found |= {"image": rendered.image, "alpha": rendered.alpha, "depth": rendered.depth}
     return {name: tensor.detach().cpu().double() for name, tensor in found.items()}
 
 
 def judge(
-    parameters: dict[str, Tensor], camera: Camera, d_image: Tensor, **options: Any
+    parameters: dict[str, Tensor],
+    camera: Camera,
+    d_image: Tensor,
+    d_alpha: Tensor | None = None,
+    d_depth: Tensor | None = None,
+    **options: Any,
 ) -> dict[str, Tensor]:
     """The same in float64 by autograd."""
     leaves = {name: tensor.clone().requires_grad_(True) for name, tensor in parameters.items()}
     truth = render_reference(leaves, camera, **options)
     loss = (truth.image * d_image.double()).sum() + 0.0 * truth.screen.sum()
+    for picture, cotangent in ((truth.alpha, d_alpha), (truth.depth, d_depth)):
+        if cotangent is not None:
+            loss = loss + (picture * cotangent.double()).sum()
     found = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True)
     gradients = {
         f"d_{name}": torch.zeros_like(leaf) if gradient is None else gradient
         for (name, leaf), gradient in zip(leaves.items(), found)
     }
-    return gradients | {"image": truth.image.detach()}
+    pictures = {"image": truth.image, "alpha": truth.alpha, "depth": truth.depth}
+    return gradients | {name: picture.detach() for name, picture in pictures.items()}
 
 
 def agree(
@@ -59,24 +94,42 @@ def agree(
 ) -> Measured:
     """Worst error of image and gradients, each over its largest value, and what it may be."""
     rng = np.random.default_rng(0)
-    d_image = torch.from_numpy(rng.normal(size=(camera.height, camera.width, 3)).astype(np.float32))
+    shapes = [(camera.height, camera.width, 3), (camera.height, camera.width), (camera.height, camera.width)]
+    d = [torch.from_numpy(rng.normal(size=shape).astype(np.float32)) for shape in shapes]
     parameters = {name: tensor.double() for name, tensor in g.items()}
-    truth = judge(parameters, camera, d_image, **options)
+    clamp = clamp_of(device)
+    truth = judge(parameters, camera, *d, **options, **clamp)
     condition = 1.0
     for _ in range(_DRAWS):
         moved = {
             name: t * (1 + UNIT * torch.from_numpy(rng.choice([-1.0, 1.0], size=t.shape)))
             for name, t in parameters.items()
         }
-        condition = max(condition, _distance(judge(moved, camera, d_image, **options), truth) / UNIT)
-    error = _distance(picture_and_gradients(g, camera, device, d_image, **options), truth)
+        again = judge(moved, camera, *d, **options, **clamp)
+        condition = max(condition, _distance(again, truth) / UNIT)
+    error = _distance(picture_and_gradients(g, camera, device, *d, **options), truth)
     steps = 96 + 6 * (len(g) if layers is None else layers)
-    return Measured(error, steps * condition * UNIT, f"{steps} roundings x condition", comes_out, condition)
+    bound, why = steps * condition * UNIT, f"{steps} roundings x condition"
+    if splat_device.accelerated(device):
+        lost = _lost_by_determinants(parameters, camera, **options)
+        bound, why = bound * FAST_MATH * lost, f"{why} x {FAST_MATH} x determinant {lost:.1e}"
+    return Measured(error, bound, why, comes_out, condition)
+
+
+def _lost_by_determinants(parameters: dict[str, Tensor], camera: Camera, **options: Any) -> float:
+    """a c / (a c - b^2) of the blurred covariance, the largest of what is drawn: 1 where no axis is oblique."""
+    truth = render_reference(parameters, camera, **options)
+    conic = truth.conic[truth.visible]
+    if not len(conic):
+        return 1.0
+    product = conic[:, 0, 0] * conic[:, 1, 1]
+    return max(float((product / torch.linalg.det(conic)).max()), 1.0)
 
 
 def _distance(a: dict[str, Tensor], b: dict[str, Tensor]) -> float:
     worst = 0.0
-    steepest = max(float(truth.abs().max()) for name, truth in b.items() if truth.numel() and name != "image")
+    slopes = [truth for name, truth in b.items() if truth.numel() and name.startswith("d_")]
+    steepest = max(float(slope.abs().max()) for slope in slopes)
     for name, truth in b.items():
         if truth.numel():
             # a gradient that is 0 in exact arithmetic has no relative error: a millionth of the largest one

@@ -9,17 +9,30 @@ import numpy as np
 import torch
 
 from ambiguous_wild.core import Camera
+from ambiguous_wild.splat import device as splat_device
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.reference import render_reference
 from ambiguous_wild.splat.render import render
-from ambiguous_wild.stress.agreement import agree, camera, cloud, front, judge, picture_and_gradients
+from ambiguous_wild.stress.agreement import (
+    FAST_MATH,
+    agree,
+    camera,
+    clamp_of,
+    cloud,
+    front,
+    judge,
+    picture_and_gradients,
+)
 from ambiguous_wild.stress.case import UNIT, Measured, case, worst, wrong
 
 BOTH = ("cpu", "cuda")
 
 
 def _unharmed(bad: Gaussians, device: str, comes_out: str) -> Measured:
-    """Whether 20 sound Gaussians are drawn and learn as if the others were not there, bit for bit."""
+    """Whether 20 sound Gaussians are drawn and learn as if the others were not there.
+
+    Bit for bit; on a GPU gradients to rounding, whose sums come in no fixed order there.
+    """
     good, cam = cloud(20, 7), camera()
     bad = dataclasses.replace(bad, sh_rest=torch.zeros(len(bad), good.sh_rest.shape[1], 3))
     d_image = torch.ones(cam.height, cam.width, 3)
@@ -28,9 +41,16 @@ def _unharmed(bad: Gaussians, device: str, comes_out: str) -> Measured:
     checks = {"picture": torch.equal(alone["image"], both["image"])}
     for name in (field.name for field in dataclasses.fields(good)):
         found = both[f"d_{name}"]
-        checks[f"{name} of the sound"] = torch.equal(found[:20], alone[f"d_{name}"])
+        checks[f"{name} of the sound"] = _same(found[:20], alone[f"d_{name}"], device)
         checks[f"{name} of the culled is 0"] = not bool(found[20:].any())
     return wrong(checks, comes_out)
+
+
+def _same(a: torch.Tensor, b: torch.Tensor, device: str) -> bool:
+    if not splat_device.accelerated(device):
+        return torch.equal(a, b)
+    # sums of up to 21 x 17 pixels in another order
+    return bool(((a - b).abs() <= 21 * 17 * UNIT * b.abs().max()).all())
 
 
 @case(1, "at or behind the near plane, at the camera, at 1e6", devices=BOTH)
@@ -43,7 +63,7 @@ def near_plane(device: str) -> Measured:
     return _unharmed(bad, device, "culled, zero gradient, nobody else's changes")
 
 
-@case(1, "just before the near plane")
+@case(1, "just before the near plane", devices=BOTH)
 def before_the_near_plane(device: str) -> Measured:
     g = front(1, depth=0.0101)
     g.means[0, :2] = torch.tensor([1e-4, -1e-4])
@@ -125,9 +145,10 @@ def logits_and_colours(device: str) -> Measured:
     )
 
 
-@case(3, "a logit of 40 meets the alpha clamp")
+@case(3, "a logit of 40 meets the alpha clamp", devices=BOTH)
 def logit_clamped(device: str) -> Measured:
-    return _single(device, "alpha 0.99, no gradient where clamped", {"opacity_logits": 40.0})
+    clamp = clamp_of(device).get("max_alpha", 0.99)
+    return _single(device, f"alpha {clamp}, no gradient where clamped", {"opacity_logits": 40.0})
 
 
 @case(4, "10 000 on one pixel", devices=BOTH)
@@ -149,7 +170,7 @@ def stack(device: str) -> Measured:
     return wrong(checks, "transmittance never negative, gradients finite")
 
 
-@case(4, "opacity 0.99 stacked 1000 deep")
+@case(4, "opacity 0.99 stacked 1000 deep", devices=BOTH)
 def opaque_stack(device: str) -> Measured:
     g = front(1000)
     g.means[:, 2] = 3.0 + 0.001 * torch.arange(1000)
@@ -170,7 +191,7 @@ def sizes(device: str) -> Measured:
     return worst(parts)
 
 
-@case(5, "nothing to draw, and one over all")
+@case(5, "nothing to draw, and one over all", devices=BOTH)
 def nothing(device: str) -> Measured:
     cam, background = camera(), (0.1, 0.5, 0.9)
     plain = torch.tensor(background).expand(cam.height, cam.width, 3)
@@ -192,7 +213,7 @@ def nothing(device: str) -> Measured:
     return wrong(checks, "the background, no gradient; the one Gaussian's opacity everywhere")
 
 
-@case(6, "principal point outside, focal lengths of 1 and 1e5 px, the frustum clamp")
+@case(6, "principal point outside, focal lengths of 1 and 1e5 px, the frustum clamp", devices=BOTH)
 def cameras(device: str) -> Measured:
     parts = []
     for cx, cy in ((-100.0, 5.0), (300.0, 300.0)):
@@ -209,11 +230,11 @@ def cameras(device: str) -> Measured:
     return dataclasses.replace(worst(parts), comes_out="as in float64")
 
 
-@case(7, "gradients against finite differences, on both sides of clamp, cut and stop")
+@case(7, "gradients against finite differences, on both sides of clamp, cut and stop", devices=BOTH)
 def finite_differences(device: str) -> Measured:
     """Central differences of the float64 picture: no derivative of anybody's is trusted."""
     parts = []
-    for opacity in (0.9899, 0.9901, 0.999 / 255, 1.001 / 255, 0.8999, 0.9003, 0.5):
+    for opacity in (0.9899, 0.9901, 0.9989, 0.9991, 0.999 / 255, 1.001 / 255, 0.8999, 0.9003, 0.5):
         g = front(4, rest=3)
         g.log_scales[:] = torch.tensor([1.0, 1.2, 0.9])
         g.opacity_logits[:] = math.log(opacity / (1 - opacity))
@@ -225,22 +246,22 @@ def finite_differences(device: str) -> Measured:
 def _against_differences(g: Gaussians, cam: Camera, device: str) -> Measured:
     rng, step = np.random.default_rng(0), 1e-6
     d_image = torch.from_numpy(rng.normal(size=(cam.height, cam.width, 3)).astype(np.float32))
-    parameters = {name: tensor.double() for name, tensor in g.items()}
+    parameters, clamp = {name: tensor.double() for name, tensor in g.items()}, clamp_of(device)
     actual = picture_and_gradients(g, cam, device, d_image, sh_degree=1)
-    exact = judge(parameters, cam, d_image, sh_degree=1)
+    exact = judge(parameters, cam, d_image, sh_degree=1, **clamp)
     worst_error, scale = 0.0, max(float(exact[f"d_{name}"].abs().max()) for name in parameters) + 1e-3
     for name, tensor in parameters.items():
         direction = torch.from_numpy(rng.normal(size=tensor.shape))
         sides = []
         for sign in (1.0, -1.0):
             moved = parameters | {name: tensor + sign * step * direction}
-            image = render_reference(moved, cam, sh_degree=1).image
+            image = render_reference(moved, cam, sh_degree=1, **clamp).image
             sides.append(float((image * d_image.double()).sum()))
         numeric = (sides[0] - sides[1]) / (2 * step)
         worst_error = max(worst_error, abs(float((actual[f"d_{name}"] * direction).sum()) - numeric) / scale)
     terms = sum(t.numel() for t in parameters.values())
     # 96 + 6 N roundings of float32, times the terms of a directional derivative; h^2 and 1e-16 / h vanish
-    tolerance = (96 + 6 * len(g)) * terms * UNIT
+    tolerance = (96 + 6 * len(g)) * terms * UNIT * (FAST_MATH if clamp else 1)
     return Measured(worst_error, tolerance, "roundings x terms of a derivative", "the same slope", None)
 
 

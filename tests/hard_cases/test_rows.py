@@ -7,6 +7,7 @@ import pytest
 
 from ambiguous_wild.stress.case import run
 from ambiguous_wild.stress.table import CASES
+from tests.splat import fake_gsplat
 
 DOCS = Path(__file__).parents[2] / "docs" / "numerics.md"
 
@@ -24,6 +25,16 @@ def test_row(case):
 def test_row_on_a_gpu(case):
     pytest.importorskip("gsplat")
     outcome = run(case, "cuda")
+    assert outcome.failure == ""
+    assert outcome.passed, (outcome.error, outcome.tolerance, outcome.why)
+
+
+@pytest.mark.parametrize("version", ["1.5.3", "1.6.0"])
+@pytest.mark.parametrize("case", [c for c in CASES if "cuda" in c.devices], ids=lambda case: case.key)
+def test_row_on_a_gpus_path_around_a_stand_in(case, version, monkeypatch):
+    """All of it but gsplat's own kernels, of which a stand-in in plain torch has the conventions."""
+    with fake_gsplat.installed(monkeypatch, version):
+        outcome = run(case, "cpu")
     assert outcome.failure == ""
     assert outcome.passed, (outcome.error, outcome.tolerance, outcome.why)
 

@@ -1,11 +1,13 @@
 """The optimiser that puts rows off against torch's dense Adam and against its own dense mode."""
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 import torch
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.splat import checkpoint
+from ambiguous_wild.splat import checkpoint, device
 from ambiguous_wild.splat.cpu.render import render_cpu
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.optim import SplatAdam
@@ -222,18 +224,73 @@ def test_a_resumed_optimiser_goes_on_with_the_same_bits(tmp_path):
     assert equal(straight, stopped)
 
 
-def test_the_path_of_other_devices_gives_the_same_steps():
+@pytest.fixture
+def accelerated(monkeypatch):
+    """A function that makes an optimiser as an accelerator's tensors get one."""
+
+    def make(model):
+        with monkeypatch.context() as patch:
+            patch.setattr(device, "accelerated", lambda _: True)
+            return SplatAdam(model, RATES)
+
+    return make
+
+
+def test_an_accelerator_takes_the_same_steps(accelerated):
     g, other = gaussians(9, 15), gaussians(9, 15)
-    a, b = SplatAdam(g, RATES), SplatAdam(other, RATES, lazy=False)
+    a, b = SplatAdam(g, RATES), accelerated(other)
     for step in range(50):
         grads, visible = gradients_at(g, step)
-        a.step(grads, visible)
-        b.steps += 1
-        rates = {name: rate / (1 - 0.9**b.steps) for name, rate in RATES.items()}
-        b._step_torch(other, grads, rates, (1 - 0.999**b.steps) ** -0.5)
+        a.step(grads, visible, rates_at(step))
+        b.step(grads, visible, rates_at(step))
     a.flush()
     for name, tensor in g.items():
         torch.testing.assert_close(tensor, getattr(other, name), rtol=1e-6, atol=1e-6)
+    assert b.state_dict()["steps"] == a.state_dict()["steps"] == 50
+
+
+def test_a_step_called_off_on_the_device_never_was(accelerated):
+    g, other = gaussians(9, 15), gaussians(9, 15)
+    a, b = accelerated(g), accelerated(other)
+    for step in range(6):
+        grads, visible = gradients_at(g, step)
+        a.step(grads, visible, called_off=torch.zeros(1))
+        b.step(grads, visible)
+        before = other.clone()
+        grads.means[:] = torch.nan
+        b.step(grads, visible, called_off=torch.ones(1))
+        assert equal(other, before)
+    assert equal(g, other)
+    assert b.state_dict()["steps"] == 6
+
+
+def test_an_accelerators_state_goes_on_on_the_cpu_and_back(accelerated):
+    g, other = gaussians(9, 15), gaussians(9, 15)
+    a, b = SplatAdam(g, RATES), accelerated(other)
+    for step in range(10):
+        grads, visible = gradients_at(g, step)
+        a.step(grads, visible)
+        b.step(grads, visible)
+    a.flush()
+    there, back = SplatAdam(other, RATES), accelerated(g)
+    there.load_state_dict(b.state_dict())
+    back.load_state_dict(a.state_dict())
+    for step in range(10, 20):
+        grads, visible = gradients_at(g, step)
+        there.step(grads, visible)
+        back.step(grads, visible)
+    there.flush()
+    for name, tensor in g.items():
+        torch.testing.assert_close(tensor, getattr(other, name), rtol=1e-6, atol=1e-6)
+
+
+def test_no_host_read_in_an_accelerators_step():
+    g = gaussians(9, 15)
+    grads, visible = gradients_at(g, 0)
+    on_meta = {f.name: getattr(grads, f.name) for f in fields(grads) if getattr(grads, f.name) is not None}
+    optimiser = SplatAdam(g.to("meta"), RATES)
+    moved = Gradients(**{name: tensor.to("meta") for name, tensor in on_meta.items()})
+    optimiser.step(moved, visible.to("meta"), called_off=torch.zeros(1, device="meta"))
 
 
 def test_learning_rates_are_checked():

@@ -1,0 +1,169 @@
+"""The calls of gsplat that a picture is made of, whichever of its versions is installed.
+
+Nothing else of the package imports gsplat. What its versions do differently is said here, once.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.core.extras import install_command
+
+NEAR = 0.01  # world units, as on the CPU
+BLUR = 0.3  # px^2, as on the CPU
+TILE = 16  # px
+
+
+@dataclass(frozen=True)
+class Splats:
+    """What one camera sees of N Gaussians, before they are blended. All but `radii` have gradients."""
+
+    radii: Tensor  # [N, 2] int32 px along x and y; 0 where culled
+    means2d: Tensor  # [N, 2] px
+    depths: Tensor  # [N]
+    conics: Tensor  # [N, 3] a, b, c of the inverse covariance
+    opacities: Tensor  # [N], antialiasing included
+
+
+@dataclass(frozen=True)
+class Tiles:
+    """Which splats lie over which tiles, by depth."""
+
+    offsets: Tensor  # [1, rows, columns] int32
+    flatten_ids: Tensor  # [intersections] int32
+
+
+@functools.cache
+def gsplat() -> Any:
+    """The installed package.
+
+    Raises:
+        AwError: there is none; says the command that installs it.
+    """
+    try:
+        import gsplat
+    except ImportError:
+        raise AwError(
+            f"the Gaussians are on a GPU and gsplat is not installed: {install_command('cuda')}, "
+            "or run with --device cpu"
+        ) from None
+    return gsplat
+
+
+def version() -> str:
+    """Of the installed gsplat."""
+    return str(gsplat().__version__)
+
+
+def max_alpha() -> float:
+    """Where alpha is clamped: 0.99 as on the CPU, but 0.999 up to release 1.5.3.
+
+    The constant is compiled into the kernels. It tells only where a Gaussian's opacity is above 0.99, and
+    there by the light of what lies behind a hundred times attenuated, or a thousand times.
+    """
+    numbers = version().split("+")[0].split(".")[:2]
+    return 0.999 if tuple(int(n) for n in numbers if n.isdigit()) < (1, 6) else 0.99
+
+
+def project(
+    means: Tensor,  # [N, 3]
+    quats: Tensor,  # [N, 4]
+    scales: Tensor,  # [N, 3]
+    opacities: Tensor,  # [N]
+    viewmat: Tensor,  # [1, 4, 4] cam_from_world
+    intrinsics: Tensor,  # [1, 3, 3]
+    width: int,
+    height: int,
+    *,
+    antialias: bool,
+) -> Splats:
+    """EWA projection and culls; differentiable."""
+    radii, means2d, depths, conics, compensations = gsplat().fully_fused_projection(
+        means=means,
+        covars=None,
+        quats=quats,
+        scales=scales,
+        viewmats=viewmat,
+        Ks=intrinsics,
+        width=width,
+        height=height,
+        eps2d=BLUR,
+        near_plane=NEAR,
+        packed=False,
+        calc_compensations=antialias,
+        opacities=opacities,
+    )
+    if antialias:
+        opacities = opacities * compensations[0]
+    return Splats(radii[0], means2d[0], depths[0], conics[0], opacities)
+
+
+def shade(
+    degree: int,
+    directions: Tensor,  # [N, 3] from the camera, any length
+    coefficients: Tensor,  # [N, K, 3], K at least (degree + 1)^2
+    visible: Tensor,  # [N] bool; the others' colours are not computed
+) -> Tensor:
+    """Colours [N, 3] of spherical harmonics, 0.5 not added; differentiable."""
+    return gsplat().spherical_harmonics(degree, directions, coefficients, masks=visible)
+
+
+def sort(splats: Splats, width: int, height: int) -> Tiles:
+    """Tiles and order. The host waits here: how many there are decides how much memory is taken."""
+    columns, rows = math.ceil(width / TILE), math.ceil(height / TILE)
+    _, ids, flatten_ids = gsplat().isect_tiles(
+        splats.means2d.detach()[None],
+        splats.radii[None],
+        splats.depths.detach()[None],
+        TILE,
+        columns,
+        rows,
+        packed=False,
+    )
+    return Tiles(gsplat().isect_offset_encode(ids, 1, columns, rows), flatten_ids)
+
+
+def blend(
+    means2d: Tensor,  # [N, 2]
+    conics: Tensor,  # [N, 3]
+    colours: Tensor,  # [N, C]
+    opacities: Tensor,  # [N]
+    tiles: Tiles,
+    width: int,
+    height: int,
+    *,
+    background: Tensor | None = None,  # [1, C]
+    absolute: bool = False,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Pictures [H, W, C], alpha [H, W], and what `absolute_gradient` reads; differentiable.
+
+    Args:
+        absolute: the backward pass also sums absolute values over pixels (AbsGS).
+    """
+    batch = means2d[None]
+    picture, alpha = gsplat().rasterize_to_pixels(
+        batch,
+        conics[None],
+        colours[None],
+        opacities[None],
+        width,
+        height,
+        TILE,
+        tiles.offsets,
+        tiles.flatten_ids,
+        backgrounds=background,
+        packed=False,
+        absgrad=absolute,
+    )
+    return picture[0], alpha[0, ..., 0], batch
+
+
+def absolute_gradient(batch: Tensor) -> Tensor:
+    """Sums over pixels of |dL/du| and |dL/dv|, [N, 2], after the backward pass of `blend(absolute=True)`."""
+    return batch.absgrad[0]  # type: ignore[attr-defined]  # gsplat hangs it on its argument

@@ -19,12 +19,16 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.palette import MASKED, faded, ramp, tint
+from ambiguous_wild.methods.later import later
+from ambiguous_wild.splat import device
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.losses import ssim_map
 from ambiguous_wild.splat.parts import MaskPolicy, Parts, State
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData
 from ambiguous_wild.vision.backends import check_instances, make_instances
 from ambiguous_wild.vision.stage import instance_labels
+
+_LANES = 64  # sums a label while an accelerator adds up
 
 
 @dataclass(frozen=True)
@@ -66,26 +70,42 @@ def combined_residual(
 def unit_range(values: Tensor) -> Tensor:
     """Values by their own minimum and maximum in [0, 1]; zeros where all are the same."""
     low, high = values.min(), values.max()
-    return (values - low) / (high - low) if bool(high > low) else torch.zeros_like(values)
+    # 0 / 1 where all are the same: asking whether they are makes the host of an accelerator wait
+    return (values - low) / (high - low).masked_fill(high <= low, 1.0)
 
 
 def heat_map(
     residual: Tensor,  # [H, W]
     labels: Tensor,  # [H, W] int64, 0 = unlabelled
+    count: int | None = None,  # above every label; None: looked up, and the host of an accelerator waits
 ) -> Tensor:
     """Each pixel its instance's mean residual, 0 where unlabelled, over its own range; float64 [H, W]."""
     flat, values = labels.reshape(-1), residual.reshape(-1).double()
-    count = int(flat.max()) + 1
-    sums = torch.bincount(flat, weights=values, minlength=count)
-    means = sums / torch.bincount(flat, minlength=count).clamp(min=1)
+    count = int(flat.max()) + 1 if count is None else count
+    if device.accelerated(flat.device):
+        sums, sizes = _label_sums(values, flat, count), _label_sums(torch.ones_like(values), flat, count)
+    else:
+        sums = torch.bincount(flat, weights=values, minlength=count)
+        sizes = torch.bincount(flat, minlength=count)
+    means = sums / sizes.clamp(min=1)
     means[0] = 0.0
     return unit_range(means[flat].reshape(labels.shape))
 
 
-def threshold(heat: Tensor, nominal: float, t_local: float = 0.4) -> float:
-    """T(it) = mu + sd + t_local sd (N - it) / N over all pixels of the photo."""
+def _label_sums(values: Tensor, flat: Tensor, count: int) -> Tensor:
+    """Sums [count] of values [P] by label [P]: `bincount` without a look at the labels by the host.
+
+    Neighbours mostly share a label and would queue for one address: each label has `_LANES` of them.
+    """
+    lane = torch.arange(len(flat), device=flat.device) % _LANES
+    sums = values.new_zeros(count * _LANES).scatter_add_(0, flat * _LANES + lane, values)
+    return sums.reshape(count, _LANES).sum(dim=1)
+
+
+def threshold(heat: Tensor, nominal: float, t_local: float = 0.4) -> Tensor:
+    """T(it) = mu + sd + t_local sd (N - it) / N over all pixels of the photo, a 0-d tensor."""
     left = max(NOMINAL_ITERATIONS - nominal, 0.0) / NOMINAL_ITERATIONS
-    return float(heat.mean() + heat.std(correction=0) * (1.0 + t_local * left))
+    return heat.mean() + heat.std(correction=0) * (1.0 + t_local * left)
 
 
 class DroneSplatMask(MaskPolicy):
@@ -94,19 +114,19 @@ class DroneSplatMask(MaskPolicy):
     def __init__(self, config: DroneSplatConfig) -> None:
         self.config = config
         self.instances = make_instances(config.instances)
-        self.shares: dict[int, float] = {}  # view: share masked when it was last seen
+        self.shares: dict[int, float | Tensor] = {}  # view: share masked when it was last seen
 
     def setup(self, data: TrainData) -> None:
         names = [view.name for view in data.scene.train]
         found = instance_labels(self.instances, data.photos, names, data.cache_dir).labels
-        self.labels = [
-            torch.from_numpy(np.maximum(label, 0).astype(np.int64)).to(data.device) for label in found
-        ]
+        labels = [np.maximum(label, 0).astype(np.int64) for label in found]
+        self.counts = [int(label.max()) + 1 for label in labels]  # labels 0..K
+        self.labels = [torch.from_numpy(label).to(data.device) for label in labels]
 
     def keep(self, step: Step) -> Tensor | None:
         keep = self.predict(step)
         if keep is not None:
-            self.shares[step.view] = float(1.0 - keep.mean())
+            self.shares[step.view] = later(1.0 - keep.mean())
         return keep
 
     @torch.no_grad()
@@ -119,7 +139,8 @@ class DroneSplatMask(MaskPolicy):
     def _stands_out(self, step: Step) -> tuple[Tensor, Tensor]:
         """Heat map, and which pixels are above its threshold."""
         labels = nearest(self.labels[step.view], *step.photo.shape[:2])
-        heat = heat_map(combined_residual(step.rendered.image, step.photo, self.config.weight_l1), labels)
+        residual = combined_residual(step.rendered.image, step.photo, self.config.weight_l1)
+        heat = heat_map(residual, labels, self.counts[step.view])
         # a photo of one heat alone has nothing that stands out, and T = 0 would mask it whole
         return heat, (heat >= threshold(heat, step.nominal, self.config.t_local)) & (heat > 0)
 
@@ -128,22 +149,22 @@ class DroneSplatMask(MaskPolicy):
         heat, out = self._stands_out(step)
         photo = faded((step.photo.cpu().numpy() * 255 + 0.5).astype(np.uint8))
         used = "" if self._begun(step) else ", not used yet"
-        limit = threshold(heat, step.nominal, self.config.t_local)
+        limit = float(threshold(heat, step.nominal, self.config.t_local))
         return {
             f"heat of instances, T {limit:.2f}": ramp(heat.cpu().numpy(), 0.0, 1.0),
             f"masked {100 * float(out.float().mean()):.0f} %{used}": tint(photo, out.cpu().numpy(), MASKED),
         }
 
     def facts(self) -> dict[str, Any]:
-        shares = [self.shares[view] for view in sorted(self.shares)]
+        shares = [float(self.shares[view]) for view in sorted(self.shares)]
         return {
             "masked_share": sum(shares) / len(shares) if shares else 0.0,
             "instances": self.instances.name,
-            "instances_per_photo": float(np.mean([int(label.max()) for label in self.labels])),
+            "instances_per_photo": float(np.mean([count - 1 for count in self.counts])),
         }
 
     def state_dict(self) -> State:
-        return {"shares": {str(view): share for view, share in self.shares.items()}}
+        return {"shares": {str(view): float(share) for view, share in self.shares.items()}}
 
     def load_state_dict(self, state: State) -> None:
         self.shares = {int(view): float(share) for view, share in state["shares"].items()}

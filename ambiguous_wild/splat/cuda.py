@@ -15,6 +15,7 @@ from torch import Tensor
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.splat import gsplat_seam as seam
+from ambiguous_wild.splat.effects.posed import PosedCamera
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
 from ambiguous_wild.splat.rendered import Gradients
 
@@ -202,6 +203,10 @@ def _colours(leaves: dict[str, Tensor], splats: seam.Splats, centre: Tensor, deg
 
 def on_device(camera: Camera, device: torch.device) -> _OnDevice:
     """The camera's matrices there, copied once: a copy from the host in every step would make it wait."""
+    if isinstance(camera, PosedCamera):  # of pose refinement: another one in every step, made there
+        return _OnDevice(
+            camera.pose.float()[None], camera.intrinsics_there.float()[None], camera.centre.float()
+        )
     key = (id(camera), device)
     if key in _cameras:
         _cameras.move_to_end(key)

@@ -6,10 +6,12 @@ Nothing else of the package imports gsplat. What its versions do differently is 
 from __future__ import annotations
 
 import functools
+import inspect
 import math
 from dataclasses import dataclass
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError
@@ -61,14 +63,20 @@ def version() -> str:
     return str(gsplat().__version__)
 
 
-def max_alpha() -> float:
+@functools.cache
+def max_alpha(device: str = "cuda") -> float:
     """Where alpha is clamped: 0.99 as on the CPU, but 0.999 up to release 1.5.3.
 
-    The constant is compiled into the kernels. It tells only where a Gaussian's opacity is above 0.99, and
-    there by the light of what lies behind a hundred times attenuated, or a thousand times.
+    The constant is compiled into the kernels, and sources after that release bear its number too: so an
+    opaque splat is drawn over one pixel and looked at. The clamp tells only where a Gaussian's opacity is
+    above 0.99, and there by the light of what lies behind.
     """
-    numbers = version().split("+")[0].split(".")[:2]
-    return 0.999 if tuple(int(n) for n in numbers if n.isdigit()) < (1, 6) else 0.99
+    one = torch.ones(1, device=device)
+    means2d, conics = 0.5 * one.expand(1, 2), torch.tensor([[1.0, 0.0, 1.0]], device=device)
+    splats = Splats(one.expand(1, 2).to(torch.int32), means2d, one, conics, one)
+    tiles = sort(splats, 1, 1)
+    _, alpha, _ = blend(means2d, conics, one[:, None], one, tiles, 1, 1)
+    return round(float(alpha), 4)
 
 
 def project(
@@ -117,6 +125,9 @@ def shade(
 def sort(splats: Splats, width: int, height: int) -> Tiles:
     """Tiles and order. The host waits here: how many there are decides how much memory is taken."""
     columns, rows = math.ceil(width / TILE), math.ceil(height / TILE)
+    finer = {}
+    if _tests_tiles_by_ellipse():
+        finer = {"conics": splats.conics.detach()[None], "opacities": splats.opacities.detach()[None]}
     _, ids, flatten_ids = gsplat().isect_tiles(
         splats.means2d.detach()[None],
         splats.radii[None],
@@ -125,8 +136,15 @@ def sort(splats: Splats, width: int, height: int) -> Tiles:
         columns,
         rows,
         packed=False,
+        **finer,
     )
     return Tiles(gsplat().isect_offset_encode(ids, 1, columns, rows), flatten_ids)
+
+
+@functools.cache
+def _tests_tiles_by_ellipse() -> bool:
+    """Whether gsplat can leave out tiles that a splat's box touches and its ellipse does not: after 1.5.3."""
+    return "conics" in inspect.signature(gsplat().isect_tiles).parameters
 
 
 def blend(

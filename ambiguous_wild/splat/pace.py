@@ -33,7 +33,7 @@ class TrainConfig:
 
 
 class Pace:
-    """Every schedule of one run; a function of its settings and of how far it is, so it has no state."""
+    """Every schedule of one run; a function of its settings and of how far it is, so nothing of it is saved."""
 
     def __init__(
         self, config: TrainConfig, schedule: Schedule, data: TrainData, *, start: int, most: int
@@ -49,6 +49,7 @@ class Pace:
         self.config, self.schedule = config, schedule
         self.extent = data.scene.extent
         self.views = len(data.photos)
+        self._order: tuple[int, np.ndarray] | None = None  # of the epoch last asked about
         self.start = start
         self.short = config.budget_s is not None or config.iterations < schedule.short_below
         self.most = self._most(data, most)
@@ -87,8 +88,11 @@ class Pace:
 
     def view(self, iteration: int) -> int:
         """Every view once an epoch, in an order of the epoch's own that the seed decides."""
-        rng = np.random.default_rng([self.config.seed, 0x51, self.epoch(iteration)])
-        return int(rng.permutation(self.views)[(iteration - 1) % self.views])
+        epoch = self.epoch(iteration)
+        if self._order is None or self._order[0] != epoch:  # asked for several times a step
+            rng = np.random.default_rng([self.config.seed, 0x51, epoch])
+            self._order = epoch, rng.permutation(self.views)
+        return int(self._order[1][(iteration - 1) % self.views])
 
     def _most(self, data: TrainData, most: int) -> int:
         """Growth ends here: a short run can neither afford nor settle more than the photos can tell apart.

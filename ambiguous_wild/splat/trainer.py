@@ -66,6 +66,10 @@ class Trainer:
         # where the host must not wait, what would make it wait is written down there and looked at later
         on = device.accelerated(data.device)
         self.sentinel = Sentinel(data.device, len(data.photos)) if on else None
+        if on:
+            from ambiguous_wild.splat import fused_loss
+
+            fused_loss.prepare(data.device, *data.photos[0].shape[:2])
         self._prefetch = getattr(data.photos, "prefetch", None)
 
         points = data.scene.points
@@ -227,7 +231,7 @@ class Trainer:
             self.optimiser.bind(self.gaussians)
         if self.effects is not None:
             with part("effects"):
-                self.effects.step(step.view, self.progress(iteration))
+                self.effects.step(step.view, self.progress(iteration), called_off)
                 if events:
                     self.effects.rows_changed()
         if "reset" in events:

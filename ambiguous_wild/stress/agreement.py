@@ -30,13 +30,13 @@ _DRAWS = 2  # roundings tried; the largest change counts
 FAST_MATH = 8  # units a GPU's exponential is off by at most
 
 
-def clamp_of(device: str) -> dict[str, float]:
+def clamp_of(device: str) -> dict[str, Any]:
     """The alpha clamp of a device's back end, as an argument of `judge`."""
     if not splat_device.accelerated(device):
         return {}
     from ambiguous_wild.splat.gsplat_seam import max_alpha
 
-    return {"max_alpha": max_alpha()}
+    return {"max_alpha": max_alpha(device)}
 
 
 def picture_and_gradients(
@@ -50,9 +50,10 @@ def picture_and_gradients(
 ) -> dict[str, Tensor]:
     """Pictures and gradient of every parameter as the back end of `device` gives them, float64 on the CPU."""
     rendered = render(g.to(device), camera, **options)
-    more = {"d_alpha": d_alpha, "d_depth": d_depth}
     grads = rendered.backward(
-        d_image.to(device), **{name: d.to(device) for name, d in more.items() if d is not None}
+        d_image.to(device),
+        d_alpha=None if d_alpha is None else d_alpha.to(device),
+        d_depth=None if d_depth is None else d_depth.to(device),
     )
     found = {f"d_{name}": getattr(grads, name) for name, _ in g.items()}
     found |= {"image": rendered.image, "alpha": rendered.alpha, "depth": rendered.depth}
@@ -95,19 +96,21 @@ def agree(
     """Worst error of image and gradients, each over its largest value, and what it may be."""
     rng = np.random.default_rng(0)
     shapes = [(camera.height, camera.width, 3), (camera.height, camera.width), (camera.height, camera.width)]
-    d = [torch.from_numpy(rng.normal(size=shape).astype(np.float32)) for shape in shapes]
+    d_image, d_alpha, d_depth = (
+        torch.from_numpy(rng.normal(size=shape).astype(np.float32)) for shape in shapes
+    )
     parameters = {name: tensor.double() for name, tensor in g.items()}
     clamp = clamp_of(device)
-    truth = judge(parameters, camera, *d, **options, **clamp)
+    truth = judge(parameters, camera, d_image, d_alpha, d_depth, **options, **clamp)
     condition = 1.0
     for _ in range(_DRAWS):
         moved = {
             name: t * (1 + UNIT * torch.from_numpy(rng.choice([-1.0, 1.0], size=t.shape)))
             for name, t in parameters.items()
         }
-        again = judge(moved, camera, *d, **options, **clamp)
+        again = judge(moved, camera, d_image, d_alpha, d_depth, **options, **clamp)
         condition = max(condition, _distance(again, truth) / UNIT)
-    error = _distance(picture_and_gradients(g, camera, device, *d, **options), truth)
+    error = _distance(picture_and_gradients(g, camera, device, d_image, d_alpha, d_depth, **options), truth)
     steps = 96 + 6 * (len(g) if layers is None else layers)
     bound, why = steps * condition * UNIT, f"{steps} roundings x condition"
     if splat_device.accelerated(device):
@@ -117,7 +120,7 @@ def agree(
 
 
 def _lost_by_determinants(parameters: dict[str, Tensor], camera: Camera, **options: Any) -> float:
-    """a c / (a c - b^2) of the blurred covariance, the largest of what is drawn: 1 where no axis is oblique."""
+    """a c / (a c - b^2) of the blurred covariance, the largest of what is drawn: 1 where none is oblique."""
     truth = render_reference(parameters, camera, **options)
     conic = truth.conic[truth.visible]
     if not len(conic):

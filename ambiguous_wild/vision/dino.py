@@ -2,11 +2,15 @@
 
 The image is resized to whole patches, never cut: the library drops the last rows and columns of an image that
 is no multiple of the patch, without a word. So the grid covers exactly the image, at any size.
+
+On an NVIDIA GPU the net's products are in bfloat16; photos and renders go the same way (`precision`).
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -38,6 +42,7 @@ _FAMILIES = {  # by model_type
     "vit": _Family("ViTModel", 16, 0, {"add_pooling_layer": False}, {"interpolate_pos_encoding": True}),
 }
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+MIXED = torch.bfloat16  # the range of float32, so that no gradient needs scaling
 
 
 @dataclass(frozen=True)
@@ -83,6 +88,7 @@ class DinoFeatures:
         self.name = f"dino-1-{name}-{self.source.digest}-{config_hash(self.config)[:8]}"
         self.unit = 0.1  # until `fit`
         self._model: nn.Module | None = None
+        self._place: torch.device | None = None  # where the net lies
 
     @property
     def model(self) -> nn.Module:
@@ -126,6 +132,10 @@ class DinoFeatures:
             max(round(width * scale / self.patch), 1),
         )
 
+    def precision(self, device: torch.device) -> str:
+        """As `stage.PreciseFeatures`."""
+        return str(MIXED).removeprefix("torch.") if mixed(device) else ""
+
     def __call__(self, image: Tensor) -> Tensor:
         """Features [h, w, C] of an image [H, W, 3] in [0, 1]; cell (r, c) covers its share of the image.
 
@@ -134,17 +144,31 @@ class DinoFeatures:
         """
         if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < 8:
             raise AwError(f"features need an image of [H, W, 3], at least 8x8 px, got {list(image.shape)}")
-        model = self.model.to(image.device)
+        model = self._model_on(image.device)
         rows, columns = self.grid(image.shape[0], image.shape[1])
         size = (rows * self.patch, columns * self.patch)
-        pixels = image.permute(2, 0, 1)[None].to(next(model.parameters()).dtype)
-        if size != tuple(image.shape[:2]):
-            pixels = F.interpolate(pixels, size=size, mode="bilinear", align_corners=False, antialias=True)
-        if self.config.normalise == "imagenet":
-            pixels = normalised(pixels)
-        call = _FAMILIES[self.source.model_type].call
-        tokens = model(pixels, **call).last_hidden_state[0, self.extra_tokens :]
-        return tokens.reshape(rows, columns, self.channels)
+        graph = torch.is_grad_enabled() and image.requires_grad
+        with torch.set_grad_enabled(graph):  # the net is frozen: the image's gradient is the only one
+            pixels = image.permute(2, 0, 1)[None].to(next(model.parameters()).dtype)
+            if size != tuple(image.shape[:2]):
+                pixels = F.interpolate(
+                    pixels, size=size, mode="bilinear", align_corners=False, antialias=True
+                )
+            if self.config.normalise == "imagenet":
+                pixels = normalised(pixels)
+            call = _FAMILIES[self.source.model_type].call
+            half = mixed(image.device)
+            with torch.autocast(image.device.type, MIXED) if half else nullcontext():
+                tokens = model(pixels, **call).last_hidden_state[0, self.extra_tokens :]
+            tokens = tokens.float() if half else tokens
+            return tokens.reshape(rows, columns, self.channels)
+
+    def _model_on(self, device: torch.device) -> nn.Module:
+        """The net there; `Module.to` goes through all its layers even where nothing is to be moved."""
+        if self._place != device:
+            self.model.to(device)
+            self._place = device
+        return self.model
 
     def state_dict(self) -> dict[str, Any]:
         return {"unit": self.unit}
@@ -155,5 +179,17 @@ class DinoFeatures:
 
 def normalised(pixels: Tensor) -> Tensor:
     """[B, 3, H, W] in [0, 1] less ImageNet's mean, over its standard deviation."""
-    mean = pixels.new_tensor(IMAGENET_MEAN).reshape(1, 3, 1, 1)
-    return (pixels - mean) / pixels.new_tensor(IMAGENET_STD).reshape(1, 3, 1, 1)
+    mean, std = _imagenet(pixels.dtype, pixels.device)
+    return (pixels - mean) / std
+
+
+@functools.cache
+def _imagenet(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Mean and deviation [1, 3, 1, 1] there, copied once: in every step the copy would be waited for."""
+    mean, std = (torch.tensor(v, dtype=dtype, device=device) for v in (IMAGENET_MEAN, IMAGENET_STD))
+    return mean.reshape(1, 3, 1, 1), std.reshape(1, 3, 1, 1)
+
+
+def mixed(device: torch.device) -> bool:
+    """Whether the net runs in mixed precision there: a CPU has no gain from it, and results to keep."""
+    return device.type == "cuda"

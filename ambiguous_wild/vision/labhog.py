@@ -8,6 +8,7 @@ for HOG alone, 0.905 for the boxed L1 residual; on objects in the background's o
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -121,11 +122,16 @@ def lab_image(image: Tensor) -> Tensor:
     # both branches of each `where` get arguments on which they are smooth: no NaN leaks backward
     high = ((rgb.clamp(min=0.04045) + 0.055) / 1.055) ** 2.4
     linear = torch.where(rgb > 0.04045, high, rgb / 12.92)
-    matrix = linear.new_tensor(_XYZ)
-    xyz = (matrix @ linear.reshape(3, -1)).reshape(linear.shape)
+    xyz = (_matrix(linear.dtype, linear.device) @ linear.reshape(3, -1)).reshape(linear.shape)
     edge = (6 / 29) ** 3
     f = torch.where(xyz > edge, xyz.clamp(min=edge) ** (1 / 3), xyz / (3 * (6 / 29) ** 2) + 4 / 29)
     return torch.stack([1.16 * f[1] - 0.16, 5.0 * (f[0] - f[1]), 2.0 * (f[1] - f[2])])
+
+
+@functools.cache
+def _matrix(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """`_XYZ` there, copied once: a copy in every step would make the host of an accelerator wait."""
+    return torch.tensor(_XYZ, dtype=dtype, device=device)
 
 
 def _blocks(image: Tensor) -> tuple[Tensor, Tensor]:

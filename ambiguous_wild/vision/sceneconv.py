@@ -6,6 +6,7 @@ from structure from motion which places are the same (see `sceneconv_train`); it
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -39,7 +40,7 @@ class ConvNet(nn.Module):
     def forward(self, images: Tensor) -> Tensor:
         lab = torch.stack([lab_image(image.permute(1, 2, 0)) for image in images])
         # lightness and colour at about unit spread
-        middle, gain = lab.new_tensor([[0.5, 0.0, 0.0], [3.0, 6.0, 6.0]])[:, :, None, None]
+        middle, gain = _lab_scale(lab.dtype, lab.device)
         lab = (lab - middle) * gain
         height, width = lab.shape[2:]
         lab = F.pad(lab, (0, -width % STRIDE, 0, -height % STRIDE), mode="replicate")
@@ -48,6 +49,12 @@ class ConvNet(nn.Module):
         wide = wide + F.relu(self.far(wide))
         raw = self.out(torch.cat([wide, cells], dim=1))
         return raw * torch.rsqrt((raw * raw).sum(1, keepdim=True) + 1e-6)
+
+
+@functools.cache
+def _lab_scale(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """[2, 3, 1, 1] middle and gain of Lab, copied there once: in every step the copy would be waited for."""
+    return torch.tensor([[0.5, 0.0, 0.0], [3.0, 6.0, 6.0]], dtype=dtype, device=device)[:, :, None, None]
 
 
 class SceneConv:
@@ -119,6 +126,10 @@ class SceneConv:
         if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < 8:
             raise AwError(f"features need an image of [H, W, 3], at least 8x8 px, got {list(image.shape)}")
         return self.net(image.permute(2, 0, 1)[None])[0].permute(1, 2, 0)
+
+    def precision(self, device: torch.device) -> str:
+        """As `stage.PreciseFeatures`: convolutions are in TF32 on a GPU unless torch is told otherwise."""
+        return "tf32" if device.type == "cuda" and torch.backends.cudnn.allow_tf32 else ""
 
     def _new_net(self) -> ConvNet:
         with torch.random.fork_rng(devices=[]):  # its first weights shall not move anybody's random numbers

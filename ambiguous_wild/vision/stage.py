@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -24,17 +25,29 @@ class SceneLabels:
     scene_wide: bool  # an id means the same thing in every photo
 
 
+@runtime_checkable
+class PreciseFeatures(Protocol):
+    """Features whose precision depends on where they are computed; offered beside `Features`."""
+
+    def precision(self, device: torch.device) -> str:
+        """What is left of float32 there, e.g. ``"bfloat16"``: part of cache keys; "" = all of it."""
+        ...
+
+
 def photo_features(
     features: Features, photos: Sequence[Tensor], folder: Path, bar: Bar | None = None
 ) -> list[Tensor]:
     """Features [h, w, C] of every photo [H, W, 3]; call `features.fit` first.
 
-    A stopped stage goes on where it was: what is in the cache is not computed again.
+    A stopped stage goes on where it was: what is in the cache is not computed again. It is kept by precision:
+    features of a render are compared with those of its photo, and another precision is a distance.
     """
     state = {k: _digest(v) if isinstance(v, Tensor) else v for k, v in features.state_dict().items()}
     result = []
     for photo in (bar or terminal_bar("features"))(photos):
-        key = cache_key("features", features.name, state, photo.detach().cpu().numpy())
+        precision = features.precision(photo.device) if isinstance(features, PreciseFeatures) else ""
+        name = f"{features.name}-{precision}" if precision else features.name
+        key = cache_key("features", name, state, photo.detach().cpu().numpy())
 
         def compute(photo: Tensor = photo) -> dict[str, np.ndarray]:
             with torch.no_grad():

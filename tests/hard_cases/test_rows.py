@@ -23,7 +23,6 @@ def test_row(case):
 @pytest.mark.gpu
 @pytest.mark.parametrize("case", [c for c in CASES if "cuda" in c.devices], ids=lambda case: case.key)
 def test_row_on_a_gpu(case):
-    pytest.importorskip("gsplat")
     outcome = run(case, "cuda")
     assert outcome.failure == ""
     assert outcome.passed, (outcome.error, outcome.tolerance, outcome.why)

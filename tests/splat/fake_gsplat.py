@@ -66,7 +66,7 @@ def spherical_harmonics(degrees_to_use, dirs, coeffs, masks=None):
 
 def isect_tiles(means2d, radii, depths, tile_size, tile_width, tile_height, sort=True, segmented=False,
                 packed=False, n_images=None, image_ids=None, gaussian_ids=None):  # fmt: skip
-    assert not depths.requires_grad
+    assert not depths.requires_grad and depths.shape == radii.shape[:-1] == means2d.shape[:-1]
     order = torch.argsort(depths[0], stable=True)
     if means2d.device.type != "meta":  # there, as many as there are Gaussians
         order = order[(radii[0] > 0).all(1)[order]]
@@ -114,6 +114,28 @@ def rasterize_to_pixels(means2d, conics, colors, opacities, image_width, image_h
     return picture.reshape(*shape, -1), (1 - before[:, -1]).reshape(*shape, 1)
 
 
+def rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, height, sh_degree, packed):
+    """What the example trainer calls; needs `means2d` with a graph of its own in what it says of itself."""
+    radii, means2d, depths, conics, _ = fully_fused_projection(
+        means, None, quats, scales, viewmats, Ks, width, height, opacities=opacities
+    )
+    centre = -viewmats[0, :3, :3].T @ viewmats[0, :3, 3]
+    shade = spherical_harmonics(sh_degree, means - centre, colors).add(0.5).clamp(min=0.0)
+    columns, rows = -(-width // 16), -(-height // 16)
+    _, ids, flat = isect_tiles(means2d.detach(), radii, depths.detach(), 16, columns, rows)
+    offsets = isect_offset_encode(ids, 1, columns, rows)
+    picture, alpha = rasterize_to_pixels(
+        means2d, conics, shade[None], opacities[None], width, height, 16, offsets, flat
+    )
+    return picture, alpha, {"means2d": means2d, "radii": radii}
+
+
+def isect_tiles_later(*arguments, conics=None, opacities=None, **options):
+    """After 1.5.3: with the ellipses, tiles are tested against them."""
+    assert conics is not None and opacities.shape == conics.shape[:-1] and not conics.requires_grad
+    return isect_tiles(*arguments, **options)
+
+
 def module(version="1.6.0"):
     """The package of that version."""
     fake = types.ModuleType("gsplat")
@@ -125,9 +147,12 @@ def module(version="1.6.0"):
         isect_tiles,
         isect_offset_encode,
         rasterize_to_pixels,
+        rasterization,
     )
     for call in calls:
         setattr(fake, call.__name__, call)
+    if not version.startswith("1.5"):
+        fake.isect_tiles = isect_tiles_later
     return fake
 
 
@@ -136,8 +161,13 @@ def installed(monkeypatch, version="1.6.0", *, everywhere=True):
     """As if gsplat were installed; `everywhere` also sends tensors on the CPU the accelerator's way."""
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "gsplat", module(version))
-        gsplat_seam.gsplat.cache_clear()
+        _forget()
         if everywhere:
             patch.setattr(device, "accelerated", lambda _: True)
         yield
-    gsplat_seam.gsplat.cache_clear()
+    _forget()
+
+
+def _forget():
+    for what in (gsplat_seam.gsplat, gsplat_seam.max_alpha, gsplat_seam._tests_tiles_by_ellipse):
+        what.cache_clear()

@@ -9,6 +9,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from ambiguous_wild.splat import device
+
 
 class MaskNet(nn.Module):
     """Features [h, w, C] to a static map [H, W]; the features' mean and std are part of it."""
@@ -54,14 +56,14 @@ def enlarged(z: Tensor, height: int, width: int) -> Tensor:
     way back cost, and the same numbers to rounding.
     """
     h, w, channels = z.shape
-    rows = _weights(h, height).to(z)
-    columns = _weights(w, width).to(z)
+    rows = _weights(h, height, z.dtype, z.device)
+    columns = _weights(w, width, z.dtype, z.device)
     return columns @ (rows @ z.reshape(h, w * channels)).reshape(height, w, channels)
 
 
 @cache
-def _weights(size: int, to: int) -> Tensor:
-    """[to, size]: how much of each value is in each enlarged one; rows sum to one."""
+def _weights(size: int, to: int, dtype: torch.dtype, place: torch.device) -> Tensor:
+    """[to, size]: how much of each value is in each enlarged one; rows sum to one. Copied there once."""
     at = ((torch.arange(to, dtype=torch.float64) + 0.5) * (size / to) - 0.5).clamp(min=0.0)
     low = at.floor().long().clamp(max=size - 1)
     high = (low + 1).clamp(max=size - 1)
@@ -69,7 +71,12 @@ def _weights(size: int, to: int) -> Tensor:
     weights = torch.zeros(to, size, dtype=torch.float64)
     weights[number, low] += 1.0 - share
     weights[number, high] += share
-    return weights.float()
+    return weights.float().to(place, dtype)
+
+
+def adam_of(net: nn.Module, lr: float, place: torch.device) -> torch.optim.Adam:
+    """Adam on the net's parameters; on an accelerator one kernel, with the count of steps kept there."""
+    return torch.optim.Adam(net.parameters(), lr=lr, fused=device.accelerated(place) or None)
 
 
 def adam_state(optimiser: torch.optim.Adam) -> list[dict[str, Any]]:
@@ -81,7 +88,9 @@ def adam_state(optimiser: torch.optim.Adam) -> list[dict[str, Any]]:
 def load_adam_state(optimiser: torch.optim.Adam, rows: list[dict[str, Any]]) -> None:
     """Put back what `adam_state` returned."""
     parameters = [p for group in optimiser.param_groups for p in group["params"]]
+    fused = bool(optimiser.defaults["fused"])
     for parameter, row in zip(parameters, rows):
-        # the count of steps stays on the CPU, as Adam keeps it
-        moved = {k: v.clone() if k == "step" else v.clone().to(parameter) for k, v in row.items()}
-        optimiser.state[parameter] = moved
+        # Adam keeps the count of steps on the CPU, the fused one where the parameter is
+        optimiser.state[parameter] = {
+            k: v.clone() if k == "step" and not fused else v.clone().to(parameter) for k, v in row.items()
+        }

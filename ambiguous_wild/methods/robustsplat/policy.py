@@ -9,10 +9,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ambiguous_wild.core import Camera
 from ambiguous_wild.io.palette import MASKED, faded, ramp, tint
+from ambiguous_wild.methods.later import later
 from ambiguous_wild.methods.robustsplat import supervision
 from ambiguous_wild.methods.robustsplat.config import RobustSplatConfig
-from ambiguous_wild.methods.robustsplat.net import MaskNet, adam_state, load_adam_state
+from ambiguous_wild.methods.robustsplat.net import MaskNet, adam_of, adam_state, load_adam_state
 from ambiguous_wild.splat.data import shrink, shrink_camera
 from ambiguous_wild.splat.parts import MaskPolicy, State
 from ambiguous_wild.splat.render import render
@@ -36,8 +38,10 @@ class RobustSplatMask(MaskPolicy):
         self.coarse: Features = make_features(config.coarse_features or coarse_spec(config))
         self.histogram = torch.zeros(config.bins, dtype=torch.float64)
         self.last_reset = 0  # iteration, 0 = never
-        self.shares: dict[int, float] = {}  # view: share masked when it was last seen
-        self.losses = [0.0, 0.0]  # sum and number, of the mask loss
+        self.shares: dict[int, float | Tensor] = {}  # view: share masked when it was last seen
+        self.loss_sum: float | Tensor = 0.0  # of the mask loss
+        self.loss_count = 0.0
+        self._coarse_cameras: dict[int, tuple[Camera, Camera]] = {}  # view: a step's, and its coarse one
 
     def setup(self, data: TrainData) -> None:
         self.data = data
@@ -49,7 +53,7 @@ class RobustSplatMask(MaskPolicy):
         self.phi_coarse = photo_features(self.coarse, small, data.cache_dir)
         self.inputs = [self._inputs(phi) for phi in self.phi]
         self.net = MaskNet(*self._statistics(), self.config.net_hidden, data.seed)
-        self.optimiser = torch.optim.Adam(self.net.parameters(), lr=self.config.net_lr)
+        self.optimiser = adam_of(self.net, self.config.net_lr, data.device)
 
     def keep(self, step: Step) -> Tensor | None:
         if not self._begun(step):
@@ -64,8 +68,8 @@ class RobustSplatMask(MaskPolicy):
                 loss.backward()
             keep = self._cut(mask.detach())  # of the net before this step, as the authors have it
             self.optimiser.step()
-            self.losses = [self.losses[0] + float(loss.detach()), self.losses[1] + 1]
-        self.shares[step.view] = float(1.0 - keep.mean())
+            self.loss_sum, self.loss_count = self.loss_sum + later(loss), self.loss_count + 1
+        self.shares[step.view] = later(1.0 - keep.mean())
         return keep
 
     def predict(self, step: Step) -> Tensor | None:
@@ -75,10 +79,10 @@ class RobustSplatMask(MaskPolicy):
         self.last_reset = step.iteration
 
     def facts(self) -> dict[str, Any]:
-        shares = [self.shares[view] for view in sorted(self.shares)]
+        shares = [float(self.shares[view]) for view in sorted(self.shares)]
         return {
             "masked_share": sum(shares) / len(shares) if shares else 0.0,
-            "mask_loss_mean": self.losses[0] / self.losses[1] if self.losses[1] else None,
+            "mask_loss_mean": float(self.loss_sum) / self.loss_count if self.loss_count else None,
             "features": self.fine.name,
         }
 
@@ -130,7 +134,8 @@ class RobustSplatMask(MaskPolicy):
         """T_cos [H, W] of the render, coarse before the switch and fine after."""
         early = step.nominal < self.config.bootstrap
         features, phi = (self.coarse, self.phi_coarse) if early else (self.fine, self.phi)
-        image = _enlarge(step.rendered.image.detach(), self.data.photos[step.view])
+        full = self.data.cameras[step.view]  # not the photo: it need not lie on the device
+        image = _enlarge(step.rendered.image.detach(), full.height, full.width)
         seen = features(self._coarse_picture(image) if early else image)
         cosine = F.cosine_similarity(phi[step.view], seen, dim=2)
         if self._calibrate:
@@ -158,9 +163,12 @@ class RobustSplatMask(MaskPolicy):
         config = self.config
         if config.coarse_render == "shrink":
             return shrink(step.rendered.image.detach(), config.coarse_divisor)
-        camera = shrink_camera(step.camera, config.coarse_divisor)
+        known = self._coarse_cameras.get(step.view)
+        if known is None or known[0] is not step.camera:  # a renderer copies a camera it has not met
+            known = (step.camera, shrink_camera(step.camera, config.coarse_divisor))
+            self._coarse_cameras[step.view] = known
         degree = min(int(step.nominal // self.sh_every), self.sh_degree, step.gaussians.sh_degree)
-        return render(step.gaussians, camera, sh_degree=degree).image.detach()
+        return render(step.gaussians, known[1], sh_degree=degree).image.detach()
 
     def _coarse_picture(self, image: Tensor) -> Tensor:
         """What coarse features see: hand-made ones a smaller picture, nets resize by themselves."""
@@ -216,8 +224,8 @@ class RobustSplatMask(MaskPolicy):
             "adam": adam_state(self.optimiser),
             "histogram": self.histogram,
             "last_reset": self.last_reset,
-            "shares": {str(view): share for view, share in self.shares.items()},
-            "losses": self.losses,
+            "shares": {str(view): float(share) for view, share in self.shares.items()},
+            "losses": [float(self.loss_sum), self.loss_count],
         }
 
     def load_state_dict(self, state: State) -> None:
@@ -227,7 +235,7 @@ class RobustSplatMask(MaskPolicy):
         self.histogram = state["histogram"].to(self.data.device)
         self.last_reset = int(state["last_reset"])
         self.shares = {int(view): float(share) for view, share in state["shares"].items()}
-        self.losses = list(state["losses"])
+        self.loss_sum, self.loss_count = state["losses"]
 
 
 def coarse_spec(config: RobustSplatConfig) -> str:
@@ -239,10 +247,9 @@ def coarse_spec(config: RobustSplatConfig) -> str:
     return head + "".join(f",{key}={value}" for key, value in found.options.items())
 
 
-def _enlarge(image: Tensor, like: Tensor) -> Tensor:
-    """A render [h, w, 3] at the size of the photo `like` [H, W, 3], bilinear."""
-    if image.shape == like.shape:
+def _enlarge(image: Tensor, height: int, width: int) -> Tensor:
+    """A render [h, w, 3] at [height, width, 3], the size of its photo, bilinear."""
+    if image.shape[:2] == (height, width):
         return image
     chw = image.permute(2, 0, 1)[None]
-    size = tuple(like.shape[:2])
-    return F.interpolate(chw, size=size, mode="bilinear", align_corners=False)[0].permute(1, 2, 0)
+    return F.interpolate(chw, size=(height, width), mode="bilinear", align_corners=False)[0].permute(1, 2, 0)

@@ -11,6 +11,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ambiguous_wild.splat import device
+
 
 def cosine_target(cosine: Tensor) -> Tensor:
     """T_cos = 1 - clip(1 - (c - 0.5) / 0.5, 0, 1): 1 where photo and render agree, 0 from 0.5 down."""
@@ -35,11 +37,19 @@ def update_histogram(histogram: Tensor, values: Tensor, decay: float) -> Tensor:
     """h <- decay h + hist(values); `histogram` [bins] float64 over [0, 1], values in [0, 1]."""
     bins = len(histogram)
     index = (values.reshape(-1).double() * bins).long().clamp(0, bins - 1)
+    if device.accelerated(histogram.device):  # bincount has the host read the largest index
+        ones = torch.ones_like(index, dtype=histogram.dtype)
+        return decay * histogram + torch.zeros_like(histogram).scatter_add_(0, index, ones)
     return decay * histogram + torch.bincount(index, minlength=bins).double()
 
 
-def percentile(histogram: Tensor, share: float) -> float:
-    """The smallest bin edge below which at least `share` of everything lies; 1 for an empty histogram."""
+def percentile(histogram: Tensor, share: float) -> float | Tensor:
+    """The smallest bin edge below which at least `share` of everything lies; 1 for an empty histogram.
+
+    A 0-d tensor on an accelerator, so that the host need not know it.
+    """
+    if device.accelerated(histogram.device):
+        return _percentile_there(histogram, share)
     total = float(histogram.sum())
     if total <= 0:
         return 1.0
@@ -48,7 +58,14 @@ def percentile(histogram: Tensor, share: float) -> float:
     return (int(torch.nonzero(reached)[0]) + 1) / len(histogram)
 
 
-def bound(e: Tensor, threshold: float) -> Tensor:
+def _percentile_there(histogram: Tensor, share: float) -> Tensor:
+    total = histogram.sum()
+    reached = torch.cumsum(histogram, 0) >= share * total * (1.0 - 1e-12)
+    first = reached.int().argmax()  # of equal values the first
+    return ((first + 1).to(histogram) / len(histogram)).masked_fill(total <= 0, 1.0)
+
+
+def bound(e: Tensor, threshold: float | Tensor) -> Tensor:
     """1 where e < threshold, or where more than half of the 3x3 neighbourhood is; zeros beyond the border."""
     inlier = (e < threshold).float()
     near = F.avg_pool2d(inlier[None, None], 3, stride=1, padding=1)[0, 0]

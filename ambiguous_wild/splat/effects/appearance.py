@@ -83,13 +83,13 @@ class AppearanceEmbedding(Effect):
         self._pending = dict(zip(leaves, found))
         return replace(gradients, sh0=self._pending.pop("sh0").contiguous())
 
-    def step(self, view: int, progress: float) -> None:
+    def step(self, view: int, progress: float, called_off: Tensor | None = None) -> None:
         if self._pending is None:
             return
         share = decayed(1.0, FINAL, progress)
-        self.rows.step(view, self._pending["row"], RATE_ROWS * share)
+        self.rows.step(view, self._pending["row"], RATE_ROWS * share, called_off)
         for name, adam in self.moments.items():
-            adam.step(0, self._pending[name], RATE_NET * share)
+            adam.step(0, self._pending[name], RATE_NET * share, called_off)
         self._pending = None
         rows = self.rows.values[: self.views]
         rows -= rows.mean(dim=0)

@@ -65,12 +65,13 @@ class Effect:
         """dL/d(what `image` was given) from dL/d(what it returned); keeps its own gradient if `learn`."""
         return d_image
 
-    def step(self, view: int, progress: float) -> None:
+    def step(self, view: int, progress: float, called_off: Tensor | None = None) -> None:
         """Learn from the gradients kept since the last step.
 
         Args:
             view: whose they are.
             progress: of the run, in [0, 1].
+            called_off: on an accelerator, [1] float32 there; 1 = nothing is to change, whatever they are.
         """
 
     def rows_changed(self) -> None:
@@ -104,12 +105,23 @@ class RowAdam:
         self.first, self.second = torch.zeros_like(values), torch.zeros_like(values)
         self.steps = [0] * len(values)
 
-    def step(self, row: int, gradient: Tensor, rate: float | Tensor) -> None:
-        """One step of one row; `rate` broadcasts over it."""
+    def step(
+        self, row: int, gradient: Tensor, rate: float | Tensor, called_off: Tensor | None = None
+    ) -> None:
+        """One step of one row; `rate` broadcasts over it, `called_off` is that of `Effect.step`.
+
+        A step that was called off counts: the host does not know of it, and only the correction of the
+        moments' bias is off by it.
+        """
         self.steps[row] += 1
         first, second = self.first[row], self.second[row]
-        first.lerp_(gradient, 1 - self.betas[0])
-        second.lerp_(gradient * gradient, 1 - self.betas[1])
+        weights: tuple[Any, Any] = (1 - self.betas[0], 1 - self.betas[1])
+        if called_off is not None:
+            go = share_of(called_off, gradient)
+            gradient = gradient.masked_fill(go <= 0, 0.0)  # it may not be finite
+            weights, rate = (weights[0] * go, weights[1] * go), rate * go
+        first.lerp_(gradient, weights[0])
+        second.lerp_(gradient * gradient, weights[1])
         bias1, bias2 = (1 - beta ** self.steps[row] for beta in self.betas)
         self.values[row] -= rate / bias1 * first / ((second / bias2).sqrt() + self.eps)
 
@@ -126,6 +138,11 @@ class RowAdam:
         for name in ("values", "first", "second"):
             getattr(self, name).copy_(state[name])
         self.steps = [int(n) for n in state["steps"]]
+
+
+def share_of(called_off: Tensor, like: Tensor) -> Tensor:
+    """0-d, in the type of `like`: 0 where the step was called off, 1 where not."""
+    return 1.0 - called_off.reshape(()).to(like)
 
 
 def decayed(first: float, last: float, progress: float) -> float:

@@ -64,10 +64,10 @@ class Chain:
             images.append(effect.image(images[-1], view))
         return Drawn(self, rendered, images, drawn, camera, view)
 
-    def step(self, view: int, progress: float) -> None:
-        """Every effect learns from the backward pass just done."""
+    def step(self, view: int, progress: float, called_off: Tensor | None = None) -> None:
+        """Every effect learns from the backward pass just done; see `Effect.step`."""
         for effect in self._step:
-            effect.step(view, progress)
+            effect.step(view, progress, called_off)
 
     def rows_changed(self) -> None:
         """Density control changed the set of Gaussians."""
@@ -127,10 +127,14 @@ class Drawn:
         camera: Camera,
         view: int | None,
     ) -> None:
-        self.image, self.alpha, self.depth = images[-1], rendered.alpha, rendered.depth
+        self.image, self.alpha = images[-1], rendered.alpha
         self.visible, self.radii = rendered.visible, rendered.radii
         self._chain, self._inner, self._images = chain, rendered, images
         self._drawn, self._camera, self._view = drawn, camera, view
+
+    @property
+    def depth(self) -> Tensor:
+        return self._inner.depth
 
     @torch.no_grad()
     def backward(

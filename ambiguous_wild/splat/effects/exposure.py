@@ -58,9 +58,9 @@ class AffineExposure(Effect):
             self._gradient = gradient.to(self.adam.values)
         return (d_image @ matrix).contiguous()
 
-    def step(self, view: int, progress: float) -> None:
+    def step(self, view: int, progress: float, called_off: Tensor | None = None) -> None:
         if self._gradient is not None:
-            self.adam.step(view, self._gradient, decayed(RATE, RATE_FINAL, progress))
+            self.adam.step(view, self._gradient, decayed(RATE, RATE_FINAL, progress), called_off)
             self._gradient = None
             self._close()
 

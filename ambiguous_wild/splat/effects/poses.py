@@ -15,7 +15,9 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import Camera
-from ambiguous_wild.splat.effects.base import Effect, RowAdam, State, decayed
+from ambiguous_wild.splat import device
+from ambiguous_wild.splat.effects.base import Effect, RowAdam, State, decayed, share_of
+from ambiguous_wild.splat.effects.posed import PosedCamera, left_jacobian, scaled, turned
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
 from ambiguous_wild.splat.reference import harmonics
 from ambiguous_wild.splat.rendered import Gradients
@@ -24,6 +26,8 @@ from ambiguous_wild.splat.step import TrainData
 RATE_PX, FINAL = 0.2, 0.01  # px a step of what a turn moves in the picture; decays to this share
 BEGIN = 0.05  # of the run: before it the render is no evidence of where a camera stood
 PULL = 1e-2  # a visit, towards the pose of the sparse model
+
+Rows = Tensor | slice  # of the Gaussians: those that learnt, or on an accelerator all
 
 
 class PoseRefinement(Effect):
@@ -36,33 +40,65 @@ class PoseRefinement(Effect):
         centres = np.array([camera.center for camera in data.cameras])
         distance = np.linalg.norm(data.scene.points.xyz - centres.mean(axis=0), axis=1)
         self.depth = float(np.median(distance)) if len(distance) else 1.0
-        self.adam = RowAdam(torch.zeros(self.views, 6, dtype=torch.float64))
+        self.adam = RowAdam(torch.zeros(self.views, 6, dtype=torch.float64, device=data.device))
+        self.cameras = data.cameras
+        # on an accelerator both lie beside the motions: a pose that the host composes is waited for
+        self.poses = torch.from_numpy(np.stack([c.cam_from_world for c in data.cameras])).to(data.device)
+        self.intrinsics = torch.from_numpy(np.stack([c.intrinsics for c in data.cameras])).to(data.device)
         self.rate = RATE_PX / float(np.median([camera.fx for camera in data.cameras]))  # rad, and of depth
         self.degree = 3
         self._gradient: Tensor | None = None
 
     def camera(self, view: int, camera: Camera) -> Camera:
+        if device.accelerated(self.adam.values.device):
+            return self._camera_there(view, camera)
         delta = self.adam.values[view].numpy()
         if not delta.any():
             return camera
         return replace(camera, cam_from_world=moved(camera.cam_from_world, delta[:3], self.depth * delta[3:]))
 
+    def _camera_there(self, view: int, camera: Camera) -> Camera:
+        if not self.adam.steps[view]:  # never moved; known without a look at its row
+            return camera
+        full, row = self.cameras[view], self.adam.values[view]
+        turn = turned(row[:3])
+        base = self.poses[view]
+        pose = base.clone()
+        pose[:3, :3] = turn @ base[:3, :3]
+        pose[:3, 3] = turn @ base[:3, 3] + self.depth * row[3:]
+        smaller = camera.width / full.width, camera.height / full.height
+        return PosedCamera(camera, pose, scaled(self.intrinsics[view], *smaller))
+
+    def _pose_backward_there(
+        self, gaussians: Gaussians, camera: Camera, gradients: Gradients, view: int
+    ) -> None:
+        pose = camera.pose if isinstance(camera, PosedCamera) else self.poses[view]
+        centre = -pose[:3, 3] @ pose[:3, :3]
+        left = _left_gradient(gaussians, pose, centre, gradients, slice(None), self.degree)
+        row = self.adam.values[view]
+        turn = left[:3] - torch.linalg.cross(self.depth * row[3:], left[3:])
+        self._gradient = torch.cat([left_jacobian(row[:3]).T @ turn, self.depth * left[3:]])
+
     def pose_backward(self, gaussians: Gaussians, camera: Camera, gradients: Gradients, view: int) -> None:
+        if device.accelerated(self.adam.values.device):
+            return self._pose_backward_there(gaussians, camera, gradients, view)
         left = left_gradient(gaussians, camera, gradients, self.degree)
         # the motion is exp(w) then the shift: about the present pose, the shift part of w is subtracted
         shift = torch.tensor(self.depth * self.adam.values[view, 3:].numpy())
         turn = left[:3] - torch.linalg.cross(shift, left[3:])
         turn = right_jacobian_transposed(self.adam.values[view, :3]) @ turn
         self._gradient = torch.cat([turn, self.depth * left[3:]])
+        return None
 
-    def step(self, view: int, progress: float) -> None:
+    def step(self, view: int, progress: float, called_off: Tensor | None = None) -> None:
         gradient, self._gradient = self._gradient, None
         if gradient is None or progress < BEGIN:
             return
         row = self.adam.values[view]
         share = decayed(1.0, FINAL, progress)
-        self.adam.step(view, gradient, self.rate * share)
-        row *= 1 - PULL * share  # decoupled from Adam's scaling, as weight decay is in AdamW
+        self.adam.step(view, gradient, self.rate * share, called_off)
+        pull = PULL * share if called_off is None else PULL * share * share_of(called_off, row)
+        row *= 1 - pull  # decoupled from Adam's scaling, as weight decay is in AdamW
 
     def facts(self) -> dict[str, Any]:
         angle = torch.rad2deg(self.adam.values[:, :3].norm(dim=1))
@@ -115,18 +151,28 @@ def left_gradient(gaussians: Gaussians, camera: Camera, gradients: Gradients, de
     if not len(rows):  # nothing in the picture learns from it
         return torch.zeros(6, dtype=torch.float64)
     pose = torch.as_tensor(camera.cam_from_world.copy(), device=gaussians.device)
+    return _left_gradient(gaussians, pose, torch.as_tensor(camera.center), gradients, rows, degree).cpu()
+
+
+@torch.no_grad()
+def _left_gradient(
+    gaussians: Gaussians, pose: Tensor, centre: Tensor, gradients: Gradients, rows: Rows, degree: int
+) -> Tensor:
+    """`left_gradient` from the Gaussians in `rows`; those without a gradient add nothing."""
+    if not len(gaussians):
+        return torch.zeros(6, dtype=torch.float64, device=gaussians.device)
     rotation, move = pose[:3, :3], pose[:3, 3]
     means = gaussians.means[rows].double()
     d_means = gradients.means[rows].double()
-    geometric = d_means - _through_direction(gaussians, camera, gradients, rows, degree)
+    geometric = d_means - _through_direction(gaussians, centre, gradients, rows, degree)
     local = means @ rotation.T + move
     d_local = geometric @ rotation.T
     shift = (d_means @ rotation.T).sum(dim=0)  # a shift does move the direction, as a mean would
     turn = torch.linalg.cross(local, d_local).sum(dim=0)
-    return torch.cat([turn + rotation @ _of_quats(gaussians, gradients, rows), shift]).cpu()
+    return torch.cat([turn + rotation @ _of_quats(gaussians, gradients, rows), shift])
 
 
-def _of_quats(gaussians: Gaussians, gradients: Gradients, rows: Tensor) -> Tensor:
+def _of_quats(gaussians: Gaussians, gradients: Gradients, rows: Rows) -> Tensor:
     """dL/dw [3] of turning every Gaussian by w in world axes: dq = (0, w) q / 2."""
     q, d = gaussians.quats[rows].double(), gradients.quats[rows].double()
     v, dv = q[:, 1:], d[:, 1:]
@@ -136,21 +182,21 @@ def _of_quats(gaussians: Gaussians, gradients: Gradients, rows: Tensor) -> Tenso
 
 
 def _through_direction(
-    gaussians: Gaussians, camera: Camera, gradients: Gradients, rows: Tensor, degree: int
+    gaussians: Gaussians, centre: Tensor, gradients: Gradients, rows: Rows, degree: int
 ) -> Tensor:
     """The part of dL/dmeans [rows, 3] that went through the direction of the harmonics."""
     degree = min(degree, gaussians.sh_degree)
+    means = gaussians.means[rows]
     if degree == 0:
-        return torch.zeros(len(rows), 3, dtype=torch.float64, device=gaussians.device)
+        return torch.zeros(means.shape, dtype=torch.float64, device=gaussians.device)
     used = gradients.sh_rest[rows]
     d_colour = gradients.sh0[rows] / SH_C0
     rest = gaussians.sh_rest[rows]
     # a coefficient that the render did not use has no gradient, whatever its value
     rest = torch.where(used.abs().amax(dim=(0, 2), keepdim=True) > 0, rest, torch.zeros_like(rest))
-    centre = torch.as_tensor(camera.center).to(gaussians.means)
     with torch.enable_grad():
-        means = gaussians.means[rows].requires_grad_(True)
-        direction = torch.nn.functional.normalize(means - centre, dim=1)
+        means = means.detach().requires_grad_(True)
+        direction = torch.nn.functional.normalize(means - centre.to(means), dim=1)
         count = (degree + 1) ** 2 - 1
         shade = torch.einsum("nk,nkc->nc", harmonics(direction, degree), rest[:, :count])
         return torch.autograd.grad(shade, means, d_colour)[0].double()

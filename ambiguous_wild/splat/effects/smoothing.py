@@ -37,7 +37,8 @@ class SmoothingFilter(Effect):
 
     def setup(self, data: TrainData) -> None:
         self.cameras = data.cameras
-        self.size = torch.zeros(0)  # [N] f, world units
+        self.size = torch.zeros(0, device=data.device)  # [N] f, world units
+        self._poses: list[Tensor] = []  # of the cameras, where the Gaussians are
         self._stale = True  # rows changed since
         self._at = 0
         self._kept: tuple[Tensor, Tensor, Tensor] | None = None
@@ -45,7 +46,7 @@ class SmoothingFilter(Effect):
     def model(self, gaussians: Gaussians, view: int | None, iteration: int) -> Gaussians:
         size = self.size
         if self._stale or (view is not None and iteration - self._at >= EVERY):
-            size = filter_sizes(gaussians.means, self.cameras)
+            size = filter_sizes(gaussians.means, self.cameras, self._poses_like(gaussians.means))
             if view is not None:  # what is drawn for a probe changes no state
                 self.size, self._at, self._stale = size, iteration, False
         variance = (2 * gaussians.log_scales).exp()
@@ -57,6 +58,12 @@ class SmoothingFilter(Effect):
         opacity = opacity.clamp(1e-7, 1 - 1e-6)
         self._kept = (share, plain, opacity)
         return replace(gaussians, log_scales=0.5 * wide.log(), opacity_logits=torch.logit(opacity))
+
+    def _poses_like(self, means: Tensor) -> list[Tensor]:
+        """Copied there once: copies in between steps make the host of an accelerator wait."""
+        if not self._poses or (self._poses[0].dtype, self._poses[0].device) != (means.dtype, means.device):
+            self._poses = poses_like(means, self.cameras)
+        return self._poses
 
     def model_backward(self, gradients: Gradients, view: int | None) -> Gradients:
         if self._kept is None:
@@ -80,20 +87,29 @@ class SmoothingFilter(Effect):
         return {"size": self.size, "at": self._at, "stale": self._stale}
 
     def load_state_dict(self, state: State) -> None:
-        self.size, self._at, self._stale = state["size"], int(state["at"]), bool(state["stale"])
+        self.size = state["size"].to(self.size.device)
+        self._at, self._stale = int(state["at"]), bool(state["stale"])
+
+
+def poses_like(means: Tensor, cameras: list[Camera]) -> list[Tensor]:
+    """cam_from_world [4, 4] of every camera, in the type and place of `means`."""
+    return [
+        torch.as_tensor(camera.cam_from_world.copy(), dtype=means.dtype, device=means.device)
+        for camera in cameras
+    ]
 
 
 @torch.no_grad()
-def filter_sizes(means: Tensor, cameras: list[Camera]) -> Tensor:
+def filter_sizes(means: Tensor, cameras: list[Camera], poses: list[Tensor] | None = None) -> Tensor:
     """f [N] in world units: sqrt(0.2) z / F, z to the nearest camera that sees it, F the longest focal.
 
     Args:
         means: [N, 3] world.
         cameras: of the train photos, at full size.
+        poses: `poses_like` of them, where they are at hand.
     """
     nearest = torch.full_like(means[:, 0], torch.inf)
-    for camera in cameras:
-        pose = torch.as_tensor(camera.cam_from_world.copy(), dtype=means.dtype, device=means.device)
+    for camera, pose in zip(cameras, poses_like(means, cameras) if poses is None else poses):
         x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
         depth = z.clamp(min=1e-3)
         u = (camera.fx * x / depth + camera.cx) / camera.width
@@ -101,6 +117,7 @@ def filter_sizes(means: Tensor, cameras: list[Camera]) -> Tensor:
         seen = (z > NEAR) & ((u - 0.5).abs() <= 0.5 + MARGIN) & ((v - 0.5).abs() <= 0.5 + MARGIN)
         nearest = torch.where(seen, torch.minimum(nearest, z), nearest)
     known = torch.isfinite(nearest)
-    far = nearest[known].max() if bool(known.any()) else nearest.new_tensor(0.0)
-    nearest = torch.where(known, nearest, far)
+    if len(means):  # the farthest of what is seen; what is seen lies before the camera, so 0 is none
+        far = nearest.masked_fill(~known, 0.0).amax()
+        nearest = torch.where(known, nearest, far)
     return nearest * (VARIANCE**0.5 / max(camera.fx for camera in cameras))

@@ -1,0 +1,75 @@
+"""gsplat's own plain loop, the yardstick of `gpu.py`: its rasterization, autograd, torch's fused Adam.
+
+As in gsplat's example trainer with its defaults: one photo a step, L1 and D-SSIM, one Adam for every
+parameter, spherical harmonics up to degree 3. The loss is the package's fused one, so that SSIM costs both
+loops the same. There is no density control: the number of Gaussians is what it is compared at.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ambiguous_wild.splat.fused_loss import photometric_fused
+from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.gsplat_seam import gsplat
+from ambiguous_wild.splat.step import TrainData
+
+
+class _Loss(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, photo: Tensor) -> Tensor:
+        l1, dssim, gradient = photometric_fused(image, photo, None, 0.2, "map")
+        ctx.save_for_backward(gradient)
+        return 0.8 * l1 + 0.2 * dssim
+
+    @staticmethod
+    def backward(ctx: Any, d_loss: Tensor) -> tuple[Tensor, None]:
+        (gradient,) = ctx.saved_tensors
+        return d_loss * gradient, None
+
+
+class PlainLoop:
+    """Trains copies of these Gaussians; every call of `step` is one iteration."""
+
+    def __init__(self, gaussians: Gaussians, data: TrainData, rates: dict[str, float]) -> None:
+        self.data = data
+        self.parameters = {name: torch.nn.Parameter(t.clone()) for name, t in gaussians.items()}
+        device = data.device
+        self.optimisers = [
+            torch.optim.Adam([p], lr=rates[name], eps=1e-15, fused=True)
+            for name, p in self.parameters.items()
+        ]
+        poses = [torch.from_numpy(c.cam_from_world.astype("float32"))[None] for c in data.cameras]
+        intrinsics = [torch.from_numpy(c.intrinsics.astype("float32"))[None] for c in data.cameras]
+        self.poses = [pose.to(device) for pose in poses]
+        self.intrinsics = [k.to(device) for k in intrinsics]
+        self.iteration = 0
+
+    def step(self) -> Tensor:
+        """One iteration; returns the loss, on the device."""
+        view = self.iteration % len(self.data.photos)
+        self.iteration += 1
+        p, camera = self.parameters, self.data.cameras[view]
+        picture, _, meta = gsplat().rasterization(
+            means=p["means"],
+            quats=p["quats"],
+            scales=torch.exp(p["log_scales"]),
+            opacities=torch.sigmoid(p["opacity_logits"]),
+            colors=torch.cat([p["sh0"][:, None], p["sh_rest"]], dim=1),
+            viewmats=self.poses[view],
+            Ks=self.intrinsics[view],
+            width=camera.width,
+            height=camera.height,
+            sh_degree=3,
+            packed=False,
+        )
+        meta["means2d"].retain_grad()  # its density control reads it
+        loss: Tensor = _Loss.apply(picture[0], self.data.photos[view])
+        loss.backward()
+        for optimiser in self.optimisers:
+            optimiser.step()
+            optimiser.zero_grad(set_to_none=True)
+        return loss.detach()

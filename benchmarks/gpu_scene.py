@@ -1,0 +1,163 @@
+"""A simulated scene for a machine without COLMAP: true poses, and points read off the exact depth.
+
+    python benchmarks/gpu_scene.py SCENE [--preset courtyard-colour] [--train 150] [--test 20] [--width 582]
+
+The default has as many pixels a photo as NeRF On-the-go at factor 8 (504x378), in the simulator's 16:9.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from ambiguous_wild.io.atomic import atomic_dir, write_text
+from ambiguous_wild.io.colmap_binary import write_cameras, write_images, write_points
+from ambiguous_wild.io.colmap_model import ModelCamera, ModelImage, ModelPoints
+from ambiguous_wild.io.images import read_png_rgb, write_png
+from ambiguous_wild.simulate.capture import simulate
+from ambiguous_wild.simulate.presets import preset
+
+EVERY_PX = 24  # a point for so many px along rows and columns of every train photo
+SAME_DEPTH = 0.02  # relative: another photo shows a point whose depth there is its own
+
+
+def make_scene(out: Path, *, name: str, train: int, test: int, width: int, seed: int = 0) -> Path:
+    """Write a scene folder with photos, model, lists and truth; returns it. Nothing is done where it is."""
+    if (out / "sparse" / "0" / "points3D.bin").is_file():
+        return out
+    spec = preset(name)
+    height = round(spec.height * width / spec.width)
+    spec = dataclasses.replace(spec, train_views=train, test_views=test, width=width, height=height)
+    with tempfile.TemporaryDirectory() as raw_name, atomic_dir(out) as folder:
+        raw = Path(raw_name) / "raw"
+        simulate(spec, raw, seed=seed, depth=True)
+        cameras = json.loads((raw / "truth" / "cameras.json").read_text())
+        for part in ("images", "sparse/0", "truth/distractor", "truth/clean"):
+            (folder / part).mkdir(parents=True)
+        lists: dict[str, list[str]] = {"train": [], "test": []}
+        for split, found in lists.items():
+            for photo in sorted((raw / split).iterdir()):
+                png = photo.with_suffix(".png").name
+                pixels = cv2.imread(str(photo), cv2.IMREAD_COLOR)
+                write_png(folder / "images" / png, np.ascontiguousarray(pixels[:, :, ::-1]))
+                found.append(png)
+        for kind in ("distractor", "clean"):
+            for path in (raw / "truth" / kind).iterdir():
+                (folder / "truth" / kind / path.name).write_bytes(path.read_bytes())
+        for split, found in lists.items():
+            write_text(folder / f"{split}_list.txt", "\n".join(found) + "\n")
+        _write_model(folder, raw, cameras, lists["train"])
+    return out
+
+
+def _write_model(folder: Path, raw: Path, cameras: dict[str, Any], train: list[str]) -> None:
+    """Every photo's pose; points on a grid of every train photo, with the train photos that show them."""
+    order = sorted(cameras)
+    first = cameras[order[0]]
+    poses = {name: np.array(cameras[name]["cam_from_world"]) for name in order}
+    stems = [Path(name).stem for name in order]
+    views = [k for k, stem in enumerate(stems) if f"{stem}.png" in set(train)]
+    depths = {k: _depth_m(raw, stems[k]) for k in views}
+    xyz, rgb = _points(raw, cameras, order, views, depths)
+    observed: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+    for k in views:
+        c = cameras[order[k]]
+        local = xyz @ poses[order[k]][:3, :3].T + poses[order[k]][:3, 3]
+        ahead = np.maximum(local[:, 2], 1e-6)
+        uv = local[:, :2] / ahead[:, None] * [c["fx"], c["fy"]] + [c["cx"], c["cy"]]
+        inside = (local[:, 2] > 0) & (uv >= 0).all(1) & (uv < [c["width"], c["height"]]).all(1)
+        at = np.where(inside[:, None], uv, 0).astype(int)
+        same = np.abs(depths[k][at[:, 1], at[:, 0]] - local[:, 2]) < SAME_DEPTH * local[:, 2]
+        rows = np.flatnonzero(inside & same)
+        observed[k] = rows, uv[rows]
+    images = []
+    for k, name in enumerate(order):
+        rows, uv = observed.get(k, (np.zeros(0, np.int64), np.zeros((0, 2))))
+        pose = poses[name]
+        q = _quaternion(pose[:3, :3])
+        png = f"{stems[k]}.png"
+        images.append(ModelImage(k + 1, q, pose[:3, 3], 1, png, uv, rows.astype(np.int64) + 1))
+    size = (first["width"], first["height"], tuple(first[key] for key in ("fx", "fy", "cx", "cy")))
+    sparse = folder / "sparse" / "0"
+    write_cameras(sparse / "cameras.bin", [ModelCamera(1, "PINHOLE", *size)])
+    write_images(sparse / "images.bin", images)
+    write_points(sparse / "points3D.bin", _tracked(xyz, rgb, observed))
+
+
+def _points(
+    raw: Path, cameras: dict[str, Any], order: list[str], views: list[int], depths: dict[int, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """World points [M, 3] on a grid of every train photo, and their colours [M, 3] uint8."""
+    xyz, rgb = [], []
+    for k in views:
+        c = cameras[order[k]]
+        rows, columns = np.mgrid[
+            EVERY_PX // 2 : c["height"] : EVERY_PX, EVERY_PX // 2 : c["width"] : EVERY_PX
+        ]
+        z = depths[k][rows, columns]
+        known = z > 0
+        rows, columns, z = rows[known], columns[known], z[known]
+        local = np.stack(
+            [(columns + 0.5 - c["cx"]) / c["fx"] * z, (rows + 0.5 - c["cy"]) / c["fy"] * z, z], 1
+        )
+        world = np.linalg.inv(np.array(c["cam_from_world"]))
+        xyz.append(local @ world[:3, :3].T + world[:3, 3])
+        clean = read_png_rgb(raw / "truth" / "clean" / f"{Path(order[k]).stem}.png")
+        rgb.append(clean[rows, columns])
+    return np.concatenate(xyz), np.concatenate(rgb)
+
+
+def _tracked(
+    xyz: np.ndarray, rgb: np.ndarray, observed: dict[int, tuple[np.ndarray, np.ndarray]]
+) -> ModelPoints:
+    point = np.concatenate([rows for rows, _ in observed.values()])
+    image = np.concatenate([np.full(len(rows), k + 1) for k, (rows, _) in observed.items()])
+    number = np.concatenate([np.arange(len(rows)) for rows, _ in observed.values()])
+    sort = np.argsort(point, kind="stable")
+    offsets = np.r_[0, np.cumsum(np.bincount(point, minlength=len(xyz)))]
+    ids = np.arange(1, len(xyz) + 1)
+    return ModelPoints(ids, xyz, rgb, np.full(len(xyz), 0.5), offsets, image[sort], number[sort])
+
+
+def _depth_m(raw: Path, stem: str) -> np.ndarray:
+    """[H, W] m, 0 where nothing is near enough for 16 bits of millimetres."""
+    codes = cv2.imread(str(raw / "truth" / "depth" / f"{stem}.png"), cv2.IMREAD_UNCHANGED)
+    return np.where(codes < 65535, codes, 0).astype(np.float64) / 1000.0
+
+
+def _quaternion(rotation: np.ndarray) -> np.ndarray:
+    """(w, x, y, z) of a rotation matrix, by the eigenvector of Bar-Itzhack's symmetric matrix."""
+    r = rotation
+    k = np.array(
+        [
+            [r[0, 0] - r[1, 1] - r[2, 2], 0, 0, 0],
+            [r[0, 1] + r[1, 0], r[1, 1] - r[0, 0] - r[2, 2], 0, 0],
+            [r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], r[2, 2] - r[0, 0] - r[1, 1], 0],
+            [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], r.trace()],
+        ]
+    )
+    x, y, z, w = np.linalg.eigh(k)[1][:, -1]
+    return np.array([w, x, y, z]) * (1.0 if w >= 0 else -1.0)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("--preset", default="courtyard-colour")
+    parser.add_argument("--train", type=int, default=150)
+    parser.add_argument("--test", type=int, default=20)
+    parser.add_argument("--width", type=int, default=582)
+    parser.add_argument("--seed", type=int, default=0)
+    a = parser.parse_args()
+    print(make_scene(a.scene, name=a.preset, train=a.train, test=a.test, width=a.width, seed=a.seed))
+
+
+if __name__ == "__main__":
+    main()

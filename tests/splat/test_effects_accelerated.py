@@ -1,0 +1,315 @@
+"""Effects on an accelerator: the CPU's numbers, and steps for which the host waits nowhere."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from ambiguous_wild.core import Points, Scene, View
+from ambiguous_wild.splat import checkpoint, device
+from ambiguous_wild.splat.data import shrink_camera
+from ambiguous_wild.splat.effects import ALL, with_effects
+from ambiguous_wild.splat.effects.base import RowAdam
+from ambiguous_wild.splat.effects.chain import Chain
+from ambiguous_wild.splat.effects.posed import PosedCamera, left_jacobian, turned
+from ambiguous_wild.splat.effects.poses import PoseRefinement, right_jacobian_transposed
+from ambiguous_wild.splat.effects.smoothing import filter_sizes
+from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.rendered import Gradients
+from ambiguous_wild.splat.step import TrainData
+from tests.host_reads import moved, no_transfers
+from tests.splat.scenes import camera as make_camera
+from tests.splat.scenes import gaussians as random_gaussians
+
+SIZE = 24, 18
+
+
+def on_accelerator(monkeypatch, yes=True):
+    monkeypatch.setattr(device, "accelerated", lambda _: yes)
+
+
+def data_of(views=3):
+    cameras = [make_camera(*SIZE, angle=0.1 * k, fx=20.0 + k, fy=21.0) for k in range(views)]
+    xyz = np.random.default_rng(0).normal([0, 0, 3], 1.0, (40, 3))
+    points = Points(xyz, np.zeros((40, 3), np.uint8), np.zeros(40), np.zeros(41, int),
+                    np.zeros(0, np.int32), np.zeros((0, 2), np.float32))  # fmt: skip
+    scene = Scene(None, "s", tuple(View(f"{i}.png", None, c, "train") for i, c in enumerate(cameras)), points)
+    photos = [torch.full((c.height, c.width, 3), 0.5) for c in cameras]
+    return TrainData(scene, photos, cameras, [None] * views, torch.device("cpu"), 0, None)
+
+
+def chain_of(data, names=ALL):
+    return Chain(with_effects(Parts(), names).effects, data)
+
+
+class Painted:
+    """Stands in for a renderer: every parameter is in the picture, and so is the pose."""
+
+    def __init__(self, gaussians, camera):
+        pose, centre = getattr(camera, "pose", None), getattr(camera, "centre", None)
+        if pose is None:
+            pose, centre = (torch.tensor(np.array(x)) for x in (camera.cam_from_world, camera.center))
+            pose, centre = pose.to(gaussians.device), centre.to(gaussians.device)
+        self.leaves = {name: t.detach().requires_grad_(True) for name, t in gaussians.items()}
+        with torch.enable_grad():
+            local = self.leaves["means"] @ pose[:3, :3].T.to(gaussians.means) + pose[:3, 3].to(
+                gaussians.means
+            )
+            shade = torch.tanh(self.leaves["sh_rest"].sum(dim=1) + (self.leaves["means"] - centre.float()))
+            colour = shade + self.leaves["sh0"] + self.leaves["quats"][:, 1:]
+            weight = torch.sigmoid(self.leaves["opacity_logits"]) * self.leaves["log_scales"].exp().sum(dim=1)
+            rows = torch.linspace(-1, 1, camera.height, device=gaussians.device)[:, None, None]
+            columns = torch.linspace(-1, 1, camera.width, device=gaussians.device)[None, :, None]
+            wave = torch.sin(local[:, 0] * columns + local[:, 1] * rows)  # [H, W, N]
+            self.drawn = 0.5 + 0.1 * (wave * weight.tanh()) @ colour / len(gaussians)
+        self.image = self.drawn.detach()
+        self.alpha = self.depth = self.image[..., 0]
+        self.visible, self.radii = gaussians.means[:, 0] > -9.0, gaussians.means[:, 0]
+
+    def backward(self, d_image, *, d_image_extra=None, d_alpha=None, d_depth=None, absolute=False):
+        found = torch.autograd.grad(self.drawn, list(self.leaves.values()), d_image)
+        return Gradients(**dict(zip(self.leaves, found)), screen=found[0][:, :2])
+
+
+def visit(chain, data, gaussians, iteration, divisor=1, called_off=None, targets=None):
+    """One step of training, but for the Gaussians."""
+    view = iteration % len(data.photos)
+    camera = chain.camera(view, shrink_camera(data.cameras[view], divisor))
+    rendered = chain.render(gaussians, camera, view, iteration, Painted)
+    target = 0.2 if targets is None else targets[view]
+    gradients = rendered.backward((rendered.image - target) / rendered.image.numel())
+    chain.step(view, 0.1 + 0.01 * iteration, called_off)
+    if iteration % 3 == 0:
+        chain.rows_changed()
+    return rendered.image, gradients
+
+
+def tensors(state):
+    """Leaves of nested dicts and lists, by path."""
+    if isinstance(state, dict):
+        return {f"{k}/{path}": t for k, v in state.items() for path, t in tensors(v).items()}
+    return {"": torch.as_tensor(state)}
+
+
+def same(one, other, **tolerance):
+    one, other = tensors(one), tensors(other)
+    assert one.keys() == other.keys()
+    for path in one:
+        where = lambda text, path=path: f"{path}: {text}"  # noqa: E731
+        torch.testing.assert_close(one[path], other[path], msg=where, **tolerance)
+
+
+# -- the same numbers -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("names", [*((name,) for name in ALL), ALL], ids="+".join)
+def test_effects_learn_what_they_learn_on_the_cpu(monkeypatch, names):
+    runs = []
+    for yes in (False, True):
+        on_accelerator(monkeypatch, yes)
+        data = data_of()
+        chain, g = chain_of(data, names), random_gaussians(3, n=30)
+        seen = [visit(chain, data, g, iteration, 1 + iteration % 2) for iteration in range(12)]
+        runs.append((chain, seen))
+    (cpu, seen), (there, seen_there) = runs
+    start = chain_of(data_of(), names).state_dict()
+    assert str(start) != str(cpu.state_dict())  # something was learnt
+    # the sums of the poses' gradients run over all Gaussians instead of those that learnt, in float64, of
+    # float32 gradients; the other effects do the same arithmetic
+    tolerance = {"rtol": 1e-5, "atol": 1e-7} if "poses" in names else {"rtol": 0, "atol": 0}
+    same(there.state_dict(), cpu.state_dict(), **tolerance)
+    for (image, gradients), (image_there, gradients_there) in zip(seen, seen_there):
+        torch.testing.assert_close(image_there, image, rtol=1e-5, atol=1e-6)
+        for name in ("means", "log_scales", "opacity_logits", "sh0"):
+            torch.testing.assert_close(
+                getattr(gradients_there, name), getattr(gradients, name), rtol=1e-4, atol=1e-8
+            )
+    facts, facts_there = cpu.facts(), there.facts()
+    for name in names:
+        assert facts_there[name] == pytest.approx(facts[name], rel=1e-4)
+
+
+def test_a_learnt_pose_is_composed_as_on_the_cpu(monkeypatch):
+    data, rng = data_of(), np.random.default_rng(1)
+    cpu, there = PoseRefinement(), PoseRefinement()
+    for effect in (cpu, there):
+        effect.setup(data)
+    delta = torch.from_numpy(rng.normal(size=(3, 6)) * 0.05)
+    delta[2] = 0.0
+    for effect in (cpu, there):
+        effect.adam.values[:] = delta
+        effect.adam.steps = [4, 1, 1]
+    for view in range(3):
+        for divisor in (1, 2):
+            camera = shrink_camera(data.cameras[view], divisor)
+            expected = cpu.camera(view, camera)
+            with monkeypatch.context() as patch:
+                on_accelerator(patch)
+                found = there.camera(view, camera)
+            assert isinstance(found, PosedCamera) and (found.width, found.height) == SIZE_OF[divisor]
+            for one in (found, found.resized(12, 6)):
+                like = expected if one is found else expected.resized(12, 6)
+                np.testing.assert_allclose(one.cam_from_world, like.cam_from_world, rtol=0, atol=1e-14)
+                np.testing.assert_allclose(one.pose.numpy(), like.cam_from_world, rtol=0, atol=1e-14)
+                np.testing.assert_allclose(one.centre.numpy(), like.center, rtol=0, atol=1e-14)
+                np.testing.assert_allclose(one.center, like.center, rtol=0, atol=1e-14)
+                np.testing.assert_allclose(one.intrinsics_there.numpy(), like.intrinsics, rtol=1e-14)
+                np.testing.assert_allclose(one.intrinsics, like.intrinsics, rtol=1e-14)
+    there.adam.steps = [0, 0, 0]
+    on_accelerator(monkeypatch)
+    assert there.camera(0, data.cameras[0]) is data.cameras[0]  # never moved
+
+
+SIZE_OF = {1: SIZE, 2: (SIZE[0] // 2, SIZE[1] // 2)}
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-3, 0.0099, 0.0101, 0.5, 3.0])
+def test_rotations_and_their_jacobian(angle):
+    axis = np.array([0.48, -0.6, 0.64])
+    w = torch.from_numpy(angle * axis)
+    np.testing.assert_allclose(turned(w), Rotation.from_rotvec(angle * axis).as_matrix(), rtol=0, atol=1e-15)
+    expected = right_jacobian_transposed(w).T
+    torch.testing.assert_close(left_jacobian(w), expected, rtol=0, atol=1e-12)
+    if angle:
+        h = 1e-6
+        for k, unit in enumerate(torch.eye(3, dtype=torch.float64)):
+            change = turned(w + h * unit) @ turned(w - h * unit).T / (2 * h)
+            change = 0.5 * (change - change.T)
+            column = torch.stack([change[2, 1], change[0, 2], change[1, 0]])
+            torch.testing.assert_close(left_jacobian(w)[:, k], column, rtol=0, atol=1e-8)
+
+
+def test_filter_sizes_with_nothing_in_sight():
+    cameras = data_of().cameras
+    behind = torch.tensor([[0.0, 0.0, -9.0], [0.0, 0.0, -8.0]])
+    assert filter_sizes(behind, cameras).tolist() == [0.0, 0.0]
+    assert filter_sizes(behind[:0], cameras).shape == (0,)
+
+
+def test_a_step_that_is_called_off_changes_nothing():
+    generator = torch.Generator().manual_seed(0)
+    off, on = torch.ones(1), torch.zeros(1)
+    plain, told = (RowAdam(torch.zeros(2, 3, dtype=torch.float64)) for _ in range(2))
+    for _ in range(5):
+        gradient = torch.randn(3, generator=generator, dtype=torch.float64)
+        plain.step(1, gradient, 0.1)
+        told.step(1, gradient, 0.1, on)
+    same(told.state_dict(), plain.state_dict(), rtol=1e-6, atol=0)
+    before = {name: t.clone() for name, t in tensors(told.state_dict()).items() if name != "steps/"}
+    told.step(1, torch.tensor([np.nan, np.inf, 1.0], dtype=torch.float64), 0.1, off)
+    for name, tensor in before.items():
+        assert torch.equal(tensors(told.state_dict())[name], tensor)
+
+
+def test_a_run_that_is_called_off_stays_where_it_is(monkeypatch):
+    on_accelerator(monkeypatch)
+    data = data_of()
+    chain, g = chain_of(data, ("exposure", "appearance", "poses")), random_gaussians(3, n=30)
+    for iteration in range(6):
+        visit(chain, data, g, iteration)
+    before = {k: t.clone() for k, t in tensors(chain.state_dict()).items() if "steps" not in k}
+    nan = [torch.full((SIZE[1], SIZE[0], 3), torch.nan)] * 3
+    for iteration in (6, 7, 8):
+        visit(chain, data, g, iteration, called_off=torch.ones(1), targets=nan)
+    after = tensors(chain.state_dict())
+    for name, tensor in before.items():  # the rows' sum is brought back to zero, which is rounding
+        torch.testing.assert_close(after[name], tensor, rtol=0, atol=1e-9)
+    assert any(not torch.equal(tensor, torch.zeros_like(tensor)) for tensor in before.values())
+
+
+# -- state ----------------------------------------------------------------------------------------
+
+
+def test_the_state_goes_from_an_accelerator_to_a_cpu_and_back(monkeypatch, tmp_path):
+    on_accelerator(monkeypatch)
+    data, g = data_of(), random_gaussians(3, n=30)
+    whole = chain_of(data)
+    for iteration in range(7):
+        visit(whole, data, g, iteration)
+    checkpoint.save(tmp_path / "state", whole.state_dict())
+
+    def resumed():
+        chain = chain_of(data)
+        chain.load_state_dict(checkpoint.load(tmp_path / "state"))
+        checkpoint.save(tmp_path / "again", chain.state_dict())
+        again, state = (checkpoint.load(tmp_path / name) for name in ("again", "state"))
+        same(again, state, rtol=0, atol=0)
+        for iteration in range(7, 13):
+            visit(chain, data, g, iteration)
+        return chain
+
+    second = resumed()
+    on_accelerator(monkeypatch, False)
+    cpu = resumed()
+    on_accelerator(monkeypatch)
+    for iteration in range(7, 13):
+        visit(whole, data, g, iteration)
+    same(second.state_dict(), whole.state_dict(), rtol=0, atol=0)
+    same(cpu.state_dict(), whole.state_dict(), rtol=1e-5, atol=1e-7)
+
+
+def test_a_state_from_the_cpu_lands_where_the_run_is():
+    chain = chain_of(data_of())
+    visit(chain, data_of(), random_gaussians(3, n=30), 0)
+    state = chain.state_dict()
+    there = moved(chain_of(data_of()))
+    there.load_state_dict(state)
+    held = [e for e in tensors(there.state_dict()).items() if not e[0].endswith(("steps/", "at/", "stale/"))]
+    assert held and all(t.device.type == "meta" for _, t in held)
+
+
+# -- without the host -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("names", [*((name,) for name in ALL), ALL], ids="+".join)
+def test_a_step_leaves_the_host_alone(monkeypatch, names):
+    with monkeypatch.context() as patch:
+        on_accelerator(patch)
+        data, g = data_of(), random_gaussians(3, n=30)
+        chain = chain_of(data, names)
+        for iteration in range(1, 4):
+            visit(chain, data, g, iteration)
+    off = torch.zeros(1)
+    chain, data, g, off, known = moved([chain, data, g, off, {}])
+    assert data.device.type == "meta"
+
+    def draw(gaussians, camera):
+        if not isinstance(camera, PosedCamera):  # a plain camera is copied where the renderer first meets it
+            if id(camera) not in known:
+                pose, centre = (torch.zeros(s, dtype=torch.float64).to("meta") for s in ((4, 4), 3))
+                size = {"width": camera.width, "height": camera.height}
+                known[id(camera)] = camera, SimpleNamespace(pose=pose, centre=centre, **size)
+            camera = known[id(camera)][1]
+        return Painted(gaussians, camera)
+
+    def step(iteration, divisor, called_off):
+        view = iteration % len(data.photos)
+        camera = chain.camera(view, cameras[view, divisor])
+        assert isinstance(camera, PosedCamera) == ("poses" in names)
+        if "poses" in names:
+            camera = shrink_camera(camera, 2)  # as a policy's coarse render does
+        rendered = chain.render(g, camera, view, iteration, draw)
+        extra = torch.zeros_like(rendered.image)
+        gradients = rendered.backward(rendered.image - 0.5, d_image_extra=extra)
+        chain.step(view, 0.5, called_off)
+        chain.rows_changed()
+        assert gradients.means.device.type == "meta"
+
+    cameras = {(v, d): shrink_camera(data.cameras[v], d) for v in range(3) for d in (1, 2)}
+    plan = [(k, d, c) for k in range(3) for d in (1, 2) for c in (None, off)]
+    for one in plan:
+        step(*one)  # what is kept by camera is copied at its first use
+    with no_transfers():
+        for one in plan:
+            step(*one)
+
+
+def test_the_pose_for_anybody_else_is_read_when_asked_for():
+    camera = replace(make_camera(*SIZE))
+    posed = PosedCamera(camera, torch.eye(4, dtype=torch.float64).to("meta"), torch.eye(3).to("meta"))
+    assert posed.resized(12, 9).width == 12
+    with pytest.raises((RuntimeError, NotImplementedError, TypeError)):
+        _ = posed.cam_from_world

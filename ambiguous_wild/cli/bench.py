@@ -242,7 +242,7 @@ def command(
     check_output(output / "run")  # before half a minute of compiling
     if chosen == "cpu" and not engine.remote and any(cell.method.program is None for cell in cells):
         prepare_cpu(threads)
-    if engine.in_process:
+    if session.in_process(cells):
         progress = Progress(len(cells))
         reports = run_cells(
             cells,

@@ -11,7 +11,6 @@ import os
 import platform
 import shlex
 import shutil
-import subprocess
 import sys
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
@@ -23,6 +22,7 @@ from ambiguous_wild.cli.probes import PROBES, Probe, probe
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.extras import install_command
 from ambiguous_wild.harness.environment import installed
+from ambiguous_wild.splat import cuda_ready
 
 PACKAGE = Path(__file__).resolve().parent.parent
 DISTRIBUTION = "ambiguous-wild"
@@ -173,31 +173,31 @@ def _numba(found: Probe) -> list[Check]:
 
 
 def _gpu(torch: Probe) -> list[Check]:
-    driver = _command("nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader")
-    cuda = bool(torch.facts and torch.facts["cuda"])
+    """In the words with which `--device` refuses a GPU."""
+    if torch.facts is None:
+        return [Check("optional", "torch cuda", False, torch.error, "mend torch first")]
+    found = cuda_ready.look(torch.facts)
+    driver, version = found.driver, installed("gsplat") or "present"
     checks = [
         Check("optional", "nvidia driver", driver is not None, driver or "no nvidia-smi; the CPU is used",
               "" if driver else "install the NVIDIA driver, if there is a GPU"),
-        Check("optional", "torch cuda", cuda, *_cuda_words(torch, driver is not None)),
+        _part("torch cuda", ", ".join(torch.facts["names"]), cuda_ready.no_cuda(found)),
+        _part("gsplat", version, cuda_ready.no_gsplat(found)),
     ]  # fmt: skip
-    version = installed("gsplat")
-    fix = "" if version else install_command("cuda")
-    checks.append(
-        Check("optional", "gsplat", version is not None, version or "absent: no GPU rendering", fix)
-    )
+    if found.gsplat and found.has_gpu:
+        state = f"compiled, in {found.folder}"
+        if found.prebuilt:
+            state = "part of its wheel"
+        elif not found.compiled:
+            state = f"not compiled yet: the first run takes several minutes more, kept in {found.folder}"
+        checks.append(_part("gsplat kernels", state, cuda_ready.no_kernels(found)))
     return checks
 
 
-def _cuda_words(torch: Probe, driver: bool) -> tuple[str, str]:
-    facts = torch.facts
-    if facts is None:
-        return torch.error, "mend torch first"
-    if facts["cuda"]:
-        return ", ".join(facts["names"]), ""
-    if facts["built"] is None:
-        fix = "pip install torch with CUDA (see pytorch.org)" if driver else "nothing to do without a GPU"
-        return f"torch {facts['version']} is a CPU build", fix
-    return f"torch is built for CUDA {facts['built']}, but sees no GPU", "check the driver with nvidia-smi"
+def _part(name: str, fine: str, lack: cuda_ready.Lack | None) -> Check:
+    return Check(
+        "optional", name, lack is None, fine if lack is None else lack.what, lack.fix if lack else ""
+    )
 
 
 def _extras() -> list[Check]:
@@ -281,19 +281,7 @@ def _metrics() -> list[Check]:
 
 
 def _git() -> Check:
-    version = _command("git", "--version")
+    version = cuda_ready.first_line("git", "--version")
     return Check(
         "optional", "git", version is not None, version or "absent", "" if version else "install git"
     )
-
-
-def _command(*words: str) -> str | None:
-    """First line of what a program prints; None where it is absent or fails."""
-    if shutil.which(words[0]) is None:
-        return None
-    try:
-        done = subprocess.run(words, capture_output=True, text=True, timeout=10, check=False)
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    lines = done.stdout.strip().splitlines()
-    return lines[0] if done.returncode == 0 and lines else None

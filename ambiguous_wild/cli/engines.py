@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 _OPTIONS = (
     click.option("--engine", type=click.Choice(["local", "ray"]), default="local", show_default=True, help="ray: a cluster, see docs/cluster.md."),
-    click.option("--jobs", type=click.IntRange(1), help="Cells at a time on this machine; the cores are divided.  [default: 1]"),
+    click.option("--jobs", type=click.IntRange(1), help="Cells at a time on this machine; cores and GPUs are divided.  [default: 1; on cuda one a GPU]"),
     click.option("--address", help="Ray: auto, HOST:PORT or ray://HOST:10001.  [default: $RAY_ADDRESS, else this machine]"),
     click.option("--cpus-per-cell", type=click.FloatRange(min=0, min_open=True), help="Ray: CPUs, also the threads.  [default: --threads, else 1]"),
     click.option("--gpus-per-cell", type=click.FloatRange(min=0), help="Ray: GPUs; 0.5 lets two cells share one.  [default: 1 on cuda]"),
@@ -76,11 +76,6 @@ class Engine:
                 raise AwError("--jobs is for this machine: a cluster at --address runs as many cells as fit")
 
     @property
-    def in_process(self) -> bool:
-        """One cell after another, here."""
-        return self.engine == "local" and (self.jobs or 1) == 1
-
-    @property
     def remote(self) -> bool:
         """A cluster that is there already, not one that this command starts."""
         return self.engine == "ray" and bool(self.address or os.environ.get("RAY_ADDRESS"))
@@ -91,6 +86,7 @@ class Session:
 
     def __init__(self, engine: Engine, threads: int | None) -> None:
         self.engine, self.threads = engine, threads
+        self.gpus: list[str] = []  # of this machine, where its processes share them out
         self.cluster: RayCluster | None = None
 
     def __enter__(self) -> Session:
@@ -110,6 +106,20 @@ class Session:
             return device
         return "cuda" if self._connected().has_gpu() else "cpu"
 
+    def in_process(self, cells: Sequence[Cell]) -> bool:
+        """Whether they run here, one after another; else `run` does. Several GPUs get a cell each."""
+        if self.engine.engine != "local":
+            return False
+        if any(cell.device == "cuda" for cell in cells):
+            import torch
+
+            from ambiguous_wild.harness.engines.gpu_slots import visible_gpus
+
+            self.gpus = visible_gpus(torch.cuda.device_count())
+        if self.engine.jobs is None:
+            self.engine = replace(self.engine, jobs=max(1, min(len(self.gpus), len(cells))))
+        return self.engine.jobs == 1
+
     def run(self, grid: Grid) -> list[CellReport]:
         """Run the cells in processes of this machine or on the cluster; reports in their order."""
         from ambiguous_wild.harness.engines.processes import run_in_processes
@@ -122,9 +132,13 @@ class Session:
         if cluster is not None:
             click.echo(f"Ray: {cluster.describe()}", err=True)
             return cluster.run(jobs, lost=grid.lost, on_end=progress.end, say=_say)
+        from ambiguous_wild.harness.engines.gpu_slots import sharing
+
+        if said := sharing(min(engine.jobs or 1, len(jobs)), self.gpus):
+            _say(f"warning: {said}")
         return run_in_processes(
             jobs, engine.jobs or 1, retries=engine.retries, lost=grid.lost,
-            on_start=progress.start, on_end=progress.end,
+            on_start=progress.start, on_end=progress.end, gpus=self.gpus,
         )  # fmt: skip
 
     def _connected(self) -> RayCluster:

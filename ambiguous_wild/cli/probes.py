@@ -13,10 +13,8 @@ TIMEOUT_S = 60
 # Each prints one line of JSON.
 PROBES = {
     "torch": """
-import torch
-cuda = torch.cuda.is_available()
-names = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())] if cuda else []
-print(json.dumps({"version": torch.__version__, "built": torch.version.cuda, "cuda": cuda, "names": names}))
+from ambiguous_wild.splat.cuda_ready import torch_facts
+print(json.dumps(torch_facts()))
 """,
     "torchvision": "import torchvision; print(json.dumps({'version': torchvision.__version__}))",
     "numba": """

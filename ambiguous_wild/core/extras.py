@@ -14,5 +14,22 @@ def install_command(extra: str) -> str:
     """
     root = Path(__file__).resolve().parents[2]
     target = f"-e '{root}[{extra}]'" if (root / "pyproject.toml").is_file() else f"'ambiguous-wild[{extra}]'"
-    pinned = f" -c '{root / 'constraints.txt'}'" if (root / "constraints.txt").is_file() else ""
-    return f"{sys.executable} -m pip install{pinned} {target}"
+    return f"{sys.executable} -m pip install{_pinned(root)} {target}"
+
+
+def torch_command(version: str) -> str:
+    """The commands that replace a CPU build of torch by the one for CUDA.
+
+    Both have the same version number but for what follows the plus, so pip must be told to let go of the one
+    before it takes the other.
+
+    Args:
+        version: of torch, e.g. ``"2.13.0+cpu"``.
+    """
+    pip, release = f"{sys.executable} -m pip", version.partition("+")[0]
+    pinned = _pinned(Path(__file__).resolve().parents[2])
+    return f"{pip} uninstall -y torch && {pip} install{pinned} 'torch=={release}'"
+
+
+def _pinned(root: Path) -> str:
+    return f" -c '{root / 'constraints.txt'}'" if (root / "constraints.txt").is_file() else ""

@@ -16,6 +16,7 @@ from ambiguous_wild.harness.regions import Regions, find_regions
 from ambiguous_wild.harness.regions import true_distractor as true_distractor  # as it always was here
 from ambiguous_wild.io.atomic import atomic_dir
 from ambiguous_wild.io.images import read_png_rgb, write_png
+from ambiguous_wild.io.images import to_uint8 as to_uint8  # as it always was here
 from ambiguous_wild.metrics import image as image_metrics
 from ambiguous_wild.metrics import lpips
 from ambiguous_wild.metrics import masks as mask_metrics
@@ -46,11 +47,6 @@ def load_test_photos(scene: Scene) -> list[TestPhoto]:
     for view in scene.test:
         image_metrics.check_size(view.camera.height, view.camera.width)
     return [TestPhoto(view, read_png_rgb(view.image_path)) for view in scene.test]
-
-
-def to_uint8(image: np.ndarray) -> np.ndarray:
-    """[H, W, 3] float to 8 bits, clipped to [0, 1] and rounded to nearest."""
-    return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
 
 def mean_psnr(truth: list[TestPhoto], draw: Callable[[Camera], np.ndarray]) -> float:

@@ -22,7 +22,12 @@ from ambiguous_wild.harness.cell import Cell, CellReport, Overwrite
 from ambiguous_wild.harness.environment import environment
 from ambiguous_wild.harness.identity import IGNORED
 from ambiguous_wild.harness.identity import scene_identity as scene_identity  # as it always was here
-from ambiguous_wild.harness.memory import peak_memory, reset_peak
+from ambiguous_wild.harness.memory import (
+    is_out_of_gpu_memory,
+    out_of_gpu_memory,
+    peak_memory,
+    reset_peak,
+)
 from ambiguous_wild.harness.provenance import provenance
 from ambiguous_wild.harness.result import result_of
 from ambiguous_wild.harness.result_file import read_result, write_result
@@ -93,7 +98,7 @@ def run_cell(
 
                 result = run_program(cell, folder)
             else:
-                result = _train_and_measure(cell, folder, cache_dir, tick, pictures)
+                result = _with_memory(cell, folder, cache_dir, tick, pictures)
             write_result(folder / RESULT, result | provenance(cell))
         except Exception as error:
             _record_failure(cell, folder, error)
@@ -176,8 +181,32 @@ def refuse_other_config(folder: Path, cell: Cell) -> None:
     )
 
 
-def _train_and_measure(
+def _with_memory(
     cell: Cell, folder: Path, cache_dir: Path, tick: Callable[[Trainer], None] | None, pictures: bool
+) -> dict[str, Any]:
+    """`_train_and_measure`; where the GPU's memory does not do, an AwError that says what helps."""
+    made: list[Trainer] = []
+    try:
+        return _train_and_measure(cell, folder, cache_dir, tick, pictures, made)
+    except Exception as error:
+        if not is_out_of_gpu_memory(error):
+            raise
+        gaussians = len(made[0].gaussians) if made else None
+        problem = out_of_gpu_memory(error, gaussians, cell.scene.info.get("loaded_factor"))
+    # Outside of the handler, where nothing holds on to the trainer: the next cell needs its memory.
+    made.clear()
+    if torch.cuda.is_available():
+        torch.cuda.empty_cache()
+    raise problem
+
+
+def _train_and_measure(
+    cell: Cell,
+    folder: Path,
+    cache_dir: Path,
+    tick: Callable[[Trainer], None] | None,
+    pictures: bool,
+    made: list[Trainer],  # the trainer, as soon as there is one
 ) -> dict[str, Any]:
     reset_peak(cell.device)
     device = torch.device(cell.device)
@@ -190,6 +219,7 @@ def _train_and_measure(
 
     before = time.perf_counter()
     trainer = Trainer(data, parts, cell.train, folder=folder, probe=probe if truth else None)
+    made.append(trainer)
     # Frozen inputs, instance masks and identities are part of what a method costs.
     trainer.setup_s = time.perf_counter() - before
     trainer.resume()

@@ -1,16 +1,19 @@
-"""Pixels for training and measuring, through OpenCV alone: a packaged scene needs nothing more.
+"""Pixels for training and measuring, through OpenCV or, where that is not installed, Pillow.
 
-Photos as people take them (EXIF, CMYK, cut files) are the business of `io/photos.py`.
+Either is imported by the first picture: a packaged scene needs no more than one of them. Photos as people
+take them (EXIF, CMYK, cut files) are the business of `io/photos.py`.
 """
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
+from typing import Any
 
-import cv2
 import numpy as np
 
 from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.io import pillow
 from ambiguous_wild.io.atomic import atomic_path
 from ambiguous_wild.io.image_header import MAX_PIXELS, READ, header_size
 
@@ -23,7 +26,7 @@ def read_png_rgb(
     Raises:
         AwError: the file is missing or does not decode.
     """
-    return _decode(path, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
+    return _decode(path, "rgb")
 
 
 def read_gray(
@@ -34,7 +37,7 @@ def read_gray(
     Raises:
         AwError: the file is missing or does not decode.
     """
-    return _decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    return _decode(path, "grey")
 
 
 def load_image_float(
@@ -45,15 +48,33 @@ def load_image_float(
     Raises:
         AwError: the file is missing or does not decode.
     """
-    flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    image = _decode(path, flags)
-    if image.dtype == np.uint8:
-        return image.astype(np.float32) / np.float32(255)
-    if image.dtype == np.uint16:
-        return image.astype(np.float32) / np.float32(65535)
-    if image.dtype == np.float32:
-        return image
-    raise AwError(f"{path}: pixels of type {image.dtype} are not read; save it as an 8 or 16-bit PNG")
+    return as_float(load_image_codes(path))
+
+
+def load_image_codes(
+    path: Path | str,
+) -> np.ndarray:  # [H, W, 3] sRGB, uint8 or uint16 codes, or float32 in [0, 1]: as the file has it
+    """Read an image as the file has it; `as_float` makes of it what is trained on.
+
+    Raises:
+        AwError: the file is missing or does not decode, or its pixels are of another type.
+    """
+    image = _decode(path, "deep")
+    if image.dtype not in (np.uint8, np.uint16, np.float32):
+        raise AwError(f"{path}: pixels of type {image.dtype} are not read; save it as an 8 or 16-bit PNG")
+    return image
+
+
+def as_float(codes: np.ndarray) -> np.ndarray:
+    """Codes of `load_image_codes` as float32 in [0, 1]."""
+    if codes.dtype == np.float32:
+        return codes
+    return codes.astype(np.float32) / np.float32(np.iinfo(codes.dtype).max)
+
+
+def to_uint8(image: np.ndarray) -> np.ndarray:
+    """[H, W, 3] float to 8 bits, clipped to [0, 1] and rounded to nearest."""
+    return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
 
 def read_keep_map(
@@ -80,7 +101,7 @@ def image_size(path: Path | str) -> tuple[int, int]:
         raise AwError(f"cannot read image {path}: {error.strerror}") from error
     if head.startswith(b"\x89PNG") and (size := header_size(head)) is not None:
         return size
-    height, width = _decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION).shape
+    height, width = _decode(path, "grey").shape
     return width, height
 
 
@@ -95,17 +116,22 @@ def write_png(
     """
     if image.dtype not in (np.uint8, np.uint16) or image.size == 0:
         raise AwError(f"{path}: a PNG takes uint8 or uint16 pixels, got {image.dtype} {list(image.shape)}")
-    if image.ndim == 3 and image.shape[2] == 3:
-        pixels = image[:, :, ::-1]
-    elif image.ndim == 2:
-        pixels = image
-    else:
+    if image.ndim != 2 and not (image.ndim == 3 and image.shape[2] == 3):
         raise AwError(f"{path}: a PNG of ours is [H, W] or [H, W, 3], got {list(image.shape)}")
+    data = _encode_png(path, image)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def _encode_png(path: Path | str, image: np.ndarray) -> bytes:
+    cv2 = _opencv()
+    if cv2 is None:
+        return pillow.encode_png(image)
+    pixels = image[:, :, ::-1] if image.ndim == 3 else image
     done, data = cv2.imencode(".png", np.ascontiguousarray(pixels), [cv2.IMWRITE_PNG_COMPRESSION, 1])
     if not done:
         raise AwError(f"{path}: OpenCV could not encode {list(image.shape)} {image.dtype} as PNG")
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(data.tobytes())
+    return data.tobytes()
 
 
 def decode(
@@ -118,27 +144,55 @@ def decode(
     Raises:
         AwError: the header announces more pixels than are read.
     """
-    size = header_size(data.tobytes())
-    if size is None:  # of no kind that is read: OpenCV has decoders for a dozen more, none of them needed
+    import cv2
+
+    if not _sound(data, where):
         return None
-    if size[0] * size[1] > MAX_PIXELS:
-        raise AwError(
-            f"{where} announces {size[0]}x{size[1]} px, more than the {MAX_PIXELS // 1_000_000} megapixels "
-            "that are read; reduce it"
-        )
     try:
         return cv2.imdecode(data, flags)
     except cv2.error:
         return None
 
 
-def _decode(path: Path | str, flags: int) -> np.ndarray:
+def _sound(data: np.ndarray, where: str) -> bool:
+    """Whether the header is one of a kind that is read, and announces no more pixels than that."""
+    size = header_size(data.tobytes())
+    if size is None:  # OpenCV has decoders for a dozen more kinds, none of them needed
+        return False
+    if size[0] * size[1] > MAX_PIXELS:
+        raise AwError(
+            f"{where} announces {size[0]}x{size[1]} px, more than the {MAX_PIXELS // 1_000_000} megapixels "
+            "that are read; reduce it"
+        )
+    return True
+
+
+@functools.cache
+def _opencv() -> Any:
+    """OpenCV, None where it is not installed."""
+    try:
+        import cv2
+    except ImportError:
+        return None
+    return cv2
+
+
+def _decode(path: Path | str, kind: pillow.Kind) -> np.ndarray:
     # Through bytes rather than cv2.imread: non-ASCII names on every platform, and a reason that is ours.
     try:
         data = np.fromfile(path, dtype=np.uint8)
     except OSError as error:
         raise AwError(f"cannot read image {path}: {error.strerror}") from error
-    image = decode(data, flags, str(path))
+    cv2 = _opencv()
+    if cv2 is not None:
+        flags = {
+            "rgb": cv2.IMREAD_COLOR_RGB,
+            "grey": cv2.IMREAD_GRAYSCALE,
+            "deep": cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH,
+        }
+        image = decode(data, flags[kind] | cv2.IMREAD_IGNORE_ORIENTATION, str(path))
+    else:
+        image = pillow.decode(data.tobytes(), kind, str(path)) if _sound(data, str(path)) else None
     if image is None:
         raise AwError(
             f"cannot read image {path}: it is empty, cut short or no {READ}; restore it and try again"

@@ -22,6 +22,7 @@ from ambiguous_wild.io.images import load_image_float, read_gray
 from ambiguous_wild.methods.registry import NoOptions
 from ambiguous_wild.splat.data import shrink_keep
 from ambiguous_wild.splat.parts import MaskPolicy, Parts
+from ambiguous_wild.splat.photos import on_device
 from ambiguous_wild.splat.step import Step, TrainData
 
 
@@ -82,11 +83,8 @@ def clean_data(data: TrainData) -> TrainData:
     """
     photos = [load_image_float(path) for path in truth_files(data.scene, "clean")]
     _check_sizes(data.scene, photos, "clean")
-    return dataclasses.replace(
-        data,
-        photos=[torch.from_numpy(photo).to(data.device) for photo in photos],
-        user_keep=[None] * len(photos),
-    )
+    tensors = [torch.from_numpy(photo) for photo in photos]
+    return dataclasses.replace(data, photos=on_device(tensors, data.device), user_keep=[None] * len(photos))
 
 
 def truth_files(scene: Scene, kind: str) -> list[Path]:

@@ -167,9 +167,9 @@ def render_cuda(
     """Render on the GPU; see `render.render`.
 
     Raises:
-        AwError: gsplat is missing; says the command that installs it.
+        AwError: gsplat is missing or cannot be used; says the command that mends it.
     """
-    seam.gsplat()
+    seam.ready(gaussians.device.type)
     cam = on_device(camera, gaussians.device)
     graph = torch.is_grad_enabled()
     leaves = {name: tensor.detach().requires_grad_(graph) for name, tensor in gaussians.items()}

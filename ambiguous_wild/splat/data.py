@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from ambiguous_wild.core import AwError, Camera, Scene
-from ambiguous_wild.io.images import load_image_float, read_keep_map
+from ambiguous_wild.core import AwError, Camera, Scene, View
+from ambiguous_wild.io.images import as_float, load_image_codes, read_keep_map
+from ambiguous_wild.splat.photos import CudaCopies, Photos, fit
 from ambiguous_wild.splat.step import TrainData
 
 
 def load_train_data(scene: Scene, *, device: torch.device, seed: int, cache_dir: Path) -> TrainData:
     """Read the train photos and the user's own keep masks.
+
+    Masks lie on the device; so do photos, unless they would fill it (`splat/photos.py`).
 
     Raises:
         AwError: no train view, or a photo whose size is not its camera's.
@@ -21,25 +25,37 @@ def load_train_data(scene: Scene, *, device: torch.device, seed: int, cache_dir:
     if not scene.train:
         raise AwError(f"scene {scene.root} has no training views: check train_list.txt")
     photos, keeps = [], []
+    pixels = sum(view.camera.height * view.camera.width for view in scene.train)
+    copies = None if fit(12 * pixels, device) else CudaCopies(device)  # 3 channels of 4 bytes
     for view in scene.train:
-        photo = load_image_float(view.image_path)
+        codes = _load_photo(view)
+        if copies is None:
+            photos.append(torch.from_numpy(as_float(codes)).to(device))
+        else:
+            small = codes if codes.dtype == np.uint8 else as_float(codes)
+            photos.append(copies.hold(torch.from_numpy(small)))
         size = (view.camera.height, view.camera.width)
-        if photo.shape[:2] != size:
-            raise AwError(
-                f"{view.image_path} is {photo.shape[1]}x{photo.shape[0]} px, its camera says "
-                f"{size[1]}x{size[0]}; build the scene again with 'aw build-scene'"
-            )
-        photos.append(torch.from_numpy(photo).to(device))
         keeps.append(None if view.keep_path is None else _load_keep(view.keep_path, size).to(device))
     return TrainData(
         scene=scene,
-        photos=photos,
+        photos=photos if copies is None else Photos(photos, device, copies),
         cameras=[view.camera for view in scene.train],
         user_keep=keeps,
         device=device,
         seed=seed,
         cache_dir=cache_dir,
     )
+
+
+def _load_photo(view: View) -> np.ndarray:
+    codes = load_image_codes(view.image_path)
+    size = (view.camera.height, view.camera.width)
+    if codes.shape[:2] != size:
+        raise AwError(
+            f"{view.image_path} is {codes.shape[1]}x{codes.shape[0]} px, its camera says "
+            f"{size[1]}x{size[0]}; build the scene again with 'aw build-scene'"
+        )
+    return codes
 
 
 def _load_keep(path: Path, size: tuple[int, int]) -> Tensor:

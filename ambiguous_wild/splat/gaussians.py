@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.splat.neighbours import nearest_three
 
 SH_C0 = 0.28209479177387814  # zeroth real spherical harmonic, 1 / (2 sqrt(pi))
 
@@ -92,6 +93,7 @@ class Gaussians:
         sh_degree: int = 3,
         opacity: float = 0.1,
         min_scale: float = 1e-7,
+        device: torch.device | str = "cpu",
     ) -> Gaussians:
         """3DGS's start: one isotropic Gaussian a point, as large as its three neighbours are far.
 
@@ -101,18 +103,17 @@ class Gaussians:
             sh_degree: largest SH degree to hold, 0 to 3.
             opacity: of every Gaussian.
             min_scale: floor of the scale, so that coincident points stay finite.
+            device: where neighbours are looked for and the Gaussians lie.
 
         Raises:
             AwError: fewer than 4 points.
         """
-        from scipy.spatial import cKDTree
-
         if len(xyz) < 4:
             raise AwError(
                 f"cannot start from {len(xyz)} points: at least 4 are needed; check the sparse model"
             )
-        distances, _ = cKDTree(xyz).query(xyz, k=4)
-        scale = np.sqrt((distances[:, 1:] ** 2).mean(axis=1)).clip(min=min_scale)
+        distances = nearest_three(xyz, device)
+        scale = np.sqrt((distances**2).mean(axis=1)).clip(min=min_scale)
         n = len(xyz)
         quats = torch.zeros(n, 4)
         quats[:, 0] = 1.0
@@ -124,4 +125,4 @@ class Gaussians:
             opacity_logits=torch.full((n,), float(np.log(opacity / (1 - opacity)))),
             sh0=torch.from_numpy(((rgb.astype(np.float64) / 255.0 - 0.5) / SH_C0).astype(np.float32)),
             sh_rest=torch.zeros(n, rest, 3),
-        )
+        ).to(device)

@@ -58,6 +58,18 @@ def gsplat() -> Any:
     return gsplat
 
 
+@functools.cache
+def ready(kind: str) -> None:
+    """Raise AwError, with what to do, where gsplat cannot compute on devices of this kind."""
+    gsplat()
+    if kind == "cuda":
+        from ambiguous_wild.splat.cuda_ready import look, why_not
+
+        lack = why_not(look())
+        if lack is not None:
+            raise AwError(f"gsplat cannot use the GPU: {lack}")
+
+
 def version() -> str:
     """Of the installed gsplat."""
     return str(gsplat().__version__)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +21,7 @@ class TrainData:
     """What every part may look at: the training side of the scene, never the test side."""
 
     scene: Scene
-    photos: list[Tensor]  # of the train views: [H, W, 3] float32 in [0, 1], sRGB, on `device`
+    photos: Sequence[Tensor]  # of the train views: [H, W, 3] float32 in [0, 1], sRGB, on `device`
     cameras: list[Camera]  # of the train views, matching the photos
     user_keep: list[Tensor | None]  # [H, W] float32, 1 = static; the capture's own masks
     device: torch.device

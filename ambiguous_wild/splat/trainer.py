@@ -74,8 +74,8 @@ class Trainer:
 
         points = data.scene.points
         self.gaussians = Gaussians.from_points(
-            points.xyz, points.rgb, sh_degree=parts.sh_degree, opacity=parts.start_opacity
-        ).to(data.device)
+            points.xyz, points.rgb, sh_degree=parts.sh_degree, opacity=parts.start_opacity, device=data.device
+        )
         start, most = len(self.gaussians), parts.density_config.max_gaussians
         self.pace = Pace(config, parts.schedule, data, start=start, most=most)
         self.optimiser = SplatAdam(self.gaussians, self.pace.learning_rates(0.0))
@@ -95,6 +95,8 @@ class Trainer:
         if divisor == 1:
             return self.data.photos[view]
         key = (view, divisor)
+        if self._prefetch is not None:  # photos do not fit on the device: neither would smaller ones beside
+            return shrink(self.data.photos[view], divisor)
         if key not in self._pyramid:
             self._pyramid[key] = shrink(self.data.photos[view], divisor)
         return self._pyramid[key]

@@ -22,8 +22,10 @@ def terminal_bar(what: str, unit: str = "photo") -> Bar:
     """
 
     def wrap(items: Sequence[Any]) -> Iterable[Any]:
-        from tqdm import tqdm
-
+        try:
+            from tqdm import tqdm
+        except ImportError:  # a machine that only trains has little installed
+            return items
         return tqdm(items, desc=what, unit=unit, disable=None, leave=False)  # None: only on a terminal
 
     return wrap

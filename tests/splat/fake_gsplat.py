@@ -169,5 +169,10 @@ def installed(monkeypatch, version="1.6.0", *, everywhere=True):
 
 
 def _forget():
-    for what in (gsplat_seam.gsplat, gsplat_seam.max_alpha, gsplat_seam._tests_tiles_by_ellipse):
+    for what in (
+        gsplat_seam.gsplat,
+        gsplat_seam.ready,
+        gsplat_seam.max_alpha,
+        gsplat_seam._tests_tiles_by_ellipse,
+    ):
         what.cache_clear()

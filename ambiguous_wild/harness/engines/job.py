@@ -131,8 +131,11 @@ def run_job(job: Job) -> CellReport:
     try:
         check_shared(job)
         cell = make_cell(job)
-        if cell.device == "cpu" and cell.method.program is None:
-            _prepare_cpu(job.threads)
+        if cell.method.program is None:
+            if cell.device == "cpu":
+                _prepare_cpu(job.threads)
+            else:
+                _prepare_cuda()
     except Exception as error:
         return CellReport(folder, "failed", error=error_line(error))
     try:
@@ -241,3 +244,14 @@ def _prepare_cpu(threads: int | None) -> None:
     if threads is not None:
         set_threads(threads)
     warm_up()
+
+
+def _prepare_cuda() -> None:
+    """On a node of a cluster, which nobody asked before; elsewhere it is done already."""
+    from ambiguous_wild.splat import cuda_ready
+
+    found = cuda_ready.look()
+    lack = cuda_ready.why_not(found)
+    if lack is not None:
+        raise AwError(f"{platform.node()} cannot use its GPU: {lack}")
+    cuda_ready.make_ready(found, lambda text: None)

@@ -8,10 +8,11 @@ import os
 import signal
 import threading
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from multiprocessing.connection import Connection, wait
 
 from ambiguous_wild.harness.cell import CellReport
+from ambiguous_wild.harness.engines.gpu_slots import slot_environment
 from ambiguous_wild.harness.engines.job import Job, run_job
 
 STOP_S = 5.0  # between asking a process to end and ending it
@@ -25,6 +26,7 @@ def run_in_processes(
     lost: Callable[[int, str], CellReport],
     on_start: Callable[[int], None] = lambda index: None,
     on_end: Callable[[int, CellReport], None] = lambda index, report: None,
+    gpus: Sequence[str] = (),
 ) -> list[CellReport]:
     """Run every job, at most `processes` at a time.
 
@@ -35,6 +37,7 @@ def run_in_processes(
         lost: makes the report of a job whose process died too often, from its index and the reason.
         on_start: told the index when a job begins, again when it begins again.
         on_end: told the index and what became of it.
+        gpus: as CUDA_VISIBLE_DEVICES names them; each process sees one of them, in turns.
 
     Returns:
         Reports in the order of the jobs.
@@ -47,9 +50,12 @@ def run_in_processes(
             busy = [worker for worker in workers if worker.index is not None]
             idle = [worker for worker in workers if worker.index is None]
             while waiting and (idle or len(workers) < processes):
-                worker = idle.pop() if idle else _Worker()
-                if worker not in workers:
-                    workers.append(worker)
+                if not idle:
+                    # The place of one that died is taken first, and with it that one's GPU.
+                    slot = min(set(range(processes)) - {worker.slot for worker in workers})
+                    idle = [_Worker(slot, slot_environment(slot, gpus))]
+                    workers += idle
+                worker = idle.pop()
                 index = waiting.popleft()
                 on_start(index)
                 worker.send(index, jobs[index])
@@ -76,12 +82,20 @@ def run_in_processes(
 class _Worker:
     """A process that runs one job after another."""
 
-    def __init__(self) -> None:
+    def __init__(self, slot: int, environment: Mapping[str, str]) -> None:
+        """
+        Args:
+            slot: its place among the processes, from 0.
+            environment: variables that differ from this process's.
+        """
+        self.slot = slot
         # Not forked: the threads of torch and Numba do not survive that.
         context = multiprocessing.get_context("spawn")
         self.connection, theirs = context.Pipe()
         self.process = context.Process(target=_serve, args=(theirs,), daemon=False)
-        self.process.start()
+        # There from its start, before torch is imported in it: CUDA reads it once.
+        with _environment(environment):
+            self.process.start()
         theirs.close()  # so that the end of the process is the end of the pipe
         self.index: int | None = None
 
@@ -110,6 +124,21 @@ class _Worker:
             self.process.join()
         code = self.process.exitcode or 0
         return f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
+
+
+@contextlib.contextmanager
+def _environment(changes: Mapping[str, str]) -> Iterator[None]:
+    """Our own variables as a process that starts now shall have them."""
+    before = {name: os.environ.get(name) for name in changes}
+    os.environ.update(changes)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
 def _serve(connection: Connection) -> None:

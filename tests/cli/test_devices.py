@@ -1,0 +1,98 @@
+"""`--device`: the same words on the command line and in `aw doctor`, and an exit code the shell can read."""
+
+import sys
+
+import pytest
+from click.testing import CliRunner
+
+from ambiguous_wild.cli import checks, devices, main
+from ambiguous_wild.cli.bench import command as bench
+from ambiguous_wild.cli.probes import Probe
+from ambiguous_wild.core import AwError
+from ambiguous_wild.splat import cuda_ready
+from tests.splat.test_cuda_ready import CASES, TORCH, found
+from tests.tiny_scene import write_tiny_scene
+
+
+@pytest.fixture
+def here(monkeypatch):
+    """Makes this machine the one that is given."""
+
+    def be(machine):
+        monkeypatch.setattr(cuda_ready, "look", lambda torch=None: machine)
+
+    return be
+
+
+def test_auto_warns_on_stderr_and_takes_the_cpu(here, capsys):
+    here(CASES["no gsplat"][0])
+    assert devices.choose_device("auto") == "cpu"
+    out, err = capsys.readouterr()
+    assert out == "" and err.count("\n") == 1
+    assert err.startswith("warning: the GPU is not used, the CPU is: gsplat is not installed: ")
+    assert f"{sys.executable} -m pip install" in err and "[cuda]" in err
+
+
+def test_cuda_is_refused_with_exit_code_2_before_anything_is_made(here, tmp_path, monkeypatch, capsys):
+    here(CASES["no nvcc"][0])
+    scene = write_tiny_scene(tmp_path / "scene")
+    words = ["bench", "--method", "3dgs", "--scene", str(scene), "-o", str(tmp_path / "runs")]
+    monkeypatch.setattr(sys, "argv", ["aw", *words, "--device", "cuda"])
+    with pytest.raises(SystemExit) as end:
+        main.main()
+    assert end.value.code == 2
+    err = capsys.readouterr().err
+    assert (
+        err.startswith("error: --device cuda: gsplat needs nvcc to compile its kernels")
+        and err.count("\n") == 1
+    )
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_grid_falls_back_and_runs(here, tmp_path, monkeypatch):
+    monkeypatch.setattr("ambiguous_wild.cli.bench.prepare_cpu", lambda threads: None)  # compiles all kernels
+    here(CASES["old gpu"][0])
+    scene = write_tiny_scene(tmp_path / "scene")
+    words = [
+        "--method",
+        "3dgs",
+        "--scene",
+        scene,
+        "-o",
+        tmp_path / "runs",
+        "--iterations",
+        3,
+        "--no-pictures",
+    ]
+    done = CliRunner().invoke(bench, [str(w) for w in words], catch_exceptions=False)
+    assert done.exit_code == 0
+    assert (
+        done.stderr.count("warning: the GPU is not used, the CPU is: Old GPU has compute capability 6.1") == 1
+    )
+    assert "1 run: 1 trained" in done.stderr
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_doctor_says_it_in_the_same_words(here, case):
+    machine, what, fix = CASES[case]
+    here(machine)
+    said = {c.name: c for c in checks._gpu(Probe(dict(machine.torch)))}
+    (wrong,) = [c for c in said.values() if c.name != "nvidia driver" and not c.ok]
+    assert what in wrong.detail and fix in wrong.fix
+    with pytest.raises(AwError) as error:
+        devices.choose_device("cuda")
+    assert f"{wrong.detail}: {wrong.fix}" in str(error.value)
+
+
+def test_doctor_says_where_the_kernels_are(here):
+    states = {
+        "compiled, in": {},
+        "part of its wheel": {"prebuilt": True},
+        "not compiled yet": {"compiled": False},
+    }
+    for words, machine in states.items():
+        here(found(**machine))
+        (kernels,) = [c for c in checks._gpu(Probe(TORCH)) if c.name == "gsplat kernels"]
+        assert kernels.ok and kernels.detail.startswith(words) and kernels.fix == ""
+    (broken,) = checks._gpu(Probe(None, "no torch"))
+    assert (broken.name, broken.ok, broken.detail) == ("torch cuda", False, "no torch")

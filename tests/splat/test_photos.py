@@ -1,0 +1,181 @@
+"""Photos read as a list are read: wherever they lie, and whenever they were sent."""
+
+import numpy as np
+import pytest
+import torch
+
+from ambiguous_wild.io.images import load_image_float, write_png
+from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.splat import data as data_module
+from ambiguous_wild.splat import photos as photos_module
+from ambiguous_wild.splat.data import load_train_data
+from ambiguous_wild.splat.photos import READY, CudaCopies, Photos, fit
+from tests.tiny_scene import write_tiny_scene
+
+CPU = torch.device("cpu")
+
+
+class SlowCopies:
+    """What was sent is nonsense until somebody waits for it."""
+
+    def __init__(self, *_):
+        self.begun, self.finished, self.held = [], 0, 0
+
+    def hold(self, tensor):
+        self.held += 1
+        return tensor
+
+    def begin(self, tensor):
+        self.begun.append(tensor)
+        return torch.full_like(tensor, 77), tensor
+
+    def finish(self, sent):
+        there, tensor = sent
+        self.finished += 1
+        return there.copy_(tensor)
+
+
+@pytest.fixture
+def codes():
+    rng = np.random.default_rng(0)
+    return [torch.from_numpy(rng.integers(0, 256, (3, 4, 3), dtype=np.uint8)) for _ in range(7)]
+
+
+def expected(codes):
+    return [torch.from_numpy(c.numpy().astype(np.float32) / np.float32(255)) for c in codes]
+
+
+def test_they_are_a_sequence_of_what_the_host_would_have_made(codes):
+    photos = Photos(codes, CPU, SlowCopies())
+    assert len(photos) == 7
+    for got, wanted in zip(photos, expected(codes), strict=True):
+        assert got.dtype == torch.float32 and torch.equal(got, wanted)
+    assert torch.equal(photos[-1], expected(codes)[-1])
+    assert [torch.equal(a, b) for a, b in zip(photos[::3], expected(codes)[::3])] == [True] * 3
+    assert len(photos[1:3]) == 2
+    with pytest.raises(IndexError):
+        photos[7]
+
+
+def test_photos_of_more_than_eight_bits_stay_what_they_are():
+    deep = torch.rand(2, 2, 3)
+    assert torch.equal(Photos([deep], CPU, SlowCopies())[0], deep)
+
+
+def test_one_sent_ahead_is_not_sent_again_and_is_waited_for_when_it_is_read(codes):
+    copies = SlowCopies()
+    photos = Photos(codes, CPU, copies)
+    photos.prefetch(3)
+    photos.prefetch(3)
+    assert len(copies.begun) == 1 and copies.begun[0] is codes[3] and copies.finished == 0
+    assert torch.equal(photos[3], expected(codes)[3])
+    assert torch.equal(photos[3], expected(codes)[3]) and photos[3] is photos[3]
+    assert len(copies.begun) == copies.finished == 1
+    photos.prefetch(3)  # it is there
+    assert len(copies.begun) == 1
+
+
+def test_few_lie_on_the_device_at_a_time(codes):
+    photos = Photos(codes, CPU, SlowCopies())
+    for index in range(7):
+        photos.prefetch((index + 1) % 7)
+        assert torch.equal(photos[index], expected(codes)[index])
+    assert list(photos._ready) == [4, 5, 6] and READY == 3
+    for index in range(7):
+        photos.prefetch(index)
+    assert len(photos._coming) <= READY
+    assert all(torch.equal(photos[i], e) for i, e in enumerate(expected(codes)))
+
+
+@pytest.fixture
+def scene(tmp_path):
+    root = write_tiny_scene(tmp_path / "scene")
+    (root / "masks" / "train").mkdir(parents=True)
+    keep = np.full((48, 64), 255, np.uint8)
+    keep[:, :9] = 0
+    write_png(root / "masks" / "train" / "train_1.png", keep)
+    return load_scene(root)
+
+
+def load(scene, tmp_path):
+    return load_train_data(scene, device=CPU, seed=0, cache_dir=tmp_path)
+
+
+def test_on_the_cpu_photos_are_a_plain_list(scene, tmp_path):
+    data = load(scene, tmp_path)
+    assert type(data.photos) is list
+    for photo, view in zip(data.photos, scene.train, strict=True):
+        assert np.array_equal(photo.numpy(), load_image_float(view.image_path))
+    assert [k is not None for k in data.user_keep] == [v.name == "train_1.png" for v in scene.train]
+
+
+def test_photos_that_do_not_fit_stay_with_the_host_as_their_files_have_them(scene, tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(data_module, "fit", lambda needed, device: asked.append(needed))
+    monkeypatch.setattr(data_module, "CudaCopies", SlowCopies)
+    resident, sent = None, load(scene, tmp_path)
+    monkeypatch.undo()
+    resident = load(scene, tmp_path)
+    assert asked == [6 * 48 * 64 * 3 * 4] == [sum(p.nbytes for p in resident.photos)]
+    assert isinstance(sent.photos, Photos) and sent.photos._copies.held == 6
+    assert {p.dtype for p in sent.photos._held} == {torch.uint8}
+    for a, b in zip(sent.photos, resident.photos, strict=True):
+        assert torch.equal(a, b)
+
+
+def test_a_share_of_the_free_memory_decides(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (1000, 8000))
+    assert photos_module.RESIDENT == 0.25
+    assert fit(250, torch.device("cuda")) and not fit(251, torch.device("cuda"))
+    assert fit(10**15, CPU)
+
+
+class Stream:
+    """Notes what a stream is asked for."""
+
+    def __init__(self, log, name):
+        self.log, self.name = log, name
+
+    def record_event(self):
+        self.log.append(f"{self.name} records")
+        return "event"
+
+    def wait_event(self, event):
+        self.log.append(f"{self.name} waits for {event}")
+
+    def synchronize(self):
+        self.log.append("the host waits")
+
+    def __enter__(self):
+        self.log.append(f"on {self.name}")
+
+    def __exit__(self, *error):
+        self.log.append(f"off {self.name}")
+
+
+class There:
+    """A tensor of a GPU."""
+
+    def __init__(self, log):
+        self.log = log
+
+    def to(self, device, non_blocking):
+        self.log.append(f"copies to {device}, host waits: {not non_blocking}")
+        return self
+
+    def record_stream(self, stream):
+        self.log.append(f"used by {stream.name}")
+
+
+def test_copies_on_a_stream_of_their_own_make_the_device_wait_and_not_the_host(monkeypatch):
+    log = []
+    monkeypatch.setattr(torch.cuda, "Stream", lambda device: Stream(log, "side"))
+    monkeypatch.setattr(torch.cuda, "stream", lambda stream: stream)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda device: Stream(log, "main"))
+    copies = CudaCopies(torch.device("cuda:1"))
+    sent = copies.begin(There(log))
+    assert log == ["on side", "copies to cuda:1, host waits: False", "off side", "side records"]
+    log.clear()
+    copies.finish(sent)
+    assert log == ["main waits for event", "used by main"]
+    assert copies.hold(torch.ones(2)).tolist() == [1.0, 1.0]  # nothing to pin it for: it stays as it is

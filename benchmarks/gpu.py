@@ -39,6 +39,7 @@ from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.metrics.image import psnr
 from ambiguous_wild.splat import gsplat_seam
 from ambiguous_wild.splat.data import load_train_data
+from ambiguous_wild.splat.device import wait
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.pace import TrainConfig
@@ -50,12 +51,6 @@ METHODS = ("3dgs", "robustsplat", "refinesplat")
 STAGES = ("build", "parity", "train", "cost", "profile")
 BLOCK = 50  # iterations
 TURNS = 12
-
-
-def wait(device: torch.device) -> None:
-    """Until the device is done."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
 
 
 def trainer_of(args: argparse.Namespace, method: str, **config: Any) -> Trainer:

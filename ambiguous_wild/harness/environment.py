@@ -27,7 +27,10 @@ def environment(device: str) -> dict[str, Any]:
         "packages": {name: installed(name) for name in PACKAGES},
     }
     if device.startswith("cuda"):
+        from ambiguous_wild.splat.gsplat_seam import max_alpha
+
         facts["gpu"] = torch.cuda.get_device_name(device)
+        facts["gsplat_max_alpha"] = max_alpha(device)  # differs between its versions
     return facts
 
 

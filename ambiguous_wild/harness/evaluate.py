@@ -21,6 +21,7 @@ from ambiguous_wild.metrics import image as image_metrics
 from ambiguous_wild.metrics import lpips
 from ambiguous_wild.metrics import masks as mask_metrics
 from ambiguous_wild.metrics.flip import flip
+from ambiguous_wild.splat import device
 from ambiguous_wild.splat.trainer import Trainer
 
 FPS_ROUNDS = 5
@@ -154,17 +155,20 @@ def frames_per_second(trainer: Trainer) -> dict[str, float]:
         fps, the median of several rounds, and fps_low and fps_high, the slowest and the fastest of them.
     """
     cameras = [v.camera for v in (trainer.data.scene.test or trainer.data.scene.train)]
-    for camera in cameras[:3]:
-        trainer.render(camera).image.cpu()
+    with torch.no_grad():
+        for camera in cameras[:3]:
+            trainer.render(camera)
+    device.wait(trainer.data.device)
     rounds = [_frames_per_second(trainer, cameras, FPS_SECONDS / FPS_ROUNDS) for _ in range(FPS_ROUNDS)]
     return {"fps": float(np.median(rounds)), "fps_low": min(rounds), "fps_high": max(rounds)}
 
 
+@torch.no_grad()
 def _frames_per_second(trainer: Trainer, cameras: list[Camera], least_s: float) -> float:
     frames, begin = 0, time.perf_counter()
     while True:
-        # .cpu() waits for a GPU; on the CPU it costs nothing.
-        trainer.render(cameras[frames % len(cameras)]).image.cpu()
+        trainer.render(cameras[frames % len(cameras)])
+        device.wait(trainer.data.device)
         frames += 1
         seconds = time.perf_counter() - begin
         if seconds >= least_s:

@@ -33,7 +33,7 @@ class TrainConfig:
 
 
 class Pace:
-    """Every schedule of one run; a function of its settings and of how far it is, so nothing of it is saved."""
+    """Every schedule of one run, from its settings and how far it is: nothing of it is saved."""
 
     def __init__(
         self, config: TrainConfig, schedule: Schedule, data: TrainData, *, start: int, most: int

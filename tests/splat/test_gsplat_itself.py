@@ -47,7 +47,7 @@ def projection_fwd(means, covars, quats, scales, opacities, viewmats, Ks, width,
 
 
 def projection_bwd(means, covars, quats, scales, viewmats, Ks, width, height, eps2d, model, radii,
-                   conics, compensations, v_means2d, v_depths, v_conics, v_compensations, wanted):  # fmt: skip
+                   conics, compensations, v_means2d, v_depths, v_conics, v_compensation, *more):  # fmt: skip
     calc = compensations is not None
     seen = (radii > 0).all(-1)
 
@@ -56,7 +56,7 @@ def projection_bwd(means, covars, quats, scales, viewmats, Ks, width, height, ep
         out = projection(m, q, s, opaque, viewmats, Ks, width, height, eps2d, 0.01, 0.0, calc)
         return [o for o in out[1:] if o is not None]
 
-    cots = [v_means2d, v_depths, v_conics, *([v_compensations] if calc else [])]
+    cots = [v_means2d, v_depths, v_conics, *([v_compensation] if calc else [])]
     cots = [torch.where(seen.view(*seen.shape, *[1] * (c.dim() - 2)), c, 0.0) for c in cots]
     v_means, v_quats, v_scales = pulled(forward, (means, quats, scales), cots)
     return v_means, None, v_quats, v_scales, None

@@ -64,14 +64,14 @@ def test_nothing_is_read_and_nothing_sent(scene, tmp_path, fake, method, effects
 
 
 _FREE = {
-    "alias", "as_strided", "detach", "empty", "empty_like", "expand", "narrow", "new_empty_strided", "permute",
-    "result_type", "select", "slice", "split", "split_with_sizes", "squeeze", "t", "transpose", "unbind",
-    "unsqueeze", "view", "_unsafe_view",
+    "alias", "as_strided", "detach", "empty", "empty_like", "expand", "narrow", "new_empty_strided",
+    "permute", "result_type", "select", "slice", "split", "split_with_sizes", "squeeze", "t",
+    "transpose", "unbind", "unsqueeze", "view", "_unsafe_view",
 }  # fmt: skip
 
 
 class Launches(TorchDispatchMode):
-    """Counts what would be a kernel; not what the stand-in or the loss, which is compiled there, is made of."""
+    """Counts what would be a kernel; not what the stand-in or the loss, compiled there, is made of."""
 
     def __init__(self, monkeypatch):
         super().__init__()

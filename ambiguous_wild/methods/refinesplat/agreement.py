@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-_FAR_MORE = 1.5  # times as many pixels
+FAR_MORE = 1.5  # times as many pixels
 
 
 def agree(difference: np.ndarray, same: np.ndarray, most: float, offset: np.ndarray) -> np.ndarray:
@@ -39,7 +39,7 @@ def common_offset(difference: np.ndarray, same: np.ndarray, most: float = 0.06) 
     if len(some):
         common = np.median(some, axis=0)
         as_they_are = np.count_nonzero(np.abs(some).mean(axis=1) < most)
-        if np.count_nonzero(np.abs(some - common).mean(axis=1) < most) > _FAR_MORE * as_they_are:
+        if np.count_nonzero(np.abs(some - common).mean(axis=1) < most) > FAR_MORE * as_they_are:
             return common.astype(np.float32)
     return np.zeros(3, np.float32)
 

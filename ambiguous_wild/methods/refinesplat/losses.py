@@ -8,6 +8,7 @@ from torch import Tensor
 
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.methods.refinesplat.entropy import Variant
+from ambiguous_wild.splat import device as devices
 
 
 def identity_loss(
@@ -47,9 +48,15 @@ def consistency_loss(logits: Tensor, one_hot: Tensor, variant: Variant = "sigmoi
     """
     sizes = one_hot.sum(1)
     used = sizes > 0
-    if not bool(used.any()):
-        return (logits * 0.0).sum()
-    weights = one_hot[used] / sizes[used, None]
+    if devices.accelerated(logits.device):
+        # instances without cells stay, with weights of 0: to leave them out the host would have to ask which
+        weights = one_hot / torch.where(used, sizes, 1.0)[:, None]
+        count = used.sum().clamp(min=1)
+    else:
+        if not bool(used.any()):
+            return (logits * 0.0).sum()
+        one_hot = one_hot[used]
+        weights, count = one_hot / sizes[used, None], None
     # logits beyond +-1e4 are saturated; the clamp keeps products of their logs finite
     logits = logits.clamp(-1e4, 1e4)
     if variant == "sigmoid":
@@ -61,14 +68,14 @@ def consistency_loss(logits: Tensor, one_hot: Tensor, variant: Variant = "sigmoi
         sides = [(torch.softmax(logits, 1), F.log_softmax(logits, 1))]
     else:
         raise unknown("entropy variant", variant, ("sigmoid", "softmax"))
-    total = logits.new_zeros(int(used.sum()))
-    of = one_hot[used].argmax(0)  # the instance of each cell; those of none weigh nothing
+    total = logits.new_zeros(len(weights))
+    of = one_hot.argmax(0)  # the instance of each cell; those of none weigh nothing
     for s, log_s in sides:
         # mean[s l] - mean[s] mean[l] = mean[(s - mean s) (l - mean l)]: where the cells agree, the first form
         # is a difference of numbers equal to seven digits
         apart = (s - (weights @ s)[of]) * (log_s - (weights @ log_s)[of])
         total = total + (weights @ apart).sum(1)
-    return total.mean()
+    return total.mean() if count is None else total.sum() / count
 
 
 def instance_matrix(labels: Tensor, count: int, weights: Tensor | None = None) -> Tensor:

@@ -34,7 +34,7 @@ from ambiguous_wild.methods.refinesplat.agreement import (
     word_weight,
 )
 
-_SPREAD = 9  # px, box over a view's evidence before others read it: depth is off by a few pixels
+SPREAD = 9  # px, box over a view's evidence before others read it: depth is off by a few pixels
 _BLUR = 5  # px, box over photos before their colours are compared, for the same reason
 _SHRINK = 2  # maps are kept at half the photo's size
 _ROW = 64  # px, pixels that are asked about one by one are put in rows of so many
@@ -97,7 +97,7 @@ class Elsewhere:
     ) -> None:
         self.cameras, self.config = list(cameras), config
         self.neighbours = nearest_views(cameras, config.views)
-        self.colours = [_small(photo, _half(c)) for photo, c in zip(photos, cameras, strict=True)]
+        self.colours = [small_colours(photo, half_size(c)) for photo, c in zip(photos, cameras, strict=True)]
         # inverse depths of the sparse points' surface, [h, w] of any size, NaN where they say nothing
         self.static = list(surfaces) if config.sparse and surfaces else [None] * len(self.cameras)
         self.evidence: dict[int, np.ndarray] = {}  # view: [h, w] float32
@@ -111,10 +111,10 @@ class Elsewhere:
             evidence: [H, W] of the photo's size.
             depth: [H', W'] expected depth of the render, of any size.
         """
-        size = _half(self.cameras[view])
+        size = half_size(self.cameras[view])
         wide = cv2.blur(
             np.ascontiguousarray(evidence, dtype=np.float32),
-            (_SPREAD, _SPREAD),
+            (SPREAD, SPREAD),
             borderType=cv2.BORDER_REPLICATE,
         )
         self.evidence[view] = cv2.resize(wide, size, interpolation=cv2.INTER_AREA)
@@ -246,12 +246,12 @@ def discount(
     return evidence / np.sqrt(1.0 + config.strength * at_pixels)
 
 
-def _half(camera: Camera) -> tuple[int, int]:
+def half_size(camera: Camera) -> tuple[int, int]:
     """(width, height) px of the maps that are kept."""
     return max(camera.width // _SHRINK, 1), max(camera.height // _SHRINK, 1)
 
 
-def _small(photo: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+def small_colours(photo: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """A photo [H, W, 3] in [0, 1] at (width, height), uint8, without what a pixel of depth error moves."""
     blurred = cv2.blur(np.ascontiguousarray(photo), (_BLUR, _BLUR), borderType=cv2.BORDER_REPLICATE)
     small = cv2.resize(blurred, size, interpolation=cv2.INTER_AREA)

@@ -15,7 +15,7 @@ from ambiguous_wild.methods.refinesplat.multiview import Elsewhere, Hearsay, Mul
 from ambiguous_wild.methods.refinesplat.structure import structure_residual, unrelated_residual
 from ambiguous_wild.vision.sparse_surface import seldom_seen
 
-_STATIC_QUANTILE = 0.25  # of a photo's pixels: static even where distractors cover two thirds of it
+STATIC_QUANTILE = 0.25  # of a photo's pixels: static even where distractors cover two thirds of it
 
 
 class PixelEvidence:
@@ -73,7 +73,7 @@ class PixelEvidence:
         evidence[~judged] = 0.0
         if self.memory > 0 and view in self.before:
             evidence = self.memory * self.before[view].astype(np.float32) + (1.0 - self.memory) * evidence
-        normal = float(np.quantile(evidence[judged], _STATIC_QUANTILE)) if judged.any() else 0.0
+        normal = float(np.quantile(evidence[judged], STATIC_QUANTILE)) if judged.any() else 0.0
         others = None
         if self.config.strength > 0:
             mean_depth = np.where(alpha > 1e-3, depth / np.maximum(alpha, 1e-3), 0.0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -13,21 +13,15 @@ from torch import Tensor
 
 from ambiguous_wild.methods.refinesplat import pictures
 from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
-from ambiguous_wild.methods.refinesplat.evidence import (
-    Judged,
-    Maps,
-    Masks,
-    compare,
-    make_masks,
-    pooled,
-    scaled_by,
-    silence,
-)
+from ambiguous_wild.methods.refinesplat.evidence import Judged, Maps, Masks, compare, silence
 from ambiguous_wild.methods.refinesplat.first_look import FirstLook, first_look
 from ambiguous_wild.methods.refinesplat.inputs import FrozenInputs
 from ambiguous_wild.methods.refinesplat.losses import consistency_loss, identity_loss, instance_matrix
+from ambiguous_wild.methods.refinesplat.on_device.maker import DeviceMasks, only_on_host
+from ambiguous_wild.methods.refinesplat.on_device.pixels import PixelEvidence as DevicePixelEvidence
+from ambiguous_wild.methods.refinesplat.on_host import HostMasks
 from ambiguous_wild.methods.refinesplat.pixels import PixelEvidence
-from ambiguous_wild.methods.refinesplat.threshold import LearntWeight, robust_floor
+from ambiguous_wild.splat import device as devices
 from ambiguous_wild.splat.data import shrink_keep
 from ambiguous_wild.splat.parts import MaskPolicy, State
 from ambiguous_wild.splat.step import Step, TrainData
@@ -41,6 +35,7 @@ class RefineSplatMask(MaskPolicy):
     """Entropy-aware local and global masks, cached per view and refreshed as the render improves."""
 
     inputs: FrozenInputs
+    masks: HostMasks | DeviceMasks  # makes and keeps them
 
     def __init__(
         self,
@@ -51,11 +46,7 @@ class RefineSplatMask(MaskPolicy):
         self.config = config
         self.features = features or make_features(config.features)
         self.instances = instances or _instances(config)
-        self.weight = LearntWeight()
-        self.keeps: dict[int, Tensor] = {}  # view: [H, W] float32 at the photo's size
         self.visits: dict[int, int] = {}  # view: steps since masks began
-        self.shares: dict[int, tuple[float, float, float, float]] = {}  # view: final, local, global, T_ent
-        self.judged: dict[int, Judged] = {}  # view: its instances when its mask was last made
         self.last_reset = 0  # iteration, 0 = never
         self.looks: dict[int, FirstLook] = {}  # view: what other photos say of it, where they can tell
 
@@ -67,18 +58,10 @@ class RefineSplatMask(MaskPolicy):
             _ = self.inputs.semantics  # part of what the method costs before its first step
         photos = [photo.cpu().numpy() for photo in data.photos]
         surfaces = static_surfaces(data.cameras, data.scene.points.xyz)
-        self.pixels = PixelEvidence(
-            photos,
-            data.cameras,
-            config.mask.multiview,
-            base=config.mask.base,
-            least_alpha=config.mask.least_alpha,
-            memory=config.mask.memory,
-            surfaces=surfaces,
-        )
         if config.first_look.on:
             found = first_look(data.cameras, photos, surfaces, config.first_look)
             self.looks = {view: look for view, look in enumerate(found) if look is not None}
+        self.masks = self._maker(photos, surfaces)
         # view: what counts before masks begin, [H, W] float32; none where everything does
         self.first = {
             view: torch.from_numpy(keep.astype(np.float32)).to(data.device)
@@ -86,26 +69,28 @@ class RefineSplatMask(MaskPolicy):
             if (keep := look.keep(photos[view].shape[:2])) is not None
         }
 
+    def _maker(self, photos: list[np.ndarray], surfaces: list[np.ndarray | None]) -> HostMasks | DeviceMasks:
+        data, inputs = self.data, self.inputs
+        known = (
+            self.config, photos, data.cameras, surfaces, self.looks, inputs.labels, inputs.static, data.device
+        )  # fmt: skip
+        if devices.accelerated(data.device):
+            setting = only_on_host(self.config)
+            if setting is None:
+                return DeviceMasks(*known, tensors=data.photos)
+            warnings.warn(f"masks are made on the host, which the GPU waits for: {setting}", stacklevel=3)
+        return HostMasks(*known, compare=self.compare)
+
     def keep(self, step: Step) -> Tensor | None:
         if not self._begun(step):
             first = self.first.get(step.view)
             return None if first is None else shrink_keep(first, step.divisor)
         visit = self.visits.get(step.view, 0)
-        due = step.view not in self.keeps or visit % self.config.mask_every == 0
+        due = not self.masks.has(step.view) or visit % self.config.mask_every == 0
         if due and not self._paused(step):
-            _, masks = self.examine(step, remember=True)
-            self.judged[step.view] = masks.judged
-            if self.config.mask.w2 is None:
-                self._learn(masks)
-            self.keeps[step.view] = torch.from_numpy(masks.keep).to(self.data.device)
-            self.shares[step.view] = (
-                float(1.0 - masks.keep.mean()),
-                float(masks.local.mean()),
-                float(masks.global_.mean()),
-                masks.cut.threshold,
-            )
+            self.masks.renew(step)
         self.visits[step.view] = visit + 1
-        keep = self.keeps.get(step.view)
+        keep = self.masks.keep_of(step.view)
         return None if keep is None else shrink_keep(keep, step.divisor)
 
     def cotangent(self, step: Step, keep: Tensor | None) -> Tensor | None:
@@ -127,14 +112,14 @@ class RefineSplatMask(MaskPolicy):
     def predict(self, step: Step) -> Tensor | None:
         if not self._begun(step):
             return None
-        keep = torch.from_numpy(self.examine(step)[1].keep).to(self.data.device)
-        return shrink_keep(keep, step.divisor)
+        return shrink_keep(self.masks.predict(step), step.divisor)
 
     def on_opacity_reset(self, step: Step) -> None:
         self.last_reset = step.iteration
 
     def facts(self) -> dict[str, Any]:
-        rows = np.array([self.shares[view] for view in sorted(self.shares)], dtype=np.float64).reshape(-1, 4)
+        shares = self.shares
+        rows = np.array([shares[view] for view in sorted(shares)], dtype=np.float64).reshape(-1, 4)
         finite = rows[np.isfinite(rows[:, 3]), 3]
         mean = rows[:, :3].mean(axis=0) if len(rows) else np.zeros(3)
         return {
@@ -155,7 +140,22 @@ class RefineSplatMask(MaskPolicy):
     @property
     def w2(self) -> float:
         """Weight of T_ent's lower subset, learnt or fixed."""
-        return self.weight.value if self.config.mask.w2 is None else self.config.mask.w2
+        return self.masks.w2
+
+    @property
+    def pixels(self) -> PixelEvidence | DevicePixelEvidence:
+        """What photos and renders differ by, and what other views say of it."""
+        return self.masks.pixels
+
+    @property
+    def shares(self) -> dict[int, tuple[float, float, float, float]]:
+        """View: share masked in all, locally, globally, and T_ent when its mask was last made."""
+        return self.masks.shares
+
+    @property
+    def judged(self) -> dict[int, Judged]:
+        """View: its instances when its mask was last made."""
+        return self.masks.judged
 
     def _begun(self, step: Step) -> bool:
         return step.nominal >= self.config.mask_start and step.iteration >= self.config.min_mask_start
@@ -167,37 +167,14 @@ class RefineSplatMask(MaskPolicy):
         pause = max(self.config.reset_pause / nominal_per_iteration, self.config.min_reset_pause)
         return step.iteration - self.last_reset < pause
 
-    @torch.no_grad()
     def examine(self, step: Step, *, remember: bool = False) -> tuple[Maps, Masks]:
-        """The maps of the step's view and its masks at the photo's own size.
+        """The maps of the step's view and its masks at the photo's own size, as arrays.
 
         Args:
             step: of any train view.
             remember: whether other views hear what this one shows; else nothing is kept.
         """
-        inputs, view, mask = self.inputs, step.view, self.config.mask
-        ceiling, unseen = math.inf, None
-        if mask.statistic == "structure":
-            rendered = step.rendered
-            evidence = self.pixels.look(
-                view,
-                rendered.image.cpu().numpy(),
-                rendered.alpha.cpu().numpy(),
-                rendered.depth.cpu().numpy(),
-                remember=remember,
-            )
-            if view in self.looks:
-                evidence *= self.looks[view].factor(self.config.first_look.weight, evidence.shape)
-            if mask.entropy_weight > 0:
-                evidence = scaled_by(evidence, self.compare(step).statistic, mask.entropy_weight)
-            maps = Maps(evidence, evidence)
-            ceiling = self.pixels.ceiling(view, mask.ceiling, mask.ceiling_least)
-            unseen = self.pixels.unseen(view)
-        else:
-            maps = self.compare(step)
-        others = [self.judged[v] for v in sorted(self.judged) if v != view]
-        labels, static = inputs.labels[view], inputs.static[view]
-        return maps, make_masks(maps, labels, static, others, self.w2, mask, ceiling, unseen)
+        return self.masks.examine(step, remember=remember)
 
     @torch.no_grad()
     def compare(self, step: Step) -> Maps:
@@ -208,16 +185,6 @@ class RefineSplatMask(MaskPolicy):
         maps = compare(found.phi[step.view], features(image), found.psi, features.unit, mask)
         alpha = F.adaptive_avg_pool2d(step.rendered.alpha[None, None], maps.distance.shape)[0, 0]
         return silence(maps, (alpha < mask.least_alpha).cpu().numpy())
-
-    def _learn(self, masks: Masks) -> None:
-        """w2 from all instances; the price of a masked pixel is a robustly high residual."""
-        everything = masks.judged
-        if self.config.mask.scope == "scene":
-            everything = pooled([self.judged[v] for v in sorted(self.judged)])
-        price = robust_floor(everything.distances, max(self.config.mask.disagree, 1.0))
-        if len(everything.values) > 1 and np.isfinite(price):
-            residuals = everything.distances / max(price, 1e-12)
-            self.weight.learn(everything.values, residuals, everything.areas, masks.cut.floor)
 
     def _entropy_terms(self, image: Tensor, step: Step, keep: Tensor | None) -> Tensor:
         inputs, config = self.inputs.semantics, self.config
@@ -249,29 +216,17 @@ class RefineSplatMask(MaskPolicy):
     def state_dict(self) -> State:
         psi = self.inputs.semantics.psi if self.inputs.has_semantics else None
         return {
-            "keeps": {str(view): (keep > 0.5).to(torch.uint8) for view, keep in self.keeps.items()},
+            **self.masks.state_dict(),
             "visits": {str(view): count for view, count in self.visits.items()},
-            "shares": {str(view): [repr(x) for x in row] for view, row in self.shares.items()},
-            "judged": {
-                str(view): torch.from_numpy(np.stack([j.values, j.distances, j.areas]))
-                for view, j in self.judged.items()
-            },
-            "theta": self.weight.theta,
             "last_reset": self.last_reset,
-            "pixels": self.pixels.state_dict(),
             # the last bits of psi's training may differ on another machine: a run goes on with the same one
             "psi": None if psi is None else dict(psi.state_dict()),
         }
 
     def load_state_dict(self, state: State) -> None:
-        device = self.data.device
-        self.keeps = {int(v): keep.float().to(device) for v, keep in state["keeps"].items()}
+        self.masks.load_state_dict(state)
         self.visits = {int(v): int(count) for v, count in state["visits"].items()}
-        self.shares = {int(v): _four(row) for v, row in state["shares"].items()}
-        self.judged = {int(v): Judged(*rows.numpy()) for v, rows in state["judged"].items()}
-        self.weight.theta = float(state["theta"])
         self.last_reset = int(state["last_reset"])
-        self.pixels.load_state_dict(state["pixels"])
         if state["psi"] is not None and self.inputs.semantics.psi is not None:
             self.inputs.semantics.psi.load_state_dict(state["psi"])
 
@@ -288,9 +243,3 @@ def _enlarge(image: Tensor, like: Tensor) -> Tensor:
 
 def _instances(config: RefineSplatConfig) -> Instances:
     return GraphSegments(config.segments) if config.instances == "graph" else make_instances(config.instances)
-
-
-def _four(row: list[str]) -> tuple[float, float, float, float]:
-    # stored as text: T_ent is inf where nothing stands apart, and JSON has no inf
-    final, local, global_, threshold = (float(x) for x in row)
-    return final, local, global_, threshold

@@ -16,8 +16,8 @@ import numpy as np
 
 RESIDUAL_BOX = 5  # px
 STRUCTURE_BOX = 7  # px
-_GREY = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # BT.601 luma
-_NOISE = 5e-4  # variance below which a patch counts as plain: (2.2 %)^2, JPEG, sensor, a render's own
+GREY = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # BT.601 luma
+NOISE = 5e-4  # variance below which a patch counts as plain: (2.2 %)^2, JPEG, sensor, a render's own
 
 
 def structure_residual(photo: np.ndarray, render: np.ndarray, base: float = 0.3) -> np.ndarray:
@@ -29,7 +29,7 @@ def structure_residual(photo: np.ndarray, render: np.ndarray, base: float = 0.3)
         base: what is left of the residual where the structure agrees perfectly.
     """
     residual = _box(mean_difference(photo, render), RESIDUAL_BOX)
-    return residual * (1.0 + base - correlation(photo @ _GREY, render @ _GREY))
+    return residual * (1.0 + base - correlation(photo @ GREY, render @ GREY))
 
 
 def mean_difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -69,7 +69,7 @@ def correlation(a: np.ndarray, b: np.ndarray, box: int = STRUCTURE_BOX) -> np.nd
     var_a = np.maximum(_box(a * a, box) - mean_a * mean_a, 0.0)
     var_b = np.maximum(_box(b * b, box) - mean_b * mean_b, 0.0)
     both = _box(a * b, box) - mean_a * mean_b
-    return np.clip((both + _NOISE) / np.sqrt((var_a + _NOISE) * (var_b + _NOISE)), -1.0, 1.0)
+    return np.clip((both + NOISE) / np.sqrt((var_a + NOISE) * (var_b + NOISE)), -1.0, 1.0)
 
 
 def _box(x: np.ndarray, size: int) -> np.ndarray:

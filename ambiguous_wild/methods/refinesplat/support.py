@@ -8,16 +8,20 @@ is learnt anew.
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import check_limits
+from ambiguous_wild.splat import device as devices
 from ambiguous_wild.splat.density import rotation_matrices
+from ambiguous_wild.splat.effects.posed import PosedCamera
 from ambiguous_wild.splat.gaussians import Gaussians
 
 
@@ -55,17 +59,30 @@ class Support:
             camera: of the step.
             keep: [H, W] float32 at the camera's size, 1 = static; None = all of it.
         """
+        if devices.accelerated(gaussians.device):
+            self._look_at_all(gaussians, visible, camera, keep)
+            return
         rows = torch.nonzero(visible).squeeze(1)
         inside, vouched = _on_kept(gaussians.means[rows], camera, keep)
         self.looked[rows] += inside.to(self.looked.dtype)
         hidden = rows[inside & ~vouched]
         if len(hidden):
-            # a large one is vouched for by its flanks too: one standard deviation along every axis
-            axes = rotation_matrices(gaussians.quats[hidden]) * gaussians.log_scales[hidden].exp()[:, None, :]
-            ends = gaussians.means[hidden][:, None, :] + torch.cat([axes, -axes], dim=2).transpose(1, 2)
-            _, flanks = _on_kept(ends.reshape(-1, 3), camera, keep)
-            vouched[inside & ~vouched] = flanks.reshape(-1, 6).any(dim=1)
+            # a large one is vouched for by its flanks too
+            parts = gaussians.means[hidden], gaussians.quats[hidden], gaussians.log_scales[hidden]
+            vouched[inside & ~vouched] = _flank_on_kept(*parts, camera, keep)
         self.kept[rows] += (inside & vouched).to(self.kept.dtype)
+
+    def _look_at_all(
+        self, gaussians: Gaussians, visible: Tensor, camera: Camera, keep: Tensor | None
+    ) -> None:
+        """As `look` where the host must not ask which rows: all are computed, those not asked count 0."""
+        inside, vouched = _on_kept(gaussians.means, camera, keep)
+        if keep is not None:
+            parts = gaussians.means, gaussians.quats, gaussians.log_scales
+            vouched |= _flank_on_kept(*parts, camera, keep)
+        inside &= visible
+        self.looked += inside.to(self.looked.dtype)
+        self.kept += (inside & vouched).to(self.kept.dtype)
 
     def judge(self) -> Tensor:
         """Who is to go, [N] bool; the evidence on those who were judged and stay counts half from now on."""
@@ -92,9 +109,26 @@ class Support:
         self.looked, self.kept = state["looked"], state["kept"]
 
 
+def _flank_on_kept(
+    means: Tensor,  # [N, 3]
+    quats: Tensor,  # [N, 4]
+    log_scales: Tensor,  # [N, 3]
+    camera: Camera,
+    keep: Tensor | None,
+) -> Tensor:
+    """Whose flanks reach a kept pixel, one standard deviation along every axis, [N] bool."""
+    axes = rotation_matrices(quats) * log_scales.exp()[:, None, :]
+    ends = means[:, None, :] + torch.cat([axes, -axes], dim=2).transpose(1, 2)
+    _, flanks = _on_kept(ends.reshape(-1, 3), camera, keep)
+    return flanks.reshape(-1, 6).any(dim=1)
+
+
 def _on_kept(points: Tensor, camera: Camera, keep: Tensor | None) -> tuple[Tensor, Tensor]:
     """Of points [N, 3] in the world: which the frame holds, and which lie on a kept pixel, [N] bool each."""
-    pose = torch.tensor(camera.cam_from_world.tolist(), dtype=points.dtype, device=points.device)
+    if isinstance(camera, PosedCamera):  # of pose refinement: it lies there already
+        pose = camera.pose.to(points.dtype)
+    else:
+        pose = _pose(camera.cam_from_world.tobytes(), points.dtype, points.device)
     local = points @ pose[:3, :3].T + pose[:3, 3]
     z = local[:, 2].clamp(min=1e-6)
     u = torch.floor((local[:, 0] / z * camera.fx + camera.cx).clamp(-1.0, camera.width)).long()
@@ -104,3 +138,9 @@ def _on_kept(points: Tensor, camera: Camera, keep: Tensor | None) -> tuple[Tenso
         return inside, inside.clone()
     kept = keep[v.clamp(0, camera.height - 1), u.clamp(0, camera.width - 1)] > 0.5
     return inside, inside & kept
+
+
+@functools.lru_cache(maxsize=4096)  # of a capture's cameras, so that no look has to bring one to the device
+def _pose(cam_from_world: bytes, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """cam_from_world [4, 4] from the bytes of its float64 array."""
+    return torch.from_numpy(np.frombuffer(cam_from_world).reshape(4, 4).copy()).to(dtype).to(device)

@@ -19,7 +19,8 @@ from torch import Tensor
 from ambiguous_wild.core.errors import unknown
 
 Form = Literal["kapur", "literal", "hard", "statistics"]
-_THETA_LIMIT = 8.0  # |theta| beyond this, sigmoid(theta) rounds to 0 or 1 in float32
+THETA_LIMIT = 8.0  # |theta| beyond this, sigmoid(theta) rounds to 0 or 1 in float32
+TEMPERATURE = 0.1  # nats, of the threshold that w2 is learnt through
 
 
 @dataclass(frozen=True)
@@ -169,7 +170,7 @@ class LearntWeight:
             return
         theta = torch.tensor(self.theta, dtype=torch.float64, requires_grad=True)
         x = torch.from_numpy(order)
-        t = soft_threshold(x, torch.from_numpy(starts), torch.sigmoid(theta), tau=0.1)
+        t = soft_threshold(x, torch.from_numpy(starts), torch.sigmoid(theta), tau=TEMPERATURE)
         spread = max(float(np.std(order)), 1e-9) / 4
         member = torch.sigmoid((x - t) / spread)
         share = torch.from_numpy(areas[index] / max(float(areas.sum()), 1.0))
@@ -178,4 +179,4 @@ class LearntWeight:
         (gradient,) = torch.autograd.grad(loss, theta)
         step = float(gradient.clamp(-1.0, 1.0)) if torch.isfinite(gradient) else 0.0
         # normalised by nothing: the sign and size both mean something, the clip bounds them
-        self.theta = float(np.clip(self.theta - self.rate * 50 * step, -_THETA_LIMIT, _THETA_LIMIT))
+        self.theta = float(np.clip(self.theta - self.rate * 50 * step, -THETA_LIMIT, THETA_LIMIT))

@@ -1,0 +1,81 @@
+"""Connected components in a fixed number of rounds: hysteresis and filled gaps without a loop that looks.
+
+Every pixel points to a pixel of its own component, at first to the largest among itself and its neighbours.
+A round takes the largest pointer among each pixel's neighbours, hangs the pixel's own target on it, and makes
+all pointers jump three times (FastSV: Zhang, Azad, Buluc 2020). Pointers only grow, so nothing is ever joined
+that is not connected; what too few rounds would leave is a component in two parts.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+_JUMPS = 3  # halve the rounds that one jump takes; more bring nothing
+# Needed at 504 x 378 px, 4 or 8 neighbours, mirrored or not: 7 by 6 of 49 mazes and 6 by the others and by
+# Hilbert curves, 5 by spirals, serpentines, combs and stairs, 5 by random pixels of any density, 4 by blobs;
+# 7 by a maze of four times the pixels. A round leaves the local maxima of the parts that touch, so the number
+# grows with the logarithm of the pixels at most.
+_ROUNDS = 8
+_ROUNDS_PIXELS = 504 * 378
+_FLOAT32_EXACT = 1 << 24
+
+
+def rounds_for(pixels: int) -> int:
+    """Rounds that suffice for a photo of so many pixels."""
+    return _ROUNDS + max(math.ceil(math.log(pixels / _ROUNDS_PIXELS, 4)), 0)
+
+
+def components(masks: Tensor, connectivity: int) -> Tensor:
+    """Components of masks [n, H, W] bool: [n * H * W] int64, a number from 1 on for each; 0 = in no mask."""
+    pixels = masks.numel()
+    # pooling knows floating point alone
+    dtype = torch.float32 if pixels < _FLOAT32_EXACT else torch.float64
+    inside = masks.reshape(-1).long()
+    own = torch.arange(1, pixels + 1, dtype=dtype, device=masks.device) * inside
+    labels = F.pad(_largest_around(own.view(masks.shape), connectivity, dtype) * inside, (1, 0))
+    for _ in range(rounds_for(masks[0].numel())):
+        for _ in range(_JUMPS):
+            labels = labels.take(labels)
+        around = _largest_around(labels[1:].view(masks.shape), connectivity, dtype) * inside
+        labels = labels.scatter_reduce(0, labels[1:], around, "amax")
+    for _ in range(_JUMPS):
+        labels = labels.take(labels)
+    return labels[1:]
+
+
+def hysteresis(values: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """As `masking.hysteresis` of maps [n, H, W]; 0-d thresholds, low <= high."""
+    labels = components(values > low, 8)
+    strong = (values > high).view(-1).int()
+    reached = strong.new_zeros(labels.numel() + 1).scatter_reduce_(0, labels, strong, "amax")
+    # a strong pixel is a weak one too: what is not in a component is not strong
+    return reached.take(labels).bool().view(values.shape)
+
+
+def fill_holes(mask: Tensor, share: float) -> Tensor:
+    """As `masking.fill_holes`, [H, W] bool."""
+    if share <= 0:
+        return mask
+    labels = components(~mask[None], 4)
+    areas = labels.new_zeros(labels.numel() + 1).scatter_add_(0, labels, torch.ones_like(labels))
+    return mask | (areas.take(labels) < share * mask.numel()).view(mask.shape)
+
+
+def dilate(mask: Tensor, size: int) -> Tensor:
+    """As `masking.dilate`, [H, W] bool; `size` odd."""
+    if size <= 1:
+        return mask
+    return F.max_pool2d(mask[None].float(), size, 1, size // 2)[0] > 0.5
+
+
+def _largest_around(labels: Tensor, connectivity: int, dtype: torch.dtype) -> Tensor:
+    """The largest label [n, H, W] among each pixel and its 4 or 8 neighbours, flat int64."""
+    x = labels.to(dtype)
+    if connectivity == 8:
+        return F.max_pool2d(x, 3, 1, 1).long().view(-1)
+    upright, level = F.max_pool2d(x, (3, 1), 1, (1, 0)), F.max_pool2d(x, (1, 3), 1, (0, 1))
+    return torch.maximum(upright, level).long().view(-1)

@@ -1,0 +1,72 @@
+"""A stack of maps of all views, read at places of other views' frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+
+def sized(array: np.ndarray, device: torch.device | str) -> Tensor:
+    """An array as float32 on the device."""
+    return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32)).to(device)
+
+
+class Maps:
+    """[views, channels, h, w] float32; smaller maps lie at the upper left, the rest is padding.
+
+    Places are [n, rows, columns, 2], x and y from -1 to 1 over the map, as for `grid_sample`.
+    """
+
+    def __init__(self, maps: Sequence[np.ndarray], device: torch.device | str, pad: str = "zero") -> None:
+        """
+        Args:
+            maps: [channels, h, w] of each view.
+            device: where they are to lie.
+            pad: what lies beyond a smaller map: `zero`, or its own `edge`.
+        """
+        self.edge = pad == "edge"
+        self.sizes = [m.shape[1:] for m in maps]
+        h, w = (max(size[axis] for size in self.sizes) for axis in (0, 1))
+        self.stack = torch.zeros((len(maps), maps[0].shape[0], h, w), device=device)
+        # of the stack's maps, how much each view's covers; None: all of it
+        self.shares: Tensor | None = None
+        if len(set(self.sizes)) > 1:
+            shares = np.array([[size[1] / w, size[0] / h] for size in self.sizes])
+            self.shares = sized(shares[:, None, None], device)
+        for view, m in enumerate(maps):
+            for channel, plane in enumerate(m):
+                if plane.any():
+                    self.put(view, sized(plane, device), channel)
+
+    def put(self, view: int, plane: Tensor, channel: int = 0) -> None:
+        """One channel [h, w] of a view's map."""
+        h, w = self.sizes[view]
+        target = self.stack[view, channel]
+        if self.edge and target.shape != plane.shape:
+            beyond = (0, target.shape[1] - w, 0, target.shape[0] - h)
+            plane = F.pad(plane[None, None], beyond, mode="replicate")[0, 0]
+            h, w = target.shape
+        target[:h, :w].copy_(plane)
+
+    def of(self, view: int) -> Tensor:
+        """A view's own map [channels, h, w], without padding."""
+        h, w = self.sizes[view]
+        return self.stack[view, :, :h, :w]
+
+    def nearest(self, views: Tensor, places: Tensor) -> Tensor:
+        """The nearest pixel [n, channels, rows, columns] of each view; 0 outside (cv2.INTER_NEAREST)."""
+        return self._read(views, places, "nearest", "zeros")
+
+    def linear(self, views: Tensor, places: Tensor) -> Tensor:
+        """Bilinear between pixels, the border replicated (cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)."""
+        return self._read(views, places, "bilinear", "border")
+
+    def _read(self, views: Tensor, places: Tensor, mode: str, outside: str) -> Tensor:
+        if self.shares is not None:
+            places = (places + 1.0) * self.shares.index_select(0, views) - 1.0
+        maps = self.stack.index_select(0, views)
+        return F.grid_sample(maps, places, mode=mode, padding_mode=outside, align_corners=False)

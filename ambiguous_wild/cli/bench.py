@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -14,6 +15,9 @@ from ambiguous_wild.cli.options import training_options
 from ambiguous_wild.cli.paths import PathName
 from ambiguous_wild.cli.progress import Progress, finish
 from ambiguous_wild.core.errors import AwError
+
+if TYPE_CHECKING:
+    from ambiguous_wild.harness.cell import Cell
 
 LONGEST_S = 366 * 24 * 3600.0
 _UNITS = {"s": 1, "m": 60, "min": 60, "h": 3600}
@@ -113,6 +117,13 @@ def parse_budget(text: str) -> float:
     help="A value that is no finite number: stop and say where, or go back and leave that photo out.",
 )
 @click.option(
+    "--gpus",
+    type=click.IntRange(1, 9),
+    default=1,
+    show_default=True,
+    help="GPUs that share one model, for a scene too large for one; iterations count photos.",
+)
+@click.option(
     "--pictures/--no-pictures",
     default=True,
     show_default=True,
@@ -146,6 +157,7 @@ def command(
     cache: Path | None,
     checkpoint_every: float,
     on_nonfinite: str,
+    gpus: int,
     pictures: bool,
     as_json: bool,
 ) -> None:
@@ -225,6 +237,8 @@ def command(
         for wanted in dict.fromkeys(effects)
     }
     cells = grouped(planned, seconds)
+    if gpus > 1:
+        cells = _sharing(cells, gpus, engine)
     told = {(cell.method.name, cell.scene.name, cell.chosen.effects): None for cell in cells}
     for method, name, on in told:
         if on:
@@ -242,7 +256,7 @@ def command(
     check_output(output / "run")  # before half a minute of compiling
     if chosen == "cpu" and not engine.remote and any(cell.method.program is None for cell in cells):
         prepare_cpu(threads)
-    if session.in_process(cells):
+    if gpus > 1 or session.in_process(cells):
         progress = Progress(len(cells))
         reports = run_cells(
             cells,
@@ -259,3 +273,21 @@ def command(
         with session:
             reports = session.run(Grid(cells, output, overwrite, cache, pictures, plugins, methods))  # type: ignore[arg-type]
     finish(reports, output, as_json, [str(output / group) for group in {cell.group: None for cell in cells}])
+
+
+def _sharing(cells: list[Cell], gpus: int, engine: Engine) -> list[Cell]:
+    """The cells with one model on so many GPUs; refused here what cannot be trained so."""
+    import dataclasses
+
+    import torch
+
+    from ambiguous_wild.harness.shared_run import check_shared
+    from ambiguous_wild.splat.shared.refuse import refuse_more_than
+
+    if engine.remote or (engine.jobs or 1) > 1:
+        raise AwError("--gpus gives all GPUs to one run at a time: leave --jobs and --engine out")
+    shared = [dataclasses.replace(cell, gpus=gpus) for cell in cells]
+    for cell in shared:
+        check_shared(cell)
+    refuse_more_than(torch.cuda.device_count(), gpus)
+    return shared

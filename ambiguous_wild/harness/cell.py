@@ -31,6 +31,7 @@ class Cell:
     device: str = "cpu"
     chosen: Chosen = field(default_factory=Chosen)  # optional effects, and why
     protocol: Protocol = "full"  # "half": measured on the right half, colour effects fitted on the left
+    gpus: int = 1  # that share the model; iterations count photos, on any number
     group: str = ""  # folder below the output, where one output takes several lengths or effects
 
     @property
@@ -41,6 +42,8 @@ class Cell:
         more: dict[str, Any] = {"effects": list(self.chosen.effects)} if self.chosen.effects else {}
         if self.protocol != "full":
             more["protocol"] = self.protocol
+        if self.gpus != 1:
+            more["gpus"] = self.gpus
         return more | {
             "method": self.method.name,
             "source": self.method.source_hash,

@@ -31,6 +31,7 @@ from ambiguous_wild.harness.memory import (
 from ambiguous_wild.harness.provenance import provenance
 from ambiguous_wild.harness.result import result_of
 from ambiguous_wild.harness.result_file import read_result, write_result
+from ambiguous_wild.harness.shared_run import shared_cost, train_shared
 from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.atomic import sweep, write_json, write_text
 from ambiguous_wild.io.lock import folder_lock
@@ -39,6 +40,7 @@ from ambiguous_wild.methods.external.program import DONE, LOGS, WORK
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.shared import shards
 from ambiguous_wild.splat.trainer import Trainer
 
 RESULT = "metrics.json"
@@ -209,6 +211,8 @@ def _train_and_measure(
     made: list[Trainer],  # the trainer, as soon as there is one
 ) -> dict[str, Any]:
     reset_peak(cell.device)
+    if cell.gpus > 1:  # before photos lie on the first of them
+        train_shared(cell, folder, cache_dir, tick)
     device = torch.device(cell.device)
     data = load_train_data(cell.scene, device=device, seed=cell.train.seed, cache_dir=cache_dir)
     parts = with_effects(cell.method.build(cell.options), cell.chosen.effects)
@@ -222,7 +226,9 @@ def _train_and_measure(
     made.append(trainer)
     # Frozen inputs, instance masks and identities are part of what a method costs.
     trainer.setup_s = time.perf_counter() - before
-    trainer.resume()
+    ranks = shards.take_over(trainer, folder) if cell.gpus > 1 else []
+    if not ranks:
+        trainer.resume()
     recorder = run_pictures.Recorder(trainer, folder) if pictures else None
 
     def after_iteration(trainer: Trainer) -> None:
@@ -231,8 +237,10 @@ def _train_and_measure(
         if tick is not None:
             tick(trainer)
 
-    trainer.train(tick=after_iteration)
-    cost = _cost(cell, trainer)  # now: what follows measures, and is no training
+    if not ranks:
+        trainer.train(tick=after_iteration)
+    # now: what follows measures, and is no training
+    cost = _cost(cell, trainer) | (shared_cost(cell, ranks) if ranks else {})
 
     write_splat_ply(
         folder / "point_cloud.ply", {k: v.cpu().numpy() for k, v in trainer.neutral_model().items()}

@@ -184,13 +184,13 @@ def render_cuda(
         camera.height,
         antialias=antialias,
     )
-    colours = _colours(leaves, splats, cam.centre, min(sh_degree, gaussians.sh_degree))
+    colours = colours_of(leaves, splats, cam.centre, min(sh_degree, gaussians.sh_degree))
     size = (camera.width, camera.height)
     tiles = seam.sort(splats, *size)
-    return RenderedCuda(leaves, splats, colours, tiles, _on_device(background, gaussians.device), size)
+    return RenderedCuda(leaves, splats, colours, tiles, background_on(background, gaussians.device), size)
 
 
-def _colours(leaves: dict[str, Tensor], splats: seam.Splats, centre: Tensor, degree: int) -> Tensor:
+def colours_of(leaves: dict[str, Tensor], splats: seam.Splats, centre: Tensor, degree: int) -> Tensor:
     """[N, 3], max(SH + 0.5, 0)."""
     if degree == 0:
         return (leaves["sh0"] * SH_C0 + 0.5).clamp(min=0.0)
@@ -223,7 +223,7 @@ def on_device(camera: Camera, device: torch.device) -> _OnDevice:
     return found
 
 
-def _on_device(background: tuple[float, float, float], device: torch.device) -> Tensor:
+def background_on(background: tuple[float, float, float], device: torch.device) -> Tensor:
     key = (background, device)
     if key not in _backgrounds:
         _backgrounds[key] = torch.tensor([background], dtype=torch.float32).to(device)

@@ -8,20 +8,18 @@ is learnt anew.
 
 from __future__ import annotations
 
-import functools
 import math
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.splat import device as devices
+from ambiguous_wild.splat.cuda import on_device
 from ambiguous_wild.splat.density import rotation_matrices
-from ambiguous_wild.splat.effects.posed import PosedCamera
 from ambiguous_wild.splat.gaussians import Gaussians
 
 
@@ -125,10 +123,10 @@ def _flank_on_kept(
 
 def _on_kept(points: Tensor, camera: Camera, keep: Tensor | None) -> tuple[Tensor, Tensor]:
     """Of points [N, 3] in the world: which the frame holds, and which lie on a kept pixel, [N] bool each."""
-    if isinstance(camera, PosedCamera):  # of pose refinement: it lies there already
-        pose = camera.pose.to(points.dtype)
+    if devices.accelerated(points.device):
+        pose = on_device(camera, points.device).viewmat[0]
     else:
-        pose = _pose(camera.cam_from_world.tobytes(), points.dtype, points.device)
+        pose = torch.tensor(camera.cam_from_world.tolist(), dtype=points.dtype)
     local = points @ pose[:3, :3].T + pose[:3, 3]
     z = local[:, 2].clamp(min=1e-6)
     u = torch.floor((local[:, 0] / z * camera.fx + camera.cx).clamp(-1.0, camera.width)).long()
@@ -138,9 +136,3 @@ def _on_kept(points: Tensor, camera: Camera, keep: Tensor | None) -> tuple[Tenso
         return inside, inside.clone()
     kept = keep[v.clamp(0, camera.height - 1), u.clamp(0, camera.width - 1)] > 0.5
     return inside, inside & kept
-
-
-@functools.lru_cache(maxsize=4096)  # of a capture's cameras, so that no look has to bring one to the device
-def _pose(cam_from_world: bytes, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """cam_from_world [4, 4] from the bytes of its float64 array."""
-    return torch.from_numpy(np.frombuffer(cam_from_world).reshape(4, 4).copy()).to(dtype).to(device)

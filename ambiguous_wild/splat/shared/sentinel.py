@@ -1,0 +1,41 @@
+"""The sentinel of several ranks: what one of them finds calls the step off on all."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ambiguous_wild.splat.sentinel import Sentinel
+from ambiguous_wild.splat.shared.ranks import Ranks
+
+
+class SharedSentinel(Sentinel):
+    """Of one rank; its numbers are the same on all, so that all look back at the same step."""
+
+    def __init__(self, device: torch.device, views: int, ranks: Ranks) -> None:
+        """
+        Args:
+            device: of this rank.
+            views: number of train photos.
+            ranks: that share the model.
+        """
+        super().__init__(device, views)
+        self._ranks = ranks
+
+    def watch(
+        self, iteration: int, view: int, loss: Tensor, gradients: Sequence[Tensor], keep: Tensor | None
+    ) -> Tensor:
+        """As `Sentinel.watch`, of all ranks at once: off where one is broken, or no photo shows anything."""
+        self._watched.append(iteration)
+        torch._amp_foreach_non_finite_check_and_unscale_(
+            [loss.detach().reshape(1), *(g.detach() for g in gradients)], self._broken, self._one
+        )
+        something = self._one if keep is None else (keep.amax() > 0).to(torch.float32).reshape(1)
+        self._empty[view : view + 1] += 1.0 - something
+        # One small message a step, and no host waits for it.
+        broken, anything = self._ranks.largest(torch.cat([self._broken, something])).split(1)
+        self._broken.copy_(broken)
+        self._sound += 1.0 - broken
+        return torch.maximum(broken, 1.0 - anything)

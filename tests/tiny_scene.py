@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
+
+from ambiguous_wild.core import Scene
 
 WIDTH, HEIGHT, FOCAL, WALL_Z = 64, 48, 60.0, 4.0
 TRAIN = [f"train_{i}.png" for i in range(6)]
@@ -58,3 +61,10 @@ def write_tiny_scene(root: Path, *, distractors: bool = True) -> Path:
     (root / "train_list.txt").write_text("\n".join(TRAIN) + "\n")
     (root / "test_list.txt").write_text("\n".join(TEST) + "\n")
     return root
+
+
+def with_points(scene: Scene, count: int) -> Scene:
+    """The scene with its first points alone: what every pixel is compared with is dear without kernels."""
+    points = scene.points
+    fewer = {name: value[:count] for name, value in vars(points).items() if len(value) == len(points)}
+    return replace(scene, points=replace(points, **fewer, track_offsets=points.track_offsets[: count + 1]))

@@ -13,9 +13,9 @@ from ambiguous_wild.splat.losses import photometric, ssim_map
 from ambiguous_wild.splat.parts import MaskPolicy, Parts
 from ambiguous_wild.splat.reference import photometric_reference, ssim_map_reference
 from ambiguous_wild.splat.sentinel import Sentinel
-from ambiguous_wild.splat.trainer import Trainer
 from ambiguous_wild.splat.watchdog import NonFinite
-from tests.tiny_scene import write_tiny_scene
+from tests.host_reads import moved
+from tests.tiny_scene import with_points, write_tiny_scene
 
 from . import fake_gsplat
 from .test_losses import pictures
@@ -25,7 +25,7 @@ from .test_watchdog import Poison
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    return load_scene(write_tiny_scene(tmp_path_factory.mktemp("data") / "scene"))
+    return with_points(load_scene(write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")), 150)
 
 
 @pytest.fixture
@@ -63,7 +63,7 @@ def test_densification_and_reset_run_there_too(scene, tmp_path, fake):
     config = DensityConfig(start=0.0, min_every=8, resets=(15_000.0,), min_reset_spacing=1, min_reset_rest=1)
     parts = Parts(density_config=replace(config, grow_grad=1e-6, max_gaussians=500))
     trainer = trained(scene, tmp_path / "run", parts=parts, iterations=24, probes=0)
-    assert len(trainer.gaussians) > 400
+    assert len(trainer.gaussians) > 150
     assert trainer.density.last_reset > 0
     assert all(bool(torch.isfinite(tensor).all()) for _, tensor in trainer.gaussians.items())
 
@@ -81,11 +81,8 @@ class OnMeta(MaskPolicy):
 @pytest.mark.parametrize("mask", [MaskPolicy, OnMeta])
 def test_no_host_read_in_the_loop_but_where_it_looks(scene, tmp_path, monkeypatch, mask):
     """On torch's `meta` device reading a value raises, and so does mixing with the host's tensors."""
-    with fake_gsplat.installed(monkeypatch, everywhere=False):
-        data = trainer_for(scene, tmp_path / "host").data
-        data = replace(data, photos=[p.to("meta") for p in data.photos], device=torch.device("meta"))
-        config = trainer_for(scene, tmp_path / "host", iterations=1000, probes=0).config
-        trainer = Trainer(data, Parts(mask=mask()), config, folder=tmp_path / "run")
+    with fake_gsplat.installed(monkeypatch):
+        trainer = moved(trainer_for(scene, tmp_path, parts=Parts(mask=mask()), iterations=1000, probes=0))
         for _ in range(2):
             trainer.timeline.loss(trainer.step())
         assert trainer.iteration == 2

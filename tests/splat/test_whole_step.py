@@ -15,7 +15,7 @@ from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
 from tests.host_reads import moved, no_transfers
-from tests.tiny_scene import write_tiny_scene
+from tests.tiny_scene import with_points, write_tiny_scene
 
 from . import fake_gsplat
 
@@ -25,7 +25,7 @@ METHODS = ("3dgs", "3dgs+truth", "robustsplat", "dronesplat", "refinesplat")
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    return load_scene(write_tiny_scene(tmp_path_factory.mktemp("data") / "scene"))
+    return with_points(load_scene(write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")), 60)
 
 
 @pytest.fixture

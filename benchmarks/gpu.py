@@ -38,6 +38,7 @@ from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.metrics.image import psnr
 from ambiguous_wild.splat import gsplat_seam
+from ambiguous_wild.splat.cuda_ready import look, make_ready
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.device import wait
 from ambiguous_wild.splat.gaussians import Gaussians
@@ -98,6 +99,8 @@ def frames_per_second(trainer: Trainer, seconds: float = 2.0) -> float:
 def build(args: argparse.Namespace) -> dict[str, Any]:
     """gsplat's kernels, compiled or loaded, and the loss."""
     begin = time.perf_counter()
+    if args.device == "cuda":
+        make_ready(look(), print)
     points = np.random.default_rng(0).normal((0.0, 0.0, 4.0), size=(64, 3))
     g = Gaussians.from_points(points, np.zeros((64, 3), np.uint8)).to(args.device)
     rendered = render(g, Camera(64, 48, 50.0, 50.0, 32.0, 24.0, np.eye(4)))

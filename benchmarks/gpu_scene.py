@@ -24,6 +24,7 @@ from ambiguous_wild.io.images import read_png_rgb, write_png
 from ambiguous_wild.simulate.capture import simulate
 from ambiguous_wild.simulate.presets import preset
 
+SAMPLES = 2  # rays a pixel; it is the time of training that is measured
 EVERY_PX = 24  # a point for so many px along rows and columns of every train photo
 SAME_DEPTH = 0.02  # relative: another photo shows a point whose depth there is its own
 
@@ -34,7 +35,8 @@ def make_scene(out: Path, *, name: str, train: int, test: int, width: int, seed:
         return out
     spec = preset(name)
     height = round(spec.height * width / spec.width)
-    spec = dataclasses.replace(spec, train_views=train, test_views=test, width=width, height=height)
+    size = {"width": width, "height": height, "samples": SAMPLES}
+    spec = dataclasses.replace(spec, train_views=train, test_views=test, **size)
     with tempfile.TemporaryDirectory() as raw_name, atomic_dir(out) as folder:
         raw = Path(raw_name) / "raw"
         simulate(spec, raw, seed=seed, depth=True)

@@ -65,8 +65,12 @@ class RenderedCuda:
         self._image, self._alpha, _ = self._blend(self._cut)
         self._depth: Tensor | None = None
         self.image, self.alpha = self._image.detach(), self._alpha.detach()
-        self.visible = (splats.radii > 0).all(dim=1)
-        self.radii = torch.where(self.visible, splats.radii.amax(dim=1), 0).to(torch.float32)
+        self.visible, self._shown = (splats.radii > 0).all(dim=1), splats.radii
+
+    @property
+    def radii(self) -> Tensor:
+        """[N] float32 px; made when it is asked for, no step does."""
+        return torch.where(self.visible, self._shown.amax(dim=1), 0).to(torch.float32)
 
     @property
     def depth(self) -> Tensor:

@@ -34,7 +34,11 @@ class Rendered(Protocol):
     image: Tensor  # [H, W, 3] float32, background included, not clamped
     alpha: Tensor  # [H, W] float32 in [0, 1]
     visible: Tensor  # [N] bool, passed every cull
-    radii: Tensor  # [N] float32 px, largest half extent of the 1/255 contour; 0 where not visible
+
+    @property
+    def radii(self) -> Tensor:
+        """[N] float32 px, largest half extent of the 1/255 contour; 0 where not visible."""
+        ...
 
     @property
     def depth(self) -> Tensor:

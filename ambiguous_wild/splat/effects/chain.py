@@ -128,13 +128,17 @@ class Drawn:
         view: int | None,
     ) -> None:
         self.image, self.alpha = images[-1], rendered.alpha
-        self.visible, self.radii = rendered.visible, rendered.radii
+        self.visible = rendered.visible
         self._chain, self._inner, self._images = chain, rendered, images
         self._drawn, self._camera, self._view = drawn, camera, view
 
     @property
     def depth(self) -> Tensor:
         return self._inner.depth
+
+    @property
+    def radii(self) -> Tensor:
+        return self._inner.radii
 
     @torch.no_grad()
     def backward(

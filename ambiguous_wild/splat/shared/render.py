@@ -94,8 +94,7 @@ class SharedRendered(RenderedCuda):
         return replace(gradients, screen=self.screens[self._rank])
 
     def _show(self, camera: int) -> None:
-        self.visible = self._seen[camera]
-        self.radii = torch.where(self.visible, self._radii[camera].amax(dim=1), 0).to(torch.float32)
+        self.visible, self._shown = self._seen[camera], self._radii[camera]
 
 
 def render_shared(

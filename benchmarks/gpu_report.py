@@ -34,8 +34,9 @@ def _parity(s: dict[str, Any]) -> list[str]:
     lines += ["| case | worst error | allowed | |", "|---|---:|---:|---|"]
     for row in s["rows"]:
         error = "none" if row["error"] is None else f"{row['error']:.1e}"
+        allowed = "none" if row["tolerance"] is None else f"{row['tolerance']:.1e}"
         verdict = "passed" if row["passed"] else "FAILED"
-        lines.append(f"| {row['key']} | {error} | {row['tolerance']:.1e} | {verdict} |")
+        lines.append(f"| {row['key']} | {error} | {allowed} | {verdict} |")
     return lines
 
 
@@ -73,8 +74,10 @@ def _train(s: dict[str, Any]) -> list[str]:
                 "",
                 f"refinesplat in all: {spent:.0f} s ({_verdict(spent <= TRAIN_S)} of {TRAIN_S:.0f} s).",
             ]
-    best = max(r["fps"] for r in s["rows"])
-    lines += ["", f"Frames a second: {best:.0f} at most ({_verdict(best > FPS)} of {FPS:.0f})."]
+    lines += [f"\n{method} failed: {why}" for method, why in s.get("failed", {}).items()]
+    if s["rows"]:
+        best = max(r["fps"] for r in s["rows"])
+        lines += ["", f"Frames a second: {best:.0f} at most ({_verdict(best > FPS)} of {FPS:.0f})."]
     return lines
 
 

@@ -25,6 +25,7 @@ from ambiguous_wild.splat.gsplat_build import (
     is_prebuilt,
     kernels_folder,
     search_path,
+    toolkit,
 )
 
 TOOLKIT = "https://developer.nvidia.com/cuda-toolkit-archive"
@@ -235,13 +236,11 @@ def _runs_on(capability: tuple[int, ...], archs: list[str]) -> bool:
 
 def _nvcc() -> str | None:
     """The CUDA version of the nvcc that torch and gsplat take, "" where it does not say."""
-    home = os.environ.get("CUDA_HOME") or os.environ.get("CUDA_PATH")
+    home = os.environ.get("CUDA_HOME") or os.environ.get("CUDA_PATH") or toolkit()
     found = shutil.which("nvcc")
     if home:
         inside = Path(home) / "bin" / "nvcc"
         found = str(inside) if inside.is_file() else found
-    elif found is None and Path("/usr/local/cuda/bin/nvcc").is_file():
-        found = "/usr/local/cuda/bin/nvcc"
     if found is None:
         return None
     try:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import functools
 import math
+import types
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -85,24 +86,31 @@ def _map(a: Tensor, b: Tensor) -> Tensor:
 
 
 class _Compiled:
-    """A function as torch compiles it on CUDA, or as it stands where it cannot."""
+    """A function as torch compiles it on CUDA, or as it stands where it cannot.
+
+    Each of its kinds (with a keep map or without, inside or outside) is a function of its own to the
+    compiler, which gives up on one after a few versions: then only sizes make versions, and the second is
+    for any size.
+    """
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self.function = function
-        self.compiled: Callable[..., Any] | None = None
-        self.broken = False
+        self.compiled: dict[tuple[Any, ...], Callable[..., Any]] = {}
+        self.broken: set[tuple[Any, ...]] = set()
 
     def __call__(self, *arguments: Any) -> Any:
-        if self.broken or arguments[0].device.type != "cuda":
+        kind = tuple(Tensor if isinstance(a, Tensor) else a for a in arguments)
+        if kind in self.broken or arguments[0].device.type != "cuda":
             return self.function(*arguments)
         try:
-            if self.compiled is None:
-                self.compiled = torch.compile(self.function, fullgraph=True)
-            return self.compiled(*arguments)
+            if kind not in self.compiled:
+                twin = types.FunctionType(self.function.__code__.replace(), self.function.__globals__)
+                self.compiled[kind] = torch.compile(twin, fullgraph=True)
+            return self.compiled[kind](*arguments)
         except torch.cuda.OutOfMemoryError:
             raise
         except Exception as error:  # of the compiler: many kinds, none of them the user's
-            self.broken = True
+            self.broken.add(kind)
             reason = str(error).strip().split("\n")[0][:200]
             warnings.warn(f"the loss is not compiled and slower for it: {reason}", stacklevel=3)
             return self.function(*arguments)
@@ -118,7 +126,7 @@ def photometric_fused(
     """L1, 1 - SSIM (0-d) and the gradient of their mix [H, W, 3]; arguments as `losses.photometric`."""
     keep = None if keep is None else keep.to(render.dtype)
     found: tuple[Tensor, Tensor, Tensor] = _compiled_loss(
-        render, photo, keep, lambda_dssim, weighting == "images"
+        render.detach(), photo, keep, lambda_dssim, weighting == "images"
     )
     return found
 
@@ -131,9 +139,10 @@ def ssim_map_fused(a: Tensor, b: Tensor) -> Tensor:
 
 
 @functools.cache
-def prepare(device: torch.device, height: int, width: int) -> None:
+def prepare(device: torch.device, height: int, width: int, lambda_dssim: float, weighting: str) -> None:
     """Compile before the clock runs, once a process; does nothing where there is nothing to compile."""
     if device.type == "cuda":
-        picture = torch.zeros(height, width, 3, device=device)
-        for keep in (None, picture[..., 0]):
-            photometric_fused(picture, picture, keep, 0.2, "map")
+        # as in a step: tensors of their own, dense; the compiler makes another version of what is not
+        render, photo = (torch.zeros(height, width, 3, device=device) for _ in range(2))
+        for keep in (None, torch.ones(height, width, device=device)):
+            photometric_fused(render, photo, keep, lambda_dssim, weighting)

@@ -8,9 +8,10 @@ begins by removing that folder), so it is done here, by one of them, before the 
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +57,9 @@ def compile_kernels(
         AwError: the compiler failed, with its first error and where the rest is.
     """
     os.environ["PATH"] = search_path()  # torch calls ninja by its name
+    if home := toolkit():
+        # torch guesses it from where nvcc lies, which may be a link; another guess next time compiles anew
+        os.environ["CUDA_HOME"] = str(home)
     if compiled():
         return
     with patient_lock(folder.with_name(f"{NAME}-compile"), "a compile of gsplat", COMPILE_S):
@@ -96,6 +100,22 @@ def kernels_folder(built: str | None) -> Path:
     kind = "cpu" if built is None else f"cu{built.replace('.', '')}"
     python = f"py{sys.version_info.major}{sys.version_info.minor}{getattr(sys, 'abiflags', '')}"
     return cache / "torch_extensions" / f"{python}_{kind}" / NAME
+
+
+def toolkit(places: Sequence[Path] | None = None) -> Path | None:
+    """The CUDA toolkit for torch where $CUDA_HOME names none; None = none is whole, or one is named.
+
+    Args:
+        places: where to look; None = around nvcc, and the usual folders.
+    """
+    if os.environ.get("CUDA_HOME") or os.environ.get("CUDA_PATH"):
+        return None
+    if places is None:
+        nvcc = shutil.which("nvcc")
+        around = [] if nvcc is None else [Path(nvcc).parents[1], Path(nvcc).resolve().parents[1]]
+        places = [*around, Path("/usr/local/cuda"), *sorted(Path("/usr/local").glob("cuda-*"), reverse=True)]
+    whole = (p for p in places if (p / "include/cuda_runtime.h").is_file() and (p / "bin/nvcc").is_file())
+    return next(whole, None)
 
 
 def search_path() -> str:

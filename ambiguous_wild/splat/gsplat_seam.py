@@ -104,6 +104,9 @@ def project(
     antialias: bool,
 ) -> Splats:
     """EWA projection and culls; differentiable."""
+    if not len(means):  # gsplat divides by their number, in C++: the process would end
+        none = means.new_zeros((0, 2), dtype=torch.int32)
+        return Splats(none, means[:, :2], means[:, 2], scales, opacities)
     radii, means2d, depths, conics, compensations = gsplat().fully_fused_projection(
         means=means,
         covars=None,

@@ -69,7 +69,8 @@ class Trainer:
         if on:
             from ambiguous_wild.splat import fused_loss
 
-            fused_loss.prepare(data.device, *data.photos[0].shape[:2])
+            size = data.photos[0].shape[:2]
+            fused_loss.prepare(data.device, *size, parts.lambda_dssim, parts.weighting)
         self._prefetch = getattr(data.photos, "prefetch", None)
 
         points = data.scene.points

@@ -22,6 +22,7 @@ def fully_fused_projection(
     opacities=None,
 ):  # fmt: skip
     assert covars is None and not packed and len(viewmats) == len(Ks) == 1
+    assert len(means), "gsplat divides by their number, in C++"
     pose, k = viewmats[0].to(means), Ks[0].to(means)
     local = means @ pose[:3, :3].T + pose[:3, 3]
     front = (local[:, 2] >= near_plane) & (local[:, 2] <= far_plane)

@@ -208,7 +208,7 @@ def test_without_a_compiler_the_loss_runs_as_it_stands_and_says_so():
         raise RuntimeError("no triton\nand more")
 
     call = fused_loss._Compiled(lambda x: x + 1)
-    call.compiled = broken
+    call.compiled[torch.Tensor,] = broken
     argument = torch.zeros(2).as_subclass(Cuda)
     with pytest.warns(UserWarning, match="not compiled and slower for it: no triton$"):
         assert torch.equal(torch.Tensor(call(argument)), torch.ones(2))

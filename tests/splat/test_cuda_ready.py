@@ -1,6 +1,7 @@
 """Every way in which a GPU cannot be used is one line that says what brings it; asked of made-up machines."""
 
 import subprocess
+import os
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -261,6 +262,28 @@ def test_ninja_of_this_environment_is_found_though_nobody_activated_it(monkeypat
     assert gsplat_build.search_path().split(":") == ["/bin", str(Path(sys.executable).parent)]
     monkeypatch.setenv("PATH", gsplat_build.search_path())
     assert gsplat_build.search_path().count(str(Path(sys.executable).parent)) == 1
+
+
+def test_a_toolkit_is_one_with_compiler_and_headers_and_what_is_named_is_left_alone(tmp_path, monkeypatch):
+    for name in ("CUDA_HOME", "CUDA_PATH"):
+        monkeypatch.setenv(name, "put back afterwards")
+        monkeypatch.delenv(name)
+    links, whole = tmp_path / "links", tmp_path / "cuda-13.0"
+    for folder in (links, whole):
+        (folder / "bin").mkdir(parents=True)
+        (folder / "bin/nvcc").touch()
+    (whole / "include").mkdir()
+    (whole / "include/cuda_runtime.h").touch()
+    assert gsplat_build.toolkit([links, whole]) == whole  # a link to nvcc has no headers around it
+    assert gsplat_build.toolkit([links]) is None
+    monkeypatch.setattr(gsplat_build, "toolkit", lambda: whole)
+    gsplat_build.compile_kernels(tmp_path / "kept", lambda: True, print)
+    assert os.environ["CUDA_HOME"] == str(whole)
+    monkeypatch.undo()
+    monkeypatch.setenv("CUDA_HOME", str(links))
+    assert gsplat_build.toolkit([whole]) is None
+    gsplat_build.compile_kernels(tmp_path / "kept", lambda: True, print)
+    assert os.environ["CUDA_HOME"] == str(links)
 
 
 # -- looking --------------------------------------------------------------------------------------

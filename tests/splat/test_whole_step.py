@@ -42,7 +42,7 @@ def late(scene, folder, method, effects=()) -> Trainer:
     trainer = Trainer(data, parts, TrainConfig(iterations=100_000, probes=0), folder=folder / "run")
     trainer.iteration = 50_000
     trainer.watchdog.every = 10**9  # looking does read
-    trainer.density.config = replace(trainer.density.config, start=1e9, stop=1e9, resets=())
+    trainer.density.config = replace(trainer.density.config, start=1e9, stop=1e9, resets=(), min_every=10**9)
     return trainer
 
 

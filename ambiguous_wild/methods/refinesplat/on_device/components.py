@@ -36,12 +36,15 @@ def components(masks: Tensor, connectivity: int) -> Tensor:
     dtype = torch.float32 if pixels < _FLOAT32_EXACT else torch.float64
     inside = masks.reshape(-1).long()
     own = torch.arange(1, pixels + 1, dtype=dtype, device=masks.device) * inside
+    slots = torch.arange(1, pixels + 1, device=masks.device)
     labels = F.pad(_largest_around(own.view(masks.shape), connectivity, dtype) * inside, (1, 0))
     for _ in range(rounds_for(masks[0].numel())):
         for _ in range(_JUMPS):
             labels = labels.take(labels)
         around = _largest_around(labels[1:].view(masks.shape), connectivity, dtype) * inside
-        labels = labels.scatter_reduce(0, labels[1:], around, "amax")
+        # who brings nothing new writes to itself: thousands at the slot of one root would queue there
+        target = torch.where(around > labels[1:], labels[1:], slots)
+        labels = labels.scatter_reduce(0, target, around, "amax")
     for _ in range(_JUMPS):
         labels = labels.take(labels)
     return labels[1:]

@@ -35,7 +35,8 @@ class PixelEvidence:
         tensors: Sequence[Tensor] | None = None,  # the photos, where they lie on the device already
     ) -> None:
         self.config = config
-        self.photos = [sized(photo, device) for photo in photos] if tensors is None else list(tensors)
+        # as they come: photos that do not fit on the device are sent there one at a time
+        self.photos = tensors or [sized(photo, device) for photo in photos]
         self.grey = filters.grey_weights(device)
         self.elsewhere = Elsewhere(cameras, photos, config.multiview, surfaces, device)
         self.unseen_on_host = [

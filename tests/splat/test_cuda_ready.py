@@ -1,7 +1,7 @@
 """Every way in which a GPU cannot be used is one line that says what brings it; asked of made-up machines."""
 
-import subprocess
 import os
+import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace

@@ -225,6 +225,8 @@ class Trainer:
                 called_off = self.sentinel.watch(
                     iteration, view, torch.as_tensor(loss.value), looked_at, keep
                 )
+                # such a step counts for nobody: statistics of growth take neither its zeros nor its NaN
+                step.rendered.visible = step.rendered.visible & (called_off == 0)
         with part("optimiser"):
             rates = self.pace.learning_rates(self.progress(iteration))
             self.optimiser.step(gradients, step.rendered.visible, rates, called_off=called_off)

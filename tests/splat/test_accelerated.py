@@ -103,6 +103,7 @@ def test_what_breaks_is_found_later_and_named_as_if_at_once(scene, tmp_path, fak
         trainer.step()
     for name, tensor in trainer.gaussians.items():  # called off, then and until somebody looks
         assert torch.equal(tensor, getattr(before, name))
+    assert torch.isfinite(trainer.density.grad_sum).all()
     with pytest.raises(NonFinite, match=rf"gradient of .*means.* iteration {bad}, view {view}"):
         trainer.step()
 
@@ -131,7 +132,10 @@ def test_a_photo_that_is_all_masked_moves_nothing_and_is_said(scene, tmp_path, f
     moved = {}
     for iteration in range(1, 13):
         before = trainer.gaussians.clone()
+        seen = trainer.density.seen.clone()
         trainer.step()
+        if trainer.pace.view(iteration) == 2 and len(seen):
+            assert torch.equal(trainer.density.seen, seen)  # nobody was looked at
         same = all(torch.equal(t, getattr(before, name)) for name, t in trainer.gaussians.items())
         moved[trainer.pace.view(iteration)] = not same
     assert moved == {view: view != 2 for view in range(6)}

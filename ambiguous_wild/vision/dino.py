@@ -89,6 +89,7 @@ class DinoFeatures:
         self.unit = 0.1  # until `fit`
         self._model: nn.Module | None = None
         self._place: torch.device | None = None  # where the net lies
+        self._halved = False  # its weights are bfloat16
 
     @property
     def model(self) -> nn.Module:
@@ -166,8 +167,12 @@ class DinoFeatures:
     def _model_on(self, device: torch.device) -> nn.Module:
         """The net there; `Module.to` goes through all its layers even where nothing is to be moved."""
         if self._place != device:
+            if self._halved and not mixed(device):
+                self._model = None  # read again: its weights have lost their last digits
             self.model.to(device)
-            self._place = device
+            self._place, self._halved = device, mixed(device)
+            if self._halved:
+                _halve(self.model)
         return self.model
 
     def state_dict(self) -> dict[str, Any]:
@@ -188,6 +193,13 @@ def _imagenet(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]
     """Mean and deviation [1, 3, 1, 1] there, copied once: in every step the copy would be waited for."""
     mean, std = (torch.tensor(v, dtype=dtype, device=device) for v in (IMAGENET_MEAN, IMAGENET_STD))
     return mean.reshape(1, 3, 1, 1), std.reshape(1, 3, 1, 1)
+
+
+def _halve(model: nn.Module) -> None:
+    """Weights of products as they are multiplied: autocast would cast each of them anew in every call."""
+    for module in model.modules():
+        if isinstance(module, (nn.Linear, nn.Conv2d)):
+            module.to(MIXED)
 
 
 def mixed(device: torch.device) -> bool:

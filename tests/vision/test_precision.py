@@ -38,14 +38,20 @@ def test_features_in_mixed_precision_are_those_in_float32_nearly(checkpoint, pho
     cotangent = torch.randn(exact.shape, generator=torch.Generator().manual_seed(0))
     (gradient,) = torch.autograd.grad((exact * cotangent).sum(), image)
     monkeypatch.setattr(dino, "mixed", lambda device: True)
-    found = features(image)
+    there = DinoFeatures(kind, DinoConfig(size=70), checkpoint(kind))
+    found = there(image)
     assert found.dtype == torch.float32 and not torch.equal(found, exact)  # it did run in another precision
     assert cosine_distance(found.detach(), exact.detach()) < 1e-3
-    assert {p.dtype for p in features.model.parameters()} == {torch.float32}
+    dtypes = {type(m): {p.dtype for p in m.parameters()} for m in there.model.modules()}
+    assert dtypes[torch.nn.Linear] == dtypes[torch.nn.Conv2d] == {torch.bfloat16}
+    assert dtypes[torch.nn.LayerNorm] == {torch.float32}
     (gradient_there,) = torch.autograd.grad((found * cotangent).sum(), image)
     assert gradient_there.dtype == torch.float32
     assert float(F.cosine_similarity(gradient_there.ravel(), gradient.ravel(), dim=0)) > 0.99
-    assert torch.equal(found, features(image))  # the same picture, the same features: no distance to itself
+    assert torch.equal(found, there(image))  # the same picture, the same features: no distance to itself
+    monkeypatch.undo()
+    there._place = torch.device("meta")  # as if it had been elsewhere: the weights are read again
+    assert torch.equal(there(image), exact)
 
 
 def test_no_graph_is_kept_where_no_gradient_is_asked_for(checkpoint, photo, half):

@@ -23,6 +23,7 @@ ABSENT = (
 )  # fmt: skip
 # Refuses what is absent by name, also below a package that is there.
 BLOCKER = """
+import importlib.util
 import sys
 
 class Absent:
@@ -32,6 +33,10 @@ class Absent:
         if name.partition(".")[0] in self.names:
             raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
 
+def found(name, package=None, look=importlib.util.find_spec):
+    return None if name.partition(".")[0] in Absent.names else look(name, package)
+
+importlib.util.find_spec = found  # who only asks is told that it is not there
 sys.meta_path.insert(0, Absent())
 sys.path.insert(0, {root!r})
 """
@@ -89,6 +94,34 @@ def test_a_scene_trains_and_is_rendered_with_pillow_alone(scene, tmp_path):
     assert lines[2] == "[]"
     render = images.read_png_rgb(tmp_path / "runs/scene/3dgs/seed0/renders/test/test_0.png")
     assert render.shape == (48, 64, 3) and render.std() > 5
+
+
+MASKED = """
+from dataclasses import replace
+from pathlib import Path
+import pytest
+from ambiguous_wild.harness import train_alone
+from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.methods.registry import get_method
+from ambiguous_wild.splat.pace import TrainConfig
+from tests.splat import fake_gsplat
+
+scene, runs = load_scene({scene!r}), Path({runs!r})
+entry = get_method("robustsplat")
+with fake_gsplat.installed(pytest.MonkeyPatch()):
+    config = TrainConfig(iterations=3, resolution="full")
+    options = replace(entry.options(), mask_start=0.0, min_mask_start=1)
+    cell = train_alone.Cell(entry, options, scene, train_alone.scene_identity(scene), config)
+    lines = []
+    train_alone.train_alone(cell, runs, lines.append)
+    print(lines[-1])
+"""
+
+
+def test_robustsplat_learns_its_masks_there_too(scene, tmp_path):
+    done = run(MASKED, absent=(*ABSENT, "cv2"), scene=str(scene), runs=str(tmp_path / "runs"))
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("100 %: iteration 3, ")
 
 
 COMMAND = """

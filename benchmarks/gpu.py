@@ -17,7 +17,6 @@ import dataclasses
 import gc
 import itertools
 import json
-import math
 import sys
 import time
 import traceback
@@ -33,15 +32,14 @@ from gpu_report import to_markdown
 from gpu_scene import make_scene
 
 from ambiguous_wild.core import Camera
+from ambiguous_wild.harness import evaluate
 from ambiguous_wild.harness.environment import environment
 from ambiguous_wild.harness.grid import plan_cells
 from ambiguous_wild.harness.memory import peak_memory, reset_peak
 from ambiguous_wild.io.atomic import write_json, write_text
-from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.io.scene_folder import load_scene
-from ambiguous_wild.metrics.image import psnr
 from ambiguous_wild.splat import gsplat_seam
-from ambiguous_wild.splat.cuda_ready import look, make_ready
+from ambiguous_wild.splat.cuda_ready import look, make_ready, why_not
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.device import wait
 from ambiguous_wild.splat.gaussians import Gaussians
@@ -73,28 +71,9 @@ def trainer_of(args: argparse.Namespace, method: str, **config: Any) -> Trainer:
 
 def test_psnr(trainer: Trainer) -> float:
     """Mean over the test photos, dB, from 8 bits."""
-    found = []
+    truth = evaluate.load_test_photos(trainer.data.scene)
     with torch.no_grad():
-        for view in trainer.data.scene.test:
-            image = trainer.render(view.camera).image.clamp(0, 1).cpu().numpy()
-            found.append(psnr((image * 255 + 0.5).astype(np.uint8), read_png_rgb(view.image_path)))
-    return float(np.mean(found))
-
-
-def frames_per_second(trainer: Trainer, seconds: float = 2.0) -> float:
-    """Renders a second of the test cameras, each waited for, nothing copied."""
-    cameras = [view.camera for view in trainer.data.scene.test] or list(trainer.data.cameras)
-    device = trainer.data.device
-    with torch.no_grad():
-        for camera in cameras:
-            trainer.render(camera)
-        wait(device)
-        frames, begin = 0, time.perf_counter()
-        while time.perf_counter() - begin < seconds:
-            trainer.render(cameras[frames % len(cameras)])
-            wait(device)
-            frames += 1
-    return frames / (time.perf_counter() - begin)
+        return evaluate.mean_psnr(truth, lambda camera: trainer.render(camera).image.cpu().numpy())
 
 
 # -- stages ---------------------------------------------------------------------------------------
@@ -118,13 +97,8 @@ def parity(args: argparse.Namespace) -> dict[str, Any]:
     from ambiguous_wild.stress.table import CASES, run_all, to_line
 
     outcomes = run_all([c for c in CASES if "cuda" in c.devices], [args.device], lambda o: print(to_line(o)))
-    rows = [{k: _plain(v) for k, v in o.plain().items()} for o in outcomes]
-    return {"passed": sum(o.passed for o in outcomes), "cases": len(outcomes), "rows": rows}
-
-
-def _plain(value: Any) -> Any:
-    """JSON has no NaN and no infinity: a figure that is none is missing."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    passed = sum(o.passed for o in outcomes)
+    return {"passed": passed, "cases": len(outcomes), "rows": [o.plain() for o in outcomes]}
 
 
 def train(args: argparse.Namespace) -> dict[str, Any]:
@@ -166,7 +140,7 @@ def _train_one(args: argparse.Namespace, method: str) -> dict[str, Any]:
         "ms_parts": {k: 1e3 * v / n for k, v in trainer.clock.parts_s.items()},
         "gaussians": len(trainer.gaussians),
         "psnr": test_psnr(trainer),
-        "fps": frames_per_second(trainer),
+        **evaluate.frames_per_second(trainer),
         **peak_memory(args.device),
     }
 
@@ -303,6 +277,9 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--warm-up", type=int, default=300, help="iterations before a loop is timed")
     parser.add_argument("--turns", type=int, default=TURNS)
     args = parser.parse_args(words)
+    lack = why_not(look()) if args.device == "cuda" else None
+    if lack is not None:
+        parser.error(f"no GPU to measure: {lack}")
     if args.scene is None and set(args.stages) & {"train", "cost", "profile"}:
         args.scene = make_scene(args.work / "scene", name="courtyard-colour", train=150, test=20, width=582)
     args.work.mkdir(parents=True, exist_ok=True)

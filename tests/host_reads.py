@@ -18,6 +18,8 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
+READ = "(?i)meta|host"  # what torch, and `no_transfers`, say of a step that does not leave it alone
+
 _PLAIN = (str, bytes, int, float, bool, type(None), type, np.ndarray, np.generic, FunctionType, MethodType,
           ModuleType, BuiltinFunctionType, torch.dtype, torch.Generator)  # fmt: skip
 

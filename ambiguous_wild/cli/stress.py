@@ -70,8 +70,7 @@ def command(
         click.echo(table.HEADER)
     outcomes = table.run_all(cases, devices, (lambda o: click.echo(table.to_line(o))) if live else None)
     if style == "json":
-        plain = [{k: _plain(v) for k, v in o.plain().items()} for o in outcomes]
-        text = json.dumps(plain, indent=2, allow_nan=False) + "\n"
+        text = json.dumps([o.plain() for o in outcomes], indent=2, allow_nan=False) + "\n"
     elif style == "markdown":
         text = table.to_markdown(outcomes)
     else:
@@ -86,13 +85,6 @@ def command(
     click.echo(f"{len(outcomes) - failed} of {len(outcomes)} passed on {' and '.join(devices)}", err=True)
     if failed:
         sys.exit(1)
-
-
-def _plain(value: object) -> object:
-    """JSON has no NaN and no infinity: an error that is none is missing."""
-    import math
-
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _devices(wanted: str) -> list[str]:

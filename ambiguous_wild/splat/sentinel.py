@@ -50,12 +50,15 @@ class Sentinel:
         torch._amp_foreach_non_finite_check_and_unscale_(
             [loss.detach().reshape(1), *(g.detach() for g in gradients)], self._broken, self._one
         )
+        nothing = None if keep is None else (keep.amax() <= 0).to(torch.float32).reshape(1)
+        if nothing is not None:
+            self._empty[view : view + 1] += nothing
+        return self._called_off(nothing)
+
+    def _called_off(self, nothing: Tensor | None) -> Tensor:
+        """[1] of what `watch` returns, from the flag and whether nothing is kept (None: something is)."""
         self._sound += 1.0 - self._broken
-        if keep is None:
-            return self._broken.clone()
-        nothing = (keep.amax() <= 0).to(torch.float32).reshape(1)
-        self._empty[view : view + 1] += nothing
-        return torch.maximum(self._broken, nothing)
+        return self._broken.clone() if nothing is None else torch.maximum(self._broken, nothing)
 
     def first_broken(self) -> int | None:
         """The first iteration since the last look at which something was not finite. The host waits."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import traceback
 from collections.abc import Callable, Iterable
@@ -53,7 +54,9 @@ class Outcome:
     failure: str = ""  # of the case itself, where it raised
 
     def plain(self) -> dict[str, Any]:
-        return asdict(self)
+        """For JSON, which has no NaN and no infinity: a figure that is none is missing."""
+        missing = {k: None for k, v in asdict(self).items() if isinstance(v, float) and not math.isfinite(v)}
+        return asdict(self) | missing
 
 
 def case(

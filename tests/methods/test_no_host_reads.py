@@ -14,7 +14,7 @@ from ambiguous_wild.methods.robustsplat import supervision
 from ambiguous_wild.methods.robustsplat.config import RobustSplatConfig
 from ambiguous_wild.methods.robustsplat.net import MaskNet, adam_of, adam_state, enlarged, load_adam_state
 from ambiguous_wild.splat import checkpoint, device
-from tests.host_reads import moved, no_transfers
+from tests.host_reads import READ, moved, no_transfers
 from tests.methods.baselines import _same, data_of, parts_of, step_of
 from tests.tiny_scene import TRAIN, write_tiny_scene
 
@@ -280,7 +280,7 @@ def test_a_step_leaves_the_host_alone(scene, cache, monkeypatch, drawn, method, 
             policy.on_opacity_reset(step)
         policy.keep(replace(steps[0], iteration=steps[0].iteration + 5000))
     if method in ("robustsplat", "dronesplat"):
-        with pytest.raises((RuntimeError, NotImplementedError)):
+        with pytest.raises((RuntimeError, NotImplementedError), match=READ):
             policy.facts()  # where the host does read
 
 
@@ -301,7 +301,7 @@ def test_a_step_leaves_the_host_alone(scene, cache, monkeypatch, drawn, method, 
 )
 def test_the_watch_sees_what_makes_a_host_wait(read):
     there = moved([torch.ones(3)])[0]
-    with pytest.raises((RuntimeError, NotImplementedError, AssertionError)), no_transfers():
+    with pytest.raises((RuntimeError, NotImplementedError, AssertionError), match=READ), no_transfers():
         read(there)
     with no_transfers():
         torch.where(there > 0, there * 2.0, 0.0).sum()

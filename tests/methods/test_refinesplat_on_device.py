@@ -34,6 +34,7 @@ from ambiguous_wild.methods.refinesplat.threshold import LearntWeight, robust_fl
 from ambiguous_wild.splat import device as devices
 from ambiguous_wild.splat.rendered import Gradients
 from ambiguous_wild.vision.sparse_surface import static_surfaces
+from tests.host_reads import READ
 from tests.methods.test_refinesplat_pixels import camera as side_camera
 from tests.methods.test_refinesplat_policy import (
     FAST,
@@ -718,13 +719,13 @@ def test_an_examination_reads_nothing_back(scene, changes):
     assert 100 < launches.count <= MOST_LAUNCHES
     early = dataclasses.replace(step, iteration=1, nominal=1.0, divisor=1)
     assert policy.keep(early).device == META  # the first look
-    with pytest.raises((RuntimeError, NotImplementedError)):
+    with pytest.raises((RuntimeError, NotImplementedError), match=READ):
         policy.masks.state_dict()  # this test would notice a read
 
 
 def test_the_host_path_would_be_noticed(scene):
     policy = made(scene)
-    with pytest.raises((RuntimeError, NotImplementedError, TypeError)):
+    with pytest.raises((RuntimeError, NotImplementedError, TypeError), match=READ):
         policy.keep(on_meta(visit(scene, 0)))
 
 
@@ -748,7 +749,7 @@ def test_a_look_of_density_control_reads_nothing_back(monkeypatch, with_keep):
     control.observe(step, gradients, keep)
     assert control.support.looked.device == META
     monkeypatch.setattr(devices, "accelerated", lambda device: False)
-    with pytest.raises((RuntimeError, NotImplementedError)):
+    with pytest.raises((RuntimeError, NotImplementedError), match=READ):
         control.observe(step, gradients, keep)
 
 

@@ -20,7 +20,7 @@ from ambiguous_wild.splat.effects.smoothing import filter_sizes
 from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.rendered import Gradients
 from ambiguous_wild.splat.step import TrainData
-from tests.host_reads import moved, no_transfers
+from tests.host_reads import READ, moved, no_transfers
 from tests.splat.scenes import camera as make_camera
 from tests.splat.scenes import gaussians as random_gaussians
 
@@ -311,5 +311,5 @@ def test_the_pose_for_anybody_else_is_read_when_asked_for():
     camera = replace(make_camera(*SIZE))
     posed = PosedCamera(camera, torch.eye(4, dtype=torch.float64).to("meta"), torch.eye(3).to("meta"))
     assert posed.resized(12, 9).width == 12
-    with pytest.raises((RuntimeError, NotImplementedError, TypeError)):
+    with pytest.raises((RuntimeError, NotImplementedError, TypeError), match=READ):
         _ = posed.cam_from_world

@@ -14,7 +14,7 @@ from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
-from tests.host_reads import moved, no_transfers
+from tests.host_reads import READ, moved, no_transfers
 from tests.tiny_scene import with_points, write_tiny_scene
 
 from . import fake_gsplat
@@ -57,7 +57,7 @@ def test_nothing_is_read_and_nothing_sent(scene, tmp_path, fake, method, effects
     with no_transfers():
         for _ in range(6 if effects else 24):  # every photo four times: masks are made anew
             trainer.timeline.loss(trainer.step())
-    with pytest.raises((RuntimeError, NotImplementedError)):
+    with pytest.raises((RuntimeError, NotImplementedError), match=READ):
         trainer.check_parameters()  # reading is what raises there
 
 

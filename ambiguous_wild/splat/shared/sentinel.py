@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor
 
@@ -24,16 +22,9 @@ class SharedSentinel(Sentinel):
         super().__init__(device, views)
         self._ranks = ranks
 
-    def watch(
-        self, iteration: int, view: int, loss: Tensor, gradients: Sequence[Tensor], keep: Tensor | None
-    ) -> Tensor:
-        """As `Sentinel.watch`, of all ranks at once: off where one is broken, or no photo shows anything."""
-        self._watched.append(iteration)
-        torch._amp_foreach_non_finite_check_and_unscale_(
-            [loss.detach().reshape(1), *(g.detach() for g in gradients)], self._broken, self._one
-        )
-        something = self._one if keep is None else (keep.amax() > 0).to(torch.float32).reshape(1)
-        self._empty[view : view + 1] += 1.0 - something
+    def _called_off(self, nothing: Tensor | None) -> Tensor:
+        """Of all ranks at once: off where one is broken, or no photo shows anything."""
+        something = self._one if nothing is None else 1.0 - nothing
         # One small message a step, and no host waits for it.
         broken, anything = self._ranks.largest(torch.cat([self._broken, something])).split(1)
         self._broken.copy_(broken)

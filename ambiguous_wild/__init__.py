@@ -1,6 +1,8 @@
 """Distractor-free 3D Gaussian Splatting in ambiguous scenes: builder, trainer, harness."""
 
+import importlib
 import os
+from typing import TYPE_CHECKING, Any
 
 # Two OpenMP pools share the cores, Numba's and torch's. By default their idle threads spin, each on the
 # core the other needs: 63 ms an iteration where sleeping threads take 4 (2 cores, 64x48 px). OpenMP reads
@@ -11,3 +13,13 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 __version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from ambiguous_wild.harness.bench import bench as bench
+
+
+def __getattr__(name: str) -> Any:
+    """`bench`, imported when it is asked for: the package itself stays quick to import."""
+    if name == "bench":
+        return importlib.import_module("ambiguous_wild.harness.bench").bench
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,15 +1,13 @@
-"""What deciding by itself loses: `--effects auto` against sets of effects picked by hand, the answer known.
+"""Test PSNR of `--effects auto` against hand-picked sets of effects, on presets with known effects.
 
     python benchmarks/auto.py --scenes DIR --out DIR [--presets NAME ...] [--iterations 1000] [--factor 2]
 
-Scenes are those that benchmarks/presets.py built (its --work DIR/scenes). On each, RefineSplat is trained
-with `auto`, with what the preset was designed for (colour per photo once as exposure, once as appearance),
-with nothing and with everything. A lower degree of the harmonics is left out: docs/effects.md says what it
-costs. Writes
-benchmarks/results/auto.json and .md: test PSNR and seconds of each, and auto against the best other: PSNR
-first, the quicker one within 0.02 dB. Where both are the same set, their times differ by the machine's noise
-alone and are not compared. Seconds are of training; what deciding takes (SfM points, no training) is in the
-results of presets.py.
+Uses the scenes of benchmarks/presets.py (its --work DIR/scenes). On each, RefineSplat is trained with `auto`,
+with the effects the preset was designed for (colour per photo once as exposure, once as appearance), with
+none and with all. A lower SH degree is left out (its cost is in docs/effects.md). Writes
+benchmarks/results/auto.json and .md: test PSNR and training seconds of each set, and auto against the best
+other one: by PSNR, or by time within 0.02 dB. If both are the same set, times are not compared. The time of
+the decision (SfM points, no training) is in the results of presets.py.
 """
 
 from __future__ import annotations
@@ -23,8 +21,8 @@ from typing import Any
 
 from presets import Stopped, aw, check_presets, mean_psnr, save
 
-from ambiguous_wild.harness.environment import environment
-from ambiguous_wild.harness.result_file import RESULT, read_result
+from ambiguous_wild.harness.running.environment import environment
+from ambiguous_wild.harness.running.result_file import RESULT, read_result
 from ambiguous_wild.simulate.presets import PRESETS
 
 RESULTS = Path(__file__).parent / "results" / "auto"
@@ -68,7 +66,7 @@ def train(scene: Path, effects: str, out: Path, args: argparse.Namespace) -> dic
 
 
 def measure(preset: str, args: argparse.Namespace) -> dict[str, Any]:
-    """Every set on one preset, and auto against the best of the others."""
+    """All sets on one preset, and auto against the best of the others."""
     scene = args.scenes / preset
     sets = sets_of(preset)
     runs = {"auto": train(scene, sets.pop("auto"), args.out / "auto", args)}
@@ -92,7 +90,7 @@ def measure(preset: str, args: argparse.Namespace) -> dict[str, Any]:
 
 
 def to_markdown(data: dict[str, Any]) -> str:
-    """The page of the results."""
+    """The results as Markdown."""
     lines = [
         "# Effects: what `auto` loses against the best set picked by hand",
         "",

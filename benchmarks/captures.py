@@ -1,13 +1,13 @@
-"""Methods x captures x seeds on captures with exact truth: how much of the possible each method reaches.
+"""Methods x captures x seeds on captures with ground truth, compared with training on exact masks.
 
     python benchmarks/captures.py --captures DIR... --out DIR [--methods ...] [--seeds 0 1 2]
         [--iterations 2000] [--jobs 2] [--set METHOD.KEY=VALUE ...] [--results STEM] [--report-only]
 
-A DIR is a scene folder or a folder of them. Every run is an `aw bench` of its own with one thread, so that
---jobs of them share the machine; runs are ordinary run folders under --out: what is finished is kept, what
-stopped resumes. Writes benchmarks/results/captures.json, .csv and .md, which name scenes and no paths, and
-captures-runs.csv, a row a run: what is in it and has the same configuration and scene is not trained again,
-on whatever machine it was. --report-only trains nothing.
+A DIR is a scene folder or a folder of them. Each run is one `aw bench` with one thread; --jobs run at the
+same time. Runs are ordinary run folders under --out: finished ones are kept, stopped ones resume. Writes
+benchmarks/results/captures.json, .csv and .md, without paths, and captures-runs.csv with a row per run. A run
+that is in this file with the same configuration and scene is not trained again, even on another machine.
+--report-only trains nothing.
 """
 
 from __future__ import annotations
@@ -35,11 +35,12 @@ from captures_report import (
 )
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.cell import Cell
-from ambiguous_wild.harness.environment import environment
-from ambiguous_wild.harness.grid import cell_folder, plan_cells
-from ambiguous_wild.harness.run import RESULT, refuse_other_config
-from ambiguous_wild.harness.store import read_runs
+from ambiguous_wild.harness.running.cell import Cell
+from ambiguous_wild.harness.running.environment import environment
+from ambiguous_wild.harness.running.grid import cell_folder, plan_cells
+from ambiguous_wild.harness.running.result_file import RESULT
+from ambiguous_wild.harness.running.run_folder import refuse_other_config
+from ambiguous_wild.harness.running.store import read_runs
 from ambiguous_wild.io.atomic import write_json, write_text
 from ambiguous_wild.splat.pace import TrainConfig
 
@@ -66,7 +67,7 @@ def find_scenes(folders: Iterable[Path]) -> list[Path]:
 
 
 def command(cell: Cell, args: argparse.Namespace) -> list[str]:
-    """The `aw bench` of one cell."""
+    """The `aw bench` command of one cell."""
     words = ["bench", "--method", cell.method.name, "--scene", str(cell.scene.root)]
     words += ["--seed", str(cell.train.seed), "--iterations", str(cell.train.iterations)]
     words += ["--device", "cpu", "--threads", "1", "--no-pictures", "--effects", "none", "-o", str(args.out)]
@@ -78,12 +79,12 @@ def command(cell: Cell, args: argparse.Namespace) -> list[str]:
 
 
 def current(book: pd.DataFrame, cells: Sequence[Cell]) -> pd.DataFrame:
-    """The rows of the book that are of these cells as they are configured now."""
+    """The recorded rows of these cells with their present configuration."""
     return book[book.config_hash.isin([cell.identity for cell in cells])]
 
 
 def run_all(cells: Sequence[Cell], book: pd.DataFrame, args: argparse.Namespace) -> list[str]:
-    """Run what is missing, `jobs` at a time; returns a line for each that failed."""
+    """Run the missing cells, `jobs` at a time; returns a line for each failure."""
     known = set(book.config_hash)
     todo = [c for c in cells if c.identity not in known and not (cell_folder(args.out, c) / RESULT).is_file()]
     print(f"{len(cells)} runs: {len(cells) - len(todo)} finished before, {len(todo)} to go", flush=True)
@@ -107,7 +108,7 @@ def run_all(cells: Sequence[Cell], book: pd.DataFrame, args: argparse.Namespace)
 
 
 def refuse_other_configs(cells: Sequence[Cell], out: Path) -> None:
-    """Raise AwError where a run folder holds another configuration: neither trained over nor tabulated."""
+    """Raise AwError if a run folder has another configuration: it is neither replaced nor used."""
     for cell in cells:
         folder = cell_folder(out, cell)
         if folder.exists():
@@ -115,7 +116,7 @@ def refuse_other_configs(cells: Sequence[Cell], out: Path) -> None:
 
 
 def without_folders(setting: str) -> str:
-    """METHOD.KEY=VALUE as it may be published: of a value that is a path, its last name."""
+    """METHOD.KEY=VALUE for publication: of a path only the last name."""
     key, equals, value = setting.partition("=")
     return f"{key}{equals}{value.replace(chr(92), '/').rsplit('/', 1)[-1]}"
 

@@ -1,4 +1,4 @@
-"""From runs on captures to a table and the few numbers that answer whether a method is worth it."""
+"""Table and summary of the runs of captures.py."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ import numpy as np
 import pandas as pd
 
 from ambiguous_wild.core import Scene
-from ambiguous_wild.harness.evaluate import true_distractor
-from ambiguous_wild.harness.identity import scene_identity
-from ambiguous_wild.harness.store import Runs
+from ambiguous_wild.harness.running.identity import scene_identity
+from ambiguous_wild.harness.running.regions import true_distractor
+from ambiguous_wild.harness.running.store import Runs
 from ambiguous_wild.io.images import read_gray
 from ambiguous_wild.metrics import stats
 
 OURS, PLAIN, EXACT = "refinesplat", "3dgs", "3dgs+truth"
 BASELINES = ("robustsplat", "dronesplat")
-REFERENCES = ("3dgs+truth", "3dgs-clean")  # they know the truth: not ranked
+REFERENCES = ("3dgs+truth", "3dgs-clean")  # they use the ground truth: not ranked
 GAP_DB = 1.0  # of exact masks over none: below it a share of the gap is noise
 Row = dict[str, Any]
 # key, label, digits
@@ -81,7 +81,7 @@ def run_numbers(run: pd.Series, images: pd.DataFrame) -> dict[str, float]:
 
 
 def book_of(runs: Runs) -> pd.DataFrame:
-    """A row a finished run: capture, method, seed, config_hash, threads and the columns."""
+    """A row per finished run: capture, method, seed, config_hash, threads and the columns."""
     ok = runs.runs[runs.runs.status == "ok"] if len(runs.runs) else runs.runs
     rows = [
         {
@@ -98,12 +98,12 @@ def book_of(runs: Runs) -> pd.DataFrame:
 
 
 def read_book(path: Path) -> pd.DataFrame:
-    """The book as it was written; empty where there is none."""
+    """The recorded runs; empty if there is no file."""
     return pd.read_csv(path, dtype={"config_hash": str}) if path.is_file() else pd.DataFrame(columns=BOOK)
 
 
 def merged(old: pd.DataFrame, new: pd.DataFrame) -> pd.DataFrame:
-    """Both books, sorted; a run of `new` takes the place of the same run in `old`."""
+    """Both records, sorted; a run of `new` replaces the same run in `old`."""
     filled = [book for book in (old, new) if len(book)]
     if not filled:
         return old
@@ -135,7 +135,7 @@ def tabulate(
 
 
 def threads_of(book: pd.DataFrame) -> list[int]:
-    """Kernel threads that the runs had: times of differing threads do not compare."""
+    """Kernel threads of the runs; times with different threads cannot be compared."""
     return sorted({int(count) for count in book["threads"]})
 
 
@@ -146,7 +146,7 @@ def missing_runs(
     methods: Sequence[str],
     seeds: Sequence[int],
 ) -> list[dict[str, Any]]:
-    """Every run that is not in the book: capture, method, seed, and whether it failed or is not finished."""
+    """Every run that is not recorded: capture, method, seed, and whether it failed or is unfinished."""
     known = set(zip(book.capture, book.method, book.seed, strict=True))
     tried = set() if runs is None else {(r.scene, r.method, r.seed) for r in runs.runs.itertuples()}
     return [
@@ -164,7 +164,7 @@ def missing_runs(
 
 
 def summarise(rows: Sequence[Row], captures: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Share of the gap, ranking, masks against the baselines, the clean captures, model sizes."""
+    """Share of the gap to exact masks, ranking, masks against baselines, clean captures, model sizes."""
     of = {(row["capture"], row["method"]): row for row in rows}
     names = [capture["name"] for capture in captures]
     methods = list(dict.fromkeys(row["method"] for row in rows))
@@ -231,7 +231,7 @@ def to_csv(rows: Sequence[Row]) -> str:
 
 
 def to_markdown(data: dict[str, Any]) -> str:
-    """The table a capture, then the summary."""
+    """A table per capture, then the summary."""
     seeds = ", ".join(map(str, data["seeds"]))
     lines = [
         "# Captures with exact truth",

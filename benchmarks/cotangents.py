@@ -1,10 +1,10 @@
-"""What a second image cotangent costs: one backward, two in one traversal, two backwards one after the other.
+"""Time of a second image cotangent: one backward pass, two cotangents in one pass, two passes.
 
     python benchmarks/cotangents.py [--runs N] [--json PATH]
 
-The scene is that of benchmarks/rasterizer.py. The three ways take turns within every run, so that they meet
-the same machine, and each is repeated for a tenth of a second, so that a slice of the scheduler is no part of
-the result; ratios are of the best of N. Prints a table and writes benchmarks/results/cotangents.json.
+Uses the scene of benchmarks/rasterizer.py. The three variants alternate within every run, so that machine
+load affects them alike, and each is repeated for a tenth of a second, longer than a scheduler slice. Ratios
+are of the best of N. Prints a table and writes benchmarks/results/cotangents.json.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from rasterizer import CASES, Stopwatch, machine, scene
 from ambiguous_wild.io.atomic import write_json
 from ambiguous_wild.splat.cpu.render import render_cpu
 from ambiguous_wild.splat.cpu.warmup import warm_up
+from ambiguous_wild.splat.rendered import Cotangents
 
 RESULTS = Path(__file__).parent / "results" / "cotangents.json"
 WARM = 3  # runs whose times are thrown away
@@ -29,7 +30,7 @@ LEAST_MS = 100.0  # that a timed piece of work takes
 
 
 def measure(n: int, width: int, height: int, runs: int) -> dict[str, Any]:
-    """Milliseconds of the three ways, and what they cost against one backward."""
+    """Milliseconds of the three variants, and their ratios to one backward pass."""
     gaussians, camera = scene(n, width, height)
     rng = np.random.default_rng(1)
     # of a mean over pixels, as a loss's is
@@ -40,7 +41,7 @@ def measure(n: int, width: int, height: int, runs: int) -> dict[str, Any]:
     rendered = render_cpu(gaussians, camera)
     ways: dict[str, Callable[[], Any]] = {
         "one": lambda: rendered.backward(first),
-        "two in one traversal": lambda: rendered.backward(first, d_image_extra=second),
+        "two in one traversal": lambda: rendered.backward(Cotangents(first, second)),
         "two backwards": lambda: (rendered.backward(first), rendered.backward(second)),
     }
     probe = Stopwatch()

@@ -1,11 +1,11 @@
-"""What optional effects cost, off and on, and what `aw plan` decides on scenes whose needs are known.
+"""Time of optional effects, and the decisions of `aw plan` on scenes with known effects.
 
     python benchmarks/effects.py --cost SCENE [--rounds N]
     python benchmarks/effects.py --scenes yard=exposure,masks street= [--no-probe] [--json PATH]
 
---cost: ms an iteration of plain 3DGS, of the same code with an effect that does nothing, and of each effect;
-all take turns within every round, so that they meet the same machine; medians of the differences count.
---scenes: FOLDER=EFFECTS, what each scene was made to call for; prints the confusion table per effect.
+--cost: ms per iteration of plain 3DGS, of 3DGS with an empty effect, and with each effect. All alternate
+within every round, so that machine load affects them alike; prints medians of the differences.
+--scenes: FOLDER=EFFECTS, the effects each scene was made with; prints the confusion table per effect.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ LINES = {
 
 
 def costs(path: Path, rounds: int, steps: int = 5) -> dict[str, Any]:
-    """ms an iteration of every way to train."""
+    """ms per iteration of every variant."""
     warm_up(print)
     scene = load_scene(path)
     with tempfile.TemporaryDirectory() as name:
@@ -82,7 +82,7 @@ def costs(path: Path, rounds: int, steps: int = 5) -> dict[str, Any]:
 
 
 def confusion(wanted: dict[Path, set[str]], probe: bool) -> dict[str, Any]:
-    """Per effect, scenes that have it and were switched on, and so on; with every decision."""
+    """Confusion counts per effect, and all decisions."""
     table: dict[str, Counter[str]] = {name: Counter() for name in LINES}
     details = {}
     for path, needs in wanted.items():

@@ -1,4 +1,4 @@
-"""What two runs of one command must have in common, and whether a file is whole."""
+"""Compare the outputs of two runs of a command, and check that files are complete."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _MACHINE = {"env.json"}  # says when and on what a run was made
 
 
 def without_clock(value: Any) -> Any:
-    """Plain data without the keys that hold times."""
+    """Plain data without keys for times."""
     if isinstance(value, dict):
         kept = {k: v for k, v in value.items() if k not in _CLOCK and not str(k).startswith("ms_")}
         return {k: without_clock(v) for k, v in kept.items()}
@@ -37,7 +37,7 @@ def without_clock(value: Any) -> Any:
 
 
 def fingerprint(path: Path) -> str:
-    """sha256 of a file's content, times taken out."""
+    """sha256 of a file's content without times."""
     if path.suffix == ".json":
         data = without_clock(json.loads(path.read_text(encoding="utf-8")))
         return _digest([json.dumps(data).encode()])
@@ -70,7 +70,7 @@ def _digest(parts: Iterable[bytes]) -> str:
 
 
 def state(folder: Path) -> dict[str, str]:
-    """Fingerprint of every file below `folder`, hidden ones too: what a kill leaves behind counts."""
+    """Fingerprint of every file below `folder`, including hidden leftovers of a kill."""
     return {
         path.relative_to(folder).as_posix(): fingerprint(path)
         for path in sorted(folder.rglob("*"))
@@ -119,7 +119,7 @@ _WHOLE: dict[str, Callable[[Path], Any]] = {
 
 
 def half_written(folder: Path) -> list[str]:
-    """Files under their final names that cannot be read whole; hidden ones are work in progress."""
+    """Incomplete files with final names; hidden ones are temporary."""
     wrong = []
     for path in sorted(folder.rglob("*")):
         inside = path.relative_to(folder)

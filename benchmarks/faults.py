@@ -1,17 +1,15 @@
-"""Kill commands at random moments, run them again, compare with undisturbed runs.
+"""Kill commands at random times, run them again and compare with uninterrupted runs.
 
     python benchmarks/faults.py [--kills bench=60 build-scene=30 simulate=10 add=10 publish=20] [--seed 0]
         [--json PATH]
 
-Kills come in rounds: a command is started in a fresh folder and killed (SIGKILL, the whole process group) at
-a moment drawn evenly over its undisturbed duration, started again and killed again, KILLS_A_ROUND times; then
-it runs to its end. After every kill, each file that stands under its final name must be whole; after the last
-run the folder must equal that of an undisturbed run, file by file and byte by byte, times aside (see
-`fault_compare`), with nothing left beside it.
+In each round a command starts in an empty folder and is killed (SIGKILL, the whole process group) at a random
+time within its normal duration, KILLS_A_ROUND times; then it runs to its end. After every kill all files with
+final names must be complete. After the last run the folder must equal that of an uninterrupted run byte by
+byte, except for times (see `fault_compare`), with no extra files.
 
-The counts asked for are totals: kills that the results file already holds are not made again, so that the
-script can be stopped and started until they are reached. Processes are forked from this one after the heavy
-imports, so that kills fall into the work and not into the imports. Linux and macOS.
+The counts are totals: kills in the results file are not repeated, so the script can be stopped and resumed.
+Processes are forked after the heavy imports, so that kills hit the work and not the imports. Linux and macOS.
 """
 
 from __future__ import annotations
@@ -55,7 +53,7 @@ class Victim:
 
 @dataclass
 class Tally:
-    """What became of a command's kills."""
+    """Results of the kills of one command."""
 
     kills: int = 0
     rounds: int = 0
@@ -131,18 +129,18 @@ VICTIMS = {
 
 
 def preload() -> None:
-    """Import what the commands would, so that a fork has it."""
+    """Import what the commands need before forking."""
     import ambiguous_wild.builder.pipeline
     import ambiguous_wild.builder.undistort
-    import ambiguous_wild.harness.grid
     import ambiguous_wild.harness.leaderboard.add
     import ambiguous_wild.harness.leaderboard.publish
+    import ambiguous_wild.harness.running.grid
     import ambiguous_wild.simulate.capture
     import ambiguous_wild.splat.trainer  # noqa: F401
 
 
 def start(argv: Sequence[str], log: Path) -> int:
-    """Fork a process, leader of a group of its own, that runs `aw ARGV`; returns its id."""
+    """Fork a process with its own process group that runs `aw ARGV`; returns its id."""
     child = os.fork()
     if child:
         return child
@@ -179,7 +177,7 @@ def finish(argv: Sequence[str], log: Path) -> float:
 
 
 def kill_after(argv: Sequence[str], log: Path, seconds: float) -> bool:
-    """Kill the process and its group after `seconds`; False where it had ended before."""
+    """Kill the process and its group after `seconds`; False if it had already ended."""
     process = start(argv, log)
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
@@ -224,7 +222,7 @@ def kill_round(
 
 
 def measure(name: str, wanted: int, tally: Tally, seed: int, save: Callable[[Tally], None]) -> None:
-    """Make rounds until the tally holds `wanted` kills; `save` is called after each."""
+    """Run rounds until the tally has `wanted` kills; calls `save` after each."""
     victim = VICTIMS[name]
     with tempfile.TemporaryDirectory(prefix="aw-faults-") as folder:
         inputs = Path(folder) / "inputs"
@@ -284,7 +282,7 @@ def parse_kills(words: Sequence[str]) -> dict[str, int]:
 
 
 def main() -> int:
-    """Kill, compare, write the results; exit code 1 where something was lost."""
+    """Kill, compare, write the results; exit code 1 if anything was lost."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--kills", nargs="+", default=[f"{k}={v}" for k, v in DEFAULT.items()])
     parser.add_argument("--seed", type=int, default=0)

@@ -1,15 +1,14 @@
-"""Feed every reader damaged files; whatever is neither a result nor a named error is a crash.
+"""Give every reader damaged files; anything but a result or an AwError is a crash.
 
     python benchmarks/fuzz.py [--inputs 10000] [--only NAME ...] [--json PATH] [--keep FOLDER]
 
-Each reader (see `fuzz_readers`) gets valid files with seeded damage (see `fuzz_mutate`): the number of an
-input says everything about it. Readers run in a forked child with a limit on its memory (1 GB above what the
-imports take) and its processor time (5 s an input); native code that dies takes the child along and nothing
-else.
-A crash is any exception but AwError, a signal, or a limit. With --keep the inputs that crash are written out.
+Each reader (see `fuzz_readers`) gets valid files with seeded damage (see `fuzz_mutate`); the number of an
+input reproduces it. Readers run in a forked child with limits on memory (1 GB above the imports) and
+processor time (5 s per input), so that native crashes end only the child. A crash is any exception but
+AwError, a signal, or an exceeded limit. --keep writes the inputs that crash.
 
-The count asked for is a total: the results file says how far a reader has come, and the script goes on there.
-Inputs that crashed before are fed again first; those that no longer crash count as fixed.
+The count is a total: the script resumes from the results file. Inputs that crashed before are tested first;
+those that no longer crash count as fixed.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ _RECORD = 8  # bytes of an input's number
 
 @dataclass
 class Tally:
-    """What became of a reader's inputs."""
+    """Results of one reader."""
 
     inputs: int = 0
     refused: int = 0
@@ -62,7 +61,7 @@ def make_input(reader: Reader, number: int) -> bytes:
 
 
 def run(reader: Reader, wanted: int, tally: Tally, keep: Path | None = None) -> None:
-    """Feed what crashed before again, then go on to `wanted` inputs; crashes do not stop it."""
+    """Test earlier crashes again, then inputs up to `wanted`; crashes do not stop it."""
     known, tally.crashes = tally.crashes, {}
     for what, numbers in known.items():
         for number in numbers:
@@ -84,7 +83,7 @@ def run(reader: Reader, wanted: int, tally: Tally, keep: Path | None = None) -> 
 
 
 def _child(reader: Reader, numbers: range, tally: Tally) -> int:
-    """Feed what a child survives; returns the next number to try."""
+    """Run inputs in a child until it crashes; returns the next number."""
     reader.samples()  # made once, here, for every child
     back, front = os.pipe()
     scratch = Path(tempfile.mkdtemp(prefix="aw-fuzz-"))
@@ -167,7 +166,7 @@ def _line_of(error: AwError) -> str:
 
 
 def _where(error: BaseException) -> str:
-    """Kind of the error and the innermost line of ours it came from."""
+    """Type of the error and the innermost line of our code."""
     frames = traceback.extract_tb(error.__traceback__)
     ours = [f for f in frames if "ambiguous_wild" in f.filename]
     frame = (ours or frames)[-1]
@@ -192,12 +191,12 @@ def table(results: dict[str, Any]) -> str:
 
 
 def _places(row: dict[str, Any]) -> int:
-    """Different kinds of crash, whatever their messages say."""
+    """Different types of crash, ignoring messages."""
     return len({":".join(what.split(":")[:2]) for key in ("fixed", "crashes") for what in row[key]})
 
 
 def main() -> int:
-    """Fuzz, print and write what was found; exit code 1 where something crashed."""
+    """Fuzz, print and write the results; exit code 1 if anything crashed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--inputs", type=int, default=10_000)
     parser.add_argument("--only", nargs="+", choices=list(READERS), default=list(READERS), metavar="NAME")

@@ -23,7 +23,7 @@ _NODES: tuple[Any, ...] = (
 
 
 def damage(data: bytes, dice: random.Random, other: bytes) -> bytes:
-    """One to six small disasters; `other` is another valid file of the kind."""
+    """Apply one to six mutations; `other` is another valid file of the same type."""
     out = bytearray(data)
     for _ in range(dice.choice((1, 1, 1, 2, 3, 6))):
         dice.choice(_STROKES)(out, dice, other)
@@ -74,7 +74,7 @@ def _number(out: bytearray, dice: random.Random, other: bytes) -> None:
 
 
 def _word(out: bytearray, dice: random.Random, other: bytes) -> None:
-    """Replace one word of a text, or put one in."""
+    """Replace or insert one word of a text."""
     at = dice.randrange(len(out) + 1)
     end = at
     while end < len(out) and out[end] not in b" \n,:\"'{}[]":
@@ -92,12 +92,12 @@ _STROKES: tuple[Callable[[bytearray, random.Random, bytes], None], ...] = (
 
 
 def _place(out: bytearray, dice: random.Random) -> int:
-    """Half of all strokes fall into the first hundred bytes: headers decide what is allocated."""
+    """A position; half of them are in the first hundred bytes, since headers decide allocations."""
     return dice.randrange(min(len(out), 100) if dice.random() < 0.5 else len(out))
 
 
 def png(data: bytes, dice: random.Random, other: bytes) -> bytes:
-    """Half the time with the checksums mended, so that the damage is read."""
+    """Damage a PNG; half the time with correct checksums, so that the damage is read."""
     out = bytearray(damage(data, dice, other))
     at = 8
     while dice.random() < 0.9 and at + 12 <= len(out):
@@ -110,7 +110,7 @@ def png(data: bytes, dice: random.Random, other: bytes) -> bytes:
 
 
 def exif(data: bytes, dice: random.Random, other: bytes) -> bytes:
-    """Damage inside the first APP1 segment of a JPEG alone."""
+    """Damage only the first APP1 segment of a JPEG."""
     start = data.find(b"\xff\xe1")
     size = int.from_bytes(data[start + 2 : start + 4], "big")
     inner = bytearray(data[start + 4 : start + 2 + size])
@@ -120,7 +120,7 @@ def exif(data: bytes, dice: random.Random, other: bytes) -> bytes:
 
 
 def tree(load: Callable[[str], Any], dump: Callable[[Any], str]) -> Callable[..., bytes]:
-    """Damage of a text format: one node of its tree replaced, removed or renamed; or of its bytes."""
+    """Damage a text format: replace, remove or rename one node of its tree; or damage its bytes."""
 
     def mutate(data: bytes, dice: random.Random, other: bytes) -> bytes:
         if dice.random() < 0.4:

@@ -1,6 +1,6 @@
-"""Every reader of files that come from others: valid samples, how to damage them, and the call.
+"""Readers of external files: valid samples, how to damage them, and the call.
 
-The calls are those the commands make. To add a reader, add a line to `READERS`.
+The calls are those of the commands. To add a reader, add a line to `READERS`.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ import yaml
 from ambiguous_wild.harness.audit.table import read_tables
 from ambiguous_wild.harness.leaderboard import board, pictures
 from ambiguous_wild.harness.planning.file import read_plan
-from ambiguous_wild.harness.run import refuse_other_config
-from ambiguous_wild.harness.store import read_runs
+from ambiguous_wild.harness.running.run_folder import refuse_other_config
+from ambiguous_wild.harness.running.store import read_runs
 from ambiguous_wild.io import archive, images, ply, scene_folder
 from ambiguous_wild.io.photos import read_photo
 from ambiguous_wild.metrics import lpips
@@ -96,8 +96,8 @@ def _scene_json(path: Path) -> None:
 
 
 def _result(path: Path) -> None:
-    from ambiguous_wild.harness.render_tables import to_csv
-    from ambiguous_wild.harness.tables import comparison
+    from ambiguous_wild.harness.tables.comparison import comparison
+    from ambiguous_wild.harness.tables.render import to_csv
 
     runs = fuzz_samples.workshop() / "results" / "scene" / "m" / "seed0"
     runs.mkdir(parents=True, exist_ok=True)
@@ -132,7 +132,7 @@ def _answer(path: Path) -> None:
 
 
 def _unpack(path: Path) -> None:
-    """Also a crash: something outside the target, or a target half made."""
+    """Also a crash: a file outside the target, or an incomplete target."""
     room = path.parent / "room"
     shutil.rmtree(room, ignore_errors=True)
     room.mkdir()
@@ -158,7 +158,7 @@ def _cutout(path: Path) -> None:
 
 
 def _cache(path: Path) -> None:
-    """A damaged entry is made anew: never an error."""
+    """A damaged entry is computed again; it is never an error."""
     shutil.copyfile(path, path.parent / "entry.npz")
     found = cached(path.parent, "entry", {"labels": np.int32}, lambda: {"labels": np.ones((2, 2), np.int32)})
     if found["labels"].dtype != np.int32:

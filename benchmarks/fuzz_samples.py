@@ -1,4 +1,4 @@
-"""Valid files of every kind that is read, made on the spot."""
+"""Valid sample files of every type that is read."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from ambiguous_wild.splat import checkpoint
 
 @functools.cache
 def workshop() -> Path:
-    """A folder of this process, removed at its end."""
+    """A temporary folder of this process."""
     folder, owner = tempfile.mkdtemp(prefix="aw-fuzz-samples-"), os.getpid()
     # Forked children end by os._exit, but whoever forks otherwise must not take the folder away.
     atexit.register(lambda: shutil.rmtree(folder, ignore_errors=True) if os.getpid() == owner else None)

@@ -1,13 +1,13 @@
-"""What a GPU gives: parity, cost of an iteration against gsplat's own loop, whole trainings, frames a second.
+"""GPU benchmarks: parity with float64, iteration time against plain gsplat, trainings, frames per second.
 
-    bash benchmarks/gpu.sh                                  everything, in a folder of its own
-    python benchmarks/gpu.py --stages parity cost           some of it
+    bash benchmarks/gpu.sh                                  everything
+    python benchmarks/gpu.py --stages parity cost           only some stages
     python benchmarks/gpu.py --stages same --captures A B   CPU and GPU on the same captures, three seeds
 
-Each stage writes benchmarks/results/gpu-STAGE.json when it is done and prints what it found; gpu.md is made
-of those that are there. `cost` compares at equal counts: the Gaussians that `3dgs` ended with are handed to
-every loop, which then run in turns of BLOCK iterations without density control, so that they meet the same
-machine. Exits 1 where parity or a training fails.
+Each stage prints its results and writes benchmarks/results/gpu-STAGE.json; gpu.md is made from these files.
+`cost` compares at equal counts: every loop starts with the final Gaussians of `3dgs` and runs without density
+control, alternating in blocks of BLOCK iterations, so that machine load affects them alike. Exits with 1 if
+parity or a training fails.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ from gpu_report import to_markdown
 from gpu_scene import make_scene
 
 from ambiguous_wild.core import Camera
-from ambiguous_wild.harness import evaluate
-from ambiguous_wild.harness.environment import environment
-from ambiguous_wild.harness.grid import plan_cells
-from ambiguous_wild.harness.memory import peak_memory, reset_peak
+from ambiguous_wild.harness.running import evaluate
+from ambiguous_wild.harness.running.environment import environment
+from ambiguous_wild.harness.running.grid import plan_cells
+from ambiguous_wild.harness.running.memory import peak_memory, reset_peak
 from ambiguous_wild.io.atomic import write_json, write_text
 from ambiguous_wild.io.scene_folder import load_scene
-from ambiguous_wild.splat import gsplat_seam
-from ambiguous_wild.splat.cuda_ready import look, make_ready, why_not
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.device import wait
 from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.gpu import gsplat_seam
+from ambiguous_wild.splat.gpu.readiness import look, make_ready, why_not
 from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.render import render
@@ -57,7 +57,7 @@ MOST_PROFILED = 600  # steps
 
 
 def trainer_of(args: argparse.Namespace, method: str, **config: Any) -> Trainer:
-    """A method on the scene, not begun."""
+    """A trainer of a method on the scene, before training."""
     config = {"iterations": args.iterations, "seed": args.seed, "probes": 0} | config
     (cell,) = plan_cells(
         [method], [args.scene], [args.seed], TrainConfig(**config),
@@ -70,7 +70,7 @@ def trainer_of(args: argparse.Namespace, method: str, **config: Any) -> Trainer:
 
 
 def test_psnr(trainer: Trainer) -> float:
-    """Mean over the test photos, dB, from 8 bits."""
+    """Mean PSNR over the test photos in dB, from 8-bit images."""
     truth = evaluate.load_test_photos(trainer.data.scene)
     with torch.no_grad():
         return evaluate.mean_psnr(truth, lambda camera: trainer.render(camera).image.cpu().numpy())
@@ -93,7 +93,7 @@ def build(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def parity(args: argparse.Namespace) -> dict[str, Any]:
-    """Every hard case of a GPU against float64."""
+    """All GPU stress tests against float64."""
     from ambiguous_wild.stress.table import CASES, run_all, to_line
 
     outcomes = run_all([c for c in CASES if "cuda" in c.devices], [args.device], lambda o: print(to_line(o)))
@@ -102,7 +102,7 @@ def parity(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def train(args: argparse.Namespace) -> dict[str, Any]:
-    """Whole trainings; a method that fails is named, and the others' figures stand."""
+    """Whole trainings; a failed method is reported and the others are kept."""
     rows: list[dict[str, Any]] = []
     failed: dict[str, str] = {}
     found = {"scene": facts_of(args), "rows": rows, "failed": failed}
@@ -146,7 +146,7 @@ def _train_one(args: argparse.Namespace, method: str) -> dict[str, Any]:
 
 
 def cost(args: argparse.Namespace) -> dict[str, Any]:
-    """ms an iteration of every loop in turns, at the Gaussians that `3dgs` ended with."""
+    """ms per iteration of every loop, alternating, with the final Gaussians of `3dgs`."""
     loops: dict[str, Callable[[], Any]] = {}
     ended = trainer_of(args, "3dgs")
     if not ended.resume():
@@ -182,7 +182,7 @@ def cost(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def late(trainer: Trainer, gaussians: Gaussians) -> Trainer:
-    """A trainer in the middle of its run with these Gaussians, whose number stays as it is."""
+    """A trainer in the middle of its run with these Gaussians and no density control."""
     trainer.gaussians = gaussians.clone()
     trainer.optimiser = SplatAdam(trainer.gaussians, trainer.pace.learning_rates(0.5))
     trainer.iteration = trainer.config.iterations // 2  # masks have begun, all harmonics are on
@@ -194,7 +194,7 @@ def late(trainer: Trainer, gaussians: Gaussians) -> Trainer:
 
 
 def profile(args: argparse.Namespace) -> dict[str, Any]:
-    """Where the time goes: kernels of the costliest method by their total, and how long the host launches."""
+    """Profile of the slowest method: kernels by total time, and launch time of the host."""
     from torch.profiler import ProfilerActivity, profile
 
     ended = trainer_of(args, "3dgs")
@@ -244,7 +244,7 @@ def same(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def write(args: argparse.Namespace, stage: str, found: dict[str, Any]) -> None:
-    """What a stage found, with what it ran on."""
+    """Results of a stage, with the environment."""
     more = {"environment": environment(args.device), "gsplat": gsplat_seam.version()}
     write_json(args.results / f"gpu-{stage}.json", found | more)
 

@@ -1,8 +1,8 @@
-"""gsplat's own plain loop, the yardstick of `gpu.py`: its rasterization, autograd, torch's fused Adam.
+"""A plain gsplat training loop, the baseline of `gpu.py`: rasterization, autograd, torch's fused Adam.
 
 As in gsplat's example trainer with its defaults: one photo a step, L1 and D-SSIM, one Adam for every
-parameter, spherical harmonics up to degree 3. The loss is the package's fused one, so that SSIM costs both
-loops the same. There is no density control: the number of Gaussians is what it is compared at.
+parameter, spherical harmonics up to degree 3. The loss is our fused one, so that SSIM takes the same time in
+both loops. There is no density control, so that the number of Gaussians is equal.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ambiguous_wild.splat.fused_loss import photometric_fused
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.gsplat_seam import gsplat
+from ambiguous_wild.splat.gpu.fused_loss import photometric_fused
+from ambiguous_wild.splat.gpu.gsplat_seam import gsplat
 from ambiguous_wild.splat.step import TrainData
 
 

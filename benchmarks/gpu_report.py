@@ -1,4 +1,4 @@
-"""The table of `gpu.py`, from the results of the stages that were run."""
+"""The report of `gpu.py`, from the results of the stages that were run."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SAME_DB = 0.15
 
 
 def to_markdown(stages: dict[str, dict[str, Any]]) -> str:
-    """One page; a stage that was not run is not mentioned."""
+    """The report as Markdown; stages without results are left out."""
     parts = ["# On a GPU", "", "Made by `bash benchmarks/gpu.sh`; the figures are in `gpu-*.json` beside it."]
     for name, write in (
         ("build", _build), ("parity", _parity), ("train", _train), ("cost", _cost), ("same", _same)

@@ -1,4 +1,4 @@
-"""A simulated scene for a machine without COLMAP: true poses, and points read off the exact depth.
+"""A simulated scene for a machine without COLMAP: true poses, and points from the true depth.
 
     python benchmarks/gpu_scene.py SCENE [--preset courtyard-colour] [--train 150] [--test 20] [--width 582]
 
@@ -19,7 +19,7 @@ import numpy as np
 
 from ambiguous_wild.io.atomic import atomic_dir, write_text
 from ambiguous_wild.io.colmap_binary import write_cameras, write_images, write_points
-from ambiguous_wild.io.colmap_model import ModelCamera, ModelImage, ModelPoints
+from ambiguous_wild.io.colmap_records import ModelCamera, ModelImage, ModelPoints
 from ambiguous_wild.io.images import read_png_rgb, write_png
 from ambiguous_wild.simulate.capture import simulate
 from ambiguous_wild.simulate.presets import preset
@@ -30,7 +30,7 @@ SAME_DEPTH = 0.02  # relative: another photo shows a point whose depth there is 
 
 
 def make_scene(out: Path, *, name: str, train: int, test: int, width: int, seed: int = 0) -> Path:
-    """Write a scene folder with photos, model, lists and truth; returns it. Nothing is done where it is."""
+    """Write a scene folder with photos, model, lists and truth; returns it. An existing one is kept."""
     if (out / "sparse" / "0" / "points3D.bin").is_file():
         return out
     spec = preset(name)
@@ -129,7 +129,7 @@ def _tracked(
 
 
 def _depth_m(raw: Path, stem: str) -> np.ndarray:
-    """[H, W] m, 0 where nothing is near enough for 16 bits of millimetres."""
+    """Depth [H, W] in m; 0 where it exceeds 16 bits of millimetres."""
     codes = cv2.imread(str(raw / "truth" / "depth" / f"{stem}.png"), cv2.IMREAD_UNCHANGED)
     return np.where(codes < 65535, codes, 0).astype(np.float64) / 1000.0
 

@@ -1,12 +1,12 @@
-"""What an iteration of RefineSplat costs against one of 3DGS at the same number of Gaussians.
+"""Iteration time of RefineSplat against 3DGS at the same number of Gaussians.
 
     python benchmarks/iteration_cost.py --scene SCENE [--iterations 2000] [--gaussians 20000] [--json PATH]
 
-Both train on SCENE under the same ceiling of Gaussians, in turns of 100 iterations, one thread each, so that
-they meet the same machine. Times are of the processor, which a busy machine does not stretch as it does the
-clock's. Only blocks after masks have begun, where the two counts are within 1 % of each other, are compared;
-a block holds every schedule whole: masks every fourth visit, growth every hundredth. Prints the blocks and
-writes benchmarks/results/iteration-cost.json. Exits 1 where no block can be compared.
+Both train on SCENE with the same limit of Gaussians and one thread, alternating in blocks of 100
+iterations, so that machine load affects them alike. Times are processor times. Only blocks after the start
+of masks, with counts within 1 % of each other, are compared; a block contains all schedules: masks every
+fourth visit, growth every hundredth iteration. Prints the blocks and writes
+benchmarks/results/iteration-cost.json. Exits with 1 if no block can be compared.
 """
 
 from __future__ import annotations

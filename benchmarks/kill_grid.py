@@ -1,10 +1,10 @@
-"""`aw bench` over methods x scenes x seeds, killed with -9 at random moments, against a run left in peace.
+"""`aw bench` over methods x scenes x seeds, killed (-9) at random times, against an uninterrupted run.
 
     python benchmarks/kill_grid.py [-o DIR] [--kills 2] [--iterations 60] [--random 0]
 
-Scenes are tiny simulated captures with their true poses, made on the spot. The killed run must end with
-every cell and with the files of the undisturbed one: same names, same bytes, times and what hangs on them
-(frames a second, memory) left out. Exit code 1 where it does not.
+Scenes are tiny simulated captures with true poses. The killed run must end with all cells and the same files
+as the uninterrupted one: same names, same bytes, except for times, frames per second and memory. Exit code 1
+otherwise.
 """
 
 from __future__ import annotations
@@ -27,9 +27,10 @@ import numpy as np
 
 from ambiguous_wild.io.images import write_png
 from ambiguous_wild.simulate.capture import plan
-from ambiguous_wild.simulate.develop import depth_m, develop
-from ambiguous_wild.simulate.effects.moment import Moment
+from ambiguous_wild.simulate.image_effects.photo_random import PhotoRandom as Moment
 from ambiguous_wild.simulate.presets import preset, resized
+from ambiguous_wild.simulate.render import depth_m
+from ambiguous_wild.simulate.render import render_photo as develop
 from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.cpu.warmup import warm_up
 from ambiguous_wild.vision.sparse_surface import world_points
@@ -82,7 +83,7 @@ def quaternion(rotation: np.ndarray) -> tuple[float, float, float, float]:
 
 
 def bench_command(scenes: Sequence[Path], seeds: Sequence[int], iterations: int, output: Path) -> list[str]:
-    """`aw bench` of the whole grid."""
+    """The `aw bench` command of the whole grid."""
     words = [sys.executable, "-m", "ambiguous_wild.cli.main", "bench", "--iterations", str(iterations)]
     words += ["--device", "cpu", "--threads", "1", "--checkpoint-every", "0.5", "-o", str(output)]
     for flag, values in (("--method", METHODS), ("--scene", scenes), ("--seed", seeds)):
@@ -91,7 +92,7 @@ def bench_command(scenes: Sequence[Path], seeds: Sequence[int], iterations: int,
 
 
 def killed_run(command: Sequence[str], delays: Sequence[float], results: Path) -> list[dict[str, Any]]:
-    """Start the command, kill it after each delay in seconds, then let it end; what happened each time."""
+    """Start the command, kill it after each delay in seconds, then let it end; returns what happened."""
     story = []
     for delay in (*delays, None):
         begin = time.monotonic()
@@ -126,7 +127,7 @@ def content(path: Path) -> Any:
 
 
 def untimed(value: Any) -> Any:
-    """Without what a clock or the machine's load decides."""
+    """Plain data without values that depend on time or load."""
     if isinstance(value, dict):
         kept = {k: v for k, v in value.items() if k not in CLOCK and not k.startswith("ms_")}
         return {k: untimed(v) for k, v in kept.items()}
@@ -143,7 +144,7 @@ def plain(value: Any) -> Any:
 
 
 def files_of(root: Path) -> dict[str, Path]:
-    """Every file of the runs, by its path; caches are none of a run's."""
+    """Every file of the runs by path, without caches."""
     found = (p for p in sorted(root.rglob("*")) if p.is_file())
     return {n: p for p in found if not (n := p.relative_to(root).as_posix()).startswith(".cache")}
 

@@ -1,11 +1,11 @@
-"""30 000 iterations on a small scene full of hard content: does anything blow up, and what does it look like?
+"""30 000 iterations on a small scene with difficult content: check stability and plot the training.
 
     python benchmarks/long_run.py [--iterations N] [--method 3dgs --method refinesplat] [-o FOLDER]
 
-The scene (48x27 px, made on the spot from a seed): a wall, 40 needles of aspect 1000 before it, a sky
-brighter than white, distractors, two photos that are all masked, a camera behind the wall and one inside
-the needles. A run that was stopped goes on where it was. Prints what was checked; writes
-benchmarks/results/long-run.json and docs/images/long-run.png. Exits 1 where a check fails.
+The scene (48x27 px, from a seed): a wall, 40 needles of aspect 1000 in front of it, a sky brighter than
+white, distractors, two photos that are masked completely, a camera behind the wall and one inside the
+needles. A stopped run resumes. Prints the checks; writes benchmarks/results/long-run.json and
+docs/images/long-run.png. Exits with 1 if a check fails.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from ambiguous_wild.core import Camera
-from ambiguous_wild.harness import evaluate
+from ambiguous_wild.harness.running import evaluate
 from ambiguous_wild.io.atomic import atomic_path, write_json
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import get_method
@@ -45,7 +45,7 @@ ROWS = 100  # looks at the model over a run
 
 
 def world(seed: int = 7) -> Gaussians:
-    """Wall at z = 4, needles before it, sky behind it; what the photos are drawn from."""
+    """Wall at z = 4, needles in front of it, sky behind it: the model that the photos are rendered from."""
     rng = np.random.default_rng(seed)
     wall, needles, sky = 300, 40, 60
     n = wall + needles + sky
@@ -123,7 +123,7 @@ def write_scene(root: Path, seed: int = 7) -> Path:
 
 
 def _points(truth: Gaussians, rng: np.random.Generator) -> list[str]:
-    """Every other centre, moved a little; one in thirty far off, as SfM has them."""
+    """Every other centre with noise; one in thirty is an outlier, as in SfM."""
     xyz = truth.means.numpy()[::2] + rng.normal(0, 0.02, (len(truth.means[::2]), 3))
     xyz[::30] += rng.normal(0, 30.0, xyz[::30].shape)
     rgb = (np.clip(truth.sh0.numpy()[::2] * SH_C0 + 0.5, 0, 1) * 255).astype(int)
@@ -147,7 +147,7 @@ def _tensor(array: np.ndarray) -> torch.Tensor:
 
 
 def train(method: str, scene_root: Path, folder: Path, iterations: int) -> list[dict[str, Any]]:
-    """Train to the end, from where it stands; rows of what was seen, one a hundredth of the run."""
+    """Train or resume to the end; returns a row per hundredth of the run."""
     scene = load_scene(scene_root)
     data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=folder.parent / ".cache")
     truth = evaluate.load_test_photos(scene)
@@ -165,7 +165,7 @@ def train(method: str, scene_root: Path, folder: Path, iterations: int) -> list[
 
 
 class Looks:
-    """What the model looked like, every so many iterations; kept beside the checkpoint."""
+    """Statistics of the model at intervals; saved next to the checkpoint."""
 
     def __init__(self, path: Path, iteration: int, every: int) -> None:
         import json
@@ -193,7 +193,7 @@ class Looks:
 
 
 def judge(rows: list[dict[str, Any]], trainer_folder: Path) -> dict[str, Any]:
-    """The checks, each with the figures it rests on."""
+    """The checks with their values."""
     loss = np.array([row["loss"] for row in rows])
     psnr = [row["psnr_probe"] for row in rows if row["psnr_probe"] is not None]
     tenth = max(len(loss) // 10, 1)

@@ -1,11 +1,11 @@
-"""Take the safeguards away one at a time and see which hard case notices.
+"""Remove the safeguards one at a time and list the stress tests that fail.
 
     python benchmarks/mutations.py [--kernels] [--only NAME] [--json PATH]
 
-Each mutation replaces one piece of source in memory, in a child process of its own; no file is changed.
-Those of compiled kernels are compiled anew, a minute each, and run with --kernels alone. Prints each
-safeguard and the cases that fail without it; writes benchmarks/results/mutations.json. Exits with 1 where
-a mutation survives, or where a case fails on the source as it is.
+Each mutation replaces one piece of source in memory, in its own child process; no file is changed. Mutations
+of compiled kernels are compiled again, a minute each, and run only with --kernels. Prints each safeguard and
+the cases that fail without it; writes benchmarks/results/mutations.json. Exits with 1 if no case fails for a
+mutation, or if a case fails on the unchanged source.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ RESULTS = ROOT / "benchmarks" / "results" / "mutations.json"
 
 @dataclass(frozen=True)
 class Mutation:
-    """A safeguard and what the source is without it."""
+    """A safeguard and the source without it."""
 
     name: str
     module: str  # below ambiguous_wild
-    old: str  # stands in the source exactly once
+    old: str  # occurs in the source exactly once
     new: str
     rows: tuple[int, ...]  # of the cases that are run
     kernel: bool = False
@@ -132,7 +132,7 @@ MUTATIONS = (
 
 
 class _Loader(importlib.machinery.SourceFileLoader):
-    """Reads one module with a piece of its source replaced."""
+    """Loads one module with a piece of its source replaced."""
 
     mutation: Mutation
 

@@ -1,11 +1,11 @@
-"""Every preset, from the spec to a trained model: is it built whole, told apart, and given what it calls for?
+"""Every preset from spec to trained model: photos registered, ambiguity class, decisions of the plan.
 
     python benchmarks/presets.py --work DIR [--presets NAME ...] [--width 480] [--factor 2] [--iterations 600]
 
 For each preset: `aw simulate`, `aw build-scene`, `aw ambiguity-report`, `aw plan` and a short `aw bench` of
-3dgs, each command as a user types it. Writes benchmarks/results/presets.json and .md: photos registered,
-class measured against class designed, every decision of the plan against what the preset was designed for,
-and the confusion table. A preset that is finished (DIR/<preset>.json) is not made again.
+3dgs, as on the command line. Writes benchmarks/results/presets.json and .md: photos registered, measured and
+designed ambiguity class, each decision of the plan against the preset's design, and the confusion table. A
+finished preset (DIR/<preset>.json) is kept.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ambiguous_wild.harness.environment import environment
-from ambiguous_wild.harness.result_file import RESULT, read_result
+from ambiguous_wild.harness.running.environment import environment
+from ambiguous_wild.harness.running.result_file import RESULT, read_result
 from ambiguous_wild.io.atomic import write_json, write_text
 from ambiguous_wild.metrics import stats
 from ambiguous_wild.simulate.presets import PRESETS
@@ -37,11 +37,11 @@ QUESTIONS = {
 
 
 class Stopped(Exception):
-    """A command of a preset failed: its last line."""
+    """A command of a preset failed; holds its last line."""
 
 
 def aw(*words: str) -> tuple[str, float]:
-    """Standard output of one command, and its seconds."""
+    """Standard output and seconds of one command."""
     begin = time.perf_counter()
     done = subprocess.run(
         [sys.executable, "-m", "ambiguous_wild.cli.main", *words], capture_output=True, text=True, check=False
@@ -85,24 +85,24 @@ def measure(preset: str, args: argparse.Namespace) -> dict[str, Any]:
 
 
 def mean_psnr(result: dict[str, Any]) -> float:
-    """Of a run's test photos."""
+    """Mean PSNR of a run's test photos."""
     return stats.mean([image["psnr"] for image in result["per_image"]])
 
 
 def check_presets(parser: argparse.ArgumentParser, names: Sequence[str]) -> None:
-    """End with a usage error where a name is none of a preset."""
+    """End with a usage error if a name is no preset."""
     if unknown := set(names) - set(PRESETS):
         parser.error(f"no preset {', '.join(sorted(unknown))}; 'aw simulate --list' names them")
 
 
 def save(results: Path, data: dict[str, Any], text: str) -> None:
-    """The results beside each other: .json and .md."""
+    """Write the results as .json and .md."""
     write_json(results.with_suffix(".json"), data)
     write_text(results.with_suffix(".md"), text)
 
 
 def scores(facts: dict[str, Any]) -> dict[str, Any]:
-    """Class and the three numbers of an ambiguity report."""
+    """Class and the three scores of an ambiguity report."""
     found: dict[str, Any] = {"class": facts["class"]}
     for name, value in facts.items():
         if isinstance(value, dict) and "value" in value:
@@ -121,7 +121,7 @@ def decided(row: dict[str, Any]) -> dict[str, tuple[bool, str]]:
 
 
 def to_markdown(data: dict[str, Any]) -> str:
-    """The page of the results."""
+    """The results as Markdown."""
     rows = data["presets"]
     lines = [
         "# Presets: built, told apart, planned",
@@ -149,7 +149,7 @@ def to_markdown(data: dict[str, Any]) -> str:
         cosine = next((v for k, v in shown.items() if k.startswith("semantic")), "—")
         lines.append(
             f"| {row['preset']} | {row['registered']} of {row['photos']} | {row['psnr_3dgs']:.2f} "
-            f"| {row['designed']} | {report.get('class', 'nobody there')} | {colour} | {cosine} "
+            f"| {row['designed']} | {report.get('class', 'no distractors')} | {colour} | {cosine} "
             f"| {shown.get('occlusion', '—')} | {', '.join(on) or '—'} | {', '.join(wrong) or '—'} |"
         )
     lines += [

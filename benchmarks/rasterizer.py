@@ -1,4 +1,4 @@
-"""How long the CPU path takes: blending alone, the whole chain, a training iteration, and peak memory.
+"""Time of the CPU renderer: blending, the whole renderer, a training iteration; and peak memory.
 
     python benchmarks/rasterizer.py [--quick] [--json PATH]
 
@@ -84,7 +84,7 @@ class Stopwatch:
 
 
 def measure(n: int, width: int, height: int, runs: int) -> dict[str, Any]:
-    """Parts of a training iteration, and the two blending kernels by themselves."""
+    """Times of the parts of a training iteration, and of the two blending kernels alone."""
     gaussians, camera = scene(n, width, height)
     optimiser = SplatAdam(gaussians, RATES)
     photo = torch.from_numpy(np.random.default_rng(1).uniform(size=(height, width, 3)).astype(np.float32))
@@ -109,7 +109,7 @@ def measure(n: int, width: int, height: int, runs: int) -> dict[str, Any]:
         d_image = photo.numpy()
         watch(
             "blend backward",
-            lambda: blend.backward(s.records, *lists, s.kept, d_image, None, None, None, None, sums),
+            lambda: blend.backward(s.records, *lists, s.kept, d_image, None, None, None, None, None, sums),
         )
 
     for warm in range(runs + 3):

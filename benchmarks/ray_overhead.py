@@ -1,10 +1,10 @@
-"""What Ray costs a cell: wall seconds of a grid on Ray beyond those of the same grid in one process.
+"""Overhead of Ray per cell: wall seconds of a grid on Ray minus those of the same grid in one process.
 
     python benchmarks/ray_overhead.py [--cells 8] [--out benchmarks/results/ray_overhead.json]
 
-Every cell is an external program that copies photos and takes next to no time, on a tiny scene made on the
-spot: what is left is the making of cells, the sending of jobs and reports, and, once for the whole grid, the
-start of Ray and of a worker. One worker, so that cells follow each other as they do without Ray.
+Every cell is an external program that only copies photos of a tiny scene. The remaining time is the creation
+of cells, the transfer of jobs and reports, and once the start of Ray and of a worker. There is one worker, so
+that cells run one after the other, as without Ray.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from pathlib import Path
 
 import yaml
 
-from ambiguous_wild.harness.engines.job import Shared, make_job, read_sources, record_lost
-from ambiguous_wild.harness.engines.ray_cluster import RayCluster, RayOptions
-from ambiguous_wild.harness.environment import environment
-from ambiguous_wild.harness.grid import cell_folder, plan_cells, run_cells
+from ambiguous_wild.harness.running.engines.job import JobSettings, make_job, read_sources, record_lost
+from ambiguous_wild.harness.running.engines.ray_cluster import RayCluster, RayOptions
+from ambiguous_wild.harness.running.environment import environment
+from ambiguous_wild.harness.running.grid import cell_folder, plan_cells, run_cells
 from ambiguous_wild.io.atomic import write_json
 from ambiguous_wild.splat.pace import TrainConfig
 
@@ -48,7 +48,7 @@ def main() -> None:
 
 
 def measure(folder: Path, count: int) -> dict[str, float]:
-    """Seconds of the start and of a cell, with and without Ray."""
+    """Seconds of the start and per cell, with and without Ray."""
     method = folder / "copy.yaml"
     command = [sys.executable, "-S", "-c", COPY, "{scene}/{images}", "{output}"]
     description = {"name": "copy", "train": command, "renders": "{output}/{index}.png"}
@@ -63,7 +63,7 @@ def measure(folder: Path, count: int) -> dict[str, float]:
     assert all(r.outcome == "trained" for r in reports), reports
 
     output = folder / "ray"
-    shared = Shared(output / ".cache", sources=read_sources([], [name]))
+    shared = JobSettings(output / ".cache", sources=read_sources([], [name]))
     jobs = [make_job(cell, cell_folder(output, cell), shared) for cell in cells]
     ends: list[float] = []
     begin = time.perf_counter()

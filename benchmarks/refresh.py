@@ -1,11 +1,11 @@
-"""How often RefineSplat's masks and entropy terms need to be refreshed: quality against time.
+"""Refresh intervals of RefineSplat's masks and entropy terms: quality against time.
 
     python benchmarks/refresh.py --scene SCENE [--scene ...] [--seed 0 --seed 1] [--iterations 3000]
         [--set KEY=VALUE] [--interval KEY=1,2,4,8] [-o RUNS] [--json PATH]
 
-Each interval is swept by itself, the others at their defaults. Runs are ordinary cells under -o: they resume,
-and what is finished is kept. Writes benchmarks/results/refresh.json and refresh.png beside it: PSNR and mask
-IoU against ms an iteration, the knee marked. Run it alone on the machine.
+Each interval is varied alone, with the others at their defaults. Runs are ordinary cells under -o: finished
+ones are kept, stopped ones resume. Writes benchmarks/results/refresh.json and refresh.png: PSNR and mask IoU
+against ms per iteration, with the knee marked. Run it alone on the machine.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from rasterizer import machine
 from ambiguous_wild.cli.devices import prepare_cpu
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import with_options
-from ambiguous_wild.harness.ablate import Outcome, read_outcomes
-from ambiguous_wild.harness.cell import Cell
-from ambiguous_wild.harness.grid import plan_cells, run_cells
+from ambiguous_wild.harness.ablation.plan import Outcome, read_outcomes
+from ambiguous_wild.harness.running.cell import Cell
+from ambiguous_wild.harness.running.grid import plan_cells, run_cells
 from ambiguous_wild.io.atomic import atomic_path, write_json
 from ambiguous_wild.io.palette import ADDED, MERGED, plot_colour
 from ambiguous_wild.metrics import stats
@@ -39,7 +39,7 @@ KNEE_DB = 0.1  # a step to a cheaper interval that costs less than this is worth
 
 @dataclasses.dataclass(frozen=True)
 class Point:
-    """One value of one interval and the cells that answer it."""
+    """One value of one interval and its cells."""
 
     key: str
     value: int
@@ -84,7 +84,7 @@ def row(point: Point, outcomes: Sequence[Outcome]) -> dict[str, Any]:
 
 
 def knee(rows: Sequence[dict[str, Any]]) -> int | None:
-    """The cheapest value whose PSNR is within `KNEE_DB` of the best; None where nothing was measured."""
+    """The fastest value whose PSNR is within `KNEE_DB` of the best; None without measurements."""
     known = [r for r in rows if r["psnr"]["mean"] is not None]
     if not known:
         return None
@@ -94,7 +94,7 @@ def knee(rows: Sequence[dict[str, Any]]) -> int | None:
 
 
 def draw(data: dict[str, Any], path: Path) -> None:
-    """A column an interval: PSNR above, IoU below, each point with its value, the knee ringed."""
+    """A column per interval: PSNR above, IoU below, points labelled by value, the knee circled."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

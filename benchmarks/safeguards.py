@@ -1,13 +1,12 @@
-"""What looking for values that are not finite costs: ms an iteration with the watchdog and without.
+"""Time of the check for values that are not finite: ms per iteration with and without it.
 
     python benchmarks/safeguards.py [--steps N] [--json PATH]
 
-Two trainings of the same seed take turns, step by step, one with the watchdog and one without, so that both
-meet the same machine; their bits must be equal at the end. Times are of the processor, which a busy machine
-does not stretch as it does the clock's. Prints medians, and the looks alone, which the noise of a busy
-machine does not drown; writes benchmarks/results/safeguards.json. Safeguards inside the kernels (culls
-written so that NaN fails them, the clamp, float64 in the projection) are a few of many operations: they
-are not told apart here.
+Two trainings with the same seed alternate step by step, one with the watchdog and one without, so that
+machine load affects them alike; their results must be bit-identical. Times are processor times. Prints
+medians, and the time of the checks alone; writes benchmarks/results/safeguards.json. Safeguards inside the
+kernels (culling of NaN, the clamp, float64 in the projection) are a few of many operations and are not
+measured.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ WARM = 5  # steps whose times are thrown away
 
 
 class Blind:
-    """Stands in for the watchdog and looks at nothing."""
+    """A watchdog that checks nothing."""
 
     def __init__(self, real: Any) -> None:
         self._real = real
@@ -49,7 +48,7 @@ class Blind:
 
 
 class Timed(Blind):
-    """The watchdog with a stopwatch: ms of this thread's processor time of every look."""
+    """The watchdog with a timer: ms of processor time of every check."""
 
     def __init__(self, real: Any) -> None:
         super().__init__(real)
@@ -69,7 +68,7 @@ class Timed(Blind):
 
 
 def trainer_of(n: int, width: int, height: int, folder: Path) -> Trainer:
-    """A training on two views of n random Gaussians, long enough that nothing but steps happens."""
+    """A training on two views of n random Gaussians, without density control during the benchmark."""
     gaussians, camera = scene(n, width, height)
     photo = render_cpu(gaussians, camera).image.clone().clamp(0, 1)
     views, photos, cameras = [], [], []
@@ -96,7 +95,7 @@ def trainer_of(n: int, width: int, height: int, folder: Path) -> Trainer:
 
 
 def measure(n: int, width: int, height: int, steps: int) -> dict[str, Any]:
-    """Medians of both, and whether they ended with the same bits."""
+    """Medians of both, and whether the results are bit-identical."""
     with tempfile.TemporaryDirectory() as name:
         runs = {kind: trainer_of(n, width, height, Path(name)) for kind in ("with", "without")}
     runs["without"].watchdog = Blind(runs["without"].watchdog)  # type: ignore[assignment]

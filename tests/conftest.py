@@ -1,6 +1,9 @@
-"""What needs a GPU is skipped elsewhere, with the reason."""
+"""Tests that need a GPU are skipped elsewhere. Parallel test processes use one kernel thread each."""
 
 from __future__ import annotations
+
+import os
+import sys
 
 import pytest
 
@@ -9,10 +12,21 @@ def pytest_collection_modifyitems(items):
     wanted = [item for item in items if item.get_closest_marker("gpu")]
     if not wanted:
         return
-    from ambiguous_wild.splat.cuda_ready import look, why_not
+    from ambiguous_wild.splat.gpu.readiness import look, why_not
 
     lack = why_not(look())
     if lack is not None:
         skip = pytest.mark.skip(reason=f"no GPU to test on: {lack.what}")
         for item in wanted:
             item.add_marker(skip)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item):
+    """Scenes of tests are tiny: a second thread doubles the work and takes a core from another process.
+
+    Kernels give the same bits for any number of threads; tests of that set the number themselves.
+    """
+    numba = sys.modules.get("numba")
+    if numba is not None and "PYTEST_XDIST_WORKER" in os.environ:
+        numba.set_num_threads(1)

@@ -5,10 +5,13 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+import numpy as np
 import pytest
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 from ambiguous_wild.cli.main import COMMANDS
 
@@ -31,6 +34,7 @@ ALLOWED: dict[str, set[str]] = {
 }
 HEAVY = ("torch", "numba", "pycolmap", "cv2", "matplotlib", "transformers", "scipy", "pandas", "skimage")
 FILES = sorted(PACKAGE.rglob("*.py"))
+MOST_LINES = 400  # of a Python file
 
 
 def imports(path: Path) -> Iterator[tuple[str, int, bool]]:
@@ -96,6 +100,65 @@ def test_the_reader_of_imports_sees_every_form(tmp_path: Path) -> None:
 def test_no_two_packages_import_each_other() -> None:
     edges = {(a, b) for a, targets in ALLOWED.items() for b in targets}
     assert not [(a, b) for a, b in edges if (b, a) in edges]
+
+
+def module_of(path: Path) -> str:
+    """The module that a file of the package is: a package's __init__.py is the package."""
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def import_graph() -> dict[str, set[str]]:
+    """Which modules of ours each module imports when it runs, imports inside functions included.
+
+    That Python runs the __init__.py of a module's own packages first is no import of the module's.
+    """
+    modules = {module_of(path): path for path in FILES}
+    graph: dict[str, set[str]] = {name: set() for name in modules}
+    for name, path in modules.items():
+        for target, _, at_run_time in imports(path):
+            # "from module import thing" is read as module.thing
+            found = next((m for m in (target, target.rpartition(".")[0]) if m in modules), None)
+            if at_run_time and found is not None:
+                graph[name].add(found)
+    return graph
+
+
+def circles(graph: Mapping[str, set[str]]) -> list[list[str]]:
+    """Sets of modules each of which leads to every other one, and modules that import themselves."""
+    names = sorted(graph)
+    number = {name: index for index, name in enumerate(names)}
+    pairs = [(number[a], number[b]) for a in names for b in graph[a]]
+    rows, columns = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+    matrix = csr_array((np.ones(len(pairs)), (rows, columns)), shape=(len(names), len(names)))
+    count, labels = connected_components(matrix, connection="strong")
+    parts = [[names[i] for i in np.flatnonzero(labels == label)] for label in range(count)]
+    return [part for part in parts if len(part) > 1 or part[0] in graph[part[0]]]
+
+
+def test_no_modules_import_each_other() -> None:
+    assert circles(import_graph()) == []
+
+
+def test_the_finder_of_circles_finds_them() -> None:
+    graph = {"a": {"b"}, "b": {"c"}, "c": {"a", "d"}, "d": set(), "e": {"e"}}
+    assert circles(graph) == [["a", "b", "c"], ["e"]]
+    assert circles({"a": {"b"}, "b": set()}) == []
+    real = import_graph()
+    ours = "ambiguous_wild.methods"
+    assert f"{ours}.graft" in real[f"{ours}.registry"]
+    assert f"{ours}.grafted_policy" in real[f"{ours}.graft"]  # inside a function
+    assert f"{ours}.refinesplat.policy" not in real[f"{ours}.refinesplat.pictures"]  # for types alone
+    assert "ambiguous_wild.core" in real[f"{ours}.truth"]  # a name of a package
+
+
+def test_no_file_is_too_long() -> None:
+    folders = [ROOT / name for name in ("ambiguous_wild", "tests", "benchmarks", "examples")]
+    files = [path for folder in folders for path in folder.rglob("*.py")]
+    lines = {str(p.relative_to(ROOT)): len(p.read_text(encoding="utf-8").splitlines()) for p in files}
+    assert len(lines) > len(FILES)
+    too_long = {name: count for name, count in lines.items() if count > MOST_LINES}
+    assert too_long == {}
 
 
 def test_pycolmap_is_imported_by_the_guard_alone() -> None:

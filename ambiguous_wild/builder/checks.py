@@ -1,7 +1,7 @@
-"""Capture checks: what was locked, what drifted, which photos to leave out, and what to do about it.
+"""Capture checks: which camera settings drifted, which photos to leave out, what to do about it.
 
-Each check says on what it rests: EXIF where the camera wrote it, the pixels of shared surfaces where not,
-and "unknown" where neither tells. Limits were set on captures that reconstruct well, see docs/capture.md.
+A check uses EXIF where the camera wrote it, else the pixels of surfaces that several photos show; where
+neither decides, its state is "unknown". Limits were set on captures that reconstruct well: docs/capture.md.
 """
 
 from __future__ import annotations
@@ -13,8 +13,9 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ambiguous_wild.builder.photo_comparison import PhotoComparison
+from ambiguous_wild.builder.records import CheckedPhoto
 from ambiguous_wild.builder.screen import BLUR_RATIO, NEAR_DUPLICATE, exposure_stops
-from ambiguous_wild.builder.shared_points import Compared
 from ambiguous_wild.core.errors import shortlist
 
 State = Literal["ok", "warning", "unknown"]
@@ -23,30 +24,30 @@ PIXEL_STOPS = 0.7  # stops between the 5th and 95th percentile photo, on the sam
 PIXEL_BALANCE = 0.4  # log2 of red or blue over green, the same percentiles: 32 %
 ISO_RATIO = 2.0  # one stop
 FOCAL_RATIO = 1.01
-SOFT = -0.8  # log2 of fine detail on the same surfaces: below it a photo is soft where others are sharp
-FOCUS_SPREAD = 1.2  # log2, the same percentiles: the focus moves
+SOFT = -0.8  # log2 of fine detail on the same surfaces: a photo below it is softer than the others
+FOCUS_SPREAD = 1.2  # log2, the same percentiles
 FORWARD = 0.6  # share of the overlapping pairs that differ by motion along the line of sight
 MIN_PARTNERS = 2  # overlapping photos a photo needs
 
 
 @dataclass(frozen=True)
 class Check:
-    """One row of the table."""
+    """Result of one check."""
 
     name: str
     state: State
     basis: str  # EXIF, pixels, or what is missing
-    finding: str  # with its number
-    advice: str = ""  # what to do; empty where nothing is to be done
-    photos: tuple[str, ...] = ()  # those it is about
+    finding: str  # with its figure
+    advice: str = ""  # empty where nothing is to be done
+    photos: tuple[str, ...] = ()  # those that fail
 
 
 def run_checks(
-    facts: Sequence[dict[str, Any]],  # per photo, as `screen` returns them
+    facts: Sequence[CheckedPhoto],
     thumbnails: np.ndarray,  # [N, 1024], see `screen.thumbnail`
-    compared: Compared,
+    compared: PhotoComparison,
 ) -> list[Check]:
-    """The table, one row a check."""
+    """All checks, in the order of the table."""
     return [
         exposure(facts, compared),
         white_balance(facts, compared),
@@ -60,8 +61,8 @@ def run_checks(
     ]
 
 
-def exposure(facts: Sequence[dict[str, Any]], compared: Compared) -> Check:
-    """Exposure time, aperture and ISO together as stops; else brightness of the same surfaces."""
+def exposure(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> Check:
+    """Exposure settings in stops, and the brightness of the same surfaces."""
     advice = "lock exposure (hold the finger on the screen: AE/AF lock), or train with an appearance model"
     stops = [exposure_stops(f["exif"]) for f in facts]
     spread = _spread(compared, 0)
@@ -71,17 +72,19 @@ def exposure(facts: Sequence[dict[str, Any]], compared: Compared) -> Check:
             return Check("exposure", "ok", "EXIF", f"locked: settings span {span:.1f} stops")
         if spread is None:
             return Check("exposure", "warning", "EXIF", f"drifts: settings span {span:.1f} stops", advice)
-        # Settings may follow the light, as under clouds: what harms is a surface that changes its brightness.
+        # Settings may follow the light, as under clouds; harmful is a surface that changes its brightness.
         finding = f"automatic: settings span {span:.1f} stops, the same surfaces differ by {spread:.1f}"
         return _row("exposure", "EXIF and pixels", spread > PIXEL_STOPS, finding, advice)
     if spread is None:
-        return Check("exposure", "unknown", _silent(facts, stops), "no shared surfaces to measure on")
+        return Check(
+            "exposure", "unknown", _silent(facts, stops), "no two photos share enough surface to measure it"
+        )
     finding = f"the same surfaces differ by {spread:.1f} stops"
     return _row("exposure", _basis(stops), spread > PIXEL_STOPS, finding, advice)
 
 
-def white_balance(facts: Sequence[dict[str, Any]], compared: Compared) -> Check:
-    """Manual in every photo is locked; automatic or silent is measured."""
+def white_balance(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> Check:
+    """Locked where EXIF says manual in every photo; else measured on the same surfaces."""
     advice = "lock white balance (manual, or a fixed preset), or train with an appearance model"
     modes = [f["exif"].get("white_balance") for f in facts]
     if all(m == 1 for m in modes):
@@ -89,14 +92,16 @@ def white_balance(facts: Sequence[dict[str, Any]], compared: Compared) -> Check:
     said = "EXIF: automatic" if any(m == 0 for m in modes) else "EXIF silent"
     red, blue = _spread(compared, 1), _spread(compared, 2)
     if red is None or blue is None:
-        return Check("white balance", "unknown", said, "no shared surfaces to measure on", advice)
+        return Check(
+            "white balance", "unknown", said, "no two photos share enough surface to measure it", advice
+        )
     worst = 100 * (2 ** max(red, blue) - 1)
     finding = f"red or blue of the same surfaces differs by {worst:.0f} %"
     return _row("white balance", f"pixels ({said})", max(red, blue) > PIXEL_BALANCE, finding, advice)
 
 
-def iso(facts: Sequence[dict[str, Any]]) -> Check:
-    """ISO by EXIF; without it the noise of flat areas."""
+def iso(facts: Sequence[CheckedPhoto]) -> Check:
+    """ISO from EXIF; without EXIF the noise of flat areas."""
     advice = "fix ISO (pro mode), as low as the light allows"
     values = [f["exif"].get("iso") for f in facts]
     known = [v for v in values if v is not None]
@@ -109,26 +114,26 @@ def iso(facts: Sequence[dict[str, Any]]) -> Check:
         return _row("ISO", "EXIF", max(known) > ISO_RATIO * min(known), finding, advice)
     noise = np.array([f["noise"] for f in facts])
     if not np.isfinite(noise).any() or np.nanmedian(noise) <= 0:
-        return Check("ISO", "unknown", _silent(facts, values), "no flat areas to measure noise in")
+        return Check("ISO", "unknown", _silent(facts, values), "no flat areas in which to measure noise")
     low, high = np.nanpercentile(noise, [5, 95])
     finding = f"not recorded; noise of flat areas {low:.1f} to {high:.1f} of 255"
-    # Noise in flat areas also holds texture and compression: it cannot accuse, so it never warns.
+    # Texture and compression look like noise: not certain enough for a warning.
     return Check("ISO", "unknown", "pixels (EXIF silent)", finding, "")
 
 
-def focus(facts: Sequence[dict[str, Any]], compared: Compared) -> Check:
-    """Fine detail on the same surfaces, photo against photo; EXIF does not say where the focus was."""
+def focus(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> Check:
+    """Fine detail of the same surfaces across photos; EXIF does not record the focus."""
     spread = _spread(compared, 3)
     if spread is None:
-        return Check("focus", "unknown", "pixels", "no shared surfaces to measure on")
+        return Check("focus", "unknown", "pixels", "no two photos share enough surface to measure it")
     finding = f"fine detail of the same surfaces differs by a factor of {2**spread:.1f}"
     return _row(
         "focus", "pixels", spread > FOCUS_SPREAD, finding, "lock focus (AE/AF lock), keep one distance"
     )
 
 
-def focal_length(facts: Sequence[dict[str, Any]]) -> Check:
-    """One focal length per camera and one picture size: what a single-camera model assumes."""
+def focal_length(facts: Sequence[CheckedPhoto]) -> Check:
+    """One focal length per camera and one picture size, as a single-camera model assumes."""
     advice = "do not zoom; or build with --camera per-image"
     spans = []
     for camera in sorted({f["camera"] or "" for f in facts}):
@@ -152,36 +157,48 @@ def focal_length(facts: Sequence[dict[str, Any]]) -> Check:
     return Check("focal length", "ok", "EXIF", f"one per camera ({cameras or 1}){several}")
 
 
-def blur(facts: Sequence[dict[str, Any]], compared: Compared) -> Check:
-    """Photos far softer than the capture, or softer than others on the same surfaces."""
+def blur(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> Check:
+    """Photos much softer than the median, or softer than others on the same surfaces."""
     sharp = np.array([f["blur"] for f in facts])
     soft = sharp < BLUR_RATIO * np.median(sharp)
     soft |= np.nan_to_num(compared.offsets[:, 3], nan=0.0) < SOFT
     names = tuple(f["source"] for f, s in zip(facts, soft) if s)
     finding = f"{len(names)} of {len(facts)} photos are soft: {shortlist(names, 3)}" if names else "all sharp"
-    return _row("blur", "pixels", bool(names), finding, "leave these out or take them again, slower", names)
+    return _row(
+        "blur",
+        "pixels",
+        bool(names),
+        finding,
+        "leave these out, or take them again with a steadier hand",
+        names,
+    )
 
 
-def near_duplicates(facts: Sequence[dict[str, Any]], thumbnails: np.ndarray) -> Check:
-    """Pairs of photos that are one photo twice."""
+def near_duplicates(facts: Sequence[CheckedPhoto], thumbnails: np.ndarray) -> Check:
+    """Pairs of photos that are nearly the same picture."""
     close = np.triu(thumbnails @ thumbnails.T > NEAR_DUPLICATE, k=1)
     pairs = [(facts[i]["source"], facts[j]["source"]) for i, j in np.argwhere(close)]
     names = tuple(b for _, b in pairs)
     listed = shortlist([f"{a} = {b}" for a, b in pairs], 2)
     finding = f"{len(pairs)} pairs: {listed}" if pairs else "none"
     return _row(
-        "near-duplicates", "pixels", bool(pairs), finding, "leave one of each out; step between photos", names
+        "near-duplicates",
+        "pixels",
+        bool(pairs),
+        finding,
+        "leave one of each pair out; move between photos",
+        names,
     )
 
 
-def overlap(facts: Sequence[dict[str, Any]], compared: Compared) -> Check:
-    """Whether the photos hang together: groups of overlapping photos, and photos with few partners."""
+def overlap(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> Check:
+    """Photos that do not overlap with the rest, and photos that overlap with few others."""
     count = len(facts)
     apart = [f["source"] for f, g in zip(facts, compared.group) if g != 0]
     advice = "take more photos between these, each sharing two thirds of the picture with the next"
     if apart:
         groups = int(compared.group.max()) + 1
-        finding = f"{len(apart)} of {count} photos do not hang together with the rest ({groups} groups): "
+        finding = f"{len(apart)} of {count} photos do not overlap with the rest ({groups} groups): "
         finding += shortlist(apart, 3)
         return Check("overlap", "warning", "pixels", finding, advice, tuple(apart))
     few = [f["source"] for f, p in zip(facts, compared.partners) if p < min(MIN_PARTNERS, count - 1)]
@@ -194,12 +211,12 @@ def overlap(facts: Sequence[dict[str, Any]], compared: Compared) -> Check:
     return _row("overlap", "pixels", bool(few), finding, advice, tuple(few))
 
 
-def motion(compared: Compared) -> Check:
-    """Whether the camera went where it looked: such photos overlap and yet give no depth."""
+def motion(compared: PhotoComparison) -> Check:
+    """Motion along the viewing direction: such photos overlap but give no depth."""
     if math.isnan(compared.forward):
-        return Check("motion", "unknown", "pixels", "no overlapping photos to measure on")
+        return Check("motion", "unknown", "pixels", "no two photos overlap enough to measure it")
     finding = f"{100 * compared.forward:.0f} % of overlapping pairs differ by motion along the line of sight"
-    advice = "walk sideways or around the subject: along the line of sight there is no parallax"
+    advice = "walk sideways or around the subject: motion along the line of sight gives no parallax"
     return _row("motion", "pixels", compared.forward > FORWARD, finding, advice)
 
 
@@ -207,8 +224,8 @@ def _row(name: str, basis: str, bad: bool, finding: str, advice: str, photos: tu
     return Check(name, "warning" if bad else "ok", basis, finding, advice if bad else "", photos)
 
 
-def _spread(compared: Compared, quantity: int) -> float | None:
-    """Log2 between the 5th and 95th percentile photo; None where fewer than three photos were compared."""
+def _spread(compared: PhotoComparison, quantity: int) -> float | None:
+    """Log2 between the 5th and the 95th percentile photo; None for fewer than three compared photos."""
     values = compared.offsets[:, quantity]
     values = values[np.isfinite(values)]
     if len(values) < 3:
@@ -222,5 +239,5 @@ def _basis(values: Sequence[Any]) -> str:
     return "pixels (EXIF silent)" if missing == len(values) else f"pixels (EXIF silent in {missing} photos)"
 
 
-def _silent(facts: Sequence[dict[str, Any]], values: Sequence[Any]) -> str:
+def _silent(facts: Sequence[CheckedPhoto], values: Sequence[Any]) -> str:
     return f"EXIF silent in {sum(v is None for v in values)} of {len(facts)} photos"

@@ -1,4 +1,4 @@
-"""First stage: which photos there are, what they will be called, what truth lies beside them."""
+"""First stage: list the photos of a capture and name them; find the truth of a simulated capture."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.photos import PHOTO_SUFFIXES
 
-MIN_PHOTOS = 3  # two views fix no scale against a third; COLMAP's smallest useful model
+MIN_PHOTOS = 3  # COLMAP's smallest useful model
 _MAX_STEM_BYTES = 120  # leaves room for prefixes of temporary files under the usual 255
 
 
@@ -24,26 +24,26 @@ class Source:
     """One photo of the capture and the name it has in the scene."""
 
     path: Path  # absolute
-    relative: str  # to the capture folder, as reported
+    relative: str  # path relative to the capture folder
     stem: str  # unique in the scene; its files are <stem>.png
     side: Literal["train", "test"] | None  # from the sub-folder, if the capture has them
     sha256: str
 
     @property
     def work_name(self) -> str:
-        """Name under which structure from motion sees the photo."""
+        """File name that COLMAP sees."""
         return self.stem + self.path.suffix.lower()
 
 
 @dataclass(frozen=True)
 class Capture:
-    """What the user's folder holds; nothing in it is changed."""
+    """The user's folder of photos; it is not changed."""
 
     root: Path
     sources: tuple[Source, ...]  # natural order of their relative names
-    has_sides: bool  # train/ and test/ sub-folders
+    has_sides: bool  # the photos are in train/ and test/
     truth: Path | None  # truth/ of a simulated capture
-    ignored: tuple[str, ...]  # names of files that are no photos
+    ignored: tuple[str, ...]  # names of other files
 
 
 def collect(raw: Path | str, jobs: int = 1) -> Capture:
@@ -125,7 +125,7 @@ def _too_few(root: Path, count: int, ignored: list[str]) -> str:
 
 
 def _unique_stems(files: list[tuple[Path, Literal["train", "test"] | None]]) -> list[str]:
-    """Scene names without spaces; where two photos share one, the side and the format tell them apart."""
+    """Names in the scene, without spaces; equal names get the side, then the format, then a number."""
     stems = [_clean(path.stem) for path, _ in files]
     for attempt in ("side", "suffix"):
         seen = Counter(s.casefold() for s in stems)
@@ -136,7 +136,7 @@ def _unique_stems(files: list[tuple[Path, Literal["train", "test"] | None]]) -> 
                 elif attempt == "suffix":
                     stems[i] = f"{stems[i]}_{path.suffix.lower().lstrip('.')}"
     taken: set[str] = set()
-    for i, stem in enumerate(stems):  # what is left differs in case alone
+    for i, stem in enumerate(stems):  # names that differ in case only
         number, free = 2, stem
         while free.casefold() in taken:
             free, number = f"{stem}_{number}", number + 1
@@ -146,7 +146,7 @@ def _unique_stems(files: list[tuple[Path, Literal["train", "test"] | None]]) -> 
 
 
 def _clean(stem: str) -> str:
-    """No white space (text models split on it), no control characters, not too long; letters stay."""
+    """The name without white space (COLMAP's text models split on it) and control characters, shortened."""
     text = unicodedata.normalize("NFC", stem)
     text = "".join("_" if c.isspace() or not c.isprintable() or c in '\\:*?"<>|' else c for c in text)
     data = text.encode("utf-8", errors="surrogateescape")

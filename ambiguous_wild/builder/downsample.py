@@ -1,7 +1,7 @@
-"""Smaller copies of what is trained on and measured against: antialiased, in linear light.
+"""Downsampled photos, masks and truth: antialiased, in linear light.
 
-Averaging sRGB values darkens fine bright detail (a black and white grid becomes 128 instead of 188);
-so pixels are decoded (IEC 61966-2-1), resampled by OpenImageIO, and encoded again.
+Averaging sRGB values darkens fine bright detail (a black and white grid becomes 128 instead of 188), so
+pixels are decoded (IEC 61966-2-1), resampled by OpenImageIO and encoded again.
 """
 
 from __future__ import annotations
@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
 from ambiguous_wild.builder.progress import Bar
+from ambiguous_wild.builder.records import DownsampleResult
 from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
 
 FACTORS = (1, 2, 4, 8)
@@ -34,12 +34,12 @@ def _encode_table() -> np.ndarray:
     return np.round(255 * srgb).astype(np.uint8)
 
 
-# 65536 steps of linear light are finer than the narrowest step of 8-bit sRGB (1 / 3294) everywhere.
+# 65536 steps of linear light are finer than the narrowest step of 8-bit sRGB (1 / 3294).
 _TO_LINEAR, _TO_SRGB = _decode_table(), _encode_table()
 
 
 def auto_factor(sizes: list[tuple[int, int]]) -> int:
-    """Of 1, 2, 4, 8 the one that brings the median longer side nearest to, not below, 480 px."""
+    """The largest of 1, 2, 4, 8 that leaves a median longer side of 480 px or more; else 1."""
     side = float(np.median([max(size) for size in sizes]))
     return max((f for f in FACTORS if side / f >= TARGET_SIDE), default=1)
 
@@ -71,17 +71,13 @@ def downsample_mask(
     width: int,  # px
     height: int,  # px
 ) -> np.ndarray:  # [height, width] uint8 in {0, 255}
-    """White where at least half of the pixel's area was white."""
+    """White where at least half of the pixel's area is white."""
     share = cv2.resize((mask >= 128).astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
     return np.where(share >= 0.5, 255, 0).astype(np.uint8)
 
 
-def downsample(folder: Path, full: Path, factor: int, *, jobs: int, bar: Bar) -> dict[str, Any]:
-    """Write smaller copies of `full/images`, `full/masks` and `full/truth` under `folder`.
-
-    Returns:
-        Facts: the size of most photos.
-    """
+def downsample(folder: Path, full: Path, factor: int, *, jobs: int, bar: Bar) -> DownsampleResult:
+    """Write smaller copies of `full/images`, `full/masks` and `full/truth` under `folder`."""
     parts = [p for p in ("images", "truth/clean", "masks", "truth/distractor") if (full / p).is_dir()]
     files = [(part, path.name) for part in parts for path in sorted((full / part).iterdir())]
     bar.start("downsampling", len(files))

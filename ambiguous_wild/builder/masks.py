@@ -1,28 +1,27 @@
-"""The user's keep masks, checked before structure from motion sees them.
+"""The user's keep masks, checked before structure from motion.
 
-COLMAP drops a photo whose mask is missing without a word, and a mask of the wrong size removes most of
-its features. Both are refused here, by name. White is kept, black is ignored: COLMAP's convention and ours.
+COLMAP drops a photo without a mask, without a message, and a mask of the wrong size removes most features.
+Both are refused here, by name. White = keep, black = ignore, as in COLMAP.
 """
 
 from __future__ import annotations
 
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 
+from ambiguous_wild.builder.records import MaskResult, ScreenedPhoto
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import read_gray, write_png
 
-LITTLE_KEPT = 0.3  # of a photo; people and cars rarely cover most of most photos
+LITTLE_KEPT = 0.3  # share of a photo; distractors rarely cover more than the rest
 
 
-def find_masks(folder: Path, facts: list[dict[str, Any]], missing: str) -> dict[str, Path]:
+def find_masks(folder: Path, facts: list[ScreenedPhoto], missing: str) -> dict[str, Path]:
     """Mask file of each photo, by stem.
 
-    Looked for as COLMAP names them (`a.jpg.png`) and as `a.png`, under the photo's path in the capture
-    and directly in `folder`.
+    Names: `a.jpg.png` (COLMAP's) or `a.png`, under the photo's path in the capture or directly in `folder`.
 
     Args:
         folder: the user's mask folder.
@@ -36,11 +35,11 @@ def find_masks(folder: Path, facts: list[dict[str, Any]], missing: str) -> dict[
         what = "is a file; give the folder that holds the masks" if folder.exists() else "does not exist"
         raise AwError(f"mask folder {folder} {what}")
     found: dict[str, Path] = {}
-    lacking, misfits = [], []
+    unmasked, misfits = [], []
     for fact in facts:
         path = _candidate(folder, fact["source"])
         if path is None:
-            lacking.append(fact["source"])
+            unmasked.append(fact["source"])
             continue
         height, width = read_gray(path).shape
         if (width, height) != (fact["width"], fact["height"]):
@@ -49,18 +48,18 @@ def find_masks(folder: Path, facts: list[dict[str, Any]], missing: str) -> dict[
     if misfits:
         raise AwError(
             f"{len(misfits)} of {len(found)} masks in {folder} have another size than their photo: "
-            f"{shortlist(misfits, 3)}; resize them without smoothing"
+            f"{shortlist(misfits, 3)}; resize them with nearest-neighbour sampling"
         )
-    if lacking and (missing == "error" or not found):
+    if unmasked and (missing == "error" or not found):
         raise AwError(
-            f"{len(lacking)} of {len(facts)} photos have no mask: {shortlist(lacking)}; add them under "
+            f"{len(unmasked)} of {len(facts)} photos have no mask: {shortlist(unmasked)}; add them under "
             f"{folder} as NAME.png, or pass --masks-missing keep to use those photos whole"
         )
     return found
 
 
-def lay_out_masks(folder: Path, found: dict[str, Path], facts: list[dict[str, Any]]) -> dict[str, Any]:
-    """Write every photo's mask as COLMAP wants it, `folder/masks/<work name>.png`, strictly 0 and 255."""
+def lay_out_masks(folder: Path, found: dict[str, Path], facts: list[ScreenedPhoto]) -> MaskResult:
+    """Write every photo's mask for COLMAP, `folder/masks/<work name>.png`, values 0 and 255."""
     (folder / "masks").mkdir()
     shares = {}
     for fact in facts:
@@ -74,8 +73,8 @@ def lay_out_masks(folder: Path, found: dict[str, Path], facts: list[dict[str, An
     return {"kept_share": shares}
 
 
-def mask_warnings(facts: dict[str, Any] | None) -> list[str]:
-    """What looks wrong about the masks, from the facts of `lay_out_masks`: they keep too little."""
+def mask_warnings(facts: MaskResult | None) -> list[str]:
+    """A warning where the masks keep so little of the photos that they may be inverted."""
     shares = list(facts["kept_share"].values()) if facts else []
     if not shares or np.median(shares) >= LITTLE_KEPT:
         return []

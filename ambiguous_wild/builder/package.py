@@ -1,4 +1,4 @@
-"""Last stage: the scene folder as gsplat, nerfstudio and NerfBaselines read it, with its own account."""
+"""Last stage: the scene folder, laid out for gsplat, nerfstudio and NerfBaselines, and its scene.json."""
 
 from __future__ import annotations
 
@@ -10,14 +10,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ambiguous_wild.builder.records import KeyedRecord, PackageResult, SceneRecord
+from ambiguous_wild.core.scene import FileEntry
 from ambiguous_wild.io.atomic import write_json
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.scene_folder import SCENE_SCHEMA
 
 
 @dataclass(frozen=True)
-class Parts:
-    """Where the finished stages left what the scene is made of."""
+class SceneParts:
+    """Files of the finished stages that the scene consists of."""
 
     full: Path  # images/, sparse/0, masks/, truth/ at full size
     small: Path | None  # the same downsampled; None at factor 1
@@ -27,18 +29,15 @@ class Parts:
     truth_files: list[Path]  # cameras.json and capture.json of a simulated capture
 
 
-def package(folder: Path, parts: Parts, account: dict[str, Any], *, link: bool, jobs: int) -> dict[str, Any]:
+def package(folder: Path, parts: SceneParts, record: KeyedRecord, *, link: bool, jobs: int) -> PackageResult:
     """Assemble the scene in `folder`.
 
     Args:
         folder: does not exist yet; renamed to the scene afterwards.
-        parts: see `Parts`.
-        account: what scene.json says, without the files.
-        link: hard-link from the stages (they are deleted afterwards) instead of copying.
+        parts: see `SceneParts`.
+        record: scene.json without its files.
+        link: hard-link the stages' files, which are deleted afterwards, instead of copying them.
         jobs: threads that hash.
-
-    Returns:
-        Facts: number of files and bytes.
     """
     begun = time.perf_counter()
     folder.mkdir()
@@ -48,7 +47,7 @@ def package(folder: Path, parts: Parts, account: dict[str, Any], *, link: bool, 
         _place(small / "images", folder / f"images_{parts.factor}", link)
     _place(parts.full / "sparse" / "0", folder / "sparse" / "0", link)
     if (small / "masks").is_dir():
-        # Never for test photos: NerfBaselines would leave those pixels out of the score.
+        # Not for test photos: NerfBaselines would leave the masked pixels out of the score.
         _place(small / "masks", folder / "masks" / "train", link, set(parts.train))
     for part in ("distractor", "clean"):
         if (small / "truth" / part).is_dir():
@@ -57,16 +56,21 @@ def package(folder: Path, parts: Parts, account: dict[str, Any], *, link: bool, 
         _place_file(path, folder / "truth" / path.name, link=False)
     (folder / "train_list.txt").write_text("".join(f"{n}\n" for n in parts.train), encoding="utf-8")
     (folder / "test_list.txt").write_text("".join(f"{n}\n" for n in parts.test), encoding="utf-8")
-    write_json(folder / "nb-info.json", nerfbaselines_info(parts.factor, account["name"]))
+    write_json(folder / "nb-info.json", nerfbaselines_info(parts.factor, record["name"]))
     files = list_files(folder, jobs)
-    seconds = {**account["seconds"], "package": round(time.perf_counter() - begun, 3)}
-    head = {"schema": "ambiguous_wild.scene", "schema_version": SCENE_SCHEMA}
-    write_json(folder / "scene.json", {**head, **account, "seconds": seconds, "files": files})
+    scene: SceneRecord = {
+        "schema": "ambiguous_wild.scene",
+        "schema_version": SCENE_SCHEMA,
+        **record,
+        "files": files,
+    }
+    scene["seconds"] = {**record["seconds"], "package": round(time.perf_counter() - begun, 3)}
+    write_json(folder / "scene.json", scene)
     return {"files": len(files) + 1, "bytes": sum(f["bytes"] for f in files.values())}
 
 
 def nerfbaselines_info(factor: int, name: str) -> dict[str, Any]:
-    """nb-info.json: which folder NerfBaselines loads and how it scores.
+    """nb-info.json: the folder that NerfBaselines loads, and its evaluation protocol.
 
     No `id`: NerfBaselines only loads ids that are registered with it.
     """
@@ -79,7 +83,7 @@ def nerfbaselines_info(factor: int, name: str) -> dict[str, Any]:
     }
 
 
-def list_files(folder: Path, jobs: int) -> dict[str, dict[str, Any]]:
+def list_files(folder: Path, jobs: int) -> dict[str, FileEntry]:
     """sha256 and size of every file, by path relative to the folder."""
     paths = sorted(p for p in folder.rglob("*") if p.is_file())
     with ThreadPoolExecutor(jobs) as pool:

@@ -1,4 +1,4 @@
-"""Which pairs of photos are matched when matching all of them would take too long."""
+"""Pairs of photos to match where matching all of them would take too long."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ EXHAUSTIVE_LIMIT = 200  # photos; 19 900 pairs, about nine minutes on two cores 
 
 
 def sequential_pairs(names: list[str], test_names: set[str]) -> list[tuple[str, str]]:
-    """Neighbours in the given order, partners 2^k further on, and every test photo against all.
+    """Neighbours in the given order, photos 2^k further on, and every test photo against all.
 
-    A test photo stands apart from the training walk: in order of names it would meet its own kind only.
+    Test photos are not part of the walk: neighbours of a test photo by name are other test photos.
 
     Args:
         names: in the order of capture.
-        test_names: those of `names` that belong to a separate test set; may be empty.
+        test_names: those of a separate test set; may be empty.
 
     Returns:
-        Pairs without repetition, in a fixed order.
+        Each pair once, in a fixed order.
     """
     walk = [n for n in names if n not in test_names]
     steps = sorted({*range(1, OVERLAP + 1), *(2**k for k in range(4, 10))})

@@ -1,4 +1,4 @@
-"""From a folder of photos to a scene: the stages in order, each resumable, the scene by one rename."""
+"""Build a scene from a folder of photos: resumable stages, and one rename at the end."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ import shutil
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import cast
 
 from ambiguous_wild.builder import report
 from ambiguous_wild.builder.collect import collect
-from ambiguous_wild.builder.places import check_places
+from ambiguous_wild.builder.path_checks import check_paths
 from ambiguous_wild.builder.progress import Bar
+from ambiguous_wild.builder.records import SceneRecord
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.builder.sfm import SfmCrash
 from ambiguous_wild.builder.stages import Stages
@@ -22,11 +23,11 @@ from ambiguous_wild.builder.workspace import Workspace, build_lock
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.names import check_name
 from ambiguous_wild.io.atomic import check_output
+from ambiguous_wild.io.foreign_files import refuse_foreign_files
 from ambiguous_wild.io.scene_folder import read_scene_json, verify_files
-from ambiguous_wild.io.strangers import refuse_strangers
 
-# Full disk, quota, rights, read-only disk, broken disk: the user's to mend.
-_USERS_DISK = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EIO}
+# Full disk, quota, permissions, read-only disk, broken disk: the user can repair these.
+_DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EIO}
 
 
 @dataclass(frozen=True)
@@ -34,10 +35,10 @@ class BuildResult:
     """A finished build."""
 
     scene: Path
-    info: dict[str, Any]  # scene.json
-    up_to_date: bool  # nothing had to be done
+    info: SceneRecord
+    up_to_date: bool  # the scene was complete already
     seconds: float  # wall time of this call
-    reused: tuple[str, ...] = ()  # stages an earlier, interrupted call had finished
+    reused: tuple[str, ...] = ()  # stages that an earlier, interrupted call had finished
 
 
 def build_scene(
@@ -54,22 +55,22 @@ def build_scene(
 ) -> BuildResult:
     """Build a scene folder from a folder of photos.
 
-    Killed at any moment, the same call goes on after the last finished stage and ends with the same
-    files. The scene appears under its name at the very end, or not at all.
+    After a kill at any moment the same call continues after the last finished stage and gives the same
+    files. The output folder appears complete or not at all.
 
     Args:
-        raw: photos directly in it, in images/, or in train/ and test/; nothing in it is changed.
+        raw: folder with photos, or with images/, or with train/ and test/; it is not changed.
         output: the scene folder.
         settings: see `BuildSettings`.
-        masks: folder of keep masks (white = keep), used for features and carried to masks/train.
-        test_list: file that names the test photos, one a line.
+        masks: folder of keep masks (white = keep), used for features and copied to masks/train.
+        test_list: file with the names of the test photos, one a line.
         overwrite: replace a scene built from other photos or settings.
-        keep_work: leave the hidden work folder with COLMAP's log and every stage.
-        jobs: threads; None takes every core. The result does not depend on it.
-        progress: bars and lines on standard error.
+        keep_work: leave the hidden work folder with every stage and COLMAP's log.
+        jobs: threads; None: one per core. The result does not depend on it.
+        progress: show bars on standard error.
 
     Raises:
-        AwError: photos, masks, lists or settings that cannot become a scene, each with the reason.
+        AwError: no scene can be built from these photos, masks, lists or settings; says why.
     """
     started = time.perf_counter()
     target = Path(os.path.abspath(output))
@@ -79,7 +80,7 @@ def build_scene(
     else:
         name = check_name("scene name (the folder's; --name sets another)", target.name)
     settings = replace(settings, name=name)
-    check_places(raw, target)
+    check_paths(raw, target)
     count = jobs or os.cpu_count() or 1
     capture = collect(raw, count)
     check_output(target)
@@ -96,22 +97,22 @@ def build_scene(
         work_root = target.parent / f".{target.name}.build"
         known = _existing(target, stages, overwrite)
         if known is not None:
-            if not keep_work:  # of a call that was killed after its last rename
+            if not keep_work:  # left by a call that was killed after its last rename
                 shutil.rmtree(work_root, ignore_errors=True)
             return BuildResult(target, known, True, time.perf_counter() - started)
         earlier = work_root.exists()
         work = Workspace(work_root)
         _run(stages, work, target, started, keep_work, earlier)
-    info = json.loads((target / "scene.json").read_text(encoding="utf-8"))
+    info: SceneRecord = json.loads((target / "scene.json").read_text(encoding="utf-8"))
     reused = tuple(r.name for r in work.results if r.reused)
     return BuildResult(target, info, False, time.perf_counter() - started, reused)
 
 
-def _existing(target: Path, stages: Stages, overwrite: bool) -> dict[str, Any] | None:
+def _existing(target: Path, stages: Stages, overwrite: bool) -> SceneRecord | None:
     """scene.json of a scene that is up to date; None if there is work to do.
 
     Raises:
-        AwError: the folder is taken by something else and may not be replaced.
+        AwError: the folder holds something else and may not be replaced.
     """
     if not target.exists():
         return None
@@ -126,16 +127,16 @@ def _existing(target: Path, stages: Stages, overwrite: bool) -> dict[str, Any] |
         except AwError:
             if not overwrite:
                 raise
-            refuse_strangers(target, {"scene.json", *info.get("files", {})})
+            refuse_foreign_files(target, {"scene.json", *info.get("files", {})})
             return None
-        return info
+        return cast(SceneRecord, info)
     if not overwrite:
         changed = report.what_changed(info.get("inputs", {}), stages.inputs)
         raise AwError(
             f"{target} exists, built from other {changed}; pass --overwrite to replace it, or "
             "choose another -o"
         )
-    refuse_strangers(target, {"scene.json", *info.get("files", {})})
+    refuse_foreign_files(target, {"scene.json", *info.get("files", {})})
     return None
 
 
@@ -147,16 +148,16 @@ def _run(
     except SfmCrash:
         raise
     except OSError as error:
-        if error.errno not in _USERS_DISK:
+        if error.errno not in _DISK_ERRORS:
             raise
         where = f" ({error.filename})" if error.filename else ""
         raise AwError(
-            f"cannot write the scene: {error.strerror}{where}; make room or mend the rights, then run "
-            "the same command again: it goes on from the last finished stage"
+            f"cannot write the scene: {error.strerror}{where}; free space or change the permissions, "
+            "then run the same command again: it goes on from the last finished stage"
         ) from error
     except AwError:
-        # What the user must mend first leaves nothing behind; a kill or a crash keeps the work, and a
-        # mistyped option of the next call does not cost it.
+        # After the user's mistake the new work folder goes; one of an interrupted call stays, also when the
+        # next call has a mistyped option.
         if not keep_work and not earlier:
             work.remove()
         raise

@@ -1,4 +1,4 @@
-"""One progress bar on standard error, safe to step from threads; silent where nobody watches."""
+"""A progress bar on standard error that threads may step; none where standard error is no terminal."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 
 class Bar:
-    """A bar that stages restart; `enabled=False` makes every call a no-op."""
+    """One bar for all stages, one after the other; with `enabled=False` every call does nothing."""
 
     def __init__(self, enabled: bool = True) -> None:
         self.enabled = enabled
@@ -18,7 +18,7 @@ class Bar:
         self._lock = threading.Lock()
 
     def start(self, what: str, total: int | None) -> None:
-        """Begin a bar of `total` steps; None where the number is not known."""
+        """Begin a bar of `total` steps; None: unknown number."""
         self.finish()
         if self.enabled:
             self._bar = tqdm(total=total, desc=what, file=sys.stderr, leave=False, disable=None)
@@ -43,7 +43,7 @@ class Bar:
                 self._bar = None
 
     def say(self, text: str) -> None:
-        """A line that stays, on standard error."""
+        """Print a line on standard error."""
         self.finish()
         if self.enabled:
             click.echo(text, err=True)

@@ -1,29 +1,44 @@
-"""The account a scene gives of itself: scene.json, the verdict line, and what changed since."""
+"""Content of scene.json, and the lines that 'aw build-scene' prints from it."""
 
 from __future__ import annotations
 
 import math
 import shlex
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
+from ambiguous_wild.builder.records import (
+    BuildInputs,
+    BuildRecord,
+    ExifRecord,
+    FeatureResult,
+    MappingResult,
+    MaskResult,
+    MatchResult,
+    ModelSummary,
+    ScenePhoto,
+    SceneRecord,
+    ScreenedPhoto,
+    ScreenResult,
+)
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core.config import to_plain
 from ambiguous_wild.core.errors import shortlist
-from ambiguous_wild.io.colmap_model import Model
+from ambiguous_wild.io.colmap_records import Model
 
-LEAST_PARALLAX_DEG = 1.5  # what COLMAP itself asks of a point
+LEAST_PARALLAX_DEG = 1.5  # COLMAP's own limit for a point
 SFM_STAGES = ("features", "matches", "mapping")
 
 
-def account(
+def scene_record(
     settings: BuildSettings,
-    screened: dict[str, Any],
-    features: dict[str, Any],
-    matches: dict[str, Any],
-    mapping: dict[str, Any],
+    screened: ScreenResult,
+    features: FeatureResult,
+    matches: MatchResult,
+    mapping: MappingResult,
     best: int,
     model: Model,
     others: dict[int, Model],
@@ -34,10 +49,10 @@ def account(
     how: str,
     factor: int,
     truth: dict[str, int] | None,
-    masks: dict[str, Any] | None,
+    masks: MaskResult | None,
     warnings: list[str],
-) -> dict[str, Any]:
-    """scene.json without its files, hashes and timings."""
+) -> BuildRecord:
+    """scene.json without its files, inputs and timings."""
     from ambiguous_wild.builder.select_model import lost_photos
 
     facts = screened["photos"]
@@ -80,7 +95,7 @@ def account(
         "warnings": [
             *screened["warnings"],
             *_model_warnings(mapping["models"], best),
-            *_turned(model),
+            *_parallax_warnings(model),
             *warnings,
         ],
         "photos": {f"{f['stem']}.png": _photo(f, sides, features["features"]) for f in facts},
@@ -90,7 +105,7 @@ def account(
 
 
 def point_checks(model: Model, names: dict[str, str], test: set[str]) -> tuple[int, int]:
-    """(points seen in test photos only, points seen twice): what leaks, and what rests on little."""
+    """(points seen in test photos only, points of track length 2): leaked, and poorly determined."""
     points = model.points
     tests = [i.image_id for i in model.images.values() if names[i.name] in test]
     lengths = np.diff(points.track_offsets)
@@ -103,7 +118,7 @@ def point_checks(model: Model, names: dict[str, str], test: set[str]) -> tuple[i
 
 
 def parallax_deg(model: Model) -> float:
-    """Median over points of the widest angle from the first ray that found it; NaN without points."""
+    """Median over points of the widest angle between its first ray and another; NaN without points."""
     points = model.points
     owner = np.repeat(np.arange(len(points.xyz)), np.diff(points.track_offsets))
     numbers = sorted(model.images)
@@ -113,15 +128,15 @@ def parallax_deg(model: Model) -> float:
     rows = np.array([at[int(i)] for i in points.track_image_ids], dtype=np.intp)
     rays = centres[rows] - points.xyz[owner]
     rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
-    # the widest of all pairs is at most twice that, and costs the square
+    # The widest angle of all pairs is at most twice that, at quadratic cost.
     first = rays[points.track_offsets[owner]]
     angles = np.zeros(len(points.xyz))
     np.maximum.at(angles, owner, np.arccos(np.clip((rays * first).sum(axis=1), -1.0, 1.0)))
     return math.degrees(float(np.median(angles))) if len(angles) else math.nan
 
 
-def verdict(info: dict[str, Any], size: tuple[int, int], scene: Path) -> str:
-    """One line: what came out, and the next command."""
+def verdict(info: SceneRecord, size: tuple[int, int], scene: Path) -> str:
+    """One line: the counts, and the next command."""
     counts = info["counts"]
     points = f"{counts['points']:,}".replace(",", " ")
     return (
@@ -131,8 +146,8 @@ def verdict(info: dict[str, Any], size: tuple[int, int], scene: Path) -> str:
     )
 
 
-def lines(info: dict[str, Any]) -> list[str]:
-    """What a person should know before training: the split, what was lost, every warning."""
+def summary_lines(info: SceneRecord) -> list[str]:
+    """The split, the lost photos and every warning."""
     counts = info["counts"]
     found = [f"{counts['train']} training and {counts['test']} test photos (split: {info['split']})"]
     if info["lost"]:
@@ -141,26 +156,29 @@ def lines(info: dict[str, Any]) -> list[str]:
     return found + [f"warning: {w}" for w in info["warnings"]]
 
 
-def sfm_share(info: dict[str, Any]) -> float:
-    """Share of the build's stages that COLMAP took, 0..1."""
+def sfm_share(info: SceneRecord) -> float:
+    """Share of the build's time that COLMAP took, 0 to 1."""
     seconds = info["seconds"]
     return sum(seconds.get(s, 0.0) for s in SFM_STAGES) / max(sum(seconds.values()), 1e-9)
 
 
-def what_changed(old: dict[str, Any], new: dict[str, Any]) -> str:
-    """Which inputs differ, for the message that refuses to overwrite."""
-    parts = [k.replace("_", " ") for k in ("photos", "masks", "truth", "test_list") if old.get(k) != new[k]]
-    for group in ("settings", "versions"):
+def what_changed(
+    old: Mapping[str, Any],  # `BuildInputs` of any version of ours
+    new: BuildInputs,
+) -> str:
+    """The inputs that differ, for the message that refuses to overwrite."""
+    pairs = {k: v for k, v in new.items() if k not in ("settings", "versions")}
+    parts = [k.replace("_", " ") for k, v in pairs.items() if old.get(k) != v]
+    groups: dict[str, Mapping[str, Any]] = {"settings": new["settings"], "versions": new["versions"]}
+    for group, values in groups.items():
         before = old.get(group) or {}
-        keys = [k for k, v in new[group].items() if before.get(k) != v]
-        parts += [f"{group} ({shortlist(f'{k} {before.get(k)} -> {new[group][k]}' for k in keys)})"] * bool(
-            keys
-        )
+        changed = [f"{k} {before.get(k)} -> {v}" for k, v in values.items() if before.get(k) != v]
+        parts += [f"{group} ({shortlist(changed)})"] if changed else []
     return ", ".join(parts) or "inputs"
 
 
-def _photo(fact: dict[str, Any], sides: dict[str, str], features: dict[str, int]) -> dict[str, Any]:
-    # Where the photographer stood is theirs to publish: GPS stays out of the scene.
+def _photo(fact: ScreenedPhoto, sides: dict[str, str], features: dict[str, int]) -> ScenePhoto:
+    # Scenes are published: GPS positions stay out of them.
     exif = {k: v for k, v in fact["exif"].items() if k not in ("latitude_deg", "longitude_deg", "altitude_m")}
     return {
         "source": fact["source"],
@@ -172,24 +190,22 @@ def _photo(fact: dict[str, Any], sides: dict[str, str], features: dict[str, int]
         "mean_luma": fact["mean_luma"],
         "features": features.get(fact["work_name"], 0),
         "notes": fact["notes"],
-        "exif": exif,
+        "exif": cast(ExifRecord, exif),
     }
 
 
-def _model_warnings(listing: list[dict[str, Any]], best: int) -> list[str]:
+def _model_warnings(listing: list[ModelSummary], best: int) -> list[str]:
     rest = [f"{m['images']} photos" for m in listing if m["model"] != best]
     if not rest:
         return []
-    return [
-        f"the capture fell apart into {len(listing)} models; the largest is used, left out: {', '.join(rest)}"
-    ]
+    return [f"the capture split into {len(listing)} models; the largest is used, left out: {', '.join(rest)}"]
 
 
-def _turned(model: Model) -> list[str]:
+def _parallax_warnings(model: Model) -> list[str]:
     angle = parallax_deg(model)
     if not angle < LEAST_PARALLAX_DEG:
         return []
     return [
-        f"the camera hardly moved: half of the points are seen under less than {angle:.2f} deg, so their "
-        "depth is a guess and views from aside will be wrong; walk between photos"
+        f"the camera hardly moved: half of the points have less than {angle:.2f} deg of parallax, so their "
+        "depth is unreliable and renders from the side will be wrong; walk between photos"
     ]

@@ -1,71 +1,77 @@
-"""Second stage: can each photo be read, and does the capture hold together?
+"""Second stage: read every photo, leave out damaged files and copies, warn of blur and changed settings.
 
-Nothing is judged by eye alone: each warning carries the number it rests on.
+Every warning states the number behind it.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import cast
 
 import cv2
 import numpy as np
 
 from ambiguous_wild.builder.collect import MIN_PHOTOS, Capture, Source, identical
 from ambiguous_wild.builder.progress import Bar
+from ambiguous_wild.builder.records import (
+    ExifRecord,
+    PhotoRecord,
+    ScreenedPhoto,
+    ScreenResult,
+    SkippedPhoto,
+)
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.io.photos import Photo, UnreadablePhoto, read_photo
 
-BLUR_SIDE = 1024  # px; blur is compared at one size, since the Laplacian grows with resolution
-BLUR_RATIO = 0.2  # of the capture's median; below it a photo is called blurred
+BLUR_SIDE = 1024  # px, longer side: the Laplacian grows with resolution, so blur is compared at one size
+BLUR_RATIO = 0.2  # of the capture's median; a photo below it counts as blurred
 NEAR_DUPLICATE = 0.995  # correlation of 32 x 32 thumbnails
 EXPOSURE_STOPS = 1.0
 _THUMBNAIL = 32
 
 
-def screen(capture: Capture, folder: Path, *, strict: bool, jobs: int, bar: Bar) -> dict[str, Any]:
-    """Read every photo once; lay out `folder/photos` for structure from motion.
+def screen(capture: Capture, folder: Path, *, strict: bool, jobs: int, bar: Bar) -> ScreenResult:
+    """Read every photo once and fill `folder/photos` for structure from motion.
 
-    A photo that other tools read as we do is a link to the user's file; any other is converted to PNG.
-
-    Returns:
-        Facts: per photo size, EXIF, blur and notes; what was skipped and why; warnings.
+    A photo that COLMAP reads as we do is linked; any other is converted to PNG.
 
     Raises:
-        AwError: `strict` and a photo cannot be read, or too few can.
+        AwError: too few photos can be read, or with `strict` one cannot.
     """
     photos = folder / "photos"
     photos.mkdir()
     sources, copies = without_copies(capture)
     bar.start("reading photos", len(sources))
 
-    def one(source: Source) -> tuple[dict[str, Any], np.ndarray | None]:
+    def one(source: Source) -> tuple[ScreenedPhoto, np.ndarray] | SkippedPhoto:
         try:
             photo, pixels = read_photo(source.path)
         except UnreadablePhoto as error:
-            return {"source": source.relative, "skipped": error.reason}, None
+            return {"source": source.relative, "skipped": error.reason}
         finally:
             bar.step()
-        facts = photo_facts(source, photo, pixels)
-        facts["work_name"] = _lay_out(source, photo, pixels, photos)
-        return facts, thumbnail(pixels)
+        record: ScreenedPhoto = {
+            **photo_record(source, photo, pixels),
+            "work_name": _lay_out(source, photo, pixels, photos),
+            "copies": [copy for copy, kept in copies.items() if kept == source.relative],
+        }
+        return record, thumbnail(pixels)
 
     with ThreadPoolExecutor(jobs) as pool:
         rows = list(pool.map(one, sources))
     bar.finish()
-    skipped = [r for r, _ in rows if "skipped" in r]
-    good = [(r, t) for r, t in rows if t is not None]
-    refuse_bad(capture, skipped, copies, len(good), strict)
-    facts = [r for r, _ in good]
-    for fact in facts:
-        fact["copies"] = [copy for copy, kept in copies.items() if kept == fact["source"]]
-    skipped = [*skipped, *_copy_rows(copies)]
+    unreadable = [r for r in rows if not isinstance(r, tuple)]
+    good = [r for r in rows if isinstance(r, tuple)]
+    refuse_bad(capture, unreadable, copies, len(good), strict)
+    facts = [record for record, _ in good]
+    skipped = [*unreadable, *copy_rows(copies)]
     warnings = [
         *_skipped_warning(skipped, len(capture.sources)),
-        *(f"{r['source']}: {n}" for r in facts for n in r["notes"]),
+        *(f"{p['source']}: {n}" for p in facts for n in p["notes"]),
         *(_identical_warning(group) for group in identical(capture) if capture.has_sides),
         *_near_duplicates(facts, np.stack([t for _, t in good])),
         *drift_warnings(facts),
@@ -73,8 +79,9 @@ def screen(capture: Capture, folder: Path, *, strict: bool, jobs: int, bar: Bar)
     return {"photos": facts, "skipped": skipped, "warnings": warnings}
 
 
-def photo_facts(source: Source, photo: Photo, pixels: np.ndarray) -> dict[str, Any]:
-    """What is recorded of one photo; `screen` adds the name structure from motion sees."""
+def photo_record(source: Source, photo: Photo, pixels: np.ndarray) -> PhotoRecord:
+    """Size, EXIF, blur and brightness of one photo."""
+    exif = {k: v for k, v in dataclasses.asdict(photo.exif).items() if v is not None}
     return {
         "source": source.relative,
         "stem": source.stem,
@@ -82,7 +89,7 @@ def photo_facts(source: Source, photo: Photo, pixels: np.ndarray) -> dict[str, A
         "sha256": source.sha256,
         "width": photo.width,
         "height": photo.height,
-        "exif": {k: v for k, v in dataclasses.asdict(photo.exif).items() if v is not None},
+        "exif": cast(ExifRecord, exif),
         "camera": photo.exif.camera,
         "blur": round(sharpness(pixels), 3),
         "mean_luma": round(float(pixels.mean()), 2),
@@ -91,10 +98,10 @@ def photo_facts(source: Source, photo: Photo, pixels: np.ndarray) -> dict[str, A
 
 
 def without_copies(capture: Capture) -> tuple[list[Source], dict[str, str]]:
-    """The photos to use, and the copies left out: relative name -> the first file with the same bytes.
+    """The photos to use, and the copies to leave out: relative name -> the first file with the same bytes.
 
-    Of two copies one could train and the other test, which would reward learning by heart. Where train/
-    and test/ are the user's own, nothing is left out: both are kept and named in a warning.
+    Of two copies one could train and the other test, which leaks test data. In a capture with train/ and
+    test/ the copies stay, and a warning names them.
     """
     if capture.has_sides:
         return list(capture.sources), {}
@@ -121,15 +128,15 @@ def sharpness(
 def thumbnail(
     rgb: np.ndarray,  # [H, W, 3] uint8
 ) -> np.ndarray:  # [1024] float32, zero mean, unit length
-    """The photo at 32 x 32 grey, normalised, so that a dot product is a correlation."""
+    """The photo at 32 x 32 grey, normalised: the dot product of two is their correlation."""
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     small = cv2.resize(gray, (_THUMBNAIL, _THUMBNAIL), interpolation=cv2.INTER_AREA).astype(np.float32)
     small -= small.mean()
     return (small / max(float(np.linalg.norm(small)), 1e-6)).ravel()
 
 
-def drift_warnings(facts: list[dict[str, Any]]) -> list[str]:
-    """Blur outliers, and camera settings that changed within the capture."""
+def drift_warnings(facts: Sequence[PhotoRecord]) -> list[str]:
+    """Blurred photos, and camera settings that changed within the capture."""
     found = []
     blur = np.array([f["blur"] for f in facts])
     limit = BLUR_RATIO * float(np.median(blur))
@@ -156,14 +163,14 @@ def drift_warnings(facts: list[dict[str, Any]]) -> list[str]:
     return found
 
 
-def exposure_stops(exif: dict[str, Any]) -> float | None:
-    """log2 of the light a setting lets in, t ISO / N^2, up to a constant; None if not recorded."""
+def exposure_stops(exif: ExifRecord) -> float | None:
+    """log2(t ISO / N^2), up to a constant; None where EXIF has no exposure time."""
     if "exposure_s" not in exif:
         return None
     return math.log2(exif["exposure_s"] * exif.get("iso", 100.0) / exif.get("f_number", 1.0) ** 2)
 
 
-def _near_duplicates(facts: list[dict[str, Any]], thumbnails: np.ndarray) -> list[str]:
+def _near_duplicates(facts: Sequence[PhotoRecord], thumbnails: np.ndarray) -> list[str]:
     close = np.triu(thumbnails @ thumbnails.T > NEAR_DUPLICATE, k=1)
     pairs = [
         f"{facts[i]['source']} = {facts[j]['source']}"
@@ -184,14 +191,16 @@ def _lay_out(source: Source, photo: Photo, pixels: np.ndarray, folder: Path) -> 
         return source.work_name
     import OpenImageIO as oiio
 
-    # Through OpenImageIO so that the EXIF focal length travels along: COLMAP starts from it.
+    # OpenImageIO copies the EXIF focal length, from which COLMAP starts.
     name = source.stem + ".png"
     original = oiio.ImageBuf(str(photo.path)).spec()
     spec = oiio.ImageSpec(photo.width, photo.height, 3, "uint8")
     for attribute in original.extra_attribs:
         known = attribute.name.startswith("Exif:") or attribute.name in ("Make", "Model")
         if known and isinstance(attribute.value, (str, int, float)):
-            spec.attribute(attribute.name, attribute.value)  # with its uint16 type it would be dropped
+            spec.attribute(
+                attribute.name, attribute.value
+            )  # passed with its uint16 type, it would be dropped
     output = oiio.ImageOutput.create(str(folder / name))
     if output is None or not output.open(str(folder / name), spec) or not output.write_image(pixels):
         reason = oiio.geterror() if output is None else output.geterror()
@@ -202,33 +211,34 @@ def _lay_out(source: Source, photo: Photo, pixels: np.ndarray, folder: Path) -> 
 
 def _identical_warning(group: list[str]) -> str:
     sides = {name.partition("/")[0] for name in group}
-    leak = ": one trains and one tests, so its score rewards learning by heart" if len(sides) > 1 else ""
+    leak = ": one trains and one tests, which leaks test data into training" if len(sides) > 1 else ""
     return f"identical files: {shortlist(group)}{leak}"
 
 
-def _copy_rows(copies: dict[str, str]) -> list[dict[str, Any]]:
+def copy_rows(copies: dict[str, str]) -> list[SkippedPhoto]:
+    """The copies as photos that are left out."""
     return [{"source": copy, "skipped": f"the same file as {kept}"} for copy, kept in copies.items()]
 
 
 def refuse_bad(
-    capture: Capture, skipped: list[dict[str, Any]], copies: dict[str, str], good: int, strict: bool
+    capture: Capture, skipped: list[SkippedPhoto], copies: dict[str, str], good: int, strict: bool
 ) -> None:
-    """Raise AwError where a photo cannot be read and `strict`, or too few can."""
+    """Raise AwError where too few photos can be read, or with `strict` one cannot."""
     reasons = shortlist([f"{r['source']} ({r['skipped']})" for r in skipped], 4)
     total = len(capture.sources)
     if skipped and strict:
         raise AwError(
-            f"{len(skipped)} of {total} photos cannot be read: {reasons}; mend or remove them, or leave "
-            "out --strict to go on without them"
+            f"{len(skipped)} of {total} photos cannot be read: {reasons}; repair or remove them, or "
+            "run without --strict to leave them out"
         )
     if good < MIN_PHOTOS:
-        reasons = shortlist([f"{r['source']} ({r['skipped']})" for r in [*skipped, *_copy_rows(copies)]], 4)
+        reasons = shortlist([f"{r['source']} ({r['skipped']})" for r in [*skipped, *copy_rows(copies)]], 4)
         raise AwError(
             f"only {good} of {total} photos in {capture.root} can be used, {MIN_PHOTOS} are needed: {reasons}"
         )
 
 
-def _skipped_warning(skipped: list[dict[str, Any]], total: int) -> list[str]:
+def _skipped_warning(skipped: list[SkippedPhoto], total: int) -> list[str]:
     if not skipped:
         return []
     reasons = shortlist([f"{r['source']} ({r['skipped']})" for r in skipped])

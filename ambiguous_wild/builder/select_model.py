@@ -1,4 +1,4 @@
-"""Which of COLMAP's models becomes the scene; what was lost and why; when to give up, and the reason."""
+"""Choose one of COLMAP's models, explain lost photos, and refuse a failed reconstruction with its cause."""
 
 from __future__ import annotations
 
@@ -9,26 +9,27 @@ from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ambiguous_wild.builder.collect import MIN_PHOTOS
+from ambiguous_wild.builder.records import LostPhoto, MatchResult, ModelSummary, ScreenedPhoto
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.io.colmap_model import Model, read_model
+from ambiguous_wild.io.colmap_model import read_model
+from ambiguous_wild.io.colmap_records import Model
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
-MIN_SHARE = 0.3  # of the readable photos; below it a scene would not show the place
-MIN_POINTS = 10  # of a placed photo; fewer fix neither the poses nor where surfaces are
-_STRONG_PAIRS = 60  # looked at for the diagnosis
+MIN_SHARE = 0.3  # of the readable photos; with fewer, most of the place is missing
+MIN_POINTS = 10  # per placed photo; fewer determine neither poses nor surfaces
+_STRONG_PAIRS = 60  # pairs with the most inliers, used for the diagnosis
 _MAX_PAIR_ID = 2147483647  # COLMAP: pair id = id1 * this + id2
 
 
 @dataclass(frozen=True)
 class PairFacts:
-    """What matching found, measured on the database."""
+    """Figures of the matching, from COLMAP's database."""
 
-    features: float  # median a photo
+    features: float  # median per photo
     tried: int
     verified: int
     inliers: float  # median over verified pairs
@@ -46,7 +47,7 @@ class PairFacts:
         return text
 
     def reason(self, photos: int) -> str:
-        """The likeliest cause and what to try."""
+        """The likeliest cause of a failure, and what to try."""
         if self.features < 200:
             return "too little texture or too much blur; try --max-features 8000 or sharper photos"
         if self.verified < photos - 1:
@@ -61,38 +62,38 @@ class PairFacts:
         return "matched pairs do not chain; add photos between the ones that fail, or try --max-features 8000"
 
 
-def choose_model(folder: Path, listing: list[dict[str, Any]]) -> tuple[int, Model]:
-    """Number and content of the largest model: most photos, then most points, then the first.
+def choose_model(folder: Path, listing: list[ModelSummary]) -> tuple[int, Model]:
+    """The largest model, with its number: most photos, then most points, then the lowest number.
 
     Raises:
-        AwError: COLMAP found none.
+        AwError: COLMAP found no model.
     """
     if not listing:
-        raise AwError("no model")
+        raise AwError("structure from motion found no model; add photos that overlap more")
     best = max(listing, key=lambda m: (m["images"], m["points"], -m["model"]))
     return best["model"], read_model(folder / str(best["model"]))
 
 
 def check_registered(
-    listing: list[dict[str, Any]],
+    listing: list[ModelSummary],
     photos: int,
     skipped: int,
     database: Path,
-    matches: dict[str, Any],
+    matches: MatchResult,
     remarks: Sequence[str] = (),
 ) -> None:
     """Refuse a reconstruction that holds too few photos or points to be a scene.
 
     Args:
         listing: the models.
-        photos: how many were tried.
-        skipped: how many were left out before.
+        photos: number of photos that COLMAP got.
+        skipped: number of photos left out before.
         database: COLMAP's.
-        matches: facts of the matching stage.
-        remarks: what else may be the reason, added to the error.
+        matches: result of the matching stage.
+        remarks: other possible causes, added to the error.
 
     Raises:
-        AwError: how many of how many, the figures, the likely reason, what to try.
+        AwError: with the counts, the figures of the matching, the likely cause and what to try.
     """
     registered = max((m["images"] for m in listing), default=0)
     points = max((m["points"] for m in listing if m["images"] == registered), default=0)
@@ -113,7 +114,7 @@ def check_registered(
 
 
 def pair_facts(database: Path, tried: int) -> PairFacts:
-    """Measure features, matches and motion between the strongest pairs."""
+    """Measure features, matches, and motion between the pairs with the most inliers."""
     with closing(sqlite3.connect(database)) as db:
         features = [r[0] for r in db.execute("SELECT rows FROM keypoints")]
         pairs = db.execute(
@@ -134,36 +135,36 @@ def pair_facts(database: Path, tried: int) -> PairFacts:
 
 
 def lost_photos(
-    facts: list[dict[str, Any]],
+    facts: list[ScreenedPhoto],
     chosen: Model,
     others: dict[int, Model],
     database: Path,
     features: dict[str, int],
-) -> list[dict[str, str]]:
-    """Why each readable photo is not in the scene."""
+) -> list[LostPhoto]:
+    """The readable photos that are not in the scene, each with the reason."""
     inside = {image.name for image in chosen.images.values()}
-    elsewhere = {i.name: number for number, model in others.items() for i in model.images.values()}
+    other_model = {i.name: number for number, model in others.items() for i in model.images.values()}
     partners = _partners(database, inside)
-    lost = []
+    lost: list[LostPhoto] = []
     for fact in facts:
         name = fact["work_name"]
         if name in inside:
             continue
-        if name in elsewhere:
-            size = len(others[elsewhere[name]].images)
-            reason = f"in another model of {size} photos that nothing joins to this one"
+        if name in other_model:
+            size = len(others[other_model[name]].images)
+            reason = f"in another model of {size} photos, which shares no points with this one"
         elif features.get(name, 0) < 50:
             reason = f"only {features.get(name, 0)} features"
         elif not partners[name]:
             reason = "no matches with the photos of the scene"
         else:
-            reason = f"matches {partners[name]} photos of the scene, too weakly to be placed"
+            reason = f"matches {partners[name]} photos of the scene, with too few inliers to be placed"
         lost.append({"source": fact["source"], "reason": reason})
     return lost
 
 
 def _partners(database: Path, inside: set[str]) -> Counter[str]:
-    """How many photos of the scene each photo has a verified pair with."""
+    """Per photo the number of photos in the scene that it has a verified pair with."""
     counts: Counter[str] = Counter()
     with closing(sqlite3.connect(database)) as db:
         names = dict(db.execute("SELECT image_id, name FROM images").fetchall())
@@ -176,7 +177,7 @@ def _partners(database: Path, inside: set[str]) -> Counter[str]:
 
 
 def _motion(database: Path, pair_ids: list[int]) -> tuple[list[float], list[float]]:
-    """|t_z| / |t| and triangulation angle in degrees for the pairs a relative pose can be found for."""
+    """|t_z| / |t| and triangulation angle in degrees, of the pairs whose relative pose can be estimated."""
     forward, angles = [], []
     db = pycolmap.Database.open(str(database))
     try:

@@ -1,4 +1,4 @@
-"""Every setting of a build, one frozen dataclass; what it holds is what scene.json records."""
+"""The settings of a build, as scene.json records them."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ MOST_FEATURES = 100_000  # a photo; SIFT finds fewer in any
 
 @dataclass(frozen=True)
 class BuildSettings:
-    """Settings of `build_scene`; nothing here changes with the machine."""
+    """Settings of `build_scene`; none depends on the machine."""
 
-    factor: int | None = None  # downsampling; None: of 1, 2, 4, 8 the one that leaves just over 480 px
+    factor: int | None = None  # downsampling; None: of 1, 2, 4, 8 the largest that leaves 480 px
     camera: CameraMode = "auto"  # auto: one camera if EXIF and size agree, else one per photo
-    matcher: Matcher = "auto"  # auto: exhaustive up to 200 photos, sequential above
+    matcher: Matcher = "auto"  # auto: exhaustive up to 200 photos, then sequential
     mapper: Mapper = "incremental"  # global is faster on many photos, weaker on few
     max_features: int = 3000  # SIFT features a photo
     max_side: int = 1600  # px; photos are reduced to this for SIFT only

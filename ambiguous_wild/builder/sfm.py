@@ -1,4 +1,4 @@
-"""Structure from motion: three stages (features, matches, mapping), each in a process of its own."""
+"""Structure from motion: the stages features, matches and mapping, each in a child process."""
 
 from __future__ import annotations
 
@@ -8,14 +8,21 @@ import shutil
 import sqlite3
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 from ambiguous_wild.builder.pairs import EXHAUSTIVE_LIMIT, sequential_pairs
 from ambiguous_wild.builder.progress import Bar
+from ambiguous_wild.builder.records import (
+    FeatureResult,
+    MappingResult,
+    MatchResult,
+    PhotoRecord,
+    ScreenedPhoto,
+)
 from ambiguous_wild.builder.settings import BuildSettings
+from ambiguous_wild.builder.sfm_jobs import FeatureJob, MappingJob, MatchJob, SfmJob
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.atomic import write_json
 
@@ -25,14 +32,14 @@ _POLL_S = 0.25
 
 
 class SfmCrash(AwError):
-    """COLMAP ended without a result; the work folder stays, so the same command goes on from there."""
+    """COLMAP ended without a result; the work folder stays, and the same command continues from it."""
 
 
-def choose_camera(photos: list[dict[str, Any]], wanted: str) -> str:
+def choose_camera(photos: Sequence[PhotoRecord], wanted: str) -> str:
     """ "single" or "per-image".
 
-    One camera needs one size and, where EXIF speaks, one model and one focal length. Photos without any
-    EXIF and of one size count as frames of one camera; internet photos differ in size.
+    "single" where size, camera model and focal length are the same in all photos. Photos of one size without
+    EXIF count as frames of one camera: internet photos differ in size.
     """
     if wanted != "auto":
         return wanted
@@ -53,21 +60,17 @@ def choose_matcher(count: int, wanted: str) -> str:
 def extract_features(
     folder: Path,
     photos: Path,
-    facts: list[dict[str, Any]],
+    facts: list[ScreenedPhoto],
     settings: BuildSettings,
     jobs: int,
     camera: str,
     masks: Path | None,
     bar: Bar,
-) -> dict[str, Any]:
-    """SIFT features of every photo into `folder/database.db`.
-
-    Returns:
-        Facts: the camera mode and the number of features of each photo.
-    """
+) -> FeatureResult:
+    """SIFT features of every photo into `folder/database.db`."""
     database = folder / DATABASE
     bar.start("features", len(facts))
-    job = {
+    job: FeatureJob = {
         "task": "features",
         "database": str(database),
         "photos": str(photos),
@@ -89,7 +92,8 @@ def extract_features(
     lost = [f["source"] for f in facts if f["work_name"] not in features]
     if lost:
         raise SfmCrash(
-            f"COLMAP dropped {len(lost)} photos without a word, the first is {lost[0]}; see --keep-work"
+            f"COLMAP dropped {len(lost)} photos without a message, the first is {lost[0]}; its log is in "
+            "the work folder that --keep-work leaves"
         )
     return {"camera": camera, "features": features}
 
@@ -97,17 +101,13 @@ def extract_features(
 def match(
     folder: Path,
     features: Path,
-    facts: list[dict[str, Any]],
+    facts: list[ScreenedPhoto],
     settings: BuildSettings,
     jobs: int,
     matcher: str,
     bar: Bar,
-) -> dict[str, Any]:
-    """Match and verify on a copy of the features' database.
-
-    Returns:
-        Facts: pairs tried, pairs verified, their inliers.
-    """
+) -> MatchResult:
+    """Match and verify pairs, in a copy of the features' database."""
     database = folder / DATABASE
     shutil.copyfile(features / DATABASE, database)
     names = [f["work_name"] for f in facts]
@@ -117,7 +117,7 @@ def match(
     else:
         pairs = len(sequential_pairs(names, set(test_names)))
     bar.start("matching pairs", pairs)
-    job = {
+    job: MatchJob = {
         "task": "matches",
         "database": str(database),
         "names": names,
@@ -135,17 +135,13 @@ def match(
 
 def map_scene(
     folder: Path, matches: Path, photos: Path, count: int, settings: BuildSettings, bar: Bar
-) -> dict[str, Any]:
-    """Build the models into `folder/0`, `folder/1`, ...
-
-    Returns:
-        Facts: one row a model: images, points, mean reprojection error in px.
-    """
+) -> MappingResult:
+    """Build the models into `folder/0`, `folder/1`, ..."""
     progress = folder / "progress"
     bar.start("placing photos", count if settings.mapper == "incremental" else None)
     database = folder / DATABASE
     shutil.copyfile(matches / DATABASE, database)  # the mapper may write to it
-    job = {
+    job: MappingJob = {
         "task": "mapping",
         "database": str(database),
         "photos": str(photos),
@@ -162,7 +158,7 @@ def map_scene(
     return {"models": listing}
 
 
-def _run(job: dict[str, Any], folder: Path, watch: Callable[[], None]) -> None:
+def _run(job: SfmJob, folder: Path, watch: Callable[[], None]) -> None:
     """Run one task of the worker; `watch` is called while it runs."""
     write_json(folder / "job.json", {**job, "parent": os.getpid()})
     log = folder / LOG
@@ -190,17 +186,17 @@ def _run(job: dict[str, Any], folder: Path, watch: Callable[[], None]) -> None:
         shutil.copyfile(log, kept)
         raise SfmCrash(
             f"COLMAP ended with code {code} while computing {job['task']}: {_last_line(log)} (log: {kept}); "
-            "the same command continues before this step"
+            "run the same command again: it continues before this step"
         )
 
 
 def _last_line(log: Path) -> str:
     lines = [s for s in log.read_text(encoding="utf-8", errors="replace").splitlines() if s.strip()]
-    return lines[-1][-200:] if lines else "it says nothing"
+    return lines[-1][-200:] if lines else "its log is empty"
 
 
 def _count(database: Path, table: str) -> int:
-    """Rows of a table another process is writing; 0 while it is locked or not there yet."""
+    """Rows of a table that another process writes; 0 while it is locked or absent."""
     if not database.is_file():
         return 0
     try:

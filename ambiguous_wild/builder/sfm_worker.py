@@ -1,9 +1,9 @@
-"""Structure from motion in a process of its own: `python -m ambiguous_wild.builder.sfm_worker JOB.json`.
+"""COLMAP in a child process: `python -m ambiguous_wild.builder.sfm_worker JOB.json`.
 
-COLMAP is noisy, cannot be interrupted from Python and may crash; apart from the command it can do all
-three. Every seed is fixed, so features and matches repeat with any number of threads. Bundle adjustment
-sums in the order of its threads, so mapping runs on one (measured on 40 photos: 11.5 s on one thread,
-12.0-14.4 s on two, and the same bits each time on one alone).
+COLMAP writes to the terminal, ignores Ctrl-C and may crash; in a child process none of that reaches the
+command. Every seed is fixed, so features and matches are the same for any number of threads. Bundle
+adjustment sums in the order of its threads, so mapping uses one (40 photos: 11.5 s on one thread,
+12.0-14.4 s on two; equal bits on one thread only).
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from ambiguous_wild.builder.pairs import sequential_pairs
+from ambiguous_wild.builder.records import ModelSummary
+from ambiguous_wild.builder.sfm_jobs import FeatureJob, MappingJob, MatchJob, SfmJob
 from ambiguous_wild.io.atomic import write_json
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
@@ -24,7 +26,7 @@ _MIN_MODEL = 3  # images; smaller models are not reported
 _PR_SET_PDEATHSIG = 1
 
 
-def run_features(job: dict[str, Any]) -> None:
+def run_features(job: FeatureJob) -> None:
     """SIFT on the CPU into a new database, then cameras."""
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
@@ -36,8 +38,8 @@ def run_features(job: dict[str, Any]) -> None:
     if job["masks"]:
         reader.mask_path = job["masks"]
     mode = pycolmap.CameraMode.SINGLE if job["camera"] == "single" else pycolmap.CameraMode.PER_IMAGE
-    # Photos enter the database first, in the order of their names: extraction alone numbers them in the
-    # order its threads finish, and every later random choice follows the numbers.
+    # Photos are imported first, ordered by name: extraction numbers them in the order its threads finish,
+    # and later random choices depend on these numbers.
     pycolmap.Database.open(job["database"]).close()
     pycolmap.import_images(
         job["database"], job["photos"], camera_mode=mode, image_names=job["names"], options=reader
@@ -52,8 +54,8 @@ def run_features(job: dict[str, Any]) -> None:
     )
 
 
-def run_matches(job: dict[str, Any]) -> None:
-    """Match and verify pairs: all, or neighbours in order plus every test photo against all."""
+def run_matches(job: MatchJob) -> None:
+    """Match and verify pairs: all of them, or those of `sequential_pairs`."""
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu = False
     options.num_threads = job["jobs"]
@@ -72,14 +74,14 @@ def run_matches(job: dict[str, Any]) -> None:
     )
 
 
-def run_mapping(job: dict[str, Any]) -> None:
-    """Build every model COLMAP finds; `models.json` lists them."""
+def run_mapping(job: MappingJob) -> None:
+    """Build every model that COLMAP finds; models.json lists them."""
     output = Path(job["output"])
     if job["mapper"] == "global":
         models = _map_globally(job, output)
     else:
         models = _map_incrementally(job, output)
-    listing = []
+    listing: list[ModelSummary] = []
     for number, model in sorted(models.items()):
         folder = output / str(number)
         folder.mkdir(exist_ok=True)
@@ -96,7 +98,7 @@ def run_mapping(job: dict[str, Any]) -> None:
     write_json(output / "models.json", listing)
 
 
-def _map_incrementally(job: dict[str, Any], output: Path) -> dict[int, Any]:
+def _map_incrementally(job: MappingJob, output: Path) -> dict[int, Any]:
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1
     options.ba_min_num_residuals_for_cpu_multi_threading = 10**9
@@ -109,7 +111,7 @@ def _map_incrementally(job: dict[str, Any], output: Path) -> dict[int, Any]:
         state["now"] = 2
 
     def following() -> None:
-        # A second model starts again at two: the bar shows the best so far.
+        # Each model starts again at two: the bar shows the largest so far.
         state["now"] += 1
         state["best"] = max(state["best"], state["now"])
         counter.write_text(str(state["best"]))
@@ -124,7 +126,7 @@ def _map_incrementally(job: dict[str, Any], output: Path) -> dict[int, Any]:
     )
 
 
-def _map_globally(job: dict[str, Any], output: Path) -> dict[int, Any]:
+def _map_globally(job: MappingJob, output: Path) -> dict[int, Any]:
     options = pycolmap.GlobalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1
     options.random_seed = options.mapper.random_seed = job["seed"]
@@ -142,13 +144,18 @@ def _map_globally(job: dict[str, Any], output: Path) -> dict[int, Any]:
 def main() -> None:
     """Read the job file and run its task."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides, and ends this process
-    if sys.platform == "linux":  # no orphan keeps both cores busy after a kill of the parent
+    if sys.platform == "linux":  # end with the parent, even if that is killed
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    job = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
-    if os.getppid() != job["parent"]:  # it died before the request above
+    job: SfmJob = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
+    if os.getppid() != job["parent"]:  # the parent ended before the line above
         sys.exit(1)
     pycolmap.set_random_seed(job["seed"])
-    {"features": run_features, "matches": run_matches, "mapping": run_mapping}[job["task"]](job)
+    if job["task"] == "features":
+        run_features(job)
+    elif job["task"] == "matches":
+        run_matches(job)
+    else:
+        run_mapping(job)
 
 
 if __name__ == "__main__":

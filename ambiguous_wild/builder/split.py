@@ -1,17 +1,17 @@
-"""Which photos train and which test: always lists of names."""
+"""The split into training and test photos, as lists of names."""
 
 from __future__ import annotations
 
 import difflib
 from pathlib import Path, PurePosixPath
-from typing import Any
 
+from ambiguous_wild.builder.records import ScreenedPhoto
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.io.scene_folder import TEST_EVERY, read_list
 
 
 def split_photos(
-    facts: list[dict[str, Any]], registered: set[str], test_stems: set[str] | None
+    facts: list[ScreenedPhoto], registered: set[str], test_stems: set[str] | None
 ) -> tuple[list[str], list[str], str, list[str]]:
     """Names of the training and the test photos.
 
@@ -21,10 +21,10 @@ def split_photos(
         test_stems: from the user's test list, or None.
 
     Returns:
-        (train, test, how the split came about, warnings); names are ``<stem>.png``, sorted.
+        (train, test, "list" or "folders" or "every-8", warnings); names are ``<stem>.png``, sorted.
 
     Raises:
-        AwError: no training photo, or a test set of which nothing was placed.
+        AwError: fewer than two training photos, or a test set without a placed photo.
     """
     inside = sorted(f["stem"] for f in facts if f["stem"] in registered)
     warnings = []
@@ -39,8 +39,8 @@ def split_photos(
         how, test = f"every-{TEST_EVERY}", inside[::TEST_EVERY]
         wanted = len(test)
         warnings.append(
-            f"no test set given, so every {TEST_EVERY}th photo tests: if those hold distractors, the "
-            "scores reward painting them; give clean photos in test/, or --test-list FILE"
+            f"no test set given, so every {TEST_EVERY}th photo tests: distractors in these photos count "
+            "as truth in the scores; give clean photos in test/, or --test-list FILE"
         )
     train = sorted(set(inside) - set(test))
     if wanted and not test:
@@ -55,11 +55,11 @@ def split_photos(
     return [f"{s}.png" for s in train], [f"{s}.png" for s in test], how, warnings
 
 
-def read_test_list(path: Path, facts: list[dict[str, Any]]) -> set[str]:
-    """Stems of the photos a test list names: by path in the capture, by name, or without extension.
+def read_test_list(path: Path, facts: list[ScreenedPhoto]) -> set[str]:
+    """Stems of the photos in a test list, which names them by path, by file name or without extension.
 
     Raises:
-        AwError: the file cannot be read, or names what is no photo of the capture.
+        AwError: the file cannot be read or is empty, names an unknown photo, or names all photos.
     """
     try:
         names = read_list(path)
@@ -72,13 +72,13 @@ def read_test_list(path: Path, facts: list[dict[str, Any]]) -> set[str]:
             known.setdefault(key, fact["stem"])
         for copy in fact.get("copies", ()):
             known.setdefault(copy, fact["stem"])
-    strangers = [n for n in names if n not in known]
-    if strangers:
-        what = "a photo" if len(strangers) == 1 else f"{len(strangers)} photos"
+    unknown = [n for n in names if n not in known]
+    if unknown:
+        what = "a photo" if len(unknown) == 1 else f"{len(unknown)} photos"
         sources = {f["stem"]: f["source"] for f in facts}
         raise AwError(
             f"{path} names {what} not in the capture: "
-            + shortlist((_with_nearest(n, known, sources) for n in strangers), 3)
+            + shortlist((_with_nearest(n, known, sources) for n in unknown), 3)
         )
     if not names:
         raise AwError(f"{path} is empty; list test photos one a line, or leave out --test-list")

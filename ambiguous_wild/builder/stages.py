@@ -1,11 +1,10 @@
-"""The stages in order: what each reads, what its result is keyed by, what it hands on."""
+"""The stages of a build in order: what each reads, and the inputs that key its result."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -13,8 +12,20 @@ from ambiguous_wild.builder import report
 from ambiguous_wild.builder.collect import Capture
 from ambiguous_wild.builder.downsample import auto_factor, downsample
 from ambiguous_wild.builder.masks import find_masks, lay_out_masks, mask_hashes, mask_warnings
-from ambiguous_wild.builder.package import Parts, package
+from ambiguous_wild.builder.package import SceneParts, package
 from ambiguous_wild.builder.progress import Bar
+from ambiguous_wild.builder.records import (
+    BuildInputs,
+    FeatureResult,
+    KeyedRecord,
+    MappingResult,
+    MaskResult,
+    MatchResult,
+    PackageResult,
+    ScreenedPhoto,
+    ScreenResult,
+    UndistortResult,
+)
 from ambiguous_wild.builder.screen import screen, without_copies
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.builder.sfm import (
@@ -29,14 +40,15 @@ from ambiguous_wild.builder.split import read_test_list, split_photos
 from ambiguous_wild.builder.versions import versions
 from ambiguous_wild.builder.workspace import StageResult, Workspace, content_key
 from ambiguous_wild.core.config import to_plain
-from ambiguous_wild.io.colmap_model import Model, read_model
+from ambiguous_wild.io.colmap_model import read_model
+from ambiguous_wild.io.colmap_records import Model
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import read_png_rgb
 
 
 @dataclass
 class Stages:
-    """One build's inputs, and its stages as methods."""
+    """The inputs of one build, and its stages as methods."""
 
     capture: Capture
     settings: BuildSettings
@@ -44,19 +56,19 @@ class Stages:
     test_list: Path | None
     jobs: int
     bar: Bar
-    link: bool  # the scene may share its files with the work folder
+    link: bool  # hard-link the stages' files into the scene
 
     @cached_property
-    def inputs(self) -> dict[str, Any]:
-        """Everything the scene's files follow from, as plain data."""
+    def inputs(self) -> BuildInputs:
+        """Everything that the scene's files follow from."""
         _, copies = without_copies(self.capture)
         return {
             "photos": [
                 [s.relative, s.stem, s.side, s.sha256, *["copy"] * (s.relative in copies)]
                 for s in self.capture.sources
             ],
-            "masks": _tree(self.mask_folder),
-            "truth": _tree(self.capture.truth),
+            "masks": _file_hashes(self.mask_folder),
+            "truth": _file_hashes(self.capture.truth),
             "test_list": sha256_file(self.test_list) if self.test_list and self.test_list.is_file() else None,
             "settings": to_plain(self.settings),
             "versions": versions(),
@@ -64,18 +76,18 @@ class Stages:
 
     @cached_property
     def build_key(self) -> str:
-        """Identity of the scene these inputs give."""
+        """Hash of the inputs: the scene's identity."""
         return content_key(self.inputs)
 
     def run(self, work: Workspace, collect_s: float) -> Path:
-        """Run what has not been run yet.
+        """Run the stages that are not finished.
 
         Args:
-            work: where finished stages lie.
-            collect_s: seconds spent before, for the account.
+            work: holds the finished stages.
+            collect_s: seconds spent before, for scene.json.
 
         Returns:
-            The whole scene, inside the work folder.
+            The scene folder, inside the work folder.
         """
         capture, settings, bar = self.capture, self.settings, self.bar
         inputs = self.inputs
@@ -94,14 +106,15 @@ class Stages:
         train, test, how, split_warnings = split_photos(facts, registered, tests)
         flat = self._undistort(work, screened, mask_stage, mapping, model)
         factor = settings.factor or auto_factor([(f["width"], f["height"]) for f in facts])
-        small = flat
+        small_key, small_folder = flat.key, None
         if factor > 1:
             small = work.run(
                 "downsample",
                 [inputs["versions"], flat.key, factor],
                 lambda f: downsample(f, flat.folder, factor, jobs=self.jobs, bar=bar),
             )
-        account = report.account(
+            small_key, small_folder = small.key, small.folder
+        found = report.scene_record(
             settings,
             screened.facts,
             features.facts,
@@ -119,34 +132,39 @@ class Stages:
             masks=mask_stage.facts if mask_stage else None,
             warnings=[*mask_warnings(mask_stage.facts if mask_stage else None), *split_warnings],
         )
-        account |= {"build_key": self.build_key, "inputs": inputs}
-        account["seconds"] = {"collect": round(collect_s, 3), **{r.name: r.seconds for r in work.results}}
+        record: KeyedRecord = {
+            **found,
+            "build_key": self.build_key,
+            "inputs": inputs,
+            "seconds": {"collect": round(collect_s, 3), **{r.name: r.seconds for r in work.results}},
+        }
         truth_files = [capture.truth / n for n in ("cameras.json", "capture.json")] if capture.truth else []
-        parts = Parts(
+        parts = SceneParts(
             flat.folder,
-            small.folder if factor > 1 else None,
+            small_folder,
             factor,
             train,
             test,
             [p for p in truth_files if p.is_file()],
         )
-        return self._package(work, small, parts, account)
+        return self._package(work, small_key, parts, record)
 
-    def _package(self, work: Workspace, small: StageResult, parts: Parts, account: dict[str, Any]) -> Path:
-        def run() -> StageResult:
+    def _package(self, work: Workspace, small_key: str, parts: SceneParts, record: KeyedRecord) -> Path:
+        def run() -> StageResult[PackageResult]:
             return work.run(
                 "package",
-                [self.inputs, small.key],
-                lambda f: package(f / "scene", parts, account, link=self.link, jobs=self.jobs),
+                [self.inputs, small_key],
+                lambda f: package(f / "scene", parts, record, link=self.link, jobs=self.jobs),
             )
 
         done = run()
-        if not (done.folder / "scene").is_dir():  # an earlier call published it, and it was deleted since
+        # An earlier call may have moved the scene to the output, where the user deleted it.
+        if not (done.folder / "scene").is_dir():
             work.forget(done)
             done = run()
         return done.folder / "scene"
 
-    def _masks(self, work: Workspace, screened: StageResult) -> StageResult | None:
+    def _masks(self, work: Workspace, screened: StageResult[ScreenResult]) -> StageResult[MaskResult] | None:
         if self.mask_folder is None:
             return None
         facts = screened.facts["photos"]
@@ -154,8 +172,11 @@ class Stages:
         return work.run("masks", [screened.key, mask_hashes(found)], lambda f: lay_out_masks(f, found, facts))
 
     def _sfm(
-        self, work: Workspace, screened: StageResult, masks: StageResult | None
-    ) -> tuple[StageResult, StageResult, StageResult]:
+        self,
+        work: Workspace,
+        screened: StageResult[ScreenResult],
+        masks: StageResult[MaskResult] | None,
+    ) -> tuple[StageResult[MappingResult], StageResult[FeatureResult], StageResult[MatchResult]]:
         settings, facts = self.settings, screened.facts["photos"]
         photos = screened.folder / "photos"
         camera = choose_camera(facts, settings.camera)
@@ -207,21 +228,21 @@ class Stages:
     def _undistort(
         self,
         work: Workspace,
-        screened: StageResult,
-        masks: StageResult | None,
-        mapping: StageResult,
+        screened: StageResult[ScreenResult],
+        masks: StageResult[MaskResult] | None,
+        mapping: StageResult[MappingResult],
         model: Model,
-    ) -> StageResult:
+    ) -> StageResult[UndistortResult]:
         from ambiguous_wild.builder.undistort import undistort
 
         photos = screened.folder / "photos"
 
-        def read(fact: dict[str, Any]) -> np.ndarray:
+        def read(fact: ScreenedPhoto) -> np.ndarray:
             return read_png_rgb(photos / fact["work_name"])
 
         return work.run(
             "undistort",
-            [mapping.key, _tree(self.capture.truth)],
+            [mapping.key, _file_hashes(self.capture.truth)],
             lambda f: undistort(
                 f,
                 model,
@@ -235,7 +256,7 @@ class Stages:
         )
 
 
-def _models(mapping: StageResult) -> tuple[int, Model, dict[int, Model]]:
+def _models(mapping: StageResult[MappingResult]) -> tuple[int, Model, dict[int, Model]]:
     from ambiguous_wild.builder.select_model import choose_model
 
     listing = mapping.facts["models"]
@@ -244,8 +265,8 @@ def _models(mapping: StageResult) -> tuple[int, Model, dict[int, Model]]:
     return best, model, others
 
 
-def _tree(folder: Path | None) -> list[list[str]] | None:
-    """[path, sha256] of every file below a folder."""
+def _file_hashes(folder: Path | None) -> list[list[str]] | None:
+    """[path, sha256] of every file below a folder; None without a folder."""
     if folder is None or not folder.is_dir():
         return None
     paths = sorted(p for p in folder.rglob("*") if p.is_file())

@@ -1,7 +1,7 @@
-"""Photos, masks and truth brought to pinhole cameras, all by one map a camera.
+"""Undistort photos, masks and truth to pinhole cameras, with one map a camera.
 
-The pinhole camera is COLMAP's choice (no blank pixels); the resampling is ours, so that masks (nearest)
-and photos (bicubic, in one pass, without another JPEG) go through the same map.
+COLMAP chooses the pinhole camera (no blank pixels). We resample: masks (nearest pixel) and photos (bicubic,
+once, without another JPEG) need the same map.
 """
 
 from __future__ import annotations
@@ -16,30 +16,33 @@ import cv2
 import numpy as np
 
 from ambiguous_wild.builder.progress import Bar
+from ambiguous_wild.builder.records import ScreenedPhoto, UndistortResult
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io import colmap_binary
-from ambiguous_wild.io.colmap_model import Model, ModelCamera, ModelImage
+from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage
 from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 TRUTH_PARTS = ("distractor", "clean")
-NEGLIGIBLE_PX = 0.1  # distortion below this everywhere leaves the pixels as they are
+NEGLIGIBLE_PX = 0.1  # distortion below this everywhere is ignored
 
 
 @dataclasses.dataclass(frozen=True)
 class Lens:
-    """A distorted camera, its pinhole replacement, and the map between their pixels."""
+    """A camera with distortion, the pinhole camera that replaces it, and the map between their pixels."""
 
     camera: Any  # pycolmap.Camera
     pinhole: ModelCamera
-    map_xy: tuple[np.ndarray, np.ndarray] | None  # [H, W] float32: source index of every pixel; None: same
+    map_xy: (
+        tuple[np.ndarray, np.ndarray] | None
+    )  # [H, W] float32 each: source of every pixel; None: no map needed
 
     def remap(self, image: np.ndarray, *, nearest: bool) -> np.ndarray:
-        """[H, W] or [H, W, 3] of the distorted camera, as the pinhole camera sees it."""
+        """The image [H, W] or [H, W, 3] of the distorted camera as the pinhole camera sees it."""
         if self.map_xy is None:
             return image
         how = cv2.INTER_NEAREST if nearest else cv2.INTER_CUBIC
-        # Reflection only fills the half pixel the map may reach over the border.
+        # The map may reach half a pixel over the border: reflection fills that.
         return cv2.remap(image, *self.map_xy, how, borderMode=cv2.BORDER_REFLECT_101)
 
     def undistort_points(self, xys: np.ndarray) -> np.ndarray:
@@ -54,8 +57,8 @@ class Lens:
 def make_lens(camera: ModelCamera) -> Lens:
     """Choose the pinhole camera and compute the map; source: COLMAP's undistort_camera.
 
-    COLMAP shrinks an undistorted camera by a pixel and shifts it by half, which blurs for nothing;
-    where the distortion is negligible the photo stays as it is.
+    Where the distortion is negligible the photo stays as it is: COLMAP would shrink the camera by a pixel
+    and shift it by half a pixel, which blurs.
     """
     lens = pycolmap.Camera(
         model=camera.model, width=camera.width, height=camera.height, params=list(camera.params)
@@ -86,14 +89,14 @@ def _source_pixels(lens: Any, pinhole: ModelCamera) -> tuple[np.ndarray, np.ndar
 def undistort(
     folder: Path,
     model: Model,
-    facts: list[dict[str, Any]],
-    read: Callable[[dict[str, Any]], np.ndarray],
+    facts: list[ScreenedPhoto],
+    read: Callable[[ScreenedPhoto], np.ndarray],
     masks: Path | None,
     truth: Path | None,
     *,
     jobs: int,
     bar: Bar,
-) -> dict[str, Any]:
+) -> UndistortResult:
     """Write `images/`, `masks/`, `truth/` at full size and `sparse/0` of the registered photos.
 
     Args:
@@ -105,9 +108,6 @@ def undistort(
         truth: the capture's truth folder, or None.
         jobs: threads.
         bar: progress.
-
-    Returns:
-        Facts: how many photos have which part of the truth.
     """
     by_name = {f["work_name"]: f for f in facts}
     lenses: dict[int, Lens] = {}
@@ -140,8 +140,8 @@ def undistort(
     return {"truth": found if truth is not None else None}
 
 
-def _truth(folder: Path, lens: Lens, fact: dict[str, Any], truth: Path) -> list[str]:
-    """The truth of one photo: the distractor mask by nearest pixel, the clean view like the photo."""
+def _truth(folder: Path, lens: Lens, fact: ScreenedPhoto, truth: Path) -> list[str]:
+    """Undistort the truth of one photo: the mask by nearest pixel, the clean photo like the photo."""
     original = fact["source"].rsplit("/", 1)[-1].rsplit(".", 1)[0]
     found = []
     for part in TRUTH_PARTS:
@@ -153,7 +153,7 @@ def _truth(folder: Path, lens: Lens, fact: dict[str, Any], truth: Path) -> list[
             raise AwError(
                 f"{path} is {pixels.shape[1]}x{pixels.shape[0]} but its photo "
                 f"{fact['width']}x{fact['height']}: the truth belongs to another capture; remove truth/ "
-                "or simulate again"
+                "or make the capture again"
             )
         flat = lens.remap(pixels, nearest=part == "distractor")
         write_png(folder / "truth" / part / f"{fact['stem']}.png", flat)

@@ -1,4 +1,4 @@
-"""What decided the result besides the photos: our version and those of the libraries that compute."""
+"""Versions that the result depends on: ours and those of the libraries."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from importlib import metadata
 
 from ambiguous_wild import __version__
 
-BUILDER = 5  # raised when a stage computes something else from the same input
+BUILDER = 5  # raised when a stage gives another result for the same input
 _LIBRARIES = ("pycolmap", "OpenImageIO", "opencv-contrib-python-headless", "numpy")
 
 

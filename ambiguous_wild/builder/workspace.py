@@ -1,7 +1,7 @@
-"""The hidden work folder of a build: one folder a stage, whole or absent, so that a kill costs one stage.
+"""The hidden work folder of a build: one folder a stage, complete or absent, so a kill costs one stage.
 
-A stage's folder carries a key: the hash of its inputs, its settings, the code's version and the keys
-of the stages it reads. A changed setting changes the keys after it and nothing before it.
+A stage's folder name holds a key: the hash of its inputs, its settings, the code's version and the keys of
+the stages it reads. A changed setting changes the keys of later stages only.
 """
 
 from __future__ import annotations
@@ -12,16 +12,17 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.atomic import atomic_dir, write_json
 
 _RESULT = "stage.json"
+Facts = TypeVar("Facts", bound=Mapping[str, object])  # a record of `records.py`
 
 
 def content_key(*parts: Any) -> str:
@@ -31,15 +32,15 @@ def content_key(*parts: Any) -> str:
 
 
 @dataclass(frozen=True)
-class StageResult:
-    """A finished stage: where its files are, what it found, what it took."""
+class StageResult(Generic[Facts]):
+    """A finished stage: its files, its record and its time."""
 
     name: str
     key: str
     folder: Path
-    facts: dict[str, Any]
+    facts: Facts
     seconds: float
-    reused: bool
+    reused: bool  # an earlier call had finished it
 
 
 class Workspace:
@@ -47,18 +48,18 @@ class Workspace:
 
     def __init__(self, root: Path) -> None:
         self.root = root
-        self.results: list[StageResult] = []
+        self.results: list[StageResult[Any]] = []
         root.mkdir(parents=True, exist_ok=True)
         for leftover in root.glob(".*.tmp-*"):  # a stage that was killed
             shutil.rmtree(leftover, ignore_errors=True)
 
-    def run(self, name: str, inputs: Any, work: Callable[[Path], dict[str, Any]]) -> StageResult:
-        """Run `work(folder)` unless its result is there already.
+    def run(self, name: str, inputs: Any, work: Callable[[Path], Facts]) -> StageResult[Facts]:
+        """Run `work(folder)` unless its result exists.
 
         Args:
             name: of the stage; part of its folder's name.
-            inputs: plain data that decides the result: settings, hashes, keys of earlier stages.
-            work: fills the folder and returns facts, JSON-able.
+            inputs: plain data that determines the result: settings, hashes, keys of earlier stages.
+            work: fills the folder and returns a record for stage.json.
         """
         key = content_key(name, inputs)
         folder = self.root / f"{name}-{key[:16]}"
@@ -70,11 +71,13 @@ class Workspace:
                 spent = round(time.perf_counter() - started, 3)
                 write_json(temporary / _RESULT, {"facts": facts, "seconds": spent})
         stored = json.loads((folder / _RESULT).read_text(encoding="utf-8"))
-        result = StageResult(name, key, folder, stored["facts"], stored["seconds"], reused)
+        result: StageResult[Facts] = StageResult(
+            name, key, folder, stored["facts"], stored["seconds"], reused
+        )
         self.results.append(result)
         return result
 
-    def forget(self, result: StageResult) -> None:
+    def forget(self, result: StageResult[Any]) -> None:
         """Delete one stage's folder, so that it runs again."""
         self.results.remove(result)
         shutil.rmtree(result.folder, ignore_errors=True)
@@ -86,10 +89,10 @@ class Workspace:
 
 @contextmanager
 def build_lock(target: Path) -> Iterator[None]:
-    """Hold the right to build `target`; another process that tries is told who has it.
+    """Lock `target` for this process.
 
     Raises:
-        AwError: somebody else is building the same folder.
+        AwError: another process builds the same folder; names it.
     """
     path = target.parent / f".{target.name}.lock"
     try:
@@ -105,7 +108,7 @@ def build_lock(target: Path) -> Iterator[None]:
             holder = handle.read().strip() or "another process"
             raise AwError(f"{target} is being built by {holder}; wait for it or choose another -o") from None
         if not (path.exists() and os.path.samestat(os.fstat(handle.fileno()), path.stat())):
-            # The holder finished, and took its file away, between our open and our lock.
+            # The holder finished and removed its file between our open and our lock.
             raise AwError(f"{target} was being built until this moment; run the command again")
         handle.truncate(0)
         handle.write(f"process {os.getpid()} since {time.strftime('%H:%M:%S')}")

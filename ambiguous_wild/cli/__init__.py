@@ -1,1 +1,1 @@
-"""One file a command: parse, call, print."""
+"""The command line: one file per command, which parses, calls and prints."""

@@ -1,4 +1,4 @@
-"""`aw ablate`: what each part of a method brings, and what it costs."""
+"""`aw ablate`: gain and cost of each part of a method."""
 
 from __future__ import annotations
 
@@ -75,10 +75,10 @@ def command(
 
     from ambiguous_wild.cli.bench import parse_budget
     from ambiguous_wild.cli.devices import choose_device, prepare_cpu
-    from ambiguous_wild.cli.progress import Progress
-    from ambiguous_wild.harness.ablate import earlier_groups, plan_study
-    from ambiguous_wild.harness.ablation_report import report, to_markdown, write_report
-    from ambiguous_wild.harness.grid import run_cells
+    from ambiguous_wild.cli.progress import ProgressBar
+    from ambiguous_wild.harness.ablation.plan import earlier_groups, plan_study
+    from ambiguous_wild.harness.ablation.report import report, to_markdown, write_report
+    from ambiguous_wild.harness.running.grid import run_cells
     from ambiguous_wild.io.atomic import check_output
     from ambiguous_wild.splat.pace import TrainConfig
 
@@ -103,10 +103,10 @@ def command(
     cells = study.cells
     absent = sum(1 for row in study.rows if row.missing)
     click.echo(f"{len(study.rows)} rows: {len(cells)} runs to have, {absent} variants missing", err=True)
-    progress = Progress(len(cells))
+    progress = ProgressBar(len(cells))
     reports = run_cells(
         cells, output, overwrite=overwrite, cache_dir=cache, tick=progress.tick, pictures=pictures,  # type: ignore[arg-type]
-        on_start=progress.start, on_end=progress.end,
+        on_start=progress.started, on_end=progress.ended,
     )  # fmt: skip
     words = ["aw", *sys.argv[1:], *(word for name in before for word in ("--group", name))]
     data = report(study, output, made_by=shlex.join(words))

@@ -1,4 +1,4 @@
-"""`aw ambiguity-report`: how hard a scene's distractors are to tell apart."""
+"""`aw ambiguity-report`: similarity of a scene's distractors to the scene."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from ambiguous_wild.cli.paths import PathName
 
 @click.command("ambiguity-report")
 @click.argument("scene", type=PathName())
-@click.option("-o", "--out", type=PathName(), help="Default: SCENE-ambiguity.")
+@click.option("-o", "--out", type=PathName(), help="Folder for the report.  [default: SCENE-ambiguity]")
 @click.option(
     "--masks",
-    help="truth, scene (build-scene's masks), run, or a folder of <stem>.png, white = distractor.  [default: the first there is]",
+    help="truth, scene (build-scene's masks), run, or a folder of <stem>.png, white = distractor.  [default: the first available]",
 )
 @click.option(
     "--masks-white",
     type=click.Choice(["distractor", "keep"]),
     default="distractor",
     show_default=True,
-    help="What white means in a folder given with --masks.",
+    help="Meaning of white in a folder given with --masks.",
 )
 @click.option(
     "--background",
     type=click.Choice(["clean", "run", "none"]),
-    help="What distractors are compared with: clean versions of the photos, or the run's render.  [default: the first there is]",
+    help="Background to compare distractors with: clean versions of the photos, or the run's render.  [default: the first available]",
 )
 @click.option(
     "--run",
     type=PathName(file_okay=False),
-    help="A trained run of this scene: its render, and its masks.",
+    help="A trained run of this scene, for its renders and masks.",
 )
 @click.option(
     "--features",
@@ -43,10 +43,10 @@ from ambiguous_wild.cli.paths import PathName
 @click.option(
     "--objects",
     type=PathName(file_okay=False),
-    help="Masks of the static objects to compare with, <stem>.png, white = object.  [default: every static segment]",
+    help="Folder with masks of static objects to compare with, <stem>.png, white = object.  [default: every static segment]",
 )
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the bootstrap.")
-@click.option("--record/--no-record", default=True, show_default=True, help="Note the scores in scene.json.")
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the bootstrap.")
+@click.option("--record/--no-record", default=True, show_default=True, help="Save the scores in scene.json.")
 @click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
 def command(
     scene: Path,
@@ -61,7 +61,7 @@ def command(
     record: bool,
     as_json: bool,
 ) -> None:
-    """Measure SCENE: colour ambiguity, semantic ambiguity, occlusion; write a page, a CSV and a picture."""
+    """Measure SCENE: colour ambiguity, semantic ambiguity, occlusion; write an HTML page, a CSV and an image."""
     from tqdm import tqdm
 
     from ambiguous_wild.core.errors import AwError
@@ -77,7 +77,7 @@ def command(
     behind = sources.find_background(loaded, background, run, found)
     folder = out or scene.resolve().parent / f"{scene.resolve().name}-ambiguity"
     if folder.resolve().is_relative_to(scene.resolve()):
-        raise AwError(f"{folder} lies inside {scene}, and would change the scene; choose another -o")
+        raise AwError(f"{folder} is inside {scene} and would change the scene; choose another -o")
     check_output(folder / "index.html" if folder.is_dir() else folder)
     page.check_folder(folder)
     measured, look = measure.measure(
@@ -92,7 +92,7 @@ def command(
         loaded, measured, look, features=features, masks=found.source, background=behind.source, seed=seed
     )
     page.write_report(loaded, found, behind, measured, look, facts, folder)
-    # scene.json lists the hashes of the other files, not its own: the scene's identity stays.
+    # scene.json is not part of the scene's identity, which is a hash of the other files.
     info = read_scene_json(scene) if record else None
     if info is not None:
         write_json(scene / "scene.json", {**info, "ambiguity": facts})
@@ -102,5 +102,5 @@ def command(
     click.echo(f"{loaded.name}: {facts['class']}")
     for line in summary.describe(facts):
         click.echo(line)
-    noted = ", scores noted in scene.json" if info is not None else ""
-    click.echo(f"wrote {folder / 'index.html'} ({len(measured)} photos){noted}")
+    saved = ", scores saved in scene.json" if info is not None else ""
+    click.echo(f"wrote {folder / 'index.html'} ({len(measured)} photos){saved}")

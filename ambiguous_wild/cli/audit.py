@@ -1,4 +1,4 @@
-"""`aw audit`: what cannot be right in a table of results."""
+"""`aw audit`: find errors in tables of results."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from ambiguous_wild.cli.paths import PathName
     show_default=True,
 )
 @click.option("-o", "--output", type=PathName(dir_okay=False), help="Write to a file instead.")
-@click.option("--strict", is_flag=True, help="Exit with 1 where anything is found.")
+@click.option("--strict", is_flag=True, help="Exit with code 1 if anything is found.")
 def command(tables: tuple[Path, ...], style: str, output: Path | None, strict: bool) -> None:
-    """Check TABLES (CSV, or folders of them; default: the reported numbers in this checkout).
+    """Check TABLES (CSV, or folders of them; default: leaderboard/reported).
 
-    Finds numbers equal to the digit where they must not be, contradictions between tables, exchanged numbers,
-    means that do not follow, SSIM and LPIPS out of place, wrong ranks. It knows no right answers: a finding
-    is a question to whoever printed the number.
+    Finds suspiciously equal numbers, contradictions between tables, exchanged numbers, means that do not match
+    their values, implausible SSIM and LPIPS, and wrong ranks. The correct values are not known: a finding is a
+    question to the authors of the table.
     """
     from ambiguous_wild.core.errors import AwError
     from ambiguous_wild.harness.audit.run import audit, to_csv, to_markdown, to_text
@@ -38,7 +38,7 @@ def command(tables: tuple[Path, ...], style: str, output: Path | None, strict: b
     if not tables:
         reported = Path(__file__).resolve().parents[2] / "leaderboard" / "reported"
         if not reported.is_dir():
-            raise AwError("no tables given, and no leaderboard/reported beside the program: name CSV files")
+            raise AwError("no tables given, and there is no folder leaderboard/reported; name CSV files")
         tables = (reported,)
     numbers = read_tables(tables)
     findings = audit(numbers)

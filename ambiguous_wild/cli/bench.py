@@ -5,19 +5,16 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import click
 
-from ambiguous_wild.cli.devices import prepare_cpu
-from ambiguous_wild.cli.engines import Engine, Grid, Session, engine_options
+from ambiguous_wild.cli.engines import engine_options
 from ambiguous_wild.cli.options import training_options
 from ambiguous_wild.cli.paths import PathName
 from ambiguous_wild.cli.progress import Progress, finish
 from ambiguous_wild.core.errors import AwError
-
-if TYPE_CHECKING:
-    from ambiguous_wild.harness.cell import Cell
+from ambiguous_wild.harness.bench import Engine, bench
 
 LONGEST_S = 366 * 24 * 3600.0
 _UNITS = {"s": 1, "m": 60, "min": 60, "h": 3600}
@@ -182,112 +179,36 @@ def command(
     seconds = [parse_budget(budget) for budget in budgets]
     if math.isnan(checkpoint_every):
         raise AwError("--checkpoint-every nan: give a number of seconds")
-    engine.check()
-
-    from ambiguous_wild.methods.graft import graft_name, idle_regulariser
-    from ambiguous_wild.methods.registry import get_method, load_plugin
-
-    for plugin in plugins:
-        load_plugin(plugin)
-    donors = {"mask": mask, "density": density, "regulariser": regulariser}
-    methods = tuple(graft_name(name, donors) for name in methods)
-    for name in methods:
-        get_method(name)  # a misspelt name is answered before torch is imported
-    from ambiguous_wild.harness.choosing import check_wanted
-
-    for wanted in effects:
-        check_wanted(wanted)
-    if plan_file is not None and len(scenes) > 1:
-        raise AwError(
-            f"--plan {plan_file} is of one scene; bench {len(scenes)} scenes one by one, or without it"
-        )
-
-    from ambiguous_wild.harness.grid import plan_cells, run_cells
-    from ambiguous_wild.harness.several import grouped
-    from ambiguous_wild.io.atomic import check_output
-    from ambiguous_wild.splat.pace import TrainConfig
-
-    session = Session(engine, threads)
-    chosen = session.device(device)
-    train = TrainConfig(
-        iterations=iterations or TrainConfig.iterations,
-        budget_s=seconds[0] if seconds else None,
-        probes=probes,
-        resolution=resolution,  # type: ignore[arg-type]
-        max_gaussians=max_gaussians,
-        checkpoint_every_s=checkpoint_every,
-        on_nonfinite=on_nonfinite,  # type: ignore[arg-type]
-    )
-    from ambiguous_wild.harness.planning.file import read_plan
-
-    plan = None if plan_file is None else read_plan(plan_file)
-    planned = {
-        wanted: plan_cells(
-            methods,
-            scenes,
-            seeds,
-            train,
-            settings=settings,
-            device=chosen,
-            factor=factor,
-            effects=wanted,
-            plan=plan,
-            protocol=protocol,  # type: ignore[arg-type]
-        )
-        for wanted in dict.fromkeys(effects)
+    parts = {"mask": mask, "density": density, "regulariser": regulariser}
+    train: dict[str, Any] = {
+        "resolution": resolution,
+        "max_gaussians": max_gaussians,
+        "probes": probes,
+        "checkpoint_every_s": checkpoint_every,
+        "on_nonfinite": on_nonfinite,
     }
-    cells = grouped(planned, seconds)
-    if gpus > 1:
-        cells = _sharing(cells, gpus, engine)
-    told = {(cell.method.name, cell.scene.name, cell.chosen.effects): None for cell in cells}
-    for method, name, on in told:
-        if on:
-            click.echo(f"{method} on {name}: {', '.join(on)}", err=True)
-    for scene in {cell.scene.name: cell.scene for cell in cells}.values():
-        for warning in scene.info.get("warnings", ()):
-            click.echo(f"warning: {scene.name}: {warning}", err=True)
-    for cell in {cell.method.name: cell for cell in cells}.values():
-        if idle := idle_regulariser(cell.method, cell.options):
-            click.echo(
-                f"warning: {cell.method.name}: {idle} adds no loss on the render with these options; "
-                f"switch it on with --set {idle}.KEY=VALUE, or leave the regulariser out",
-                err=True,
-            )
-    check_output(output / "run")  # before half a minute of compiling
-    if chosen == "cpu" and not engine.remote and any(cell.method.program is None for cell in cells):
-        prepare_cpu(threads)
-    if gpus > 1 or session.in_process(cells):
-        progress = Progress(len(cells))
-        reports = run_cells(
-            cells,
-            output,
-            overwrite=overwrite,  # type: ignore[arg-type]
-            cache_dir=cache,
-            tick=progress.tick,
-            pictures=pictures,
-            on_start=progress.start,
-            on_end=progress.end,
-        )
-    else:
-        cache = cache or output / ".cache"
-        with session:
-            reports = session.run(Grid(cells, output, overwrite, cache, pictures, plugins, methods))  # type: ignore[arg-type]
-    finish(reports, output, as_json, [str(output / group) for group in {cell.group: None for cell in cells}])
-
-
-def _sharing(cells: list[Cell], gpus: int, engine: Engine) -> list[Cell]:
-    """The cells with one model on so many GPUs; refused here what cannot be trained so."""
-    import dataclasses
-
-    import torch
-
-    from ambiguous_wild.harness.shared_run import check_shared
-    from ambiguous_wild.splat.shared.refuse import refuse_more_than
-
-    if engine.remote or (engine.jobs or 1) > 1:
-        raise AwError("--gpus gives all GPUs to one run at a time: leave --jobs and --engine out")
-    shared = [dataclasses.replace(cell, gpus=gpus) for cell in cells]
-    for cell in shared:
-        check_shared(cell)
-    refuse_more_than(torch.cuda.device_count(), gpus)
-    return shared
+    report = bench(
+        methods,
+        scenes,
+        output=output,
+        seeds=seeds,
+        iterations=iterations,
+        budgets_s=seconds,
+        effects=effects,
+        plan=plan_file,
+        settings=settings,
+        parts={place: donor for place, donor in parts.items() if donor},  # type: ignore[misc]
+        train=train,  # type: ignore[arg-type]
+        plugins=plugins,
+        device=device,  # type: ignore[arg-type]
+        threads=threads,
+        engine=engine,
+        gpus=gpus,
+        factor=factor,
+        protocol=protocol,  # type: ignore[arg-type]
+        overwrite=overwrite,  # type: ignore[arg-type]
+        cache=cache,
+        pictures=pictures,
+        callbacks=Progress(),
+    )
+    finish(report, as_json)

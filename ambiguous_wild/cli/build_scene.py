@@ -1,19 +1,25 @@
-"""`aw build-scene`: photos in, scene out."""
+"""`aw build-scene`: build a scene from photos."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from ambiguous_wild.cli.paths import PathName
 
+if TYPE_CHECKING:
+    from ambiguous_wild.builder.pipeline import BuildResult
+
 
 @click.command("build-scene")
 @click.argument("raw", type=PathName())
 @click.option("-o", "--output", required=True, type=PathName(), help="Scene folder to make.")
-@click.option("--factor", type=int, help="Downsampling; default: of 1, 2, 4, 8 what leaves just over 480 px.")
+@click.option(
+    "--factor", type=int, help="Downsampling; default: of 1, 2, 4, 8 the largest that leaves 480 px."
+)
 @click.option(
     "--camera", type=click.Choice(["auto", "single", "per-image"]), default="auto", show_default=True
 )
@@ -34,7 +40,7 @@ from ambiguous_wild.cli.paths import PathName
     type=click.Choice(["error", "keep"]),
     default="error",
     show_default=True,
-    help="A photo without a mask: refuse, or use it whole.",
+    help="A photo without a mask: refuse the capture, or use the whole photo.",
 )
 @click.option("--test-list", type=PathName(), help="File naming the test photos, one a line.")
 @click.option("--strict", is_flag=True, help="Refuse the capture if one photo cannot be read.")
@@ -42,8 +48,8 @@ from ambiguous_wild.cli.paths import PathName
 @click.option("--seed", type=int, default=0, show_default=True)
 @click.option("--name", help="Name of the scene; default: the output folder's.")
 @click.option("--license", "license_", default="", help="Licence of the photos, recorded in scene.json.")
-@click.option("--overwrite", is_flag=True, help="Replace a scene built from something else.")
-@click.option("--keep-work", is_flag=True, help="Leave the work folder: every stage, COLMAP's log.")
+@click.option("--overwrite", is_flag=True, help="Replace a scene built from other photos or settings.")
+@click.option("--keep-work", is_flag=True, help="Leave the work folder with every stage and COLMAP's log.")
 @click.option("--json", "as_json", is_flag=True, help="Print the same facts as JSON.")
 def command(
     raw: Path,
@@ -65,10 +71,10 @@ def command(
     keep_work: bool,
     as_json: bool,
 ) -> None:
-    """Make a scene from the photos in RAW: check, COLMAP, undistort, downsample, split.
+    """Build a scene from the photos in RAW: check, COLMAP, undistort, downsample, split.
 
-    RAW holds photos directly, in images/, or in train/ and test/ (clean photos for testing). Nothing in
-    it is changed. Killed at any moment, the same command continues.
+    RAW holds photos directly, in images/, or in train/ and test/ (clean photos for testing); it is not
+    changed. If the command is killed, the same command continues the build.
     """
     from ambiguous_wild.builder import report
     from ambiguous_wild.builder.pipeline import build_scene
@@ -112,7 +118,7 @@ def command(
         return
     if result.up_to_date:
         click.echo(f"{output} is up to date")
-    for line in report.lines(info):
+    for line in report.summary_lines(info):
         click.echo(line)
     if not result.up_to_date:
         spent = ", ".join(f"{stage} {s:.1f}" for stage, s in info["seconds"].items())
@@ -120,8 +126,8 @@ def command(
     click.echo(verdict)
 
 
-def _facts(result, size: tuple[int, int], verdict: str) -> dict:
-    """scene.json without its long lists, and what this call did."""
+def _facts(result: BuildResult, size: tuple[int, int], verdict: str) -> dict[str, Any]:
+    """scene.json without its long lists, and facts of this call."""
     long = ("files", "photos", "inputs")
     return {
         "scene": str(result.scene),

@@ -1,4 +1,4 @@
-"""`aw capture`: photos for a scene, from a video, a folder or a camera."""
+"""`aw capture`: take photos from a video, a folder or a camera."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import click
 
 from ambiguous_wild.cli.paths import PathName
 
-BROKEN_BELOW = 0.9  # of the frames that a video announces; headers are often wrong by a few
+BROKEN_BELOW = 0.9  # of the frames in a video's header, which is often wrong by a few
 
 
 @click.command("capture")
@@ -34,11 +34,11 @@ BROKEN_BELOW = 0.9  # of the frames that a video announces; headers are often wr
 @click.option("--jobs", type=click.IntRange(min=1), help="Threads; the result does not depend on it.")
 @click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
 def command(source: str, output: Path, frames: int, every: float, jobs: int | None, as_json: bool) -> None:
-    """Take photos from SOURCE: a video (sharp, evenly spaced frames), a folder of photos (copied with their
+    """Take photos from SOURCE: a video (sharp, evenly spaced frames), a folder of photos (copies with
     EXIF), or 'camera' ('camera:1' is the second one)."""
     import os
 
-    from ambiguous_wild.builder import take
+    from ambiguous_wild.builder import capture_photos
     from ambiguous_wild.builder.progress import Bar
     from ambiguous_wild.core.errors import AwError
 
@@ -48,11 +48,13 @@ def command(source: str, output: Path, frames: int, every: float, jobs: int | No
     path = Path(source)
     camera = re.fullmatch(r"camera(?::(\d{1,3}))?", source)
     if path.is_dir():
-        facts = take.take_folder(path, output, jobs=jobs or os.cpu_count() or 1, bar=bar)
+        facts = capture_photos.photos_from_folder(path, output, jobs=jobs or os.cpu_count() or 1, bar=bar)
     elif path.is_file():
-        facts = take.take_video(path, output, frames=frames, bar=bar)
+        facts = capture_photos.photos_from_video(path, output, frames=frames, bar=bar)
     elif camera:
-        facts = take.take_camera(int(camera[1] or 0), output, frames=frames, every_s=every, bar=bar)
+        facts = capture_photos.photos_from_camera(
+            int(camera[1] or 0), output, frames=frames, every_s=every, bar=bar
+        )
     elif source.startswith("camera"):
         raise AwError(f"unknown camera {source!r}: write 'camera' or 'camera:1'")
     else:

@@ -1,6 +1,6 @@
-"""What `aw doctor` looks at: each check says what it found and, where something lacks, what brings it.
+"""The checks of `aw doctor`: what was found and, if something is missing, a command to install it.
 
-Nothing heavy is imported with this module: what may crash or hang is tried by `probes`, all at the same time.
+This module imports nothing heavy: imports that may crash or hang are tested by `probes`, in parallel.
 """
 
 from __future__ import annotations
@@ -21,25 +21,26 @@ from typing import Literal
 from ambiguous_wild.cli.probes import PROBES, Probe, probe
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.extras import install_command
-from ambiguous_wild.harness.environment import installed
-from ambiguous_wild.splat import cuda_ready
+from ambiguous_wild.harness.running.environment import installed
+from ambiguous_wild.splat.gpu import readiness
 
 PACKAGE = Path(__file__).resolve().parent.parent
 DISTRIBUTION = "ambiguous-wild"
-SMALL_MEMORY_GB = 2.0  # below it COLMAP and a training of 100 000 Gaussians do not fit
+SMALL_MEMORY_GB = 2.0  # COLMAP and a training of 100 000 Gaussians need this much
 UNUSED = "not used by this version yet"
 SMALL_DISK_GB = 1.0  # photos, features and one run
+_PIP = f"{shlex.quote(sys.executable)} -m pip"
 
 
 @dataclass(frozen=True)
 class Check:
     """One line of the report."""
 
-    group: Literal["core", "optional", "planned"]  # planned: no code of this version uses it
+    group: Literal["core", "optional", "planned"]  # planned: not used by this version
     name: str
     ok: bool
     detail: str  # what was found
-    fix: str = ""  # the command that brings it; empty where nothing lacks or nothing is gained
+    fix: str = ""  # shell command to paste, or a # comment where no command can do it; "" if nothing is to do
 
 
 def all_checks() -> list[Check]:
@@ -52,7 +53,9 @@ def all_checks() -> list[Check]:
         *_packages(),
         _library("torch", found["torch"], "training and LPIPS"),
         _library("OpenImageIO", found["OpenImageIO"], "reading photos"),
-        _library("pycolmap", found["pycolmap"], "structure from motion; a PNG written after it is intact"),
+        _library(
+            "pycolmap", found["pycolmap"], "structure from motion; PNG files are written correctly after it"
+        ),
         *_numba(found["numba"]),
         *_gpu(found["torch"]),
         _torchvision(found.get("torchvision")),
@@ -73,7 +76,7 @@ def _machine() -> list[Check]:
             "python",
             python,
             platform.python_version(),
-            "" if python else "install Python 3.11 or newer",
+            "" if python else _system_install("python3.11", "https://www.python.org/downloads"),
         ),
         Check("core", "cpu", True, f"{cores} cores usable of {os.cpu_count()}, {platform.machine()}"),
     ]
@@ -81,18 +84,29 @@ def _machine() -> list[Check]:
     if memory is not None:
         fine = memory >= SMALL_MEMORY_GB
         fix = (
-            "" if fine else f"free some, or train with --max-gaussians: {SMALL_MEMORY_GB:.0f} GB are advised"
+            ""
+            if fine
+            else f"# use {SMALL_MEMORY_GB:.0f} GB or more, or train with aw bench --max-gaussians 50000"
         )
         checks.append(Check("core", "memory", fine, f"{memory:.1f} GB", fix))
     free = shutil.disk_usage(Path.cwd()).free / 1e9
     fine = free >= SMALL_DISK_GB
-    fix = "" if fine else f"free {SMALL_DISK_GB:.0f} GB, or work elsewhere"
+    fix = "" if fine else f"df -h .  # free at least {SMALL_DISK_GB:.0f} GB, or use a folder on another disk"
     checks.append(Check("core", "disk", fine, f"{free:.0f} GB free in {Path.cwd()}", fix))
     return checks
 
 
+def _system_install(package: str, page: str) -> str:
+    """The command that installs a system package, for the package manager of this machine."""
+    managers = {"apt-get": "sudo apt-get install -y", "dnf": "sudo dnf install -y", "brew": "brew install"}
+    for name, command in managers.items():
+        if shutil.which(name) is not None:
+            return f"{command} {package}"
+    return f"# install {package} from {page}"
+
+
 def _memory_gb() -> float | None:
-    """Physical memory; None where the system does not say."""
+    """Physical memory; None if the system does not report it."""
     try:
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
     except (AttributeError, ValueError, OSError):
@@ -100,25 +114,30 @@ def _memory_gb() -> float | None:
 
 
 def _packages() -> list[Check]:
-    """The required packages against their ranges, and against the versions the project is tested with."""
+    """The required packages: allowed ranges, and the tested versions."""
+    root = shlex.quote(str(PACKAGE.parent))
     try:
         required = importlib.metadata.requires(DISTRIBUTION) or []
     except importlib.metadata.PackageNotFoundError:
-        return [Check("core", "packages", False, f"{DISTRIBUTION} is not installed", "pip install -e .")]
+        return [
+            Check("core", "packages", False, f"{DISTRIBUTION} is not installed", f"{_PIP} install -e {root}")
+        ]
     wrong = unmet(r for r in required if "extra ==" not in r)
     if wrong:
-        fix = "pip install " + " ".join(f"'{w}'" for w in wrong)
-        return [Check("core", "packages", False, "absent or too old: " + ", ".join(wrong), fix)]
+        fix = f"{_PIP} install " + " ".join(f"'{w}'" for w in wrong)
+        return [Check("core", "packages", False, "missing or wrong version: " + ", ".join(wrong), fix)]
     other = other_versions(PACKAGE.parent / "constraints.txt")
-    detail = f"all {sum('extra ==' not in r for r in required)} required ones"
+    detail = f"all {sum('extra ==' not in r for r in required)} required packages"
     if other is None:
         return [Check("core", "packages", True, detail)]
-    detail += ", the tested versions" if not other else "; not the tested version: " + ", ".join(other)
+    detail += (
+        ", in the tested versions" if not other else "; other than the tested version: " + ", ".join(other)
+    )
     return [Check("core", "packages", True, detail)]
 
 
 def unmet(requirements: Iterable[str]) -> list[str]:
-    """The requirements ("name>=1.0") that what is installed does not meet."""
+    """The requirements ("name>=1.0") that the installed packages do not meet."""
     from packaging.requirements import Requirement
 
     wrong = []
@@ -131,7 +150,7 @@ def unmet(requirements: Iterable[str]) -> list[str]:
 
 
 def other_versions(constraints: Path) -> list[str] | None:
-    """Installed packages whose version is not the pinned one; None where there is no such file."""
+    """Installed packages whose version differs from the pinned one; None if there is no such file."""
     if not constraints.is_file():
         return None
     lines = []
@@ -144,18 +163,24 @@ def other_versions(constraints: Path) -> list[str] | None:
     return lines
 
 
+def _constraints() -> str:
+    """The option of pip that installs the tested versions, in a checkout."""
+    path = PACKAGE.parent / "constraints.txt"
+    return f" -c {shlex.quote(str(path))}" if path.is_file() else ""
+
+
 def _library(name: str, found: Probe, use: str) -> Check:
     if found.facts is not None:
         return Check("core", name, True, f"{found.facts['version']} ({use})")
-    fix = "pip install -c constraints.txt --force-reinstall --no-deps " + name
+    fix = f"{_PIP} install{_constraints()} --force-reinstall --no-deps {name}"
     return Check("core", name, False, f"{found.error} ({use})", fix)
 
 
 def _numba(found: Probe) -> list[Check]:
     if found.facts is None:
-        fix = "pip install -c constraints.txt --force-reinstall numba llvmlite"
+        fix = f"{_PIP} install{_constraints()} --force-reinstall numba llvmlite"
         return [Check("core", "numba", False, found.error, fix)]
-    layer = f"{found.facts['threads']} threads, layer {found.facts['layer']}"
+    layer = f"{found.facts['threads']} threads, threading layer {found.facts['layer']}"
     checks = [Check("core", "numba", True, layer)]
     from ambiguous_wild.splat.cpu.cache import kernel_cache
 
@@ -163,7 +188,9 @@ def _numba(found: Probe) -> list[Check]:
     existing = next(p for p in (folder, *folder.parents) if p.exists())
     compiled = len(list(folder.rglob("*.nbi"))) if folder.is_dir() else 0
     state = (
-        f"{compiled} kernels compiled" if compiled else "not compiled yet: the first run takes a minute more"
+        f"{compiled} kernels compiled"
+        if compiled
+        else "not compiled yet: the first run takes 1 minute longer"
     )
     writable = os.access(existing, os.W_OK)
     where = f"in {folder}" if writable else f"{folder} is not writable"
@@ -173,35 +200,42 @@ def _numba(found: Probe) -> list[Check]:
 
 
 def _gpu(torch: Probe) -> list[Check]:
-    """In the words with which `--device` refuses a GPU."""
+    """The same messages as those of `--device`."""
     if torch.facts is None:
-        return [Check("optional", "torch cuda", False, torch.error, "mend torch first")]
-    found = cuda_ready.look(torch.facts)
+        fix = _library("torch", torch, "").fix
+        return [Check("optional", "torch cuda", False, torch.error, fix)]
+    found = readiness.look(torch.facts)
     driver, version = found.driver, installed("gsplat") or "present"
     checks = [
         Check("optional", "nvidia driver", driver is not None, driver or "no nvidia-smi; the CPU is used",
-              "" if driver else "install the NVIDIA driver, if there is a GPU"),
-        _part("torch cuda", ", ".join(torch.facts["names"]), cuda_ready.no_cuda(found)),
-        _part("gsplat", version, cuda_ready.no_gsplat(found)),
+              "" if driver else _driver_install()),
+        _part("torch cuda", ", ".join(torch.facts["names"]), readiness.no_cuda(found)),
+        _part("gsplat", version, readiness.no_gsplat(found)),
     ]  # fmt: skip
     if found.gsplat and found.has_gpu:
         state = f"compiled, in {found.folder}"
         if found.prebuilt:
-            state = "part of its wheel"
+            state = "prebuilt in the wheel"
         elif not found.compiled:
-            state = f"not compiled yet: the first run takes several minutes more, kept in {found.folder}"
-        checks.append(_part("gsplat kernels", state, cuda_ready.no_kernels(found)))
+            state = f"not compiled yet: the first run takes several minutes longer, kept in {found.folder}"
+        checks.append(_part("gsplat kernels", state, readiness.no_kernels(found)))
     return checks
 
 
-def _part(name: str, fine: str, lack: cuda_ready.Lack | None) -> Check:
+def _driver_install() -> str:
+    if shutil.which("ubuntu-drivers") is not None:
+        return "sudo ubuntu-drivers install  # only if this machine has an NVIDIA GPU"
+    return "# if this machine has an NVIDIA GPU, install its driver: https://www.nvidia.com/drivers"
+
+
+def _part(name: str, fine: str, lack: readiness.Lack | None) -> Check:
     return Check(
         "optional", name, lack is None, fine if lack is None else lack.what, lack.fix if lack else ""
     )
 
 
 def _extras() -> list[Check]:
-    """Packages that one command needs, and a program that has an environment of its own."""
+    """Packages for single commands, and nerfbaselines, which has its own environment."""
     from ambiguous_wild.methods.external.nerfbaselines import find_program
 
     packages = {
@@ -213,7 +247,9 @@ def _extras() -> list[Check]:
     for name, (extra, use) in packages.items():
         version = installed(name)
         fix = "" if version else install_command(extra)
-        checks.append(Check("optional", name, version is not None, f"{version or 'absent'} ({use})", fix))
+        checks.append(
+            Check("optional", name, version is not None, f"{version or 'not installed'} ({use})", fix)
+        )
     try:
         checks.append(Check("optional", "nerfbaselines", True, f"{find_program()} (its methods)"))
     except AwError as error:
@@ -223,28 +259,28 @@ def _extras() -> list[Check]:
 
 
 def _planned() -> list[Check]:
-    """What later versions will use: named without a command, so that nobody installs it for nothing."""
+    """Packages of later versions, listed without a command, since installing them has no use yet."""
     packages = {"viser": "interactive viewer"}
     return [
         Check(
             "planned", name, bool(version := installed(name)),
-            f"{'present' if version else 'absent'}, {UNUSED} ({use})",
+            f"{'installed' if version else 'not installed'}, {UNUSED} ({use})",
         )
         for name, use in packages.items()
     ]  # fmt: skip
 
 
 def _vision() -> list[Check]:
-    """Real foundation models: the package that runs them, and which weights are here."""
+    """Foundation models: transformers and the weights."""
     from ambiguous_wild.vision import weights
 
     version = installed("transformers")
-    detail = f"{version or 'absent'} (DINO features, SAM masks)"
+    detail = f"{version or 'not installed'} (DINO features, SAM masks)"
     fix = "" if version else install_command("masks")
     checks = [Check("optional", "transformers", version is not None, detail, fix)]
     hub = {w.name: w.used_for for w in weights.KNOWN if w.kind == "hub"}
     checks += [
-        Check("optional", line.name, line.present, f"{hub[line.name]}: {line.where}", line.bring)
+        Check("optional", line.name, line.present, f"{hub[line.name]}: {line.where}", line.command)
         for line in weights.status()
         if line.name in hub
     ]
@@ -252,36 +288,35 @@ def _vision() -> list[Check]:
 
 
 def _torchvision(found: Probe | None) -> Check:
-    """Absent is fine. Present but broken takes transformers down with it."""
+    """Not needed; but if it is installed and broken, transformers cannot be imported."""
     if found is None:
-        return Check("optional", "torchvision", True, "absent, and not needed")
+        return Check("optional", "torchvision", True, "not installed, not needed")
     if found.facts is not None:
         return Check("optional", "torchvision", True, f"{found.facts['version']}, not needed")
     return Check("optional", "torchvision", False, f"broken, and breaks transformers: {found.error}",
-                 "pip uninstall torchvision")  # fmt: skip
+                 f"{_PIP} uninstall -y torchvision")  # fmt: skip
 
 
 def _metrics() -> list[Check]:
-    """LPIPS by metric, not by file: a backbone alone measures nothing."""
+    """LPIPS per metric, because each needs two files."""
     from ambiguous_wild.metrics import lpips
     from ambiguous_wild.vision import weights
 
-    own = weights.weights_folder()
-    if own:
-        folder = f"mkdir -p {shlex.quote(str(own))}"
-    else:
-        folder = f'export AW_WEIGHTS={weights.USUAL_FOLDER} && mkdir -p "$AW_WEIGHTS"'
     checks = []
-    for metric, reason in lpips.available().items():
-        detail, _, what = (reason or "weights found").partition(": ")
-        # A comment keeps the line fit to paste: no program brings these files.
-        fix = f"{folder}  # then {what.rpartition(' into ')[0]} into it" if what else ""
-        checks.append(Check("optional", metric, reason is None, detail, fix))
+    for metric in lpips.VARIANTS:
+        missing = lpips.missing_weights(metric)
+        detail = f"weights missing: {', '.join(missing)}" if missing else "weights found"
+        fix = weights.download_command(*map(weights.named, missing)) if missing else ""
+        checks.append(Check("optional", metric, not missing, detail, fix))
     return checks
 
 
 def _git() -> Check:
-    version = cuda_ready.first_line("git", "--version")
+    version = readiness.first_line("git", "--version")
     return Check(
-        "optional", "git", version is not None, version or "absent", "" if version else "install git"
+        "optional",
+        "git",
+        version is not None,
+        version or "not installed",
+        "" if version else _system_install("git", "https://git-scm.com/downloads"),
     )

@@ -1,4 +1,4 @@
-"""`aw composite`: distractors with exact masks on a scene of real photographs."""
+"""`aw composite`: add distractors with exact masks to a scene of real photos."""
 
 from __future__ import annotations
 
@@ -15,17 +15,25 @@ from ambiguous_wild.cli.paths import PathName
 @click.argument("scene", type=PathName())
 @click.option("-o", "--output", required=True, type=PathName(), help="Scene folder to make.")
 @click.option("--cutouts", type=PathName(), help="Folder of PNG files; alpha is the mask.")
-@click.option("--patches", is_flag=True, help="Fill the shapes with the scene's own texture: same colours.")
+@click.option("--patches", is_flag=True, help="Fill the shapes with the scene's own texture.")
 @click.option("--coverage", type=float, default=0.15, show_default=True, help="Mean share of a train photo.")
-@click.option("--presence", type=float, default=0.8, show_default=True, help="Share of photos a thing is in.")
+@click.option(
+    "--presence",
+    type=float,
+    default=0.8,
+    show_default=True,
+    help="Share of the train photos that show a distractor.",
+)
 @click.option(
     "--pose",
     type=click.Choice(["standing", "lying"]),
     default="standing",
     show_default=True,
-    help="Upright; or lying and turned any way, for photos from above.",
+    help="Upright; or lying at any angle, for photos from above.",
 )
-@click.option("--shadow", type=float, default=0.0, show_default=True, help="0 none, 1 black.")
+@click.option(
+    "--shadow", type=float, default=0.0, show_default=True, help="Darkness of the shadows: 0 none, 1 black."
+)
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
 @click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
 def command(
@@ -40,17 +48,17 @@ def command(
     seed: int,
     as_json: bool,
 ) -> None:
-    """Put things into the train photos of SCENE, elsewhere in each; test photos stay as they are.
+    """Add distractors to the train photos of SCENE, at other places in each; test photos do not change.
 
-    Without --cutouts, --patches draws rounded shapes of its own.
+    --patches without --cutouts draws rounded shapes.
     """
     from tqdm import tqdm
 
     from ambiguous_wild.core.config import from_plain
     from ambiguous_wild.io.atomic import check_output, sweep_siblings
     from ambiguous_wild.io.lock import folder_lock
-    from ambiguous_wild.simulate.composite.placing import CompositeConfig
-    from ambiguous_wild.simulate.composite.scene import composite
+    from ambiguous_wild.simulate.composite.composite_scene import composite
+    from ambiguous_wild.simulate.composite.placement import CompositeConfig
 
     config = from_plain(
         CompositeConfig,
@@ -69,14 +77,14 @@ def command(
 
     check_output(output)
     with folder_lock(output, "aw composite"):
-        sweep_siblings(output)  # of a call that was killed
+        sweep_siblings(output)  # left by a killed call
         facts = composite(scene, output, config, cutouts, bar)
     if as_json:
         click.echo(json.dumps({k: v for k, v in facts.items() if k != "photos"}, indent=2))
         return
     share = facts["occlusion"]
     click.echo(
-        f"wrote: {output}: {len(facts['photos'])} train photos, {len(facts['cutouts'])} things cover "
+        f"wrote: {output}: {len(facts['photos'])} train photos, {len(facts['cutouts'])} distractors cover "
         f"{100 * share['min']:.0f} to {100 * share['max']:.0f} % (mean {100 * share['mean']:.1f} %) of each"
     )
     click.echo(f"next: aw bench --method refinesplat --scene {shlex.quote(str(output))} -o runs")

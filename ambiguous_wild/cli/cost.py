@@ -1,4 +1,4 @@
-"""`aw cost`: what accuracy costs in time."""
+"""`aw cost`: accuracy against training time."""
 
 from __future__ import annotations
 

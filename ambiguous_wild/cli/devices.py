@@ -1,4 +1,4 @@
-"""Where a command computes: CPU or GPU, and the kernels made ready."""
+"""Choice of CPU or GPU, and compilation of the kernels."""
 
 from __future__ import annotations
 
@@ -6,22 +6,22 @@ import click
 
 
 def choose_device(device: str) -> str:
-    """ "auto" is the GPU where torch and gsplat can both use one; one that lies idle is said on stderr.
+    """The device for "cpu", "cuda" or "auto": auto is the GPU if torch and gsplat can use one.
 
-    Compiles gsplat's kernels where they are not yet.
+    Compiles gsplat's kernels if needed; reports a GPU that cannot be used on stderr.
 
     Raises:
-        AwError: cuda was asked for and is not usable; says what is missing.
+        AwError: cuda was requested but is not usable; names what is missing.
     """
     if device == "cpu":
         return "cpu"
-    from ambiguous_wild.splat.cuda_ready import choose
+    from ambiguous_wild.splat.gpu.readiness import choose
 
     return choose(device, lambda text: click.echo(text, err=True))
 
 
 def prepare_cpu(threads: int | None) -> None:
-    """Set the threads of the kernels and compile them, once per machine."""
+    """Set the number of threads and compile the CPU kernels, once per machine."""
     from ambiguous_wild.splat.cpu import set_threads
     from ambiguous_wild.splat.cpu.warmup import warm_up
 

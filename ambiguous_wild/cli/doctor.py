@@ -1,4 +1,4 @@
-"""`aw doctor`: what is installed, what is missing, and the command that brings it."""
+"""`aw doctor`: missing dependencies and the commands that install them."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 @click.command(name="doctor")
 @click.option("--json", "as_json", is_flag=True, help="Print the report as JSON.")
 def command(as_json: bool) -> None:
-    """Check this machine: packages, CPU and GPU, kernels, weights; names what brings what is missing.
+    """Check this machine: packages, CPU, GPU, kernels, weights; with a command to install what is missing.
 
-    Exit code 0 when the core works (optional parts may lack), 2 otherwise.
+    Exit code 0 if the core works (optional parts may be missing), else 2.
     """
     from ambiguous_wild.cli.checks import all_checks
 
@@ -33,11 +33,11 @@ def command(as_json: bool) -> None:
             _print_group(group, [c for c in checks if c.group == group])
     if broken:
         names = ", ".join(c.name for c in broken)
-        raise AwError(f"the core does not work here: {names}; run {broken[0].fix!r} first")
+        raise AwError(f"the core does not work on this machine: {names}; first run: {broken[0].fix}")
     if not as_json:
         missing = sum(c.group == "optional" and not c.ok for c in checks)
         click.echo(
-            f"\nthe core works; {missing} optional parts are missing" if missing else "\neverything works"
+            f"\nthe core works; {missing} optional parts are missing" if missing else "\nall parts work"
         )
 
 
@@ -53,7 +53,7 @@ def _print_group(group: str, checks: list[Check]) -> None:
 
 
 def _mark(check: Check) -> str:
-    if check.group == "planned":  # neither good nor bad
+    if check.group == "planned":  # not a result
         return "·"
     if check.ok:
         return click.style("✓", fg="green")

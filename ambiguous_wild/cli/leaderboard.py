@@ -1,4 +1,4 @@
-"""`aw leaderboard`: take runs in, publish the page, check what is there."""
+"""`aw leaderboard`: add runs, publish the page, check the board."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import click
 from ambiguous_wild.cli.paths import PathName
 
 if TYPE_CHECKING:
-    from ambiguous_wild.harness.leaderboard.add import Report
+    from ambiguous_wild.harness.leaderboard.add import AddReport
 
 _board = click.option(
     "--board",
@@ -72,8 +72,8 @@ def add_command(
 ) -> None:
     """Check RUNS (run folders, or folders of them) and add those that pass.
 
-    Changed, partial, failed and foreign runs are refused, one line each; runs that are not finished are left
-    for later. Whoever adds a run twice changes nothing.
+    Changed, partial, failed and foreign runs are refused, one line each; unfinished runs are
+    left for later. Adding a run twice changes nothing.
     """
     from ambiguous_wild.core import AwError
     from ambiguous_wild.harness.leaderboard.add import add
@@ -101,7 +101,7 @@ def add_command(
         sys.exit(AwError.exit_code)
 
 
-def _print_reports(reports: list[Report], as_json: bool) -> None:
+def _print_reports(reports: list[AddReport], as_json: bool) -> None:
     if as_json:
         rows = [{"run": str(r.run), "outcome": r.outcome, "error": r.error or None} for r in reports]
         click.echo(json.dumps(rows, indent=2))
@@ -149,7 +149,7 @@ def remove_command(
     seed: int | None,
     dry_run: bool,
 ) -> None:
-    """Take runs down, with their pictures; the board is then as if they had never been there."""
+    """Remove runs and their pictures from the board."""
     from ambiguous_wild.harness.leaderboard.remove import remove
 
     gone = remove(board, method=method, dataset=dataset, scene=scene, setting=setting, seed=seed, dry=dry_run)

@@ -11,25 +11,31 @@ import click
 from ambiguous_wild import __version__
 from ambiguous_wild.core.errors import AwError, unknown
 
-# command -> (module, one line of help); the help line stands here so that `aw --help` imports nothing.
+# command -> (module, one line of help); help is here so that `aw --help` imports no command.
 COMMANDS = {
-    "doctor": ("doctor", "What is installed, what is missing, and the command that brings it."),
-    "simulate": ("simulate", "Make a capture with exact truth: poses, distractor masks, clean views."),
-    "composite": ("composite", "Put distractors with exact masks into a scene of real photos."),
-    "capture": ("capture", "Sharp, evenly spaced photos from a video, a folder or a camera."),
-    "screen": ("screen", "Check a capture: exposure, white balance, focus, blur, overlap; what to do."),
-    "build-scene": ("build_scene", "From a folder of photos to a scene: check, COLMAP, downsample, split."),
-    "ambiguity-report": ("ambiguity_report", "How hard are this scene's distractors to tell apart?"),
-    "plan": ("plan", "Which optional effects does this scene call for, and what do they cost?"),
-    "bench": ("bench", "Train methods on scenes and measure them."),
-    "ablate": ("ablate", "What each part of a method brings, and what it costs."),
+    "doctor": ("doctor", "Check this machine: missing dependencies and the commands that install them."),
+    "simulate": (
+        "simulate",
+        "Make a synthetic capture with ground truth: poses, distractor masks, clean views.",
+    ),
+    "composite": ("composite", "Add distractors with exact masks to a scene of real photos."),
+    "capture": ("capture", "Select sharp, evenly spaced photos from a video, a folder or a camera."),
+    "screen": ("screen", "Check a capture: exposure, white balance, focus, blur, overlap; with advice."),
+    "build-scene": (
+        "build_scene",
+        "Build a scene from a folder of photos: check, COLMAP, downsample, split.",
+    ),
+    "ambiguity-report": ("ambiguity_report", "Measure how similar the distractors are to the scene."),
+    "plan": ("plan", "Recommend optional effects for a scene, with their cost."),
+    "bench": ("bench", "Train methods on scenes and evaluate them."),
+    "ablate": ("ablate", "Measure the gain and cost of each part of a method."),
     "table": ("table", "Compare runs: Markdown, CSV, LaTeX."),
-    "cost": ("cost", "What accuracy costs in time: tables and plots."),
-    "audit": ("audit", "What cannot be right in a table of results."),
-    "leaderboard": ("leaderboard", "Take checked runs into CSVs, and publish them as a page."),
-    "study": ("study", "Ask people, blind: what is hard to see, which render is better."),
-    "stress": ("stress", "Numerically hard cases against float64; a training that met a NaN once more."),
-    "methods": ("methods", "List the methods there are."),
+    "cost": ("cost", "Accuracy against training time: tables and plots."),
+    "audit": ("audit", "Find errors in tables of results."),
+    "leaderboard": ("leaderboard", "Add checked runs to CSV files and publish them as a page."),
+    "study": ("study", "Blind user study: which distractor is hard to see, which render is better."),
+    "stress": ("stress", "Numerical stress tests against float64; replay of a training that met a NaN."),
+    "methods": ("methods", "List the available methods."),
 }
 
 
@@ -60,15 +66,15 @@ def cli() -> None:
     """Distractor-free 3D Gaussian Splatting where the distractor looks like the scene.
 
     \b
-    aw simulate courtyard -o raw        a capture with exact truth, or use your own photos
+    aw simulate courtyard -o raw        a synthetic capture; or use your own photos
     aw build-scene raw -o scene         check, COLMAP, downsample, split
     aw bench --method 3dgs --method refinesplat --scene scene -o runs
-    aw table runs                       compare
+    aw table runs                       compare the methods
     """
 
 
 def main() -> None:
-    """Run the command line: one red line and exit code 2 for what the user can mend."""
+    """Run the command line: one red line and exit code 2 for errors that the user can fix."""
     try:
         cli.main(standalone_mode=False)
     except AwError as error:
@@ -79,11 +85,11 @@ def main() -> None:
         click.secho("interrupted; run the same command again to continue", fg="yellow", err=True)
         sys.exit(130)
     except BrokenPipeError:
-        # The reader of our output left (`aw table | head`): not an error of ours.
+        # The reader closed our output (`aw table | head`); this is not an error.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)
     except OSError as error:
-        # Disk full, no permission, a file where a folder is needed: the user's to mend, in one line.
+        # Disk full, no permission, a file in place of a folder: the user can fix these.
         _fail(f"{error.filename or 'input or output'}: {error.strerror or error}")
 
 

@@ -1,4 +1,4 @@
-"""`aw methods`: which methods there are and what each needs."""
+"""`aw methods`: the available methods and their requirements."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from ambiguous_wild.cli.paths import PathName
 
 @click.command(name="methods")
 @click.option("--plugin", "plugins", multiple=True, type=PathName(),
-              help="A Python file that registers methods of your own; repeatable.")  # fmt: skip
+              help="A Python file that registers your methods; repeatable.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print the list as JSON.")
 def command(plugins: tuple[Path, ...], as_json: bool) -> None:
-    """List the methods: name, what it does, paper, what it needs beyond the core."""
+    """List the methods: name, summary, paper, requirements beyond the core."""
     from ambiguous_wild.methods.registry import all_methods, load_plugin
 
     for plugin in plugins:

@@ -1,4 +1,4 @@
-"""Options that every command that trains has: how long, on what, with which code, what is kept."""
+"""Options shared by all commands that train."""
 
 from __future__ import annotations
 
@@ -17,44 +17,42 @@ _OPTIONS = (
         type=click.IntRange(0),
         default=(0,),
         show_default=True,
-        help="Repeatable.",
+        help="Random seed; repeatable.",
     ),
     click.option("--iterations", type=click.IntRange(1), help="Length of a training.  [default: 30000]"),
     click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True),
-    click.option("--threads", type=click.IntRange(1), help="CPU threads; the result does not depend on it."),
+    click.option("--threads", type=click.IntRange(1), help="CPU threads; they do not change the result."),
     click.option(
         "--factor",
         type=click.IntRange(1),
         help="Train on images_N.  [default: what the scene was built for]",
     ),
-    click.option(
-        "--max-gaussians", type=click.IntRange(4), help="Growth stops here.  [default: the method's own]"
-    ),
+    click.option("--max-gaussians", type=click.IntRange(4), help="Most Gaussians.  [default: the method's]"),
     click.option(
         "--plugin",
         "plugins",
         multiple=True,
         type=PathName(),
-        help="A Python file that registers methods of your own.",
+        help="A Python file that registers your methods; repeatable.",
     ),
     click.option(
         "--overwrite",
         type=click.Choice(["never", "missing", "always"]),
         default="missing",
         show_default=True,
-        help="missing: keep what is finished, resume what stopped.",
+        help="missing: keep finished runs, resume stopped ones.",
     ),
     click.option(
         "--cache",
         type=PathName(),
-        help="Features and instance masks.  [default: OUTPUT/.cache]",
+        help="Folder for features and instance masks.  [default: OUTPUT/.cache]",
     ),
 )
 
 
 def training_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add them to a click command, as seeds, iterations, device, threads, factor, max_gaussians,
-    plugins, overwrite and cache."""
+    """Add these options to a click command: seeds, iterations, device, threads, factor, max_gaussians,
+    plugins, overwrite, cache."""
     for option in reversed(_OPTIONS):
         command = option(command)
     return command

@@ -1,4 +1,4 @@
-"""`aw plan`: which optional effects a scene calls for."""
+"""`aw plan`: recommend optional effects for a scene."""
 
 from __future__ import annotations
 
@@ -19,25 +19,30 @@ if TYPE_CHECKING:
 @click.command("plan")
 @click.argument("scene", type=PathName())
 @click.option(
-    "--factor", type=click.IntRange(1), help="Look at images_N.  [default: what the scene was built for]"
+    "--factor", type=click.IntRange(1), help="Use images_N.  [default: what the scene was built for]"
 )
 @click.option(
     "--probe/--no-probe",
     default=True,
     show_default=True,
-    help="Train 3DGS on small photos, longer where it finds something: masks need it, all others do not.",
+    help="Train 3DGS on small photos, to decide on masks; other effects do not need it.",
 )
 @click.option(
-    "--costs/--no-costs", default=False, show_default=True, help="Time every effect on this machine."
+    "--costs/--no-costs",
+    default=False,
+    show_default=True,
+    help="Measure the time of each effect on this machine.",
 )
-@click.option("-o", "--out", type=PathName(dir_okay=False), help="Default: SCENE-plan.json.")
+@click.option(
+    "-o", "--out", type=PathName(dir_okay=False), help="File for the plan.  [default: SCENE-plan.json]"
+)
 @click.option("--json", "as_json", is_flag=True, help="Print the plan as JSON.")
 def command(
     scene: Path, factor: int | None, probe: bool, costs: bool, out: Path | None, as_json: bool
 ) -> None:
-    """Measure what SCENE calls for: effect, evidence, threshold, decision, cost.
+    """Measure SCENE and decide on each effect: evidence, threshold, decision, cost.
 
-    'aw bench --effects auto' makes the same decisions by itself, without the probe.
+    'aw bench --effects auto' makes the same decisions, but without the probe.
     """
     from ambiguous_wild.core.errors import AwError
     from ambiguous_wild.harness.planning.decide import plan_without_training
@@ -47,9 +52,9 @@ def command(
     loaded = load_scene(scene, factor=factor)
     path = out or scene.resolve().parent / f"{scene.resolve().name}-plan.json"
     if path.resolve().is_relative_to(scene.resolve()):
-        raise AwError(f"{path} lies inside {scene}, and would change the scene; choose another -o")
+        raise AwError(f"{path} is inside {scene} and would change the scene; choose another -o")
     check_output(path)
-    _refuse_loss(path, probe)
+    _check_overwrite(path, probe)
     plan = plan_without_training(loaded)
     if probe or costs:
         from ambiguous_wild.cli.devices import prepare_cpu
@@ -76,8 +81,8 @@ def command(
     click.echo(f"wrote {path}")
 
 
-def _refuse_loss(path: Path, probe: bool) -> None:
-    """A plan may be made again in the place of an earlier one, and of nothing else."""
+def _check_overwrite(path: Path, probe: bool) -> None:
+    """Only an earlier plan may be replaced, and not one with a probe by one without."""
     from ambiguous_wild.core.errors import AwError
     from ambiguous_wild.harness.planning.file import read_plan
 
@@ -86,15 +91,15 @@ def _refuse_loss(path: Path, probe: bool) -> None:
     try:
         earlier = read_plan(path)
     except AwError:
-        raise AwError(f"{path} is there already and is no plan of 'aw plan'; choose another -o") from None
+        raise AwError(f"{path} exists and is not a plan of 'aw plan'; choose another -o") from None
     if earlier.probed and not probe:
         raise AwError(
-            f"{path} holds what a probe found, which a plan without one would replace; choose another -o"
+            f"{path} holds the result of a probe, which --no-probe would discard; choose another -o"
         )
 
 
 def table(plan: Plan) -> list[str]:
-    """The plan as lines of a terminal."""
+    """The plan as text lines for a terminal."""
     head = ("effect", "evidence", "found", "from", "decision", "ms/iteration", "why")
     rows = [head, *(_row(d) for d in plan.decisions)]
     widths = [max(len(row[k]) for row in rows) for k in range(len(head) - 1)]

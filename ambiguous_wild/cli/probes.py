@@ -1,4 +1,4 @@
-"""What may crash or hang (torch, torchvision, pycolmap), tried in a process of its own."""
+"""Test imports that may crash or hang (torch, torchvision, pycolmap), each in its own process."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ TIMEOUT_S = 60
 # Each prints one line of JSON.
 PROBES = {
     "torch": """
-from ambiguous_wild.splat.cuda_ready import torch_facts
+from ambiguous_wild.splat.gpu.readiness import torch_facts
 print(json.dumps(torch_facts()))
 """,
     "torchvision": "import torchvision; print(json.dumps({'version': torchvision.__version__}))",
@@ -40,14 +40,14 @@ print(json.dumps({"version": pycolmap.__version__}))
 
 @dataclass(frozen=True)
 class Probe:
-    """What a process said: its facts, or why there are none."""
+    """The facts a process printed, or the error."""
 
     facts: dict[str, Any] | None
     error: str = ""
 
 
 def probe(name: str) -> Probe:
-    """Run one of `PROBES` in a process of its own."""
+    """Run one of `PROBES` in its own process."""
     code = "import json\n" + PROBES[name]
     try:
         done = subprocess.run(

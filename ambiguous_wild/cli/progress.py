@@ -1,37 +1,44 @@
-"""What is said while runs are made, one after another, and when all are there."""
+"""What commands print while runs are made, and when all are made."""
 
 from __future__ import annotations
 
 import json
 import shlex
 import sys
-from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.harness.running.callbacks import Callbacks, Lines, outcome_line, run_name
 
 if TYPE_CHECKING:
-    from ambiguous_wild.harness.cell import Cell, CellReport
+    from ambiguous_wild.harness.bench import BenchReport
+    from ambiguous_wild.harness.running.cell import Cell, CellReport
     from ambiguous_wild.splat.trainer import Trainer
 
 
-class Progress:
-    """A bar a cell; on stderr, so that stdout stays clean for results."""
+def say(text: str) -> None:
+    """Write a line on stderr, so that stdout stays clean for results."""
+    click.echo(text, err=True)
+
+
+class ProgressBar(Callbacks):
+    """A bar for each run, for runs that are made one by one."""
 
     def __init__(self, cells: int) -> None:
         self.cells, self.index = cells, 0
         self.bar: Any = None
 
-    def start(self, cell: Cell, folder: Path) -> None:
+    def say(self, text: str) -> None:
+        say(text)
+
+    def started(self, cell: Cell, folder: Path) -> None:
         self.index += 1
-        self.title = (
-            f"[{self.index}/{self.cells}] {cell.method.name} on {cell.scene.name}, seed {cell.train.seed}"
-            + (f", {cell.group}" if cell.group else "")
-        )
-        click.echo(f"{self.title} -> {folder}", err=True)
+        group = f", {cell.group}" if cell.group else ""
+        say(f"[{self.index}/{self.cells}] {run_name(cell)}{group} -> {folder}")
 
     def tick(self, trainer: Trainer) -> None:
         from tqdm import tqdm
@@ -53,46 +60,58 @@ class Progress:
             )
         self.bar.update(done - self.bar.n)
 
-    def end(self, cell: Cell, report: CellReport) -> None:
+    def ended(self, cell: Cell, report: CellReport) -> None:
         if self.bar is not None:
             self.bar.close()
             self.bar = None
         if report.outcome != "failed" or self.cells > 1:  # a single failure is the command's one error line
-            click.echo(f"    {outcome_line(report)}", err=True)
+            say(f"    {outcome_line(report)}")
 
 
-def outcome_line(report: CellReport) -> str:
-    if report.outcome == "kept":
-        return "finished before, kept"
-    if report.outcome == "skipped":
-        return "exists, left as it is (--overwrite never)"
-    if report.outcome == "failed":
-        return "failed: " + " ".join(report.error.split())
-    cost, images = report.result["cost"], report.result["per_image"]
-    values = [float(row["psnr"]) for row in images]
-    parts = [f"PSNR {sum(values) / len(values):.2f} dB over {len(values)} test views"] if values else []
-    # Of an external program not everything is known.
-    known = {
-        "train_s": "{:.0f} s training",
-        "ms_per_iteration": "{:.1f} ms/iteration",
-        "gaussians": "{:,} Gaussians",
-    }
-    parts += [text.format(cost[name]) for name, text in known.items() if cost.get(name) is not None]
-    return ", ".join(parts)
+class Progress(Callbacks):
+    """Bars for runs made one by one; for several at a time lines, as their bars would mix."""
+
+    def __init__(self) -> None:
+        self.shown: Callbacks = Lines(say)
+
+    def say(self, text: str) -> None:
+        say(text)
+
+    def planned(self, cells: Sequence[Cell], one_by_one: bool) -> None:
+        if one_by_one:
+            self.shown = ProgressBar(len(cells))
+        self.shown.planned(cells, one_by_one)
+
+    def started(self, cell: Cell, folder: Path) -> None:
+        self.shown.started(cell, folder)
+
+    def tick(self, trainer: Trainer) -> None:
+        self.shown.tick(trainer)
+
+    def ended(self, cell: Cell, report: CellReport) -> None:
+        self.shown.ended(cell, report)
 
 
-def finish(reports: list[CellReport], output: Path, as_json: bool, folders: list[str]) -> None:
-    counts = Counter(report.outcome for report in reports)
-    summary = ", ".join(f"{n} {name}" for name, n in counts.items())
+def finish(report: BenchReport, as_json: bool) -> None:
+    """Print what became of the runs and how to compare them.
+
+    Raises:
+        AwError: a run failed.
+    """
     if as_json:
-        rows = [{"folder": str(r.folder), "outcome": r.outcome, "error": r.error or None} for r in reports]
+        rows = [
+            {"folder": str(run.folder), "outcome": run.outcome, "error": run.error or None}
+            for run in report.runs
+        ]
         click.echo(json.dumps(rows, indent=2))
-    failed = [report for report in reports if report.outcome == "failed"]
-    if len(failed) == len(reports) == 1:
+    failed, count, folders = report.failed, len(report.runs), report.folders
+    if len(failed) == count == 1:
         raise AwError(failed[0].error)
-    compare = f"compare them with: aw {'cost' if len(folders) > 1 else 'table'} {shlex.quote(str(output))}"
+    output = shlex.quote(str(report.output))
+    compare = f"compare them with: aw {'cost' if len(folders) > 1 else 'table'} {output}"
     if len(folders) > 1:
-        compare += f", or one folder with: aw table {shlex.quote(folders[0])}"
-    click.echo(f"{len(reports)} run{'s' if len(reports) > 1 else ''}: {summary}; {compare}", err=True)
+        compare += f", or one folder with: aw table {shlex.quote(str(folders[0]))}"
+    summary = ", ".join(f"{n} {outcome}" for outcome, n in report.outcomes.items())
+    say(f"{count} run{'s' if count > 1 else ''}: {summary}; {compare}")
     if failed:
-        raise AwError(f"{len(failed)} of {len(reports)} runs failed: " + failed[0].error)
+        raise AwError(f"{len(failed)} of {count} runs failed: " + failed[0].error)

@@ -1,14 +1,18 @@
-"""`aw screen`: does a capture hold together, and what to do where it does not."""
+"""`aw screen`: check a capture before a scene is built from it."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from ambiguous_wild.cli.paths import PathName
+
+if TYPE_CHECKING:
+    from ambiguous_wild.builder.capture_report import CaptureReport
 
 _WORDS = {"ok": ("ok", "green"), "warning": ("WARNING", "red"), "unknown": ("unknown", "yellow")}
 
@@ -23,10 +27,10 @@ def command(raw: Path, strict: bool, jobs: int | None, as_json: bool) -> None:
     near-duplicates, overlap. Nothing is written."""
     import os
 
+    from ambiguous_wild.builder.capture_report import check_capture, refuse_failed
     from ambiguous_wild.builder.progress import Bar
-    from ambiguous_wild.builder.survey import refuse, survey
 
-    found = survey(raw, jobs=jobs or os.cpu_count() or 1, bar=Bar(not as_json))
+    found = check_capture(raw, jobs=jobs or os.cpu_count() or 1, bar=Bar(not as_json))
     if as_json:
         facts = {
             "capture": str(found.root),
@@ -38,14 +42,14 @@ def command(raw: Path, strict: bool, jobs: int | None, as_json: bool) -> None:
     else:
         _print(found)
     if strict:
-        refuse(found)
+        refuse_failed(found)
 
 
-def _print(found) -> None:
+def _print(found: CaptureReport) -> None:
     width = max(len(c.name) for c in found.checks)
     for check in found.checks:
         word, colour = _WORDS[check.state]
-        # Names of files are a stranger's: nothing in them may steer the terminal.
+        # File names may hold control characters of the terminal.
         text = "".join(c if c.isprintable() else "?" for c in f"{check.finding}  [{check.basis}]")
         click.echo(f"{check.name:<{width}}  {click.style(f'{word:<7}', fg=colour)}  {text}")
         if check.advice:

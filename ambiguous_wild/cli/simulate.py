@@ -1,4 +1,4 @@
-"""`aw simulate`: a capture with exact truth, from a preset or a YAML spec."""
+"""`aw simulate`: simulate a capture with exact truth, from a preset or a YAML spec."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import json
 import shlex
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
 from ambiguous_wild.cli.paths import PathName
 
 if TYPE_CHECKING:
+    from ambiguous_wild.simulate.records import PhotoTruth
     from ambiguous_wild.simulate.spec import CaptureSpec
 
 
@@ -23,14 +24,14 @@ if TYPE_CHECKING:
     "--seed", type=click.IntRange(0), default=0, show_default=True, help="World, walk and distractors."
 )
 @click.option("--views", type=int, help="Train photos; test photos in proportion.")
-@click.option("--width", type=int, help="Width of a photo in px; its shape stays.")
+@click.option("--width", type=int, help="Width of a photo in px; the aspect ratio stays.")
 @click.option("--depth", is_flag=True, help="Also write depth maps of the static scene.")
 @click.option("--overwrite", is_flag=True, help="Replace an earlier capture in this folder.")
 @click.option(
     "--sheet/--no-sheet", default=True, show_default=True, help="Write truth/sheet.jpg, a contact sheet."
 )
-@click.option("--print-spec", is_flag=True, help="Print the capture as YAML, ready to be changed, and stop.")
-@click.option("--list", "listing", is_flag=True, help="List the captures there are.")
+@click.option("--print-spec", is_flag=True, help="Print the spec as YAML, and stop.")
+@click.option("--list", "listing", is_flag=True, help="List all presets.")
 @click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
 def command(
     name: str | None,
@@ -45,10 +46,10 @@ def command(
     listing: bool,
     as_json: bool,
 ) -> None:
-    """Make a capture: photos with distractors, clean test photos, and the exact truth.
+    """Simulate a capture: photos with distractors, clean test photos, and the exact truth.
 
-    NAME is one of --list; SPEC.yaml says world, walk, distractors and effects (docs/simulation.md). What it
-    leaves out is as in the courtyard.
+    NAME is a preset of --list. SPEC.yaml holds world, walk, distractors and effects (docs/simulation.md);
+    what it leaves out is as in the preset courtyard.
     """
     from ambiguous_wild.core.errors import AwError, counted
     from ambiguous_wild.simulate.presets import PRESETS, preset, resized
@@ -64,7 +65,7 @@ def command(
         click.echo(dump_spec(spec), nl=False)
         return
     if out is None:
-        raise AwError(f"say where to write: aw simulate {name} -o raw")
+        raise AwError(f"the output folder is missing: aw simulate {name} -o raw")
 
     from tqdm import tqdm
 
@@ -77,24 +78,23 @@ def command(
 
     check_output(out)
     with folder_lock(out, f"aw simulate {name}"):
-        sweep_siblings(out)  # of a call that was killed
+        sweep_siblings(out)  # left by a killed call
         facts = simulate(spec, out, seed, depth, overwrite, bar)
         if sheet and not (facts["reused"] and (out / "truth" / "sheet.jpg").is_file()):
-            from ambiguous_wild.harness.capture_sheet import write_capture_sheet
+            from ambiguous_wild.harness.pictures.capture_sheet import write_capture_sheet
 
             write_capture_sheet(out)
     outside = _outside(spec, facts["photos"])
     if outside:
         click.echo(
-            f"warning: in {outside} of {spec.train_views} train photos distractors cover less or more than "
-            f"occlusion [{spec.occlusion[0]:g}, {spec.occlusion[1]:g}] asks for; other sizes, distances or "
-            "numbers of them would reach it",
+            f"warning: in {outside} of {spec.train_views} train photos the share of distractors is outside "
+            f"occlusion [{spec.occlusion[0]:g}, {spec.occlusion[1]:g}]; change their size, distance or number",
             err=True,
         )
     for name in _never_seen(spec, facts["photos"]):
         click.echo(
-            f"warning: distractor {name!a} is in none of the train photos; other waypoints, laps, distances or "
-            "a larger size would bring it in",
+            f"warning: no train photo shows the distractor {name!a}; change its waypoints, laps or distance, or "
+            "raise its size",
             err=True,
         )
     if as_json:
@@ -104,13 +104,13 @@ def command(
     state = "already there, unchanged" if facts["reused"] else "wrote"
     things = counted(len(spec.distractors), "distractor")
     cover = "covers" if len(spec.distractors) == 1 else "cover"
-    who = (
+    covered = (
         f"{things} {cover} {100 * share['min']:.0f} to {100 * share['max']:.0f} % "
         f"(mean {100 * share['mean']:.1f} %) of a train photo"
     )
     click.echo(
         f"{state}: {out}: {spec.train_views} train and {spec.test_views} test photos of "
-        f"{spec.width}x{spec.height}; {who if spec.distractors else 'nobody there'}"
+        f"{spec.width}x{spec.height}; {covered if spec.distractors else 'no distractors'}"
     )
     effects = list(plain_spec(spec)["effects"])
     if effects:
@@ -121,17 +121,17 @@ def command(
     click.echo(f"next: aw build-scene {shlex.quote(str(out))} -o {shlex.quote(str(scene))}")
 
 
-def _outside(spec: CaptureSpec, photos: dict[str, Any]) -> int:
-    """Train photos whose share of distractors is clearly outside the band that was asked for."""
+def _outside(spec: CaptureSpec, photos: dict[str, PhotoTruth]) -> int:
+    """Number of train photos whose share of distractors is clearly outside ``spec.occlusion``."""
     low, high = spec.occlusion
     if not spec.distractors or all(d.path == "walk" for d in spec.distractors):
-        return 0  # who walks is where the walk leads
+        return 0  # walkers have no choice of place
     slack = 0.02 + 0.1 * (high - low)  # shares were chosen in a small preview
     return sum(not low - slack <= photo["occlusion"] <= high + slack for photo in photos.values())
 
 
-def _never_seen(spec: CaptureSpec, photos: dict[str, Any]) -> list[str]:
-    """Names of distractors that were to be seen and that no train photo shows."""
+def _never_seen(spec: CaptureSpec, photos: dict[str, PhotoTruth]) -> list[str]:
+    """Names of distractors with a presence above 0 that no train photo shows."""
     seen = {d["distractor"] for photo in photos.values() for d in photo["distractors"] if d["occlusion"] > 0}
     return [d.name for d in spec.distractors if d.name not in seen and d.presence > 0]
 

@@ -1,4 +1,4 @@
-"""`aw stress`: the hard cases as a table, and a training that met a NaN once more."""
+"""`aw stress`: numerical stress tests, and the replay of a training that met a NaN."""
 
 from __future__ import annotations
 
@@ -12,14 +12,16 @@ from ambiguous_wild.cli.paths import PathName
 
 
 @click.command("stress")
-@click.option("--only", multiple=True, metavar="CASE", help="A row (4), a name or a part of one; repeatable.")
-@click.option("--list", "listing", is_flag=True, help="Print the names of the cases and do nothing.")
+@click.option(
+    "--only", multiple=True, metavar="CASE", help="A row (4), a name or a part of a name; repeatable."
+)
+@click.option("--list", "listing", is_flag=True, help="Only print the names of the cases.")
 @click.option(
     "--device",
     type=click.Choice(["auto", "cpu", "cuda"]),
     default="auto",
     show_default=True,
-    help="auto: the CPU, and the GPU too where there is one.",
+    help="auto: the CPU, and the GPU if there is one.",
 )
 @click.option(
     "--format",
@@ -28,13 +30,13 @@ from ambiguous_wild.cli.paths import PathName
     default="text",
     show_default=True,
 )
-@click.option("--json", "as_json", is_flag=True, help="Short for --format json.")
+@click.option("--json", "as_json", is_flag=True, help="Same as --format json.")
 @click.option("-o", "--output", type=PathName(dir_okay=False), help="Write to a file instead.")
 @click.option(
     "--replay",
     "run",
     type=PathName(file_okay=False),
-    help="A run folder whose training met a value that is not finite: run up to it again.",
+    help="A run folder whose training met a value that is not finite: repeat the training up to it.",
 )
 def command(
     only: tuple[str, ...],
@@ -45,14 +47,14 @@ def command(
     output: Path | None,
     run: Path | None,
 ) -> None:
-    """Numerically hard cases against float64: what comes out, how far off, how far it may be.
+    """Numerical stress tests: error against float64 and the allowed error of each case.
 
     \b
     aw stress                     every case
     aw stress --only 4 --only needle
     aw stress --replay runs/scene/3dgs/seed0
 
-    Exits with 1 where a case fails, or a replay finds something else. docs/numerics.md explains each case.
+    Exits with code 1 if a case fails or a replay differs. docs/numerics.md explains each case.
     """
     if run is not None:
         _replay(run)
@@ -90,7 +92,7 @@ def command(
 def _devices(wanted: str) -> list[str]:
     from ambiguous_wild.cli.devices import choose_device, prepare_cpu
 
-    found = choose_device(wanted)  # names what is missing where a GPU was asked for
+    found = choose_device(wanted)  # its error names what is missing for a GPU
     devices = ["cuda"] if wanted == "cuda" else ["cpu"] if found == "cpu" else ["cpu", "cuda"]
     if "cpu" in devices:
         prepare_cpu(None)
@@ -99,12 +101,14 @@ def _devices(wanted: str) -> list[str]:
 
 def _replay(run: Path) -> None:
     from ambiguous_wild.cli.devices import prepare_cpu
-    from ambiguous_wild.harness.replay import replay
+    from ambiguous_wild.harness.running.replay import replay
 
     prepare_cpu(None)
     result = replay(run)
     click.echo(f"reported: {result.reported}")
-    click.echo(f"again, from iteration {result.started_at}: {result.found or 'everything is finite'}")
+    click.echo(f"replayed from iteration {result.started_at}: {result.found or 'all values are finite'}")
     if not result.same:
-        click.echo("not the same: was it another version, another machine, or a plugin?", err=True)
+        click.echo(
+            "the replay differs from the report: check the version, the machine and the plugins", err=True
+        )
         sys.exit(1)

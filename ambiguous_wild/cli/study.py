@@ -1,4 +1,4 @@
-"""`aw study`: ask people, blind, and score what they said."""
+"""`aw study`: make a blind user study and score its answers."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from ambiguous_wild.cli.paths import PathName
 
 @click.group("study")
 def command() -> None:
-    """Ask people, blind: is the distractor hard to see, and which render is better?
+    """Blind user study: is the distractor hard to see, and which render is better?
 
     \b
-    aw study make --runs runs --scene scene -o study.html    a page to send round, and study.key.json to keep
+    aw study make --runs runs --scene scene -o study.html    a page for raters, and study.key.json to keep private
     aw study score answers/ --key study.key.json             shares, ranking, agreement
     """
 
@@ -26,19 +26,19 @@ def command() -> None:
     "scenes",
     multiple=True,
     type=PathName(),
-    help="Ask about the train photos of this scene folder; repeatable.",
+    help="Ask about the training photos of this scene folder; repeatable.",
 )
 @click.option(
     "--runs",
     type=PathName(),
-    help="Ask about the test renders below this folder of 'aw bench'.",
+    help="Ask about the test renders in this output folder of 'aw bench'.",
 )
 @click.option(
     "-o",
     "--out",
     required=True,
     type=PathName(dir_okay=False),
-    help="The page, *.html; the key goes beside it.",
+    help="The page, *.html; the key is written next to it.",
 )
 @click.option(
     "--method", "methods", multiple=True, help="Compare only this method; repeatable.  [default: all]"
@@ -47,40 +47,46 @@ def command() -> None:
     "--only-scene",
     "only",
     multiple=True,
-    help="Compare only on the scene of this name; repeatable.  [default: all]",
+    help="Compare only on this scene; repeatable.  [default: all]",
 )
 @click.option(
     "--questions",
     type=click.IntRange(1, 1000),
     default=40,
     show_default=True,
-    help="Of each kind, at most; spread evenly.",
+    help="Most questions of each kind; spread evenly.",
 )
 @click.option(
-    "--truth/--no-truth", default=True, show_default=True, help="Show the test photo beside the two renders."
+    "--truth/--no-truth", default=True, show_default=True, help="Show the test photo next to the two renders."
 )
 @click.option(
     "--outline/--no-outline",
     default=True,
     show_default=True,
-    help="Let raters see what moved, where the scene has exact masks.",
+    help="Let raters show the distractor's outline, if the scene has exact masks.",
 )
 @click.option(
     "--side",
     type=click.IntRange(64, 4000),
     default=1000,
     show_default=True,
-    help="Pixels of the longer side of a picture, at most.",
+    help="Most pixels of an image's longer side.",
 )
 @click.option(
-    "--quality", type=click.IntRange(50, 100), default=92, show_default=True, help="Of the JPEG in the page."
+    "--quality",
+    type=click.IntRange(50, 100),
+    default=92,
+    show_default=True,
+    help="JPEG quality of the images.",
 )
-@click.option("--title", default="Picture study", show_default=True, help="What raters read on top.")
+@click.option("--title", default="Picture study", show_default=True, help="Title of the page.")
 @click.option(
-    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Which questions are drawn."
+    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the choice of questions."
 )
 @click.option(
-    "--force", is_flag=True, help="Replace a page and key that are there: answers to the old page are lost."
+    "--force",
+    is_flag=True,
+    help="Replace an existing page and key; answers to the old page can no longer be scored.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
 def make_command(
@@ -88,17 +94,17 @@ def make_command(
     questions: int, truth: bool, outline: bool, side: int, quality: int, title: str, seed: int, force: bool,
     as_json: bool,
 ) -> None:  # fmt: skip
-    """Write one HTML file that asks, works from a file and on a phone, and requests nothing from anywhere.
+    """Write the study as one HTML file that works offline and on a phone.
 
-    The page holds no name of a method, scene or file. The key does: do not hand it to raters.
+    The page contains no names of methods, scenes or files. The key does: do not give it to raters.
     """
     from tqdm import tqdm
 
     from ambiguous_wild.core.errors import AwError
     from ambiguous_wild.core.names import is_text
     from ambiguous_wild.io.atomic import check_output
-    from ambiguous_wild.study.make import Settings, make
-    from ambiguous_wild.study.questions import Question, pairs_of_runs, photos_of_scene
+    from ambiguous_wild.study.make import StudySettings, make_study
+    from ambiguous_wild.study.questions import Question, render_pairs, scene_photos
 
     if not scenes and runs is None:
         raise AwError("nothing to ask about: give --scene SCENE (photos), --runs RUNS (renders), or both")
@@ -106,34 +112,35 @@ def make_command(
         raise AwError("--method and --only-scene choose among runs: give --runs too")
     if out.suffix.lower() not in (".html", ".htm"):
         raise AwError(
-            f"the page must be called *.html, so that browsers open it: -o {out.with_suffix('.html')}"
+            f"the page must be named *.html, so that browsers open it: -o {out.with_suffix('.html')}"
         )
     if not is_text(title):
-        raise AwError(f"--title {title!a} holds half a character: the terminal's encoding is not UTF-8")
+        raise AwError(f"--title {title!a} contains half a character; set the terminal's encoding to UTF-8")
     same = [scene for k, scene in enumerate(scenes) if scene.resolve() in [s.resolve() for s in scenes[:k]]]
     if same:
-        raise AwError(f"--scene {same[0]} is given twice: each photo would count twice; name it once")
+        raise AwError(f"--scene {same[0]} is given twice, so its photos would count twice; give it once")
     key = out.with_suffix(".key.json")
     check_output(out)
     there = [str(p) for p in (out, key) if p.exists()]
     if there and not force:
         raise AwError(
-            f"{' and '.join(there)} {'exist' if len(there) > 1 else 'exists'}: answers to another page cannot be scored; choose another -o or --force"
+            f"{' and '.join(there)} {'exist' if len(there) > 1 else 'exists'}; answers to the old page could "
+            "not be scored without its key; choose another -o, or replace it with --force"
         )
-    asked: list[Question] = [q for scene in scenes for q in photos_of_scene(scene, outline=outline)]
+    asked: list[Question] = [q for scene in scenes for q in scene_photos(scene, outline=outline)]
     if runs is not None:
-        asked += pairs_of_runs(runs, methods=methods, scenes=only, truth=truth)
-    settings = Settings(title=title, limit=questions, side=side, quality=quality, seed=seed)
-    made = make(asked, out, key, settings, lambda q: tqdm(q, unit="question", disable=as_json or None))
+        asked += render_pairs(runs, methods=methods, scenes=only, truth=truth)
+    settings = StudySettings(title=title, limit=questions, side=side, quality=quality, seed=seed)
+    made = make_study(asked, out, key, settings, lambda q: tqdm(q, unit="question", disable=as_json or None))
     if as_json:
         facts = {k: str(v) if isinstance(v, Path) else v for k, v in vars(made).items()}
         click.echo(json.dumps(facts, indent=2))
         return
     click.echo(
         f"wrote {made.page} ({made.photos} questions about photos, {made.pairs} about renders, "
-        f"{made.pictures} pictures, {made.megabytes:.1f} MB)"
+        f"{made.pictures} images, {made.megabytes:.1f} MB)"
     )
-    click.echo(f"wrote {made.key}: keep it, it says which method is which")
+    click.echo(f"wrote {made.key}: keep it private, it names the method of each render")
 
 
 @command.command("score")
@@ -142,7 +149,7 @@ def make_command(
     "--key",
     required=True,
     type=PathName(),
-    help="What 'aw study make' wrote beside the page.",
+    help="The key that 'aw study make' wrote next to the page.",
 )
 @click.option(
     "-o",
@@ -151,13 +158,13 @@ def make_command(
     help="Folder for scores.md, .csv and .json.  [default: KEY-scores]",
 )
 @click.option(
-    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the bootstrap over raters."
+    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the bootstrap over raters."
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the scores as JSON.")
 def score_command(answers: tuple[Path, ...], key: Path, out: Path | None, seed: int, as_json: bool) -> None:
-    """Score ANSWERS: files (JSON or CSV) that raters saved, or folders of them."""
+    """Score ANSWERS: files (JSON or CSV) saved by raters, or folders of them."""
     from ambiguous_wild.io.atomic import check_output
-    from ambiguous_wild.io.strangers import refuse_strangers
+    from ambiguous_wild.io.foreign_files import refuse_foreign_files as refuse_strangers
     from ambiguous_wild.study.answers import read_answers
     from ambiguous_wild.study.key import read_key
     from ambiguous_wild.study.report import SCORE_FILES, to_markdown, write_scores

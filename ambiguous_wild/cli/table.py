@@ -14,8 +14,8 @@ from ambiguous_wild.cli.paths import PathName
 from ambiguous_wild.core.errors import AwError
 
 if TYPE_CHECKING:
-    from ambiguous_wild.harness.layouts.grid import Layout
-    from ambiguous_wild.harness.store import Runs
+    from ambiguous_wild.harness.running.store import Runs
+    from ambiguous_wild.harness.tables.layouts.grid import Layout
 
 STYLES = ("text", "markdown", "csv", "latex", "html", "tidy")
 SHEETS = (".png", ".jpg")
@@ -93,7 +93,7 @@ def command(
 
     found = None if layout == "ablation" else _read(runs)
     if sheet is not None and found is not None:
-        from ambiguous_wild.harness.sheet import write_sheet
+        from ambiguous_wild.harness.tables.sheet import write_sheet
 
         shown = write_sheet(found, sheet, scene=scenes[0] if scenes else None)
         click.echo(f"wrote {sheet}: {shown} methods side by side", err=True)
@@ -114,13 +114,13 @@ def command(
 
 
 def _read(runs: Path) -> Runs:
-    from ambiguous_wild.harness.store import read_runs
+    from ambiguous_wild.harness.running.store import read_runs
 
     return read_runs(runs)
 
 
 def _write_tidy(found: Runs, output: Path | None, metrics: Sequence[str], scenes: Sequence[str]) -> None:
-    from ambiguous_wild.harness.table_frame import tidy, to_csv
+    from ambiguous_wild.harness.tables.tidy import tidy, to_csv
     from ambiguous_wild.io.atomic import write_text
 
     frame = tidy(found, metrics=metrics, scenes=scenes)
@@ -136,8 +136,8 @@ def _write_tidy(found: Runs, output: Path | None, metrics: Sequence[str], scenes
 def _blocks(
     found: Runs, style: str, metrics: Sequence[str], scenes: Sequence[str], made_by: str, color: bool
 ) -> tuple[str, str]:
-    from ambiguous_wild.harness.render_tables import RENDERERS, plain, to_text
-    from ambiguous_wild.harness.tables import comparison
+    from ambiguous_wild.harness.tables.comparison import comparison
+    from ambiguous_wild.harness.tables.render import RENDERERS, plain, to_text
 
     table = comparison(found, metrics=metrics, scenes=scenes)
     if style == "csv":
@@ -160,8 +160,8 @@ def _layouts(
     reported: bool,
     reported_from: Path | None,
 ) -> list[Layout]:
-    from ambiguous_wild.harness.layouts import ablation, build
-    from ambiguous_wild.harness.layouts.reported import datasets_of, read_reported, with_reported
+    from ambiguous_wild.harness.tables.layouts import ablation, build
+    from ambiguous_wild.harness.tables.layouts.reported import datasets_of, read_reported, with_reported
 
     if found is None:
         return ablation.ablation(runs, tuple(metrics))
@@ -182,16 +182,16 @@ def _layouts(
 
 def _known() -> list:
     """What the checkout's reported tables tell of datasets; nothing where there are none."""
-    from ambiguous_wild.harness.layouts.reported import FOLDER, read_reported
+    from ambiguous_wild.harness.tables.layouts.reported import FOLDER, read_reported
 
     return read_reported() if FOLDER.is_dir() else []
 
 
 def _laid_out(made: list[Layout], style: str, made_by: str, color: bool) -> tuple[str, str]:
-    from ambiguous_wild.harness.layouts import plain_formats
-    from ambiguous_wild.harness.layouts.html_page import to_html
-    from ambiguous_wild.harness.layouts.latex import to_latex
-    from ambiguous_wild.harness.render_tables import plain
+    from ambiguous_wild.harness.tables.layouts import plain_formats
+    from ambiguous_wild.harness.tables.layouts.html_page import to_html
+    from ambiguous_wild.harness.tables.layouts.latex import to_latex
+    from ambiguous_wild.harness.tables.render import plain
 
     told = f"{len(made)} table{'' if len(made) == 1 else 's'}"
     if style == "csv":

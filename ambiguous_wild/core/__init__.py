@@ -1,4 +1,4 @@
-"""The vocabulary everything else speaks: cameras, scenes, errors, configs. numpy only."""
+"""Cameras, scenes, errors and configs, which all packages use. numpy only."""
 
 from ambiguous_wild.core.camera import Camera
 from ambiguous_wild.core.errors import AwError

@@ -1,4 +1,4 @@
-"""Frozen dataclasses as configs: strict keys, plain-data form, a hash that is their identity."""
+"""Frozen dataclasses as configs: strict keys, plain data, and a hash as identity."""
 
 from __future__ import annotations
 
@@ -50,8 +50,7 @@ def from_plain(cls: type[T], data: Mapping[str, Any], where: str = "config") -> 
     """Build the dataclass from plain data; an unknown key or a wrong type is an error that names it.
 
     Raises:
-        AwError: unknown key (with the nearest known one), a value of the wrong type, or a key that is needed
-            and absent.
+        AwError: unknown key (with the nearest known one), wrong type, or a required key is absent.
     """
     hints = typing.get_type_hints(cls)
     names = [f.name for f in dataclasses.fields(cls)]  # type: ignore[arg-type]
@@ -84,7 +83,7 @@ def with_options(config: T, options: Mapping[str, str], where: str = "option") -
         if rest:
             nested.setdefault(head, {})[rest] = text
             continue
-        # a word stays what it is: back ends have commas in their names, and 1e3 may be one's name
+        # Texts are not parsed: names of back ends hold commas, and 1e3 may be a name.
         value = text.strip() if hints[head] is str and text.strip() else _parse(text)
         values[head] = _coerce(hints[head], value, f"{where} {key}")
     for head, inside in nested.items():
@@ -93,20 +92,20 @@ def with_options(config: T, options: Mapping[str, str], where: str = "option") -
             key = f"{head}.{next(iter(inside))}"
             raise AwError(f"{where} {key!r}: {head!r} has no keys of its own")
         values[head] = with_options(inner, inside, f"{where} {head}")
-    # all at once: what two options must be to each other holds of what comes out, not on the way
+    # All at once: limits between two options apply to the result only.
     return dataclasses.replace(config, **values)  # type: ignore[type-var]
 
 
 def check_limits(config: Any, where: str, **limits: tuple[float, float]) -> None:
-    """Refuse numbers out of their range; of a tuple every one, and None is no number.
+    """Refuse numbers out of range; in a tuple each number, and None passes.
 
     Args:
         config: the dataclass instance.
-        where: what its keys are called before the dot, e.g. ``"refinesplat.mask"``.
-        limits: per field the lowest and the highest value, both allowed; the highest may be infinite.
+        where: prefix of its keys in the message, e.g. ``"refinesplat.mask"``.
+        limits: per field the lowest and the highest allowed value; the highest may be infinite.
 
     Raises:
-        AwError: the first number outside, with what it may be.
+        AwError: the first number out of range, with the range.
     """
     for name, (low, high) in limits.items():
         value = getattr(config, name)

@@ -1,35 +1,35 @@
-"""One error class for everything a user can cause and mend."""
+"""The error class for everything that a user can correct."""
 
 from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
 
-_LONGEST = 2000  # characters of a message; ours have below 700
+_LONGEST = 2000  # characters of a message; ours have fewer than 700
 
 
 class AwError(Exception):
-    """Something the user can mend: one line that says what, where, why, and what to do next.
+    """An error that the user can correct. The message is one line: what, where, why, what to do.
 
-    The command line prints the message in red without a traceback and exits with code 2.
+    The command line prints it in red without a traceback and exits with code 2.
     """
 
     exit_code = 2
 
     def __init__(self, message: object = "") -> None:
         text = str(message)
-        # What a damaged file holds may be a word of a megabyte; a message stays one that can be read.
+        # Messages may quote a damaged file, where one word can have a megabyte.
         super().__init__(text if len(text) <= _LONGEST else f"{text[: _LONGEST - 300]} ... {text[-290:]}")
 
 
 def unknown(kind: str, name: str, choices: Iterable[str], hint: str = "") -> AwError:
-    """The error for a name that does not exist: names the nearest one that does.
+    """The error for an unknown name; it gives the nearest known one.
 
     Args:
-        kind: what is looked up, e.g. ``"method"``.
-        name: what the user wrote.
-        choices: what there is.
-        hint: what to do to see all of them, e.g. ``"'aw methods' lists them"``.
+        kind: of the name, e.g. ``"method"``.
+        name: as the user wrote it.
+        choices: the known names.
+        hint: how to see all of them, e.g. ``"'aw methods' lists them"``.
     """
     known = sorted(choices)
     near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
@@ -49,7 +49,7 @@ def counted(number: int, noun: str) -> str:
 
 
 def shortlist(names: Iterable[str], limit: int = 5) -> str:
-    """``"a.jpg, b.jpg and 3 more"``: names for a message that must stay one line."""
+    """``"a.jpg, b.jpg and 3 more"``: names in a message of one line."""
     listed = [str(n) for n in names]
     if len(listed) <= limit:
         return ", ".join(listed)

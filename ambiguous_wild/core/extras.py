@@ -1,4 +1,4 @@
-"""The exact command that brings an optional part, for this installation."""
+"""Commands that install optional dependencies, for this installation."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def install_command(extra: str) -> str:
-    """The pip command for the extra: from the checkout the package runs from, else by the package's name.
+    """The pip command for the extra, from the checkout that is running, else by the package's name.
 
     Args:
         extra: a name under [project.optional-dependencies], e.g. ``"cuda"``.
@@ -18,10 +18,10 @@ def install_command(extra: str) -> str:
 
 
 def torch_command(version: str) -> str:
-    """The commands that replace a CPU build of torch by the one for CUDA.
+    """The commands that replace a CPU build of torch by a CUDA build.
 
-    Both have the same version number but for what follows the plus, so pip must be told to let go of the one
-    before it takes the other.
+    Both have the same version apart from the part after "+", so pip must remove one before it installs the
+    other.
 
     Args:
         version: of torch, e.g. ``"2.13.0+cpu"``.

@@ -1,4 +1,4 @@
-"""What a name may be, where it is printed, written into tables and used as part of a path."""
+"""Rules for names that are printed, written into tables and used in paths."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ LONGEST = 100  # bytes of UTF-8; file systems allow 255, and suffixes are added 
 
 
 def check_name(kind: str, name: str) -> str:
-    """The name, stripped of surrounding blanks, where it is fit to print and to be part of a path.
+    """The name without surrounding blanks, if it can be printed and be part of a path.
 
     Args:
-        kind: what is named, for the error, e.g. ``"scene name"``.
-        name: as it was given.
+        kind: for the error, e.g. ``"scene name"``.
+        name: as given.
 
     Raises:
         AwError: empty, longer than 100 bytes, starting with a dot, or holding ``/``, ``\\`` or a character
@@ -35,7 +35,7 @@ def check_name(kind: str, name: str) -> str:
 
 
 def is_text(value: str) -> bool:
-    """Whether it can be written: JSON and command lines may hold halves of characters (lone surrogates)."""
+    """Whether it can be written as UTF-8: JSON and command lines may hold lone surrogates."""
     return not any("\ud800" <= c <= "\udfff" for c in value)
 
 

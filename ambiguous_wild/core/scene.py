@@ -1,11 +1,11 @@
-"""A scene as every reader returns it: posed views, sparse points, a split by name."""
+"""A scene: views with poses, sparse points and the split by name."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypedDict
 
 import numpy as np
 
@@ -14,9 +14,33 @@ from ambiguous_wild.core.camera import Camera
 Split = Literal["train", "test"]
 
 
+class FileEntry(TypedDict):
+    """One file that scene.json lists."""
+
+    sha256: str
+    bytes: int
+
+
+class SceneInfo(TypedDict, total=False):
+    """The keys of scene.json that programs read, and what `load_scene` adds; the file may hold more."""
+
+    schema_version: int
+    name: str
+    factor: int  # downsampling that the scene was built for
+    images: str  # folder of that factor
+    license: str
+    dataset: str
+    build_key: str
+    inputs: dict[str, Any]  # what it was built from
+    files: dict[str, FileEntry]  # by path relative to the scene
+    loaded_factor: int  # added: of the pictures that were opened
+    missing: dict[str, list[str]]  # added: per side the listed names that the model lacks
+    warnings: list[str]  # the build's; after `load_scene` what it found
+
+
 @dataclass(frozen=True)
 class View:
-    """One photo: where it lies, which camera took it, which side of the split it is on.
+    """One photo: its file, its camera and its side of the split.
 
     Keep maps follow one convention everywhere: 1 = static (kept), 0 = transient.
     """
@@ -31,7 +55,7 @@ class View:
 
 @dataclass(frozen=True)
 class Points:
-    """Sparse points of structure from motion with their tracks in compressed rows.
+    """Sparse points of structure from motion; tracks in compressed rows (CSR).
 
     Observation k of point i, for ``track_offsets[i] <= k < track_offsets[i + 1]``, is at
     ``track_xy[k]`` of the view ``views[track_views[k]]``.
@@ -50,13 +74,13 @@ class Points:
 
 @dataclass(frozen=True)
 class Scene:
-    """Views in the order of their names, points, and where they came from."""
+    """Views ordered by name, sparse points, and scene.json."""
 
     root: Path
     name: str
     views: tuple[View, ...]
     points: Points
-    info: dict[str, Any] = field(default_factory=dict, repr=False)  # scene.json, or what stands for it
+    info: SceneInfo = field(default_factory=SceneInfo, repr=False)
 
     @cached_property
     def train(self) -> tuple[View, ...]:
@@ -76,7 +100,7 @@ class Scene:
         """
         centers = np.array([v.camera.center for v in (self.train or self.views)])
         radius = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max(initial=0.0))
-        # A capture from one spot has no baseline; fall back on the points so that rates stay finite.
+        # A capture from one spot has no baseline: the points keep the learning rates finite.
         if radius <= 0.0 and len(self.points):
             radius = float(np.median(np.linalg.norm(self.points.xyz - centers.mean(axis=0), axis=1)))
         return 1.1 * radius if radius > 0.0 else 1.0

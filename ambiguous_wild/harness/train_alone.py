@@ -18,18 +18,18 @@ from pathlib import Path
 import torch
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.cell import Cell
-from ambiguous_wild.harness.environment import environment
-from ambiguous_wild.harness.identity import scene_identity
-from ambiguous_wild.harness.memory import is_out_of_gpu_memory, out_of_gpu_memory
+from ambiguous_wild.harness.running.cell import Cell
+from ambiguous_wild.harness.running.environment import environment
+from ambiguous_wild.harness.running.identity import scene_identity
+from ambiguous_wild.harness.running.memory import is_out_of_gpu_memory, out_of_gpu_memory
 from ambiguous_wild.io.atomic import atomic_dir, write_json, write_text
 from ambiguous_wild.io.images import to_uint8, write_png
 from ambiguous_wild.io.lock import folder_lock
 from ambiguous_wild.io.ply import write_splat_ply
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.registry import get_method
-from ambiguous_wild.splat import cuda_ready
 from ambiguous_wild.splat.data import load_train_data
+from ambiguous_wild.splat.gpu import readiness
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
 
@@ -103,7 +103,7 @@ class _Lines:
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    """Parse, train, say where it lies; one line and exit code 2 for what the user can mend."""
+    """Parse, train, print the run folder; a mistake of the user is one line and exit code 2."""
     parser = argparse.ArgumentParser(prog="python -m ambiguous_wild.harness.train_alone")
     parser.add_argument("scene", type=Path)
     parser.add_argument("-o", "--output", type=Path, default=Path("runs"))
@@ -116,7 +116,7 @@ def main(words: Sequence[str] | None = None) -> None:
     wanted = parser.parse_args(words)
     device = wanted.device
     try:
-        device = cuda_ready.choose(wanted.device, _say)
+        device = readiness.choose(wanted.device, _say)
         entry, scene = get_method(wanted.method), load_scene(wanted.scene, factor=wanted.factor)
         train = TrainConfig(
             iterations=wanted.iterations, seed=wanted.seed, max_gaussians=wanted.max_gaussians

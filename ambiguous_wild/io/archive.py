@@ -1,7 +1,7 @@
-"""Archives from strangers: what comes out is plain files below one folder, or nothing.
+"""Unpack untrusted archives: plain files below one folder, or nothing.
 
-Refused by name: paths that lead out, links, devices, encrypted and sparse members, two members of one name,
-and bombs. Sizes are counted while writing; what a header announces is never trusted.
+Refused with the member's name: paths out of the folder, links, devices, encrypted and sparse members, two
+members of one name, and archive bombs. Sizes are counted while writing, never taken from headers.
 """
 
 from __future__ import annotations
@@ -24,25 +24,29 @@ from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.atomic import atomic_dir
 
 _CHUNK = 1 << 20
-_HEADER = 4 << 20  # bytes that all headers of one tar member may take: names and nothing else
-_ZIP_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2)  # others allocate as told
+_HEADER = 4 << 20  # bytes that all headers of one tar member may have
+_ZIP_METHODS = (
+    zipfile.ZIP_STORED,
+    zipfile.ZIP_DEFLATED,
+    zipfile.ZIP_BZIP2,
+)  # others allocate what a header says
 _LONGEST = 255  # bytes of a name, what file systems hold
 _DEEPEST = 32  # folders inside each other
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What an archive may grow to."""
+    """Greatest size of an unpacked archive."""
 
     files: int = 200_000
     bytes: int = 50_000_000_000
     ratio: float = 200.0  # unpacked to packed; photos and models stay under 20
-    free: int = 64 << 20  # bytes that no ratio is asked of: small text packs well
+    free: int = 64 << 20  # bytes below which the ratio is not checked: text compresses well
 
 
 @dataclass
 class _Budget:
-    """Counts what one archive has written."""
+    """Counts the files and bytes of one archive."""
 
     archive: Path
     packed: int
@@ -50,7 +54,7 @@ class _Budget:
     wanted: Callable[[str], bool]
     written: int = 0
     wrote: list[str] = field(default_factory=list)
-    names: dict[str, str] = field(default_factory=dict)  # as a careless file system sees it -> as given
+    names: dict[str, str] = field(default_factory=dict)  # normalised, case-folded -> as given
 
     def add(self, count: int) -> None:
         self.written += count
@@ -58,11 +62,11 @@ class _Budget:
         if self.written > most:
             raise AwError(
                 f"{self.archive} unpacks to more than {most / 1e6:.0f} MB from {self.packed / 1e6:.2f} MB: "
-                "that is a bomb, or no archive of photos; unpack it by hand if you trust it"
+                "that may be an archive bomb; unpack it by hand if you trust it"
             )
 
     def place(self, name: str, folder: bool) -> PurePosixPath | None:
-        """Where the member goes below the target; None for the target itself."""
+        """The member's path below the target; None for the target itself."""
         path = _inside(self.archive, name)
         if not path.parts:
             return None
@@ -70,7 +74,7 @@ class _Budget:
             return path
         if len(self.names) >= self.limits.files:
             raise AwError(f"{self.archive} holds more than {self.limits.files} files; unpack a part of it")
-        # Two names that one file system keeps apart and another does not: one would silently win.
+        # Some file systems take two such names for one file, and one would overwrite the other.
         key = unicodedata.normalize("NFC", str(path)).casefold()
         if key in self.names:
             raise AwError(
@@ -84,8 +88,7 @@ class _Budget:
 def extract(archive: Path | str, target: Path | str, limits: Limits | None = None) -> list[str]:
     """Unpack a .zip, .tar, .tar.gz or .tar.bz2 (known by content) into a new folder.
 
-    The folder appears when everything is in it, or not at all. Rights, owners and times in the archive are
-    not carried over.
+    The folder appears complete or not at all. Permissions, owners and times are not kept.
 
     Args:
         archive: the file.
@@ -96,7 +99,7 @@ def extract(archive: Path | str, target: Path | str, limits: Limits | None = Non
         Names of the files, relative to the target, sorted.
 
     Raises:
-        AwError: no archive of these kinds, damaged, or refused, with the member that is to blame.
+        AwError: another format, damaged, or refused; names the member.
     """
     source, out = Path(archive), Path(target)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -112,16 +115,16 @@ def unpack(
     *,
     wanted: Callable[[str], bool] = lambda name: True,
 ) -> list[str]:
-    """As `extract`, into a folder that exists and is the caller's to remove if this fails.
+    """As `extract`, into an existing folder that the caller removes after an error.
 
     Args:
         source: the archive's path, or its bytes.
-        folder: where files go; nothing is written outside it and nothing in it is replaced.
-        limits: see `Limits`; they count what is passed over too.
-        wanted: which names are written; the others are passed over.
+        folder: nothing is written outside it, and nothing in it is replaced.
+        limits: see `Limits`; skipped files count too.
+        wanted: tells which names to write; the others are skipped.
 
     Returns:
-        The names that were written, relative, in the order of the archive.
+        The names of the written files, relative, in the order of the archive.
 
     Raises:
         AwError: as `extract`.
@@ -141,19 +144,19 @@ def unpack(
 
 
 def pack_folder(folder: Path | str, limit_mb: float) -> bytes:
-    """The files below a folder as an uncompressed tar; names that begin with a dot are left out.
+    """The files below a folder as an uncompressed tar, without names that begin with a dot.
 
-    Links are followed: what arrives elsewhere must not depend on what lies there.
+    Links are followed: the receiver may not have their targets.
 
     Args:
         folder: what to pack.
-        limit_mb: largest sum of the files, MB (10^6 bytes).
+        limit_mb: greatest total size, MB (10^6 bytes).
 
     Raises:
-        AwError: they are more than that.
+        AwError: the files are larger.
     """
     root = Path(folder)
-    # A part of a path that begins with a dot is a lock, a cache or half-written.
+    # Names that begin with a dot are locks, caches and unfinished files.
     paths = [p for p in sorted(root.rglob("*")) if p.is_file() and not _hidden(p.relative_to(root))]
     size_mb = sum(p.stat().st_size for p in paths) / 1e6
     if size_mb > limit_mb:
@@ -174,17 +177,17 @@ def _hidden(relative: Path) -> bool:
 
 @contextmanager
 def _named_errors(source: Path) -> Iterator[None]:
-    """What the standard library raises for damaged archives, as one line of ours."""
+    """Turn the errors that the standard library raises for damaged archives into AwError."""
     try:
         yield
     except (zipfile.BadZipFile, tarfile.TarError, zlib.error, EOFError, ValueError, IndexError) as error:
-        raise AwError(f"{source} is a damaged or cut archive ({error}); fetch it again") from error
+        raise AwError(f"{source} is a damaged or cut archive ({error}); download it again") from error
     except (NotImplementedError, RuntimeError, KeyError) as error:
-        raise AwError(f"{source} holds what is not unpacked here ({error}); unpack it by hand") from error
+        raise AwError(f"{source} holds an unsupported member ({error}); unpack it by hand") from error
     except OSError as error:
         if error.errno is not None:
             raise
-        raise AwError(f"{source} is a damaged or cut archive ({error}); fetch it again") from error
+        raise AwError(f"{source} is a damaged or cut archive ({error}); download it again") from error
 
 
 def _unzip(raw: IO[bytes], folder: Path, budget: _Budget) -> None:
@@ -198,7 +201,7 @@ def _unzip(raw: IO[bytes], folder: Path, budget: _Budget) -> None:
             if member.flag_bits & 0x1:
                 raise NotImplementedError(f"{_short(member.filename)} is encrypted")
             if member.compress_type not in _ZIP_METHODS:
-                raise NotImplementedError(f"{_short(member.filename)} is packed by a method that is not read")
+                raise NotImplementedError(f"{_short(member.filename)} uses an unsupported compression method")
             path = budget.place(member.filename, member.is_dir())
             if path is None:
                 continue
@@ -218,7 +221,9 @@ def _untar(raw: IO[bytes], folder: Path, budget: _Budget) -> None:
     elif head.startswith(b"BZh"):
         stream = bz2.BZ2File(raw)
     elif head.startswith(b"\xfd7zXZ"):
-        raise AwError(f"{source} is packed with xz, which is not read; unpack it by hand, or use .tar.gz")
+        raise AwError(
+            f"{source} is compressed with xz, which is not supported; unpack it by hand, or use .tar.gz"
+        )
     gate = _Gate(source, stream)
     with tarfile.open(fileobj=gate, mode="r|") as archive:  # type: ignore[call-overload]
         while True:
@@ -242,7 +247,7 @@ def _untar(raw: IO[bytes], folder: Path, budget: _Budget) -> None:
 
 
 class _Gate:
-    """Lets through what the next step may need: a header that unpacks to gigabytes is stopped here."""
+    """Limits how much one step reads, against headers that unpack to gigabytes."""
 
     def __init__(self, source: Path, stream: IO[bytes]) -> None:
         self.source, self.stream, self.allowed = source, stream, _HEADER
@@ -256,7 +261,7 @@ class _Gate:
 
 
 def _write(data: IO[bytes], folder: Path, name: PurePosixPath, budget: _Budget) -> None:
-    """The member below the folder; what is not wanted is read, for its size counts, and dropped."""
+    """Write the member below the folder; a skipped member is read all the same, since its size counts."""
     if not budget.wanted(str(name)):
         while chunk := data.read(_CHUNK):
             budget.add(len(chunk))
@@ -271,13 +276,13 @@ def _write(data: IO[bytes], folder: Path, name: PurePosixPath, budget: _Budget) 
 
 
 def _inside(archive: Path, name: str) -> PurePosixPath:
-    """The member's path, proven to stay below the target.
+    """The member's path, checked to stay below the target.
 
     Raises:
-        AwError: it is absolute, climbs, is of Windows' kind, or holds what no file name should.
+        AwError: it is absolute, has "..", a backslash or a colon, or is no valid file name.
     """
     path = PurePosixPath(name)
-    # A backslash and a colon are innocent here and a way out elsewhere.
+    # A backslash or a colon leads out of the folder on Windows.
     if path.is_absolute() or ".." in path.parts or "\\" in name or ":" in name:
         raise _refused(archive, name, "a path that leads out of the folder")
     if not name.isprintable() or len(path.parts) > _DEEPEST:

@@ -1,4 +1,4 @@
-"""Nothing half-written: files and folders appear under their name only when they are whole."""
+"""Atomic writes: files and folders appear under their name complete or not at all."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from ambiguous_wild.core.errors import AwError
 
 @contextmanager
 def atomic_path(path: Path | str) -> Iterator[Path]:
-    """Yield a temporary path beside `path` with the same suffix; rename it over `path` on success.
+    """Yield a temporary path beside `path` with the same suffix; rename it to `path` on success.
 
-    On an error the temporary file is removed and `path` stays as it was.
+    After an error the temporary file is removed and `path` is unchanged.
 
     Raises:
-        OSError: it cannot be written there; names `path`, not the temporary file.
+        OSError: it cannot be written; names `path`, not the temporary file.
     """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -38,7 +38,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         yield temporary
         with open(temporary, "rb") as f:
             os.fsync(f.fileno())
-        # mkstemp makes files private; the user's umask decides, as for any other file.
+        # mkstemp makes private files; here the user's umask applies.
         umask = os.umask(0)
         os.umask(umask)
         os.chmod(temporary, 0o666 & ~umask)
@@ -51,18 +51,18 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
 
 
 def _named(error: OSError, target: Path) -> OSError:
-    """The same error about the file that was asked for; OSError makes itself the fitting subclass."""
+    """The same error with the target's name; OSError chooses the subclass."""
     return OSError(error.errno, error.strerror, str(target))
 
 
 @contextmanager
 def atomic_dir(path: Path | str) -> Iterator[Path]:
-    """Yield a temporary folder beside `path`; rename it to `path` on success, replacing what was there.
+    """Yield a temporary folder beside `path`; rename it to `path` on success, replacing an older folder.
 
-    Where `path` is a link, what it leads to is replaced, not the link.
+    If `path` is a link, its target is replaced, not the link.
 
     Raises:
-        AwError: `path` is a file: whosever it is, it is no folder of an earlier call.
+        AwError: `path` is a file.
     """
     target = Path(os.path.realpath(path))
     refuse_file(path)
@@ -86,13 +86,13 @@ def atomic_dir(path: Path | str) -> Iterator[Path]:
 
 
 def refuse_file(path: Path | str) -> None:
-    """Raise AwError where a file lies at the path of a folder to be made."""
+    """Raise AwError where `path`, a folder to be made, is a file."""
     if os.path.exists(path) and not os.path.isdir(path):
         raise AwError(f"cannot make the folder {path}: a file lies there; move it, or choose another -o")
 
 
 def sweep(folder: Path | str) -> None:
-    """Remove what a killed process left of the writes above; call it only while holding the folder."""
+    """Remove temporary files of killed processes; call it only with the folder locked."""
     for left in sorted(Path(folder).rglob(".*.tmp*")) + sorted(Path(folder).rglob(".*.old-*")):
         if left.is_dir():
             shutil.rmtree(left, ignore_errors=True)
@@ -101,7 +101,7 @@ def sweep(folder: Path | str) -> None:
 
 
 def sweep_siblings(path: Path | str) -> None:
-    """Remove what killed calls of `atomic_dir(path)` left beside it; call it only while holding `path`."""
+    """Remove temporary folders of killed `atomic_dir(path)` calls; call it only with `path` locked."""
     target = Path(path)
     name = glob.escape(target.name)
     for pattern in (f".{name}.tmp-*", f".{name}.old-*"):
@@ -110,10 +110,10 @@ def sweep_siblings(path: Path | str) -> None:
 
 
 def check_output(path: Path | str) -> None:
-    """Make sure, before long work, that something can be made at `path`; its parents are made on the way.
+    """Check, before long work, that `path` can be written; its parent folders are made.
 
     Raises:
-        AwError: a parent is a file, or nothing can be written there.
+        AwError: a parent is a file, or the folder is not writable.
     """
     if os.path.islink(path) and not os.path.exists(path):
         raise AwError(f"cannot write {path}: it is a link to nowhere; remove it or choose another -o")
@@ -126,7 +126,8 @@ def check_output(path: Path | str) -> None:
         os.rmdir(tempfile.mkdtemp(prefix=".aw-probe-", dir=folder))
     except OSError as error:
         raise AwError(
-            f"cannot write in {folder}: {error.strerror or error}; choose another -o or mend the rights"
+            f"cannot write in {folder}: {error.strerror or error}; choose another -o, or change the "
+            "permissions"
         ) from error
 
 
@@ -137,5 +138,5 @@ def write_text(path: Path | str, text: str) -> None:
 
 
 def write_json(path: Path | str, data: Any) -> None:
-    """Write JSON atomically: two-space indent, sorted as given, NaN refused."""
+    """Write JSON atomically: two-space indent, key order as given, NaN refused."""
     write_text(path, json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False) + "\n")

@@ -1,4 +1,4 @@
-"""COLMAP's binary model files; see `colmap_model` for what they hold."""
+"""COLMAP's binary model files; see `colmap_records` for what they hold."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.atomic import atomic_path
-from ambiguous_wild.io.colmap_model import MODELS, ModelCamera, ModelImage, ModelPoints, model_of_id
+from ambiguous_wild.io.colmap_records import MODELS, ModelCamera, ModelImage, ModelPoints, model_of_id
 
 _OBSERVATION = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 _POINT = struct.Struct("<Q3d3BdQ")  # id, xyz, rgb, error, track length

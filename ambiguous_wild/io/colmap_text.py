@@ -1,4 +1,4 @@
-"""COLMAP's text model files; see `colmap_model` for what they hold."""
+"""COLMAP's text model files; see `colmap_records` for what they hold."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ambiguous_wild.core.errors import AwError, unknown
-from ambiguous_wild.io.colmap_model import MODELS, ModelCamera, ModelImage, ModelPoints
+from ambiguous_wild.io.colmap_records import MODELS, ModelCamera, ModelImage, ModelPoints
 
 
 def read_cameras(path: Path) -> dict[int, ModelCamera]:

@@ -1,4 +1,4 @@
-"""What a camera wrote beside the pixels: the part structure from motion and capture checks use."""
+"""The EXIF values that structure from motion and capture checks use."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 
 @dataclass(frozen=True)
 class Exif:
-    """Camera settings of one photo; None where the file does not say."""
+    """Camera settings of one photo; None = not recorded."""
 
     make: str | None = None
     model: str | None = None
@@ -86,7 +86,7 @@ def _degrees(spec: Any, name: str, negative: str, limit: float) -> float | None:
     if not isinstance(parts, tuple) or len(parts) != 3 or not all(math.isfinite(v) for v in parts):
         return None
     value = parts[0] + parts[1] / 60 + parts[2] / 3600
-    if abs(value) > limit or value == 0.0:  # 0, 0, 0 is what cameras without a fix write
+    if abs(value) > limit or value == 0.0:  # cameras without a GPS fix write 0, 0, 0
         return None
     return -value if _text(spec, f"GPS:{name}Ref") == negative else value
 

@@ -1,4 +1,4 @@
-"""How large an image says it is, before a decoder believes it and allocates that much."""
+"""Image size from the header, to be checked before a decoder allocates it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
 def header_size(data: bytes) -> tuple[int, int] | None:
-    """(width, height) in px as the file's header has it; None where it is no image of a kind in `READ`.
+    """(width, height) in px from the file's header; None where it is no image of a format in `READ`.
 
     Sources: PNG 1.2, ITU T.81 B.2.2, TIFF 6.0 section 2, BITMAPINFOHEADER, RFC 9649.
     """

@@ -1,7 +1,7 @@
-"""Pixels for training and measuring, through OpenCV or, where that is not installed, Pillow.
+"""Read and write the images of a scene, through OpenCV or, without it, Pillow.
 
-Either is imported by the first picture: a packaged scene needs no more than one of them. Photos as people
-take them (EXIF, CMYK, cut files) are the business of `io/photos.py`.
+The first image imports one of them, and a packaged scene needs no more. For photos of any kind (EXIF, CMYK,
+damaged files) see `io/photos.py`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.io import pillow
+from ambiguous_wild.io import pillow_fallback
 from ambiguous_wild.io.atomic import atomic_path
 from ambiguous_wild.io.image_header import MAX_PIXELS, READ, header_size
 
@@ -53,15 +53,17 @@ def load_image_float(
 
 def load_image_codes(
     path: Path | str,
-) -> np.ndarray:  # [H, W, 3] sRGB, uint8 or uint16 codes, or float32 in [0, 1]: as the file has it
-    """Read an image as the file has it; `as_float` makes of it what is trained on.
+) -> np.ndarray:  # [H, W, 3] sRGB, uint8 or uint16 codes, or float32 in [0, 1], as in the file
+    """Read an image at the file's depth; `as_float` converts it for training.
 
     Raises:
         AwError: the file is missing or does not decode, or its pixels are of another type.
     """
     image = _decode(path, "deep")
     if image.dtype not in (np.uint8, np.uint16, np.float32):
-        raise AwError(f"{path}: pixels of type {image.dtype} are not read; save it as an 8 or 16-bit PNG")
+        raise AwError(
+            f"{path}: pixels of type {image.dtype} are not supported; save it as an 8 or 16-bit PNG"
+        )
     return image
 
 
@@ -89,7 +91,7 @@ def read_keep_map(
 
 
 def image_size(path: Path | str) -> tuple[int, int]:
-    """(width, height) in px; of a PNG from its header alone, of anything else by decoding.
+    """(width, height) in px; PNG: from the header, other formats: by decoding.
 
     Raises:
         AwError: the file is missing or does not decode.
@@ -112,12 +114,12 @@ def write_png(
     """Write a PNG atomically; the same pixels give the same bytes.
 
     Raises:
-        AwError: shape or type that a PNG of ours does not hold.
+        AwError: another shape or type.
     """
     if image.dtype not in (np.uint8, np.uint16) or image.size == 0:
         raise AwError(f"{path}: a PNG takes uint8 or uint16 pixels, got {image.dtype} {list(image.shape)}")
     if image.ndim != 2 and not (image.ndim == 3 and image.shape[2] == 3):
-        raise AwError(f"{path}: a PNG of ours is [H, W] or [H, W, 3], got {list(image.shape)}")
+        raise AwError(f"{path}: a PNG takes [H, W] or [H, W, 3], got {list(image.shape)}")
     data = _encode_png(path, image)
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
@@ -126,7 +128,7 @@ def write_png(
 def _encode_png(path: Path | str, image: np.ndarray) -> bytes:
     cv2 = _opencv()
     if cv2 is None:
-        return pillow.encode_png(image)
+        return pillow_fallback.encode_png(image)
     pixels = image[:, :, ::-1] if image.ndim == 3 else image
     done, data = cv2.imencode(".png", np.ascontiguousarray(pixels), [cv2.IMWRITE_PNG_COMPRESSION, 1])
     if not done:
@@ -139,10 +141,10 @@ def decode(
     flags: int,  # of cv2.imdecode
     where: str,  # the file's name, for the message
 ) -> np.ndarray | None:
-    """What `cv2.imdecode` makes of the bytes, None where they are damaged; nothing is allocated for a lie.
+    """`cv2.imdecode`, None where the bytes are damaged. The header's size is checked before decoding.
 
     Raises:
-        AwError: the header announces more pixels than are read.
+        AwError: the header announces too many pixels.
     """
     import cv2
 
@@ -155,14 +157,14 @@ def decode(
 
 
 def _sound(data: np.ndarray, where: str) -> bool:
-    """Whether the header is one of a kind that is read, and announces no more pixels than that."""
+    """Whether the format is supported; raises AwError where the header announces too many pixels."""
     size = header_size(data.tobytes())
-    if size is None:  # OpenCV has decoders for a dozen more kinds, none of them needed
+    if size is None:  # OpenCV decodes a dozen more formats, which are not needed
         return False
     if size[0] * size[1] > MAX_PIXELS:
         raise AwError(
-            f"{where} announces {size[0]}x{size[1]} px, more than the {MAX_PIXELS // 1_000_000} megapixels "
-            "that are read; reduce it"
+            f"{where} announces {size[0]}x{size[1]} px, more than the limit of {MAX_PIXELS // 1_000_000} "
+            "megapixels; reduce it"
         )
     return True
 
@@ -177,8 +179,8 @@ def _opencv() -> Any:
     return cv2
 
 
-def _decode(path: Path | str, kind: pillow.Kind) -> np.ndarray:
-    # Through bytes rather than cv2.imread: non-ASCII names on every platform, and a reason that is ours.
+def _decode(path: Path | str, kind: pillow_fallback.Kind) -> np.ndarray:
+    # Not cv2.imread: non-ASCII names on every platform, and our own error messages.
     try:
         data = np.fromfile(path, dtype=np.uint8)
     except OSError as error:
@@ -192,7 +194,7 @@ def _decode(path: Path | str, kind: pillow.Kind) -> np.ndarray:
         }
         image = decode(data, flags[kind] | cv2.IMREAD_IGNORE_ORIENTATION, str(path))
     else:
-        image = pillow.decode(data.tobytes(), kind, str(path)) if _sound(data, str(path)) else None
+        image = pillow_fallback.decode(data.tobytes(), kind, str(path)) if _sound(data, str(path)) else None
     if image is None:
         raise AwError(
             f"cannot read image {path}: it is empty, cut short or no {READ}; restore it and try again"

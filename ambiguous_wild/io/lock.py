@@ -1,4 +1,4 @@
-"""One command at a time on one folder; says who holds it."""
+"""Folder locks: one command at a time on one folder."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from ambiguous_wild.core.errors import AwError
 
 
 class Busy(AwError):
-    """Another process works on the folder: nothing in it may be touched."""
+    """Another process works on the folder."""
 
 
 @contextmanager
 def folder_lock(folder: Path | str, doing: str) -> Iterator[None]:
-    """Hold `.<name>.lock` beside the folder; the kernel frees it even after kill -9.
+    """Lock `.<name>.lock` beside the folder; the kernel frees it even after kill -9.
 
     Args:
-        folder: what is worked on; need not exist yet.
-        doing: what for, shown to whoever is refused, e.g. ``"aw bench"``.
+        folder: it need not exist yet.
+        doing: the command, for the error message of other processes, e.g. ``"aw bench"``.
 
     Raises:
         Busy: another process holds it.
@@ -36,17 +36,17 @@ def folder_lock(folder: Path | str, doing: str) -> Iterator[None]:
         os.write(handle, f"{doing} (process {os.getpid()})".encode())
         yield
     finally:
-        # Unlinked while still held, so that no stale file stays behind.
+        # Unlinked while it is locked: no stale file is left.
         path.unlink(missing_ok=True)
         os.close(handle)
 
 
 @contextmanager
 def patient_lock(folder: Path | str, doing: str, patience_s: float) -> Iterator[None]:
-    """`folder_lock`, but wait for whoever holds it.
+    """As `folder_lock`, but wait for up to `patience_s` seconds.
 
     Raises:
-        Busy: it is still held after `patience_s` seconds.
+        Busy: it is locked even then.
     """
     deadline = time.monotonic() + patience_s
     with ExitStack() as stack:
@@ -72,8 +72,8 @@ def _locked(path: Path, folder: Path) -> int:
             raise Busy(
                 f"{folder} is being worked on by {holder}; wait for it to end, or choose another folder"
             ) from None
-        # The one before may have unlinked the file between our open and our lock: then what we hold is
-        # no longer the file others will find under this name.
+        # The previous holder may unlink the file between our open and our lock. Then other processes would
+        # lock a new file of this name, so try again.
         try:
             if os.path.samestat(os.fstat(handle), os.stat(path)):
                 return handle

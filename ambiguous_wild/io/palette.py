@@ -1,21 +1,21 @@
-"""Colours of every picture we draw: one palette, so that a colour means one thing everywhere."""
+"""The colours of all figures: one colour has one meaning."""
 
 from __future__ import annotations
 
 import numpy as np
 
-# zero to one as in the paper's figures: green is certain or equal, red uncertain or different
+# From 0 to 1 as in the paper's figures: green = certain or equal, red = uncertain or different.
 _RAMP = np.array(
     [[95, 186, 168], [136, 207, 164], [178, 224, 162], [215, 239, 155], [239, 248, 166], [255, 255, 191],
      [254, 235, 158], [253, 211, 128], [253, 180, 102], [248, 141, 81], [240, 103, 68]], np.float64,
 )  # fmt: skip
-MASKED = (255, 30, 30)  # M_final, or what a method masks
+MASKED = (255, 30, 30)  # M_final, or a method's mask
 LOCAL = (245, 133, 24)
 GLOBAL = (150, 60, 200)
 ADDED = (31, 119, 180)
 MERGED = (214, 39, 40)
 NEUTRAL = (140, 140, 140)
-# Okabe and Ito's categories, for colour-blind eyes too; without their yellow, too light for a line on white
+# Okabe and Ito's colours, safe for colour blindness; without yellow, which is too light on white.
 CATEGORIES = ((0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167), (230, 159, 0), (86, 180, 233),
               (0, 0, 0))  # fmt: skip
 
@@ -33,18 +33,18 @@ def ramp(values: np.ndarray, low: float, high: float) -> np.ndarray:
 
 
 def tint(photo: np.ndarray, mask: np.ndarray, colour: tuple[int, int, int]) -> np.ndarray:
-    """The photo [H, W, 3] uint8 with the pixels of `mask` [H, W] bool in the colour, half seen through."""
+    """The photo [H, W, 3] uint8 with the pixels of `mask` [H, W] bool tinted."""
     shown = photo.astype(np.float32)
     shown[mask] = 0.45 * shown[mask] + 0.55 * np.array(colour, np.float32)
     return shown.astype(np.uint8)
 
 
 def faded(photo: np.ndarray) -> np.ndarray:
-    """The photo [H, W, 3] uint8 in light grey, so that a tint on it is seen whatever the photo's colours."""
+    """The photo [H, W, 3] uint8 in light grey, as background of a tint."""
     grey = photo.astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32)
     return np.repeat((70 + 0.65 * grey)[..., None], 3, axis=2).astype(np.uint8)
 
 
 def plot_colour(colour: tuple[int, int, int]) -> tuple[float, float, float]:
-    """The colour in [0, 1], as plots want it."""
+    """The colour in [0, 1], for matplotlib."""
     return (colour[0] / 255, colour[1] / 255, colour[2] / 255)

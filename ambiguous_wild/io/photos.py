@@ -1,7 +1,6 @@
-"""Photos as people take them: every format, orientation and defect a capture may hold.
+"""Read the photos of a capture, of any format and orientation, through OpenImageIO.
 
-Reading goes through OpenImageIO. What comes out is always upright 8-bit RGB; what cannot be read is
-refused with the reason.
+The result is upright 8-bit RGB; a photo that cannot be read is refused with the reason.
 """
 
 from __future__ import annotations
@@ -17,13 +16,13 @@ from ambiguous_wild.io.exif import Exif, exif_from_spec
 from ambiguous_wild.io.image_header import MAX_PIXELS
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".jp2", ".heic", ".heif")
-MIN_SIDE = 16  # px; nothing can be matched in less
+MIN_SIDE = 16  # px; smaller photos have no features
 
 _FORMAT_OF_SUFFIX = {".jpg": "jpeg", ".jpeg": "jpeg", ".tif": "tiff", ".jp2": "jpeg2000", ".heif": "heic"}
 
 
 class UnreadablePhoto(AwError):
-    """One photo that cannot be used; `reason` is the part of the message after the name."""
+    """A photo that cannot be used; `reason` is the message without the name."""
 
     def __init__(self, path: Path | str, reason: str) -> None:
         super().__init__(f"{path}: {reason}")
@@ -32,21 +31,21 @@ class UnreadablePhoto(AwError):
 
 @dataclass(frozen=True)
 class Photo:
-    """What one photo file holds, upright."""
+    """One photo file, upright."""
 
     path: Path
     format: str  # by content: "jpeg", "png", ...
     width: int  # px, after EXIF orientation
     height: int  # px, after EXIF orientation
     exif: Exif
-    plain: bool  # 8-bit upright RGB under its right suffix: other tools read the file as we do
+    plain: bool  # 8-bit upright RGB with the right suffix: other tools read the same pixels
     notes: tuple[str, ...]  # what was converted, e.g. "16 bits reduced to 8"
 
 
 def read_photo(
     path: Path | str,
 ) -> tuple[Photo, np.ndarray]:  # pixels [H, W, 3] uint8, sRGB, upright
-    """Read a photo whole; orientation applied, depth, grey, CMYK and alpha brought to 8-bit RGB.
+    """Read a photo as upright 8-bit RGB; converts 16 bits, grey, CMYK and alpha.
 
     Raises:
         UnreadablePhoto: empty, cut short, no image, too large or too small, with the reason.
@@ -103,12 +102,12 @@ def _sniff(path: Path) -> str:
     if head[:4] == b"RIFF" and head[8:12] == b"WEBP":
         return "webp"
     if head[4:12] in (b"ftypheic", b"ftypheix", b"ftypmif1", b"ftypheim", b"ftypmsf1"):
-        raise UnreadablePhoto(path, "HEIC photos are not read here; export them as JPEG")
+        raise UnreadablePhoto(path, "HEIC photos are not supported; export them as JPEG")
     raise UnreadablePhoto(path, "no image (the content is of no photo format)")
 
 
 def _check_whole(path: Path, form: str) -> None:
-    """Refuse a cut file by its missing end: decoders fill the rest with grey and report success."""
+    """Refuse a file without its end: decoders fill the rest with grey and report no error."""
     if form == "jpeg":
         data = path.read_bytes()
         scan = _first_scan(data)
@@ -123,7 +122,7 @@ def _check_whole(path: Path, form: str) -> None:
 
 
 def _first_scan(data: bytes) -> int:
-    """Offset of the first start-of-scan marker, -1 without; thumbnails in headers are stepped over."""
+    """Offset of the first start-of-scan marker outside header thumbnails; -1 without."""
     at = 2
     while at + 4 <= len(data):
         if data[at] != 0xFF:
@@ -144,23 +143,23 @@ def _check_size(path: Path, spec: Any) -> None:
         raise UnreadablePhoto(
             path,
             f"{width}x{height} is {width * height / 1e6:.0f} megapixels, more than the "
-            f"{MAX_PIXELS // 1_000_000} that are read; reduce it",
+            f"limit of {MAX_PIXELS // 1_000_000}; reduce it",
         )
     if min(width, height) < MIN_SIDE:
         raise UnreadablePhoto(path, f"{width}x{height} px is too small to match (at least {MIN_SIDE} a side)")
     if str(spec.format) not in ("uint8", "uint16"):
-        raise UnreadablePhoto(path, f"pixels of type {spec.format} are not read; export 8 or 16 bits")
+        raise UnreadablePhoto(path, f"pixels of type {spec.format} are not supported; export 8 or 16 bits")
 
 
 def _to_rgb(path: Path, pixels: np.ndarray, spec: Any) -> tuple[np.ndarray, list[str]]:
-    """[H, W, C] uint8 to [H, W, 3] with what was done to it."""
+    """[H, W, C] uint8 to [H, W, 3], with notes on the conversion."""
     notes = []
     if str(spec.format) == "uint16":
         notes.append("16 bits reduced to 8")
     names = tuple(n.upper() for n in spec.channelnames)
     space = next((spec.getattribute(f"{f}:ColorSpace") for f in ("jpeg", "tiff", "psd")), None)
     if spec.alpha_channel >= 0:
-        # OpenImageIO hands out colours already multiplied by alpha, which is a composite over black.
+        # OpenImageIO returns colours multiplied by alpha: a composite over black.
         if int(pixels[..., spec.alpha_channel].min()) < 255:
             notes.append("transparency composited over black")
         else:

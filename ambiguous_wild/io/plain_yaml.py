@@ -1,4 +1,4 @@
-"""YAML that holds data and nothing else: no tags, no aliases, no key twice, no text without end."""
+"""YAML of plain data: no tags, no aliases, no repeated keys, limited size."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ import yaml
 
 from ambiguous_wild.core.errors import AwError
 
-LARGEST = 1_000_000  # bytes; what is read here has a few thousand
+LARGEST = 1_000_000  # bytes; our files have a few thousand
 DEEPEST = 50  # nested lists and mappings
 LONGEST_NUMBER = 400  # characters of a whole number; no float is larger
 
 
 class PlainLoader(yaml.SafeLoader):
-    """YAML's safe loader, which takes a key twice and an alias that grows without end; this one does not."""
+    """YAML's safe loader, without repeated keys and aliases."""
 
     _depth = 0  # of the node being composed
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.AliasEvent):
-            raise AwError(f"line {self.peek_event().start_mark.line + 1}: aliases (*name) are not read")
+            raise AwError(f"line {self.peek_event().start_mark.line + 1}: aliases (*name) are not supported")
         self._depth += 1
         if self._depth > DEEPEST:
             raise AwError(f"line {self.peek_event().start_mark.line + 1}: nested deeper than {DEEPEST}")
@@ -33,19 +33,21 @@ class PlainLoader(yaml.SafeLoader):
         seen = set()
         for key, _ in node.value:
             if not isinstance(key.value, str):
-                raise AwError(f"not YAML that is read here: no word as key in line {key.start_mark.line + 1}")
+                raise AwError(
+                    f"not YAML that is supported: the key in line {key.start_mark.line + 1} is no text"
+                )
             if key.tag == "tag:yaml.org,2002:merge":
-                raise AwError(f"line {key.start_mark.line + 1}: merged keys (<<) are not read")
+                raise AwError(f"line {key.start_mark.line + 1}: merged keys (<<) are not supported")
             if key.value in seen:
                 raise AwError(f"line {key.start_mark.line + 1}: the key {key.value!r} is there twice")
             seen.add(key.value)
         return super().construct_mapping(node, deep)
 
     def construct_yaml_int(self, node: Any) -> int:
-        # 0xfff... and 1:59:59... know no limit of Python's own, and what they give cannot be printed
+        # Python limits decimal numbers only, not 0xfff... and 1:59:59..., and cannot print such values.
         if len(node.value) > LONGEST_NUMBER:
             raise AwError(
-                f"line {node.start_mark.line + 1}: a whole number of {len(node.value)} characters is not read"
+                f"line {node.start_mark.line + 1}: a whole number of {len(node.value)} characters is too long"
             )
         return int(super().construct_yaml_int(node))
 
@@ -57,7 +59,7 @@ def parse(text: str) -> Any:
     """The plain data of a YAML text.
 
     Raises:
-        AwError: it is no YAML, or uses what is not read here; says the line.
+        AwError: no YAML, or something that is not supported; names the line.
     """
     try:
         return yaml.load(text, Loader=PlainLoader)
@@ -66,9 +68,9 @@ def parse(text: str) -> Any:
         line = f" in line {mark.line + 1}" if mark else ""
         problem = " ".join(str(getattr(error, "problem", None) or "it does not parse").split())
         raise AwError(f"not YAML{line}: {problem}") from None
-    # 2025-99-99, a number of ten thousand digits, a thousand brackets; PyYAML's own slips on odd scalars
+    # Raised for 2025-99-99, numbers of ten thousand digits, a thousand brackets, and by bugs of PyYAML.
     except (ValueError, TypeError, RecursionError, KeyError, AttributeError, IndexError) as error:
-        raise AwError(f"not YAML that is read here: {error or type(error).__name__}") from None
+        raise AwError(f"not YAML that is supported: {error or type(error).__name__}") from None
 
 
 def read_text(path: Path) -> str:
@@ -79,7 +81,7 @@ def read_text(path: Path) -> str:
     """
     try:
         if path.stat().st_size > LARGEST:
-            raise AwError(f"{path} is larger than {LARGEST // 10**6} MB: that is none of ours")
+            raise AwError(f"{path} is larger than {LARGEST // 10**6} MB, which no file of ours is")
         return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "it is not UTF-8 text"

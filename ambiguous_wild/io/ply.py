@@ -71,11 +71,10 @@ def write_splat_ply(path: Path | str, gaussians: Mapping[str, np.ndarray]) -> No
 def read_splat_ply(path: Path | str) -> dict[str, np.ndarray]:
     """Read a splat PLY, ours or another tool's; arrays as `write_splat_ply` takes them, float32.
 
-    Columns may come in any order and any scalar type, others are ignored, and a vertex element of
-    another number of harmonics than degree 0 to 3 holds is refused.
+    Columns may have any order and scalar type; unknown ones are ignored.
 
     Raises:
-        AwError: not such a file, cut short, or columns are missing.
+        AwError: no splat PLY, cut short, missing columns, or harmonics of no degree from 0 to 3.
     """
     path = Path(path)
     try:
@@ -85,7 +84,7 @@ def read_splat_ply(path: Path | str) -> dict[str, np.ndarray]:
             if count * dtype.itemsize > size - start:
                 raise AwError(
                     f"{path} is cut short: {count} Gaussians of {dtype.itemsize} bytes announced, "
-                    f"{size - start} bytes there; copy or export it again"
+                    f"{size - start} bytes present; copy or export it again"
                 )
             f.seek(start)
             table = np.frombuffer(f.read(count * dtype.itemsize), dtype, count)
@@ -117,10 +116,10 @@ def read_splat_ply(path: Path | str) -> dict[str, np.ndarray]:
 
 
 def splat_count(path: Path | str) -> int:
-    """Number of Gaussians by the file's header.
+    """Number of Gaussians, from the file's header.
 
     Raises:
-        AwError: no such file, or no PLY that `read_splat_ply` would take.
+        AwError: no such file, or no splat PLY.
     """
     path = Path(path)
     try:
@@ -131,7 +130,7 @@ def splat_count(path: Path | str) -> int:
 
 
 def _header(path: Path, head: bytes) -> tuple[int, np.dtype, int]:
-    """Number of vertices, their record, and where the data starts."""
+    """Number of vertices, their dtype, and the offset of the data."""
     if not head.startswith(b"ply"):
         raise AwError(f"{path} is no PLY file: it does not start with 'ply'")
     end = head.find(b"end_header")

@@ -5,21 +5,22 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal, TypeGuard
+from typing import Any, Literal, TypeGuard, cast
 
 import numpy as np
 
 from ambiguous_wild.core import AwError, Camera, Points, Scene, View
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.core.names import check_name
-from ambiguous_wild.core.scene import Split
-from ambiguous_wild.io.colmap_model import Model, ModelImage, read_model
+from ambiguous_wild.core.scene import SceneInfo, Split
+from ambiguous_wild.io.colmap_model import read_model
+from ambiguous_wild.io.colmap_records import Model, ModelImage
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import image_size
 
 SCENE_SCHEMA = 1  # of scene.json; raised when a reader of the old one would be wrong
-MOST_FACTOR = 1000  # of downsampling; the builder makes up to 64
-TEST_EVERY = 8  # the 3DGS and gsplat habit for scenes that bring no lists
+MOST_FACTOR = 1000  # of downsampling; the builder allows 64
+TEST_EVERY = 8  # test photos of scenes without lists, as in 3DGS and gsplat
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
 
@@ -34,32 +35,31 @@ def load_scene(
 
     Args:
         path: our scene folder, or a plain COLMAP scene (``images/`` and ``sparse/0``).
-        factor: 1 takes ``images/``, n takes ``images_n/``; None takes what the scene was built for.
-        verify: True compares the sha256 of every file scene.json lists, "quick" their sizes,
-            False nothing. A folder without scene.json has nothing to compare with.
+        factor: 1 opens ``images/``, n opens ``images_n/``; None: the factor of scene.json.
+        verify: True compares the sha256 of every file in scene.json, "quick" the sizes, False nothing.
 
     Returns:
-        The scene: views ordered by name, intrinsics at the size of the loaded files, points with
-        tracks in px of those files. ``info["warnings"]`` says what the lists name and the model lacks.
-        Observations in photos whose 2D points were stripped from the model point to view -1.
+        The scene: views ordered by name, intrinsics at the size of the loaded files, tracks in px of these
+        files. ``info["warnings"]`` counts listed photos that the model lacks. Observations in photos
+        without 2D points in the model have view -1.
 
     Raises:
-        AwError: the folder is no scene, its name is unfit, a file changed, lists and model do not fit.
+        AwError: no scene, an invalid name, a changed file, or lists that do not fit the model.
     """
     root = Path(path)
     if root.is_file():
         raise AwError(f"{root} is a file, not a scene folder; give the folder: {root.parent}")
     if not root.is_dir():
         raise AwError(f"there is no scene folder {root}; 'aw build-scene PHOTOS -o {root}' makes one")
-    info = read_scene_json(root)
-    if info is not None and verify:
-        verify_files(root, info, quick=verify == "quick")
-    # Photos alone lack a model first of all, whatever their folders are called.
+    read = read_scene_json(root)
+    if read is not None and verify:
+        verify_files(root, read, quick=verify == "quick")
+    # The model first: a folder of photos alone is told that it has none.
     model_folder = _model_folder(root)
-    chosen = _default_factor(root, info) if factor is None else factor
+    chosen = _default_factor(root, read) if factor is None else factor
     folder = _image_folder(root, chosen)
-    info = {} if info is None else dict(info)
-    # Runs are written to a folder of this name: a stranger's scene must not choose where that lies.
+    info: SceneInfo = {} if read is None else read.copy()
+    # Runs are written to a folder of this name, and the scene may be somebody else's.
     name = check_name(f"scene name in {root}", info.get("name", root.resolve().name))
     model = read_model(model_folder)
     info["loaded_factor"] = chosen
@@ -77,16 +77,15 @@ def load_scene(
     )
     _refuse_same_stems(root, views)
     if not any(v.split == "train" for v in views):
-        raise AwError(f"{root} has no training photo: none of train_list.txt is in the model")
+        raise AwError(f"{root} has no training photo: none of train_list.txt is in the model; build it again")
     return Scene(root, name, views, _points(model, views), info)
 
 
-def read_scene_json(root: Path | str) -> dict[str, Any] | None:
-    """scene.json as a dict, or None where there is none.
+def read_scene_json(root: Path | str) -> SceneInfo | None:
+    """scene.json, or None where there is none.
 
     Raises:
-        AwError: it does not parse, is of a newer schema than this version knows, or a field that is read
-            here has the wrong type.
+        AwError: it does not parse, has a newer schema, or a key that is read here has the wrong type.
     """
     path = Path(root) / "scene.json"
     if not path.is_file():
@@ -103,11 +102,11 @@ def read_scene_json(root: Path | str) -> dict[str, Any] | None:
             f"{path} has schema {version}, this version reads up to {SCENE_SCHEMA}: update ambiguous-wild"
         )
     _check_fields(path, info)
-    return info
+    return cast(SceneInfo, info)
 
 
 def _check_fields(path: Path, info: dict[str, Any]) -> None:
-    """Raise AwError where a field that this version reads has the wrong type."""
+    """Raise AwError where a key that is read here has the wrong type."""
     factor, name, files = info.get("factor"), info.get("name", ""), info.get("files")
     wrong = []
     if not _is_count(factor) or not 1 <= factor <= MOST_FACTOR:
@@ -118,7 +117,9 @@ def _check_fields(path: Path, info: dict[str, Any]) -> None:
         wrong.append("it lists no files")
     else:
         odd = [_short(file) for file, entry in files.items() if not _is_file_entry(entry)]
-        wrong += [f"under files, sha256 or bytes is absent or no such thing: {shortlist(odd)}"] if odd else []
+        wrong += (
+            [f"under files, sha256 or bytes is absent or has the wrong type: {shortlist(odd)}"] if odd else []
+        )
     if wrong:
         raise AwError(f"{path} is damaged ({'; '.join(wrong)}); restore it, or build the scene again")
 
@@ -136,12 +137,12 @@ def _short(value: Any) -> str:
     try:
         text = ascii(value)
     except ValueError:  # a whole number of thousands of digits
-        text = "a number without end"
+        text = "a huge number"
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def verify_files(root: Path | str, info: dict[str, Any], *, quick: bool = False) -> None:
-    """Compare the files scene.json lists with what lies there; quick compares sizes only.
+def verify_files(root: Path | str, info: SceneInfo, *, quick: bool = False) -> None:
+    """Compare the scene's files with scene.json.
 
     Args:
         root: the scene folder.
@@ -169,7 +170,7 @@ def verify_files(root: Path | str, info: dict[str, Any], *, quick: bool = False)
 
 def read_list(path: Path) -> list[str]:
     """Names of a split list, one a line; empty lines are skipped."""
-    # some editors begin a file with a byte order mark, which is no part of the first name
+    # Some editors write a byte order mark, which is no part of the first name.
     lines = path.read_text(encoding="utf-8-sig", errors="surrogateescape").splitlines()
     return [line.strip() for line in lines if line.strip()]
 
@@ -191,7 +192,7 @@ def _model_folder(root: Path) -> Path:
     )
 
 
-def _default_factor(root: Path, info: dict[str, Any] | None) -> int:
+def _default_factor(root: Path, info: SceneInfo | None) -> int:
     if info is not None:
         return int(info["factor"])
     found = _factors(root)
@@ -215,7 +216,7 @@ def _image_folder(root: Path, factor: int) -> Path:
 
 
 def _split(root: Path, registered: list[str]) -> tuple[dict[str, Split], dict[str, list[str]]]:
-    """name -> side for the registered photos, and the listed names the model lacks, per side."""
+    """name -> side of the registered photos; per side the listed names that the model lacks."""
     paths: dict[Split, Path] = {"train": root / "train_list.txt", "test": root / "test_list.txt"}
     present = [p for p in paths.values() if p.is_file()]
     if not present:
@@ -240,14 +241,14 @@ def _split(root: Path, registered: list[str]) -> tuple[dict[str, Split], dict[st
 
 
 def _refuse_same_stems(root: Path, views: tuple[View, ...]) -> None:
-    """Raise AwError where two photos differ in their extension alone: their renders would be one PNG."""
+    """Raise AwError where two photos differ in their extension only: their renders are one PNG."""
     seen: dict[tuple[str, str], str] = {}
     for view in views:
         key = (view.split, str(PurePosixPath(view.name).with_suffix("")))
         if key in seen:
             raise AwError(
-                f"{root}: photos {seen[key]!r} and {view.name!r} differ in their extension alone, so their "
-                "renders would be one file; rename one before the model is made"
+                f"{root}: photos {seen[key]!r} and {view.name!r} differ in their extension only, so their "
+                "renders would be one file; rename one and build the model again"
             )
         seen[key] = view.name
 
@@ -260,7 +261,7 @@ def _view(root: Path, folder: Path, model: Model, image: ModelImage, side: Split
     if abs(width * full.height / full.width - height) > max(2.0, 0.02 * height):
         raise AwError(
             f"{path} is {width}x{height}, but its camera in the model is {full.width}x{full.height}: another "
-            "shape, so the photo was cropped or turned; use the photos the model was made from"
+            "aspect ratio, so the photo was cropped or turned; use the photos the model was built from"
         )
     camera = Camera(full.width, full.height, fx, fy, cx, cy, image.cam_from_world()).resized(width, height)
     stem = str(PurePosixPath(image.name).with_suffix(""))
@@ -270,7 +271,7 @@ def _view(root: Path, folder: Path, model: Model, image: ModelImage, side: Split
 
 
 def _image_path(folder: Path, name: str) -> Path:
-    # Downsampled copies often change extension (gsplat writes PNG next to JPEG models).
+    # Downsampled copies may have another extension (gsplat writes PNG for JPEG photos).
     candidates = [folder / name, *((folder / name).with_suffix(s) for s in _SUFFIXES)]
     for path in candidates:
         if path.is_file():
@@ -290,10 +291,13 @@ def _points(model: Model, views: tuple[View, ...]) -> Points:
     for image_id, image in model.images.items():
         rows = order[np.searchsorted(ids, image_id) : np.searchsorted(ids, image_id, side="right")]
         if not len(image.xys):
-            continue  # a stripped model: its tracks name 2D points that it no longer lists
+            continue  # the model was stored without 2D points, which its tracks name
         index = points.track_point2d[rows]
         if len(index) and (index.min() < 0 or index.max() >= len(image.xys)):
-            raise AwError(f"the model's tracks and its image {image.name!r} contradict each other: damaged")
+            raise AwError(
+                f"the model's tracks and its image {image.name!r} contradict each other: it is damaged; "
+                "build it again"
+            )
         scale = np.ones(2)
         if image_id in scaled:
             position, view = scaled[image_id]
@@ -305,5 +309,5 @@ def _points(model: Model, views: tuple[View, ...]) -> Points:
 
 
 def without_keep(scene: Scene) -> Scene:
-    """The scene as if nobody had drawn masks: for methods that must find distractors themselves."""
+    """The scene without keep masks, for methods that find distractors themselves."""
     return replace(scene, views=tuple(replace(v, keep_path=None) for v in scene.views))

@@ -1,4 +1,4 @@
-"""Ablations as data: a method says which settings to vary, `aw ablate` trains and tabulates them.
+"""Ablations as data: a method lists the settings to vary, `aw ablate` trains and tabulates them.
 
 Imports nothing heavy: `aw ablate --list` shows them without torch.
 """
@@ -21,9 +21,11 @@ class Variant:
 
     name: str
     settings: tuple[str, ...] = ()  # "key=value", as `--set METHOD.KEY=VALUE` takes them
-    text: str = ""  # one line where the name does not say it all
-    features: str = ""  # a features back end it needs, see vision/backends.py; absent weights = missing
-    method: str = ""  # another method at its defaults instead, where the paper compares with one
+    text: str = ""  # one line of explanation, if the name needs one
+    features: str = (
+        ""  # a features back end it needs, see vision/backends.py; without its weights the row is missing
+    )
+    method: str = ""  # another method at its defaults, if the paper compares with one
 
 
 @dataclass(frozen=True)
@@ -37,12 +39,12 @@ class Group:
 
 
 def folder_name(method: str, group: Group, variant: Variant) -> str:
-    """What runs of a variant are called instead of their method's name: refinesplat@masks-local."""
+    """The name of a variant's runs, in place of the method's: refinesplat@masks-local."""
     return f"{method}@{group.name}-{variant.name}"
 
 
 def check_groups(method: str, groups: Sequence[Group]) -> None:
-    """Raise AwError where two things share a name, or a name cannot be a folder's."""
+    """Raise AwError if two groups or variants share a name, or a name cannot be a folder name."""
     for kind, names in [("groups", [g.name for g in groups])] + [
         (f"variants of {g.name}", [v.name for v in g.variants]) for g in groups
     ]:
@@ -54,7 +56,7 @@ def check_groups(method: str, groups: Sequence[Group]) -> None:
 
 
 def choose_groups(method: str, groups: Sequence[Group], names: Sequence[str]) -> tuple[Group, ...]:
-    """The groups of these names in their own order; all where none is named.
+    """The groups of these names in their own order; all if none is named.
 
     Raises:
         AwError: the method has no ablations, or none of that name.

@@ -1,11 +1,10 @@
-"""DroneSplat: instances whose residual stands out in their photo are masked whole.
+"""DroneSplat: masks whole instances whose residual is high for their photo.
 
 Source: "DroneSplat: 3D Gaussian Splatting for Robust 3D Reconstruction from In-the-Wild Drone Imagery",
-CVPR 2025 (arXiv 2503.16964) and its released code, whose local masking this is. The paper's global step
-(tracking of high-residual objects through the sequence) is described there without constants and not
-released: it is left out, and so are its dense initialisation and voxel-guided optimisation. The released code
-takes its instances from SAM 2 (`instances=sam2-large`); without weights they are graph segments, smaller
-than objects.
+CVPR 2025 (arXiv 2503.16964) and its released code; this is its local masking. Left out: the global step
+(tracking of high-residual objects through the sequence; no constants in the paper, no code), the dense
+initialisation and the voxel-guided optimisation. The released code takes instances from SAM 2
+(`instances=sam2-large`); without weights they are graph segments, smaller than objects.
 """
 
 from __future__ import annotations
@@ -19,14 +18,14 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.palette import MASKED, faded, ramp, tint
-from ambiguous_wild.methods.later import later
+from ambiguous_wild.methods.masking_common import MaskedShares, WarmUpMask
 from ambiguous_wild.splat import device
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.losses import ssim_map
-from ambiguous_wild.splat.parts import MaskPolicy, Parts, State
+from ambiguous_wild.splat.parts import Parts, State
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData
 from ambiguous_wild.vision.backends import check_instances, make_instances
-from ambiguous_wild.vision.stage import instance_labels
+from ambiguous_wild.vision.precompute import instance_labels
 
 _LANES = 64  # sums a label while an accelerator adds up
 
@@ -39,8 +38,8 @@ class DroneSplatConfig:
     density: DensityConfig = field(default_factory=DensityConfig)
     lambda_dssim: float = 0.2
     mask_start: float = 500.0
-    min_mask_start: int = 300  # a render of fewer iterations means nothing
-    t_local: float = 0.4  # deviations of bonus at the start, none at the end
+    min_mask_start: int = 300  # earlier renders show too little
+    t_local: float = 0.4  # standard deviations added to the threshold at the start, none at the end
     weight_l1: float = 4.0  # in the residual, beside 1 for 1 - SSIM
 
     def __post_init__(self) -> None:
@@ -68,16 +67,16 @@ def combined_residual(
 
 
 def unit_range(values: Tensor) -> Tensor:
-    """Values by their own minimum and maximum in [0, 1]; zeros where all are the same."""
+    """Values by their own minimum and maximum in [0, 1]; zeros if all are equal."""
     low, high = values.min(), values.max()
-    # 0 / 1 where all are the same: asking whether they are makes the host of an accelerator wait
+    # 0 / 1 if all are equal: a test on the host would make it wait for the accelerator
     return (values - low) / (high - low).masked_fill(high <= low, 1.0)
 
 
 def heat_map(
     residual: Tensor,  # [H, W]
     labels: Tensor,  # [H, W] int64, 0 = unlabelled
-    count: int | None = None,  # above every label; None: looked up, and the host of an accelerator waits
+    count: int | None = None,  # above every label; None: looked up, for which the host waits
 ) -> Tensor:
     """Each pixel its instance's mean residual, 0 where unlabelled, over its own range; float64 [H, W]."""
     flat, values = labels.reshape(-1), residual.reshape(-1).double()
@@ -93,9 +92,9 @@ def heat_map(
 
 
 def _label_sums(values: Tensor, flat: Tensor, count: int) -> Tensor:
-    """Sums [count] of values [P] by label [P]: `bincount` without a look at the labels by the host.
+    """Sums [count] of values [P] by label [P]: `bincount` without reading the labels on the host.
 
-    Neighbours mostly share a label and would queue for one address: each label has `_LANES` of them.
+    Neighbouring pixels mostly share a label and would wait for one address: each label has `_LANES` of them.
     """
     lane = torch.arange(len(flat), device=flat.device) % _LANES
     sums = values.new_zeros(count * _LANES).scatter_add_(0, flat * _LANES + lane, values)
@@ -108,13 +107,15 @@ def threshold(heat: Tensor, nominal: float, t_local: float = 0.4) -> Tensor:
     return heat.mean() + heat.std(correction=0) * (1.0 + t_local * left)
 
 
-class DroneSplatMask(MaskPolicy):
-    """Nothing is learnt: statistics of the current render, instance by instance."""
+class DroneSplatMask(WarmUpMask):
+    """From statistics of the current render, instance by instance; nothing is learnt."""
+
+    config: DroneSplatConfig
 
     def __init__(self, config: DroneSplatConfig) -> None:
         self.config = config
         self.instances = make_instances(config.instances)
-        self.shares: dict[int, float | Tensor] = {}  # view: share masked when it was last seen
+        self.shares = MaskedShares()
 
     def setup(self, data: TrainData) -> None:
         names = [view.name for view in data.scene.train]
@@ -126,29 +127,26 @@ class DroneSplatMask(MaskPolicy):
     def keep(self, step: Step) -> Tensor | None:
         keep = self.predict(step)
         if keep is not None:
-            self.shares[step.view] = later(1.0 - keep.mean())
+            self.shares.take(step.view, keep)
         return keep
 
     @torch.no_grad()
     def predict(self, step: Step) -> Tensor | None:
-        return (~self._stands_out(step)[1]).float() if self._begun(step) else None
-
-    def _begun(self, step: Step) -> bool:
-        return step.nominal >= self.config.mask_start and step.iteration >= self.config.min_mask_start
+        return (~self._stands_out(step)[1]).float() if self.begun(step) else None
 
     def _stands_out(self, step: Step) -> tuple[Tensor, Tensor]:
         """Heat map, and which pixels are above its threshold."""
         labels = nearest(self.labels[step.view], *step.photo.shape[:2])
         residual = combined_residual(step.rendered.image, step.photo, self.config.weight_l1)
         heat = heat_map(residual, labels, self.counts[step.view])
-        # a photo of one heat alone has nothing that stands out, and T = 0 would mask it whole
+        # a photo of equal heat everywhere has T = 0, which would mask all of it
         return heat, (heat >= threshold(heat, step.nominal, self.config.t_local)) & (heat > 0)
 
     @torch.no_grad()
     def panels(self, step: Step) -> dict[str, np.ndarray]:
         heat, out = self._stands_out(step)
         photo = faded((step.photo.cpu().numpy() * 255 + 0.5).astype(np.uint8))
-        used = "" if self._begun(step) else ", not used yet"
+        used = "" if self.begun(step) else ", not used yet"
         limit = float(threshold(heat, step.nominal, self.config.t_local))
         return {
             f"heat of instances, T {limit:.2f}": ramp(heat.cpu().numpy(), 0.0, 1.0),
@@ -156,18 +154,17 @@ class DroneSplatMask(MaskPolicy):
         }
 
     def facts(self) -> dict[str, Any]:
-        shares = [float(self.shares[view]) for view in sorted(self.shares)]
         return {
-            "masked_share": sum(shares) / len(shares) if shares else 0.0,
+            "masked_share": self.shares.mean(),
             "instances": self.instances.name,
             "instances_per_photo": float(np.mean([count - 1 for count in self.counts])),
         }
 
     def state_dict(self) -> State:
-        return {"shares": {str(view): float(share) for view, share in self.shares.items()}}
+        return {"shares": self.shares.state_dict()}
 
     def load_state_dict(self, state: State) -> None:
-        self.shares = {int(view): float(share) for view, share in state["shares"].items()}
+        self.shares = MaskedShares.from_state(state["shares"])
 
 
 def nearest(labels: Tensor, height: int, width: int) -> Tensor:

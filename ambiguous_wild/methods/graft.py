@@ -1,38 +1,42 @@
-"""Plug and play: masking, density control and regulariser of one method in another.
+"""Plug and play: masking, density control, regulariser and effects of one method in another.
 
-`3dgs@mask=refinesplat` is 3DGS under RefineSplat's masks, `refinesplat@mask=truth` RefineSplat under exact
+`3dgs@mask=refinesplat` is 3DGS with RefineSplat's masks, `refinesplat@mask=truth` RefineSplat with exact
 ones. What a place takes:
 
 mask         the keep map (`MaskPolicy.keep`, `predict`), and what it learns
 density      the density control and its config
 regulariser  the donor policy's loss on the render (`MaskPolicy.cotangent`), under the host's keep map
+effects      the donor's own effects (`Parts.effects`) instead of the host's
 
-Everything else - schedule, how the keep map enters SSIM, which photos - stays the host's. Imports no torch:
-names are checked before anything heavy is loaded.
+Everything else - schedule, how the keep map enters SSIM, which photos - stays the host's. A warning names
+a donor's effects that the graft does not take. Imports no torch: names are checked before anything
+heavy is loaded.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Mapping
+import warnings
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from ambiguous_wild.core.errors import AwError, unknown
+from ambiguous_wild.methods.entry import MethodEntry, NoOptions, resolve
 from ambiguous_wild.methods.references import is_reference
-from ambiguous_wild.methods.registry import MethodEntry, NoOptions, all_methods, get_method, resolve
 
 if TYPE_CHECKING:
     from ambiguous_wild.splat.parts import Parts
 
-PLACES = ("mask", "density", "regulariser")
+PLACES = ("mask", "density", "regulariser", "effects")
 ALIASES = {"none": "3dgs", "truth": "3dgs+truth"}  # of donors
 
 
 def graft_name(host: str, donors: Mapping[str, str | None]) -> str:
-    """`3dgs@mask=refinesplat,density=refinesplat`; the host's own name where no place is taken.
+    """`3dgs@mask=refinesplat,density=refinesplat`; the host's own name if no place is filled.
 
-    Donors of places that the host's name already fills are replaced.
+    Donors replace those that the host's name already has.
     """
     base, rest = split_graft(host)
     filled = dict(_pairs(host)) if rest else {}
@@ -42,7 +46,7 @@ def graft_name(host: str, donors: Mapping[str, str | None]) -> str:
 
 
 def split_graft(name: str) -> tuple[str, str]:
-    """(host, what stands after its @); a host may be a reference, whose path may hold an @ too.
+    """(host, the text after its @); a host may be a reference, whose path may contain an @ too.
 
     Raises:
         AwError: nothing after the @, or two of them.
@@ -56,26 +60,41 @@ def split_graft(name: str) -> tuple[str, str]:
     return host, rest
 
 
-def grafted(name: str) -> MethodEntry:
+def knows_truth(name: str) -> bool:
+    """Whether a method of this name uses exact masks or clean photos, which no real capture has.
+
+    Such a row is an upper bound; tables do not rank it. A graft has its host's photos and, unless a donor
+    replaces them, its host's masks. Any other name, such as an ablation variant's, is accepted too.
+    """
+    host, _, rest = name.rpartition("@") if "@" in name else (name, "", "")
+    masks = [ALIASES.get(donor, donor) for place, donor in _written(rest) if place == "mask"] or [host]
+    return host == "3dgs-clean" or masks[-1] == "3dgs+truth"
+
+
+def grafted(name: str, host: MethodEntry, methods: Mapping[str, MethodEntry]) -> MethodEntry:
     """The method that `graft_name` names.
 
+    Args:
+        name: of the graft, as it was typed.
+        host: the method before its @.
+        methods: those that may be donors, by name.
+
     Raises:
-        AwError: unknown host, place or donor, or a place filled twice.
+        AwError: unknown place or donor, or a place filled twice.
     """
     pairs = _pairs(name)
-    host = get_method(split_graft(name)[0])
-    donors = {place: _donor(place, donor) for place, donor in pairs}
+    donors = {place: _donor(place, donor, methods) for place, donor in pairs}
     entries = {"host": host} | donors
     fields = [
         (place, _options_class(entry), dataclasses.field(default_factory=entry.options))
         for place, entry in entries.items()
     ]
     hashes = [entry.source_hash for entry in entries.values()]
+    ordered = graft_name(host.name, dict(pairs))  # in the order of the places, so that one graft has one name
     return MethodEntry(
-        # in the order of the places, so that one graft has one name
-        name=graft_name(host.name, dict(pairs)),
+        name=ordered,
         summary=f"{host.name} with " + ", ".join(f"the {place} of {e.name}" for place, e in donors.items()),
-        recipe=lambda options: build(entries, options),
+        recipe=Graft(ordered, entries),
         config=dataclasses.make_dataclass("GraftOptions", fields, frozen=True),
         needs="; ".join(dict.fromkeys(e.needs for e in entries.values() if e.needs)),
         source_hash=hashlib.sha256("".join(hashes).encode()).hexdigest() if any(hashes) else "",
@@ -85,18 +104,34 @@ def grafted(name: str) -> MethodEntry:
     )
 
 
-def build(entries: Mapping[str, MethodEntry], options: Any) -> Parts:
+@dataclass(frozen=True, eq=False)
+class Graft:
+    """The recipe of a graft."""
+
+    name: str
+    entries: Mapping[str, MethodEntry]  # "host", and the donor of every place that is filled
+
+    def __call__(self, options: Any) -> Parts:
+        return build(self.name, self.entries, options)
+
+
+def build(name: str, entries: Mapping[str, MethodEntry], options: Any) -> Parts:
     """The host's parts with the donors' in their places.
 
-    A method that fills two places with the same options is built once: its frozen inputs are prepared once,
-    and its own mask on itself is the method itself.
+    A method that fills two places with the same options is built once, so its frozen inputs are prepared
+    once, and a method grafted onto itself is unchanged.
+
+    Args:
+        name: of the graft, for warnings.
+        entries: "host", and the donor of every place that is filled.
+        options: of each of them, by place.
     """
     built: list[tuple[str, Any, Parts]] = []
 
     def parts_of(place: str) -> Parts:
         entry, own = entries[place], getattr(options, place)
-        for name, known, parts in built:
-            if name == entry.name and known == own:
+        for donor, known, parts in built:
+            if donor == entry.name and known == own:
                 return parts
         parts = entry.build(own)
         built.append((entry.name, own, parts))
@@ -107,9 +142,32 @@ def build(entries: Mapping[str, MethodEntry], options: Any) -> Parts:
     regulariser = parts_of("regulariser").mask if "regulariser" in entries else host.mask
     changed: dict[str, Any] = {"mask": compose(mask, regulariser)}
     if "density" in entries:
-        donor = parts_of("density")
-        changed |= {"density": donor.density, "density_config": donor.density_config}
-    return dataclasses.replace(host, **changed)
+        density = parts_of("density")
+        changed |= {"density": density.density, "density_config": density.density_config}
+    if "effects" not in entries:
+        _warn_of_effects(name, host, [(donor, parts) for donor, _, parts in built])
+        return dataclasses.replace(host, **changed)
+    effects = parts_of("effects").effects
+    for effect in effects:
+        host = effect.change_parts(host)
+    return dataclasses.replace(host, **changed, effects=effects)
+
+
+def _warn_of_effects(name: str, host: Parts, donors: Iterable[tuple[str, Parts]]) -> None:
+    """Warn if a donor's recipe brings effects that the host does not have."""
+    own = set(_effect_names(host))
+    for donor, parts in donors:
+        left_out = [effect for effect in _effect_names(parts) if effect not in own]
+        if left_out:
+            warnings.warn(
+                f"{name} leaves out {donor}'s effects ({', '.join(left_out)}): add effects={donor} to the "
+                "name to take them, or effects=none to leave them out without this warning",
+                stacklevel=2,
+            )
+
+
+def _effect_names(parts: Parts) -> list[str]:
+    return [effect.name or type(effect).__name__ for effect in parts.effects]
 
 
 def compose(mask: Any, regulariser: Any) -> Any:
@@ -118,40 +176,48 @@ def compose(mask: Any, regulariser: Any) -> Any:
 
     if regulariser is mask:
         return mask
-    # Without one that regularises: a loss that the mask's donor may have was not asked for.
+    # the loss of the mask's donor was not asked for
     return GraftedPolicy(mask, regulariser if regulariser.regularises() else None)
 
 
 def idle_regulariser(method: MethodEntry, options: Any) -> str:
-    """The donor whose loss was asked for and which adds none under these options; empty where all is well."""
+    """The regulariser's donor if it adds no loss with these options; else empty."""
     donor = dict(method.places).get("regulariser", "")
-    if ALIASES.get(donor, donor) in ("", "3dgs"):
+    if not isinstance(method.recipe, Graft) or ALIASES.get(donor, donor) in ("", "3dgs"):
         return ""
-    parts = _donor("regulariser", donor).build(options.regulariser)
+    parts = method.recipe.entries["regulariser"].build(options.regulariser)
     return "" if parts.mask.regularises() else donor
 
 
 def _pairs(name: str) -> list[tuple[str, str]]:
-    """(place, donor) as written after the @."""
+    """(place, donor) of every place that the name of a graft fills.
+
+    Raises:
+        AwError: an unknown place, no donor, or a place filled twice.
+    """
     host, rest = split_graft(name)
-    pairs: list[tuple[str, str]] = []
-    for text in rest.split(",") if host != name else []:
-        place, equals, donor = (part.strip() for part in text.partition("="))
-        if not equals or not donor:
+    pairs = _written(rest) if rest else []
+    for number, (place, donor) in enumerate(pairs):
+        if not donor:
             raise AwError(f"method {name!r}: write {host}@mask=METHOD; places are {', '.join(PLACES)}")
         if place not in PLACES:
             raise unknown(f"place in {name!r}", place, PLACES)
-        if place in dict(pairs):
+        if place in dict(pairs[:number]):
             raise AwError(f"method {name!r}: the {place} is given twice")
-        pairs.append((place, donor))
     return pairs
 
 
-def _donor(place: str, name: str) -> MethodEntry:
+def _written(rest: str) -> list[tuple[str, str]]:
+    """(place, donor) of `mask=refinesplat,density=truth`, unchecked; an empty donor if there is no `=`."""
+    parts = [text.partition("=") for text in rest.split(",")]
+    return [(place.strip(), donor.strip()) for place, _, donor in parts]
+
+
+def _donor(place: str, name: str, methods: Mapping[str, MethodEntry]) -> MethodEntry:
     target = ALIASES.get(name, name)
-    if "@" in target or target not in all_methods():
-        raise unknown(f"{place} donor", name, [*all_methods(), *ALIASES], "'aw methods' lists them")
-    return get_method(target)
+    if "@" in target or target not in methods:
+        raise unknown(f"{place} donor", name, [*methods, *ALIASES], "'aw methods' lists them")
+    return methods[target]
 
 
 def _options_class(entry: MethodEntry) -> type:

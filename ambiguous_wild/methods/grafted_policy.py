@@ -1,4 +1,4 @@
-"""A mask policy made of two: one says what is kept, the other adds its loss on the render."""
+"""A mask policy made of two: one gives the keep maps, the other adds its loss on the render."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ import numpy as np
 from torch import Tensor
 
 from ambiguous_wild.splat.parts import MaskPolicy, State
+from ambiguous_wild.splat.rendered import Cotangents, Gradients
 from ambiguous_wild.splat.step import Step, TrainData
 
 
 class GraftedPolicy(MaskPolicy):
-    """Keep maps, pictures and facts of `mask`; cotangents of `regulariser`, where there is one."""
+    """Keep maps, pictures and facts of `mask`; cotangents of `regulariser`, if there is one."""
 
     def __init__(self, mask: MaskPolicy, regulariser: MaskPolicy | None) -> None:
         self.mask, self.regulariser = mask, regulariser
@@ -26,8 +27,11 @@ class GraftedPolicy(MaskPolicy):
     def keep(self, step: Step) -> Tensor | None:
         return self.mask.keep(step)
 
-    def cotangent(self, step: Step, keep: Tensor | None) -> Tensor | None:
+    def cotangent(self, step: Step, keep: Tensor | None) -> Cotangents | Tensor | None:
         return None if self.regulariser is None else self.regulariser.cotangent(step, keep)
+
+    def gradients(self, step: Step, keep: Tensor | None) -> Gradients | None:
+        return None if self.regulariser is None else self.regulariser.gradients(step, keep)
 
     def predict(self, step: Step) -> Tensor | None:
         return self.mask.predict(step)

@@ -1,4 +1,4 @@
-"""Methods that are named by where they lie: a recipe in a file, a program's description, NerfBaselines.
+"""Methods named by their location: a recipe in a file, a program's description, NerfBaselines.
 
 recipe.py:my_recipe     a function, or a MethodEntry, in a Python file
 external:my.yaml        a program with commands of its own, see external/description.py
@@ -16,20 +16,20 @@ from pathlib import Path
 
 from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.core.names import check_name
-from ambiguous_wild.methods import registry
-from ambiguous_wild.methods.registry import MethodEntry
+from ambiguous_wild.methods.entry import MethodEntry
+from ambiguous_wild.methods.plugin_file import import_file
 
 EXTERNAL, NERFBASELINES = "external:", "nerfbaselines:"
 _RECIPE = re.compile(r"(?P<path>.+\.py):(?P<name>[A-Za-z_]\w*)")
 
 
 def is_reference(name: str) -> bool:
-    """Whether the name says where the method lies."""
+    """Whether the name is such a reference."""
     return name.startswith((EXTERNAL, NERFBASELINES)) or _RECIPE.fullmatch(name) is not None
 
 
 def reference_file(name: str) -> Path | None:
-    """The file that a reference names; None where it names none."""
+    """The file that a reference names; None if it names none."""
     if name.startswith(EXTERNAL):
         return Path(name.removeprefix(EXTERNAL))
     match = None if name.startswith(NERFBASELINES) else _RECIPE.fullmatch(name)
@@ -37,27 +37,27 @@ def reference_file(name: str) -> Path | None:
 
 
 def with_file(name: str, path: Path) -> str:
-    """The same reference to a file that lies elsewhere."""
+    """The same reference with another path of the file."""
     if name.startswith(EXTERNAL):
         return f"{EXTERNAL}{path}"
     return f"{path}:{name.rpartition(':')[2]}"
 
 
 def absolute(name: str) -> str:
-    """The same reference, whatever folder it is read in."""
+    """The same reference with an absolute path."""
     path = reference_file(name)
     return name if path is None else with_file(name, path.resolve())
 
 
-def load_reference(name: str, *, given_as: str = "") -> MethodEntry:
-    """The method behind a reference; registered, so that its name alone finds it from now on.
+def read_reference(name: str, *, given_as: str = "") -> MethodEntry:
+    """The method behind a reference; `registry.load_reference` also registers it.
 
     Args:
         name: the reference.
-        given_as: what was typed, where `name` is a copy of that.
+        given_as: what was typed, if `name` refers to a copy of that file.
 
     Raises:
-        AwError: no such file, nothing fit in it, or its name is taken by another method.
+        AwError: no such file, or no recipe in it.
     """
     if name.startswith(EXTERNAL):
         from ambiguous_wild.methods.external.description import load_description
@@ -69,14 +69,7 @@ def load_reference(name: str, *, given_as: str = "") -> MethodEntry:
         entry = nerfbaselines_entry(name.removeprefix(NERFBASELINES))
     else:
         entry = _recipe(name)
-    return _registered(dataclasses.replace(entry, given_as=absolute(given_as or name)), name)
-
-
-def _registered(entry: MethodEntry, name: str) -> MethodEntry:
-    known = registry.all_methods().get(entry.name)
-    if known is not None and known.source_hash != entry.source_hash:
-        raise AwError(f"{name} is called {entry.name!r}, and so is another method: give it another name")
-    return registry.register(entry)
+    return dataclasses.replace(entry, given_as=absolute(given_as or name))
 
 
 def _recipe(name: str) -> MethodEntry:
@@ -85,7 +78,7 @@ def _recipe(name: str) -> MethodEntry:
     path = Path(path_text)
     if not path.is_file():
         raise AwError(f"no file {path} for --method {name}: write PATH.py:NAME of a recipe in it")
-    module = registry.import_file(path)
+    module = import_file(path)
     found = getattr(module, attribute, None)
     if found is None:
         public = [key for key, value in vars(module).items() if callable(value) and not key.startswith("_")]
@@ -106,7 +99,7 @@ def _recipe(name: str) -> MethodEntry:
 
 
 def _config_of(recipe: typing.Callable[..., object], name: str) -> type | None:
-    """The frozen dataclass that the function takes; None where it takes nothing."""
+    """The frozen dataclass that the function takes; None if it takes nothing."""
     required = [p for p in inspect.signature(recipe).parameters.values() if p.default is p.empty]
     if not required:
         return None

@@ -1,7 +1,7 @@
-"""Reference rows for captures with exact truth: what is possible, not what a method can do.
+"""Reference rows for captures with exact truth: upper bounds, not methods.
 
-`3dgs+truth` trains 3DGS with the exact distractor masks, `3dgs-clean` on photos of the same poses with nobody
-there. Both read SCENE/truth, which `aw simulate` writes and no method may look at.
+`3dgs+truth` trains 3DGS with the exact distractor masks, `3dgs-clean` on photos of the same poses without
+distractors. Both read SCENE/truth, which `aw simulate` writes and no method may read.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from torch import Tensor
 from ambiguous_wild.core import AwError, Scene, View
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.io.images import load_image_float, read_gray
-from ambiguous_wild.methods.registry import NoOptions
+from ambiguous_wild.methods.entry import NoOptions
 from ambiguous_wild.splat.data import shrink_keep
 from ambiguous_wild.splat.parts import MaskPolicy, Parts
 from ambiguous_wild.splat.photos import on_device
@@ -38,7 +38,7 @@ class TruthConfig:
 
 
 def build_masked(options: TruthConfig) -> Parts:
-    """3DGS under the exact masks."""
+    """3DGS with the exact masks."""
     return Parts(mask=TruthMask(options))
 
 
@@ -76,7 +76,7 @@ def keep_outside(mask: np.ndarray, dilation: int) -> Tensor:
 
 
 def clean_data(data: TrainData) -> TrainData:
-    """The training side with clean photos, all of which is believed.
+    """The training side with clean photos, every pixel of which is kept.
 
     Raises:
         AwError: the scene has no clean photos, or not of all views, or of another size.

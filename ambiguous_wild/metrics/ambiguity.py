@@ -1,9 +1,9 @@
-"""How hard distractors are to tell from what is behind them: by colour, and by the share they cover.
+"""Colour ambiguity of distractors with their background, and the share of the photo they cover.
 
-The paper (supplement, "Evaluation of ambiguity") calls a scene colour-ambiguous when more than 30 % of the
-distractor pixels differ from the background by less than 0.3. It leaves open which norm, which background
-and which pixels; here: the L2 norm over RGB in [0, 1], the background that is truly behind the distractor,
-and distractor pixels pooled over the training photos. What is not known is counted and left out. The
+The paper (supplement, "Evaluation of ambiguity") calls a scene colour-ambiguous if more than 30 % of the
+distractor pixels differ from the background by less than 0.3. It does not define the norm, the background or
+the pixels. Here: the L2 norm over RGB in [0, 1], the true background behind the distractor, and the
+distractor pixels of all training photos. Pixels with unknown background are counted and left out. The
 semantic criterion is in `metrics.semantic`.
 """
 
@@ -18,20 +18,20 @@ import numpy as np
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.metrics.stats import Interval
 
-COLOUR_THRESHOLD = 0.3  # of the L2 distance in RGB; its range is [0, sqrt(3)]
-COLOUR_AMBIGUOUS_ABOVE = 0.3  # share of the distractor pixels
+COLOUR_THRESHOLD = 0.3  # L2 distance in RGB, of [0, sqrt(3)]
+COLOUR_AMBIGUOUS_ABOVE = 0.3  # share of distractor pixels
 COLOUR_METRIC = "colour_share_rgb_l2_below_0.3"
 
 
 @dataclass(frozen=True)
 class ColourCounts:
-    """Pixel counts of one photo, or of several added up."""
+    """Pixel counts of one photo, or sums over several."""
 
     pixels: int  # of the photo
     distractor: int  # pixels of distractors
     known: int  # of these, with a known background
     close: int  # of these, closer to the background than the threshold
-    residual_sum: float  # sum of the differences over the known ones
+    residual_sum: float  # sum of colour differences over the known ones
 
     def __add__(self, other: ColourCounts) -> ColourCounts:
         return ColourCounts(
@@ -44,7 +44,7 @@ class ColourCounts:
 
     @property
     def unknown(self) -> int:
-        """Distractor pixels whose background nobody knows."""
+        """Distractor pixels with unknown background."""
         return self.distractor - self.known
 
     @property
@@ -54,12 +54,12 @@ class ColourCounts:
 
     @property
     def close_share(self) -> float:
-        """Share of the known distractor pixels that look like their background; NaN where there is none."""
+        """Share of the known distractor pixels closer than the threshold; NaN without such pixels."""
         return self.close / self.known if self.known else math.nan
 
     @property
     def mean_residual(self) -> float:
-        """Mean colour difference over the known distractor pixels; NaN where there is none."""
+        """Mean colour difference over the known distractor pixels; NaN without such pixels."""
         return self.residual_sum / self.known if self.known else math.nan
 
 
@@ -67,10 +67,10 @@ def colour_residual(
     photo: np.ndarray,  # [H, W, 3] float in [0, 1], sRGB
     background: np.ndarray,  # [H, W, 3] the same
 ) -> np.ndarray:  # [H, W] float64 in [0, sqrt(3)]
-    """L2 distance in RGB between the photo and what is behind it.
+    """L2 distance in RGB between the photo and the background.
 
     Raises:
-        AwError: sizes differ, or values are not colours in [0, 1].
+        AwError: sizes differ, or values are not floating point in [0, 1].
     """
     if photo.shape != background.shape or photo.ndim != 3 or photo.shape[2] != 3:
         raise AwError(
@@ -85,10 +85,10 @@ def colour_residual(
 
 def colour_counts(
     photo: np.ndarray,  # [H, W, 3] float in [0, 1], sRGB
-    background: np.ndarray | None,  # [H, W, 3] float in [0, 1], sRGB; None where there is none
+    background: np.ndarray | None,  # [H, W, 3] float in [0, 1], sRGB; None = unknown
     distractor: np.ndarray,  # [H, W] bool, True = distractor
     *,
-    known: np.ndarray | None = None,  # [H, W] bool: where the background is known, default all
+    known: np.ndarray | None = None,  # [H, W] bool: where the background is known; default: everywhere
     threshold: float = COLOUR_THRESHOLD,
 ) -> ColourCounts:
     """Count the distractor pixels of one photo that are closer than `threshold` to their background.
@@ -116,7 +116,7 @@ def colour_counts(
 
 
 def pooled(counts: Sequence[ColourCounts]) -> ColourCounts:
-    """The counts of several photos added up: a photo weighs by its distractor pixels."""
+    """The sum of the counts of several photos: each is weighted by its distractor pixels."""
     return sum(counts, ColourCounts(0, 0, 0, 0, 0.0))
 
 
@@ -130,8 +130,8 @@ def ratio_interval(
 ) -> Interval:
     """Percentile bootstrap over photos of sum(part) / sum(whole).
 
-    Photos are drawn, not pixels: pixels of one photo are anything but independent. A resample without
-    anything in `whole` has no ratio and is left out. One photo has a ratio and no interval.
+    Photos are resampled, because pixels of one photo are not independent. A resample in which `whole` sums to
+    0 is left out. One photo has a ratio but no interval.
 
     Raises:
         AwError: different lengths.
@@ -154,5 +154,5 @@ def ratio_interval(
 
 
 def verdict(value: float, above: float) -> bool | None:
-    """Whether the score exceeds the limit; None where there is no score."""
+    """Whether the score exceeds the limit; None for NaN."""
     return None if math.isnan(value) else value > above

@@ -1,9 +1,9 @@
-"""LDR-FLIP: how much a person sees when two pictures alternate on a screen (0 = nothing, less is better).
+"""LDR-FLIP: visible difference between two images that alternate on a screen (0 = none, lower is better).
 
 Source: Andersson et al., "FLIP: A Difference Evaluator for Alternating Images", HPG 2020; equation numbers
-are the paper's. NVIDIA's package `flip-evaluator` (BSD-3) has no build for every platform, computes in
-float32 and ends the process on bad input; this is the same number in float64 on any machine, and the tests
-hold it to that package.
+are the paper's. NVIDIA's package `flip-evaluator` (BSD-3) is not available on every platform, computes in
+float32 and ends the process on bad input. This is the same metric in float64; tests compare it with the
+package.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from scipy.ndimage import correlate1d
 from ambiguous_wild.core import AwError
 from ambiguous_wild.metrics.image import checked_pair
 
-# A 3840 px wide screen of 0.7 m seen from 0.7 m, the paper's default: 67.02.
+# The paper's default: a screen of 0.7 m and 3840 px, seen from 0.7 m: 67.02.
 PIXELS_PER_DEGREE = 0.7 * (3840 / 0.7) * math.pi / 180
 
-# Contrast sensitivity: Gaussians (amplitude, width in degrees^2) a channel, table 1.
+# Contrast sensitivity per channel: Gaussians (amplitude, width in degrees^2), table 1.
 _CSF = {
     "achromatic": ((1.0, 0.0047),),
     "red-green": ((1.0, 0.0053),),
     "blue-yellow": ((34.1, 0.04), (13.5, 0.025)),
 }
 _COLOUR_EXPONENT = 0.7  # q_c
-_KNEE, _KNEE_ERROR = 0.4, 0.95  # p_c, p_t: share of the largest colour error, and what it maps to
-_FEATURE_DEGREES = 0.082  # w, width of an edge that the eye sees best
+_KNEE, _KNEE_ERROR = 0.4, 0.95  # p_c, p_t: share of the largest colour error, and the value it maps to
+_FEATURE_DEGREES = 0.082  # w, edge width of highest visibility
 _FEATURE_EXPONENT = 0.5  # q_f
 
 # CIE xy of sRGB's primaries and of its white point D65.
@@ -39,7 +39,7 @@ def flip(
     a: np.ndarray,  # [H, W, 3] uint8 or float in [0, 1], sRGB
     b: np.ndarray,  # [H, W, 3] the same size
 ) -> float:
-    """Mean LDR-FLIP error in [0, 1] at 67 pixels per degree; 0 for identical pictures.
+    """Mean LDR-FLIP error in [0, 1] at 67 pixels per degree; 0 for identical images.
 
     Raises:
         AwError: see `image.checked_pair`.
@@ -52,15 +52,15 @@ def flip_map(
     b: np.ndarray,  # [H, W, 3] the same size
     pixels_per_degree: float = PIXELS_PER_DEGREE,
 ) -> np.ndarray:
-    """The LDR-FLIP error of every pixel, [H, W] float64 in [0, 1]; symmetric in the pictures.
+    """The LDR-FLIP error of every pixel, [H, W] float64 in [0, 1]; symmetric in the images.
 
     Raises:
-        AwError: pixels per degree not above zero, or see `image.checked_pair`.
+        AwError: pixels per degree not positive, or see `image.checked_pair`.
     """
     if not (math.isfinite(pixels_per_degree) and pixels_per_degree > 0):
-        raise AwError(f"pixels per degree must be above zero, got {pixels_per_degree}")
+        raise AwError(f"pixels per degree must be positive, got {pixels_per_degree}")
     first, second = (_opponent(_linear(picture)) for picture in checked_pair(a, b))
-    colour = _colour_error(_as_seen(first, pixels_per_degree), _as_seen(second, pixels_per_degree))
+    colour = _colour_error(_perceived(first, pixels_per_degree), _perceived(second, pixels_per_degree))
     feature = _feature_error(_luminance(first), _luminance(second), pixels_per_degree)
     return colour ** (1.0 - feature)  # equation 7
 
@@ -71,7 +71,7 @@ def _linear(image: np.ndarray) -> np.ndarray:
 
 
 def _xyz_from_rgb() -> np.ndarray:
-    """Linear RGB to XYZ, [3, 3], from the primaries and the white point."""
+    """Matrix [3, 3] from linear RGB to XYZ, from the primaries and the white point."""
     columns = np.array([(x / y, 1.0, (1.0 - x - y) / y) for x, y in _PRIMARIES]).T
     x, y = _WHITE
     return columns * np.linalg.solve(columns, [x / y, 1.0, (1.0 - x - y) / y])
@@ -79,7 +79,7 @@ def _xyz_from_rgb() -> np.ndarray:
 
 _XYZ_FROM_RGB = _xyz_from_rgb()
 _XYZ_WHITE = _XYZ_FROM_RGB.sum(axis=1)
-# YCxCz, the opponent space the eye's contrast sensitivity is known in: rows over XYZ / white.
+# YCxCz, the opponent space of the contrast sensitivity functions: rows act on XYZ / white.
 _YCC_FROM_XYZ = np.array([[0.0, 116.0, 0.0], [500.0, -500.0, 0.0], [0.0, 200.0, -200.0]])
 _YCC_OFFSET = np.array([-16.0, 0.0, 0.0])
 _YCC_FROM_RGB = _YCC_FROM_XYZ @ (_XYZ_FROM_RGB / _XYZ_WHITE[:, None])
@@ -90,12 +90,12 @@ def _opponent(linear: np.ndarray) -> np.ndarray:
 
 
 def _luminance(opponent: np.ndarray) -> np.ndarray:
-    """Y of YCxCz brought to [0, 1], [H, W]."""
+    """Y of YCxCz scaled to [0, 1], [H, W]."""
     return (opponent[..., 0] + 16.0) / 116.0
 
 
-def _as_seen(opponent: np.ndarray, pixels_per_degree: float) -> np.ndarray:
-    """Filtered as the eye does, in L*a*b* with Hunt's adjustment, [H, W, 3]."""
+def _perceived(opponent: np.ndarray, pixels_per_degree: float) -> np.ndarray:
+    """Filtered by contrast sensitivity, in L*a*b* with Hunt's adjustment, [H, W, 3]."""
     widest = max(width for gaussians in _CSF.values() for _, width in gaussians)
     radius = math.ceil(3.0 * math.sqrt(widest / (2.0 * math.pi**2)) * pixels_per_degree)
     degrees = np.arange(-radius, radius + 1) / pixels_per_degree
@@ -107,7 +107,7 @@ def _as_seen(opponent: np.ndarray, pixels_per_degree: float) -> np.ndarray:
 def _blur_csf(
     channel: np.ndarray, gaussians: tuple[tuple[float, float], ...], degrees: np.ndarray
 ) -> np.ndarray:
-    """A channel through its contrast sensitivity, equation 3; a sum of separable Gaussians of sum 1."""
+    """Filter a channel by its contrast sensitivity, equation 3: separable Gaussians with sum 1."""
     kernels = [np.exp(-(math.pi**2) * degrees**2 / width) for _, width in gaussians]
     weights = [a * math.sqrt(math.pi / width) for a, width in gaussians]
     total = sum(w * k.sum() ** 2 for w, k in zip(weights, kernels))
@@ -125,18 +125,18 @@ def _lab(linear: np.ndarray) -> np.ndarray:
 
 
 def _hunt(lab: np.ndarray) -> np.ndarray:
-    """Colours look stronger where it is bright, equation 4."""
+    """Hunt effect: colour differences grow with luminance, equation 4."""
     return np.concatenate([lab[..., :1], 0.01 * lab[..., :1] * lab[..., 1:]], axis=-1)
 
 
 def _hyab(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Distance for large colour differences, equation 5."""
+    """HyAB distance, for large colour differences, equation 5."""
     difference = a - b
     return np.abs(difference[..., 0]) + np.hypot(difference[..., 1], difference[..., 2])
 
 
 def _colour_error(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Colour difference in [0, 1]: most of the range for what differs little, section 4.1.3."""
+    """Colour difference in [0, 1]; small differences take most of the range, section 4.1.3."""
     green, blue = _hunt(_lab(np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])))
     largest = _hyab(green, blue) ** _COLOUR_EXPONENT
     error, knee = _hyab(a, b) ** _COLOUR_EXPONENT, _KNEE * largest
@@ -145,7 +145,7 @@ def _colour_error(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _feature_error(a: np.ndarray, b: np.ndarray, pixels_per_degree: float) -> np.ndarray:
-    """Edges and points that one of two luminances [H, W] has and the other lacks, equation 6."""
+    """Difference in edges and points between two luminances [H, W], equation 6."""
     deviation = 0.5 * _FEATURE_DEGREES * pixels_per_degree
     radius = math.ceil(3.0 * deviation)
     x = np.arange(-radius, radius + 1)
@@ -158,7 +158,7 @@ def _feature_error(a: np.ndarray, b: np.ndarray, pixels_per_degree: float) -> np
 
 
 def _balanced(kernel: np.ndarray) -> np.ndarray:
-    """What is positive sums to 1 and what is negative to -1: a filter's answer lies in [-1, 1]."""
+    """Scale the positive part to sum 1 and the negative to -1: the response lies in [-1, 1]."""
     positive, negative = kernel[kernel > 0].sum(), -kernel[kernel < 0].sum()
     return np.where(kernel > 0, kernel / positive, kernel / negative)
 
@@ -168,6 +168,6 @@ def _strength(luminance: np.ndarray, kernel: np.ndarray, smooth: np.ndarray) -> 
 
 
 def _separable(image: np.ndarray, down: np.ndarray, across: np.ndarray) -> np.ndarray:
-    """Filtered along both axes; the border's pixels are repeated."""
+    """Filter along both axes; border pixels are repeated."""
     rows = correlate1d(image, down, axis=0, mode="nearest")
     return correlate1d(rows, across, axis=1, mode="nearest")

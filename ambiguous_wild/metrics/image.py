@@ -1,7 +1,7 @@
-"""PSNR and SSIM of one picture pair; each variant has its own name (full image, float64, range 1).
+"""PSNR and SSIM of one image pair; each variant has its own name (full image, float64, range 1).
 
-Code bases differ by more than methods do: padding at the border alone moves SSIM by up to 0.009. So the
-variant is part of the name, and everything is computed from the same saved 8-bit pictures.
+Implementations differ more than methods: padding at the border alone changes SSIM by up to 0.009. So the
+variant is part of the name, and all metrics are computed from the same saved 8-bit images.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ C1, C2 = 0.01**2, 0.03**2  # for a data range of 1
 
 
 def checked_pair(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Both pictures as [H, W, 3] float64 in [0, 1].
+    """Both images as [H, W, 3] float64 in [0, 1].
 
     Args:
         a: [H, W, 3], uint8 or floating point in [0, 1].
-        b: the same size; the kind of number may differ.
+        b: the same size; the number type may differ.
 
     Raises:
         AwError: not three channels, another number type, empty, different sizes, values outside
@@ -33,8 +33,8 @@ def checked_pair(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     left, right = _as_float(a, "first"), _as_float(b, "second")
     if left.shape != right.shape:
         raise AwError(
-            f"pictures of different size: {left.shape[1]}x{left.shape[0]} and "
-            f"{right.shape[1]}x{right.shape[0]}; a metric compares pixel by pixel"
+            f"images of different size: {left.shape[1]}x{left.shape[0]} and "
+            f"{right.shape[1]}x{right.shape[0]}; render at the photo's size"
         )
     return left, right
 
@@ -45,8 +45,8 @@ def psnr(
 ) -> float:
     """Peak signal-to-noise ratio in dB over all pixels and channels, -10 log10(MSE).
 
-    Identical pictures give ``inf``. It stays ``inf`` in means, tables and files (never capped, never
-    dropped), so that a copied test picture shows.
+    Identical images give ``inf``, which is neither capped nor dropped in means, tables and files, so that a
+    copied test photo is noticed.
 
     Raises:
         AwError: see `checked_pair`.
@@ -61,10 +61,10 @@ def psnr_from_mse(mse: float) -> float:
 
 
 def ssim(a: np.ndarray, b: np.ndarray) -> float:
-    """Mean SSIM over the pixels whose whole window lies in the picture (as scikit-image, NerfBaselines).
+    """Mean SSIM over the pixels whose window lies inside the image (as scikit-image, NerfBaselines).
 
     Gaussian window 11x11, sigma 1.5, biased variances, data range 1, per channel. (torchmetrics 1.9 pads by
-    reflection and averages over the border too: another number on small pictures.)
+    reflection and includes the border: a different value on small images.)
 
     Args:
         a: [H, W, 3] uint8 or float in [0, 1].
@@ -80,19 +80,18 @@ def ssim(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def check_size(height: int, width: int) -> None:
-    """Raise AwError for a picture that `ssim` cannot measure."""
+    """Raise AwError for an image smaller than the window of `ssim`."""
     if min(height, width) < WINDOW:
         raise AwError(
-            f"picture of {width}x{height} px is smaller than SSIM's {WINDOW}x{WINDOW} window; "
-            "measure at a larger size"
+            f"image of {width}x{height} px is smaller than SSIM's {WINDOW}x{WINDOW} window; use larger images"
         )
 
 
 def ssim_inria(a: np.ndarray, b: np.ndarray) -> float:
-    """Mean SSIM over all pixels, the picture padded with zeros (as the original 3DGS and RobustSplat).
+    """Mean SSIM over all pixels, with zero padding (as the original 3DGS and RobustSplat).
 
-    The same window as `ssim`. Windows at the border see zeros in both pictures, which adds 0.002 to
-    0.009. The network form of the code it follows pads any size, so any size is accepted.
+    The same window as `ssim`. The zeros at the border are equal in both images, which adds 0.002 to 0.009.
+    Any image size is accepted.
 
     Args:
         a: [H, W, 3] uint8 or float in [0, 1].
@@ -104,7 +103,7 @@ def ssim_inria(a: np.ndarray, b: np.ndarray) -> float:
     return float(_ssim_map(*checked_pair(a, b)).mean())
 
 
-# What a harness measures on every test picture; more means better for all of them.
+# Measured on every test photo; higher is better for all.
 METRICS: dict[str, Callable[[np.ndarray, np.ndarray], float]] = {
     "psnr": psnr,
     "ssim": ssim,
@@ -122,7 +121,7 @@ def window() -> np.ndarray:
 def _ssim_map(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """SSIM of every pixel and channel, [H, W, 3] float64, zero padding."""
     mean_a, mean_b = _blur(a), _blur(b)
-    # Biased moments, E[xy] - E[x]E[y], as every code base of the field has them.
+    # Biased moments, E[xy] - E[x]E[y], as in all implementations of the field.
     var_a = _blur(a * a) - mean_a * mean_a
     var_b = _blur(b * b) - mean_b * mean_b
     cov = _blur(a * b) - mean_a * mean_b
@@ -140,15 +139,15 @@ def _blur(x: np.ndarray) -> np.ndarray:
 def _as_float(image: np.ndarray, which: str) -> np.ndarray:
     image = np.asarray(image)
     if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
-        raise AwError(f"the {which} picture must be [H, W, 3] and not empty, got {list(image.shape)}")
+        raise AwError(f"the {which} image must be [H, W, 3] and not empty, got {list(image.shape)}")
     if image.dtype == np.uint8:
         return image.astype(np.float64) / 255.0
     if not np.issubdtype(image.dtype, np.floating):
-        raise AwError(f"the {which} picture must be uint8 or floating point in [0, 1], got {image.dtype}")
+        raise AwError(f"the {which} image must be uint8 or floating point in [0, 1], got {image.dtype}")
     values = image.astype(np.float64)
-    # One comparison catches NaN as well: it is not inside any range.
+    # This also catches NaN, which is inside no range.
     if not bool(((values >= 0.0) & (values <= 1.0)).all()):
         raise AwError(
-            f"the {which} picture has values outside [0, 1] or not finite; clip the render before measuring"
+            f"the {which} image has values outside [0, 1] or not finite; clip the render before measuring"
         )
     return values

@@ -1,8 +1,8 @@
-"""LPIPS v0.1 from weights that lie on disk: no package of its own, no torchvision, no download.
+"""LPIPS v0.1 from weights on disk, without the lpips package, torchvision or downloads.
 
-Each variant needs two files: the backbone as torchvision publishes it and the learnt heads of the LPIPS
-repository. Where one is not there the metric is *missing*, with the reason; it is never 0 and never
-another variant's number. torch is imported when a network is loaded, not before.
+Each variant needs two files: torchvision's backbone and the linear heads of the LPIPS repository. If one is
+absent, the metric is *missing*, with the reason; it is never 0 or another variant's value. torch is imported
+only when a network is loaded.
 
 Source: Zhang et al., CVPR 2018; layout of the layers and of the files: richzhang/PerceptualSimilarity.
 """
@@ -43,9 +43,9 @@ class _Backbone:
     head_source: str
     layers: tuple[Any, ...]  # (channels, kernel, stride, padding), or "M" for a max pool
     pool: tuple[int, int]  # kernel, stride
-    taps: tuple[int, ...]  # index of the ReLU after which a feature is taken
+    taps: tuple[int, ...]  # indices of the ReLU layers whose outputs are used
     channels: tuple[int, ...]  # of the taps
-    smallest: int  # px, shortest side that leaves every tap at least one pixel
+    smallest: int  # px, shortest side that leaves each tap at least one pixel
 
 
 ALEX = _Backbone(
@@ -75,7 +75,7 @@ VGG = _Backbone(
     channels=(64, 128, 256, 512, 512),
     smallest=16,
 )
-# metric -> (backbone, whether [0, 1] becomes [-1, 1] first). Less means better for all of them.
+# metric -> (backbone, whether [0, 1] is scaled to [-1, 1] first). Lower is better for all.
 VARIANTS: dict[str, tuple[_Backbone, bool]] = {
     "lpips_alex": (ALEX, True),
     "lpips_vgg": (VGG, True),
@@ -84,21 +84,26 @@ VARIANTS: dict[str, tuple[_Backbone, bool]] = {
 
 
 def available() -> dict[str, str | None]:
-    """Every variant with None where its files are there, else what to put where. Reads no file."""
+    """For every variant None if its files exist, else which files are missing. Reads no file."""
     return {name: _reason(backbone) for name, (backbone, _) in VARIANTS.items()}
 
 
+def missing_weights(name: str) -> list[str]:
+    """Names of the weights (see `vision.weights`) that a variant of `VARIANTS` lacks."""
+    return [weight for weight, file in _files(VARIANTS[name][0]) if _find(weight, file) is None]
+
+
 def load(name: str) -> Metric:
-    """The metric of that name, weights loaded (once per process and file).
+    """The metric of this name; weights are loaded once per process and file.
 
     Args:
         name: a key of `VARIANTS`.
 
     Returns:
-        A function of two pictures [H, W, 3] (uint8 or float in [0, 1]) that returns their distance.
+        A function of two images [H, W, 3] (uint8 or float in [0, 1]) that returns their distance.
 
     Raises:
-        AwError: no such variant, files missing, or a file of another layout.
+        AwError: unknown variant, missing files, or a file with other contents.
     """
     if name not in VARIANTS:
         raise unknown("LPIPS variant", name, VARIANTS)
@@ -120,7 +125,7 @@ def lpips_alex(a: np.ndarray, b: np.ndarray) -> float:
         b: the same size.
 
     Raises:
-        AwError: weights missing or unusable (see `available`), a picture too small, or `checked_pair`.
+        AwError: weights missing or unusable (see `available`), an image too small, or see `checked_pair`.
     """
     return load("lpips_alex")(a, b)
 
@@ -131,9 +136,9 @@ def lpips_vgg(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def lpips_vgg_01(a: np.ndarray, b: np.ndarray) -> float:
-    """LPIPS with VGG-16 fed [0, 1] without scaling: what the original 3DGS code reports as LPIPS.
+    """LPIPS with VGG-16 and input in [0, 1], not scaled: the LPIPS of the original 3DGS code.
 
-    Halves the contrast the network was calibrated for: comparable only with itself. See `lpips_alex`.
+    The network was calibrated for twice this contrast: compare only with itself. See `lpips_alex`.
     """
     return load("lpips_vgg_01")(a, b)
 
@@ -151,12 +156,12 @@ def _distance(
     left, right = checked_pair(a, b)
     if min(left.shape[:2]) < backbone.smallest:
         raise AwError(
-            f"picture of {left.shape[1]}x{left.shape[0]} px is too small for LPIPS with {backbone.name}: "
+            f"image of {left.shape[1]}x{left.shape[0]} px is too small for LPIPS with {backbone.name}: "
             f"the shorter side must be at least {backbone.smallest} px"
         )
     with torch.inference_mode():
         total = 0.0
-        # One picture at a time: half the memory of a batch of two, and both take the same arithmetic.
+        # One image at a time: half the memory of a batch of two, same result.
         features = [_features(backbone, stack, image, centred) for image in (left, right)]
         for head, f, g in zip(heads, *features):
             # Mean of the weighted sum over channels, equation (1) of the paper; accumulated in float64.
@@ -165,7 +170,7 @@ def _distance(
 
 
 def _features(backbone: _Backbone, stack: nn.Sequential, image: np.ndarray, centred: bool) -> list[Tensor]:
-    """Channel-normalised features of the taps: [1, C, h, w] each."""
+    """Channel-normalised features [1, C, h, w] of each tap."""
     import torch
 
     x = torch.from_numpy(image.astype(np.float32)).permute(2, 0, 1)[None]
@@ -183,15 +188,15 @@ def _features(backbone: _Backbone, stack: nn.Sequential, image: np.ndarray, cent
 
 @lru_cache(maxsize=4)
 def _network(backbone: _Backbone, stamps: tuple[tuple[str, int], ...]) -> tuple[nn.Sequential, list[Tensor]]:
-    """The stack and the heads [C, 1, 1]; `stamps` are the two files with their times, so that a file
-    that was replaced is read again."""
+    """The layers and the heads [C, 1, 1]; `stamps` are the files and their times, so that a replaced
+    file is read again."""
     trunk, head = (Path(path) for path, _ in stamps)
     stack = _stack(backbone)
     weights = {k.removeprefix("features."): v for k, v in _read(trunk).items() if k.startswith("features.")}
     try:
         stack.load_state_dict(weights, strict=True)
     except RuntimeError as error:
-        raise AwError(f"{trunk} is not {backbone.name}: {error}; replace the file") from None
+        raise AwError(f"{trunk} is not {backbone.name}: {error}; download it again") from None
     stack.eval().requires_grad_(False)
     expected = {f"lin{i}.model.1.weight": (1, c, 1, 1) for i, c in enumerate(backbone.channels)}
     linear = _read(head)
@@ -199,13 +204,13 @@ def _network(backbone: _Backbone, stamps: tuple[tuple[str, int], ...]) -> tuple[
     if found != expected:
         raise AwError(
             f"{head} does not hold the LPIPS heads of {backbone.name} (five of [1, C, 1, 1]); "
-            f"replace it by {backbone.head_source} of the LPIPS repository"
+            f"replace it with {backbone.head_source} of the LPIPS repository"
         )
     return stack, [linear[key][0].float() for key in expected]
 
 
 def _stack(backbone: _Backbone) -> nn.Sequential:
-    """The convolutions with the indices that the published files use."""
+    """The layers, with the indices of the published files."""
     from torch import nn
 
     layers: list[nn.Module] = []
@@ -225,11 +230,11 @@ def _read(path: Path) -> dict[str, Tensor]:
 
     try:
         data = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch raises many kinds for a damaged file, none of them documented
+    except Exception as error:  # torch raises many undocumented types for a damaged file
         line = (str(error).splitlines() or [type(error).__name__])[0]
-        raise AwError(f"{path} cannot be read as weights ({line}); replace the file") from None
+        raise AwError(f"{path} cannot be read as weights ({line}); download it again") from None
     if not isinstance(data, dict) or not all(isinstance(v, torch.Tensor) for v in data.values()):
-        raise AwError(f"{path} holds no table of tensors; replace the file")
+        raise AwError(f"{path} holds no dictionary of tensors; download it again")
     return data
 
 
@@ -242,7 +247,7 @@ def _find(name: str, file: str) -> Path | None:
 
 
 def _folders(name: str) -> list[Path]:
-    """$AW_WEIGHTS/<name>, $AW_WEIGHTS, torch hub's checkpoints: the places `vision/weights.py` names."""
+    """$AW_WEIGHTS/<name>, $AW_WEIGHTS and torch hub's checkpoints, as in `vision/weights.py`."""
     own = os.environ.get("AW_WEIGHTS", "").strip()
     folders = [Path(own).expanduser() / name, Path(own).expanduser()] if own else []
     cache = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
@@ -251,7 +256,7 @@ def _folders(name: str) -> list[Path]:
 
 
 def _reason(backbone: _Backbone) -> str | None:
-    """None where both files are there, else what goes where."""
+    """None if both files exist, else which files to put where."""
     (name, file), (head_name, head_file) = _files(backbone)
     need = []
     if _find(name, file) is None:

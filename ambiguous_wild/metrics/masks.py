@@ -1,8 +1,8 @@
-"""How well predicted keep maps match the truth, and PSNR on kept pixels.
+"""Accuracy of predicted keep maps against the truth, and PSNR on kept pixels.
 
-Keep maps are 1 on static pixels and 0 on transient ones. The class that is scored is *transient*: a
-map that keeps everything finds nothing. Counts are pooled over a scene's photos before the ratio, so that
-a photo without distractors weighs by its pixels and has no ratio of its own to invent.
+Keep maps are 1 on static pixels and 0 on transient ones. The scored class is *transient*: a map that keeps
+everything has recall 0. Counts are summed over a scene's photos before the ratio, because a photo without
+distractors has no ratio.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from ambiguous_wild.metrics.image import checked_pair, psnr_from_mse
 class Confusion:
     """Pixel counts; positive = transient."""
 
-    true_positive: int = 0  # transient, and masked
-    false_positive: int = 0  # static, but masked
-    false_negative: int = 0  # transient, but kept
-    true_negative: int = 0  # static, and kept
+    true_positive: int = 0  # transient and masked
+    false_positive: int = 0  # static but masked
+    false_negative: int = 0  # transient but kept
+    true_negative: int = 0  # static and kept
 
     def __add__(self, other: Confusion) -> Confusion:
         return Confusion(
@@ -36,27 +36,27 @@ class Confusion:
 
     @property
     def iou(self) -> float:
-        """Intersection over union of the transient class in [0, 1]; NaN where nothing is transient."""
+        """Intersection over union of the transient class; NaN if no pixel is transient or masked."""
         return _ratio(self.true_positive, self.true_positive + self.false_positive + self.false_negative)
 
     @property
     def precision(self) -> float:
-        """Share of the masked pixels that are transient; NaN where nothing is masked."""
+        """Share of the masked pixels that are transient; NaN if none is masked."""
         return _ratio(self.true_positive, self.true_positive + self.false_positive)
 
     @property
     def recall(self) -> float:
-        """Share of the transient pixels that are masked; NaN where nothing is transient."""
+        """Share of the transient pixels that are masked; NaN if none is transient."""
         return _ratio(self.true_positive, self.true_positive + self.false_negative)
 
 
 def confusion(
     keep: np.ndarray,  # [H, W] bool, uint8 {0, 255} or float in [0, 1]; predicted, 1 = static
-    truth: np.ndarray,  # [H, W] the same kinds; true
+    truth: np.ndarray,  # [H, W] the same types; ground truth
     *,
     known: np.ndarray | None = None,  # [H, W] bool; pixels whose truth is known, default all
 ) -> Confusion:
-    """Pixel counts of one predicted keep map against the true one; soft maps are cut at one half.
+    """Pixel counts of one predicted keep map against the true one; soft maps are thresholded at 0.5.
 
     Raises:
         AwError: maps of different size, or not two-dimensional.
@@ -78,7 +78,7 @@ def mask_scores(
     distractor: np.ndarray,  # [H, W] bool, predicted; True = transient
     truth: np.ndarray,  # [H, W] bool, true; True = transient
 ) -> dict[str, float]:
-    """IoU, precision and recall of the transient pixels of one photo; NaN where not defined.
+    """IoU, precision and recall of the transient pixels of one photo; NaN if undefined.
 
     Raises:
         AwError: maps of different size, or not two-dimensional.
@@ -97,10 +97,10 @@ def psnr_valid(
     b: np.ndarray,  # [H, W, 3] the same size
     keep: np.ndarray,  # [H, W] bool, uint8 {0, 255} or float in [0, 1]; 1 = measured
 ) -> float:
-    """PSNR in dB over the kept pixels alone: the squared error is divided by their number.
+    """PSNR in dB over the kept pixels only: the squared error is divided by their number.
 
-    (Multiplying both pictures by the map and averaging over all pixels, as NerfBaselines does, adds
-    -10 log10(kept share).) No pixel kept: NaN, which means missing. Identical there: ``inf``.
+    NerfBaselines multiplies both images by the map and averages over all pixels, which adds
+    -10 log10(kept share). No kept pixel: NaN (missing). Identical on kept pixels: ``inf``.
 
     Raises:
         AwError: sizes that differ; see `checked_pair`.
@@ -114,7 +114,7 @@ def psnr_valid(
 
 
 def as_keep(keep: np.ndarray, which: str) -> np.ndarray:
-    """A keep map as [H, W] bool: float above or at 0.5, uint8 at or above 128.
+    """A keep map as [H, W] bool: float >= 0.5, uint8 >= 128.
 
     Raises:
         AwError: not two-dimensional, or another number type.
@@ -125,7 +125,7 @@ def as_keep(keep: np.ndarray, which: str) -> np.ndarray:
     if keep.dtype == bool:
         return keep
     if keep.dtype == np.uint8:
-        # 0/1 maps are common slips: 1 would count as transient without a word.
+        # A map of 0 and 1 is a common mistake: 1 would silently mean transient.
         if keep.max(initial=0) == 1:
             raise AwError(f"the {which} keep map is uint8 with values 0 and 1: give bool, or 0 and 255")
         return keep >= 128

@@ -1,14 +1,14 @@
-"""How like static objects distractors are: cosines of region means of frozen features.
+"""Semantic ambiguity: similarity of distractors and static objects, as cosines of mean frozen features.
 
-The paper (supplement, "Evaluation of ambiguity") calls a scene semantically ambiguous when the cosine
-similarity of distractors and static objects exceeds 0.7. Here a region's feature is the mean over its
-pixels, a distractor is compared with every static region of the *other* photos, the best counts, and a
-photo's score is that of its most similar distractor. Two anchors say what the number means with the features
-at hand: what a static region scores against itself in another photo, and what unrelated regions score.
+The paper (supplement, "Evaluation of ambiguity") calls a scene semantically ambiguous if the cosine
+similarity of distractors and static objects exceeds 0.7. Here a region's feature is the mean over its pixels.
+A distractor is compared with every static region of the *other* photos and scores its best match. A photo
+scores as its most similar distractor. Two anchors calibrate the cosine of the features in use: the best
+match of a static region in another photo, and the mean over unrelated regions.
 
-Features without pretrained meaning see looks, and the paper's limit says nothing of their cosines. Of these
-the question is put so that no limit on a cosine is needed: is a distractor as like something static in
-another photo as the static scene's own regions are like each other?
+Features without pretraining compare appearance, not object category, so the paper's limit does not apply to
+them. For these the criterion needs no limit on the cosine: does a distractor match static regions of other
+photos as well as static regions match each other?
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ import numpy as np
 from ambiguous_wild.core.errors import AwError
 
 AMBIGUOUS_ABOVE = 0.7  # cosine; stated by the paper for DINOv2 features
-LOOKALIKE_ABOVE = 0.25  # share of distractor pixels, of weight-free features; see docs/ambiguity.md
-USUAL = 0.05  # quantile of static regions' best matches from which a match is as good as usual
-MIN_SHARE = 0.002  # of a photo's pixels; a smaller region says nothing
-_ANCHOR_REGIONS = 2000  # static regions the anchors rest on at most, evenly chosen
+LOOKALIKE_ABOVE = 0.25  # share of distractor pixels, for weight-free features; see docs/ambiguity.md
+USUAL = 0.05  # quantile of static regions' best matches; a match above it is usual
+MIN_SHARE = 0.002  # of a photo's pixels; smaller regions are ignored
+_ANCHOR_REGIONS = 2000  # most static regions used for the anchors, evenly chosen
 
 
 @dataclass(frozen=True)
 class Regions:
-    """Regions of one photo, each with the mean of its features."""
+    """Regions of one photo with their mean features."""
 
     labels: np.ndarray  # [R] int, as in the label map
     means: np.ndarray  # [R, C] float64
@@ -40,13 +40,13 @@ class Regions:
         return len(self.labels)
 
     def whitened(self, mean: np.ndarray, whiten: np.ndarray) -> Regions:
-        """The regions with each channel's mean [C] taken off, and multiplied by a matrix [C, C]."""
+        """The regions after subtracting the mean [C] and multiplying by the matrix [C, C]."""
         return replace(self, means=(self.means - mean) @ whiten)
 
 
 @dataclass(frozen=True)
 class RegionMatch:
-    """One distractor region and the static region that is most like it."""
+    """One distractor region and its most similar static region."""
 
     label: int  # of the distractor region
     pixels: int
@@ -57,9 +57,9 @@ class RegionMatch:
 
 @dataclass(frozen=True)
 class Anchors:
-    """What cosines of static regions are: the scale on which a distractor's is read."""
+    """Cosines of static regions, the scale for a distractor's cosine."""
 
-    same: float  # mean best match of a static region in another photo: the same surface, seen again
+    same: float  # mean best match of a static region in another photo: the same surface
     different: float  # mean cosine of static regions of two photos: unrelated surfaces
 
     def calibrated(self, cosine: float) -> float:
@@ -71,10 +71,9 @@ class Anchors:
 class ChannelStatistics:
     """Mean and covariance of the channels over all photos, distractors included, from running sums.
 
-    Features whose mean is far from zero have cosines near 1 whatever they show, and channels that say the
-    same count several times. Taking the mean off and whitening makes 0 the similarity of two unrelated
-    regions. Statistics of static cells alone are worse: distractors in colours that nothing else has then
-    all lie in the same far direction.
+    Features with a large mean have cosines near 1 for any content, and correlated channels are overweighted.
+    Subtracting the mean and whitening gives two unrelated regions a similarity of 0. Statistics of static
+    cells alone are worse: distractors in unusual colours then all lie in the same direction.
     """
 
     def __init__(self) -> None:
@@ -83,34 +82,34 @@ class ChannelStatistics:
         self.products: np.ndarray | float = 0.0
 
     def add(self, features: np.ndarray) -> None:  # [h, w, C]
-        """Count one photo's features in."""
+        """Add one photo's features."""
         flat = features.reshape(-1, features.shape[2]).astype(np.float64)
         self.count += len(flat)
         self.sum, self.products = self.sum + flat.sum(0), self.products + flat.T @ flat
 
     def whitening(self) -> tuple[np.ndarray, np.ndarray]:  # ([C], [C, C]) float64
-        """The mean, and what to multiply deviations from it by; a channel without spread becomes 0.
+        """The mean and the whitening matrix; a constant channel becomes 0.
 
-        Channels are given unit spread first; directions with less than a thousandth of the largest variance
-        are rounding and noise, and are not blown up further than that.
+        Channels are first scaled to unit variance. The variance of a direction is limited to at least a
+        thousandth of the largest, so that noise is not amplified.
         """
         mean = np.asarray(self.sum) / max(self.count, 1)
         covariance = np.asarray(self.products) / max(self.count, 1) - np.outer(mean, mean)
         variance = np.maximum(np.diag(covariance), 0.0)
-        # A constant channel's variance is rounding: relative to its square, as sums of squares round.
-        still = variance <= 1e-10 * np.maximum(mean * mean, 1e-12)
-        scale = np.where(still, 0.0, 1.0 / np.sqrt(np.where(still, 1.0, variance)))
+        # A constant channel's variance is rounding error, relative to the square of its mean.
+        constant = variance <= 1e-10 * np.maximum(mean * mean, 1e-12)
+        scale = np.where(constant, 0.0, 1.0 / np.sqrt(np.where(constant, 1.0, variance)))
         values, vectors = np.linalg.eigh(covariance * np.outer(scale, scale))
         values = np.maximum(values, 1e-3 * max(float(values.max()), 1e-12))
         return mean, scale[:, None] * vectors / np.sqrt(values)
 
 
 def region_means(
-    features: np.ndarray,  # [h, w, C], a coarser grid over the same picture
+    features: np.ndarray,  # [h, w, C], a coarser grid over the same photo
     labels: np.ndarray,  # [H, W] int, 0 = no region
-    min_share: float = 0.0,  # of the picture; smaller regions are left out
+    min_share: float = 0.0,  # of the photo; smaller regions are left out
 ) -> Regions:
-    """Mean feature of each labelled region; a cell counts by how many of its pixels the region holds."""
+    """Mean feature of each region; a cell is weighted by the number of its pixels in the region."""
     h, w, channels = features.shape
     cell = _cells(labels.shape, h, w)[labels > 0]
     names, index = np.unique(labels[labels > 0], return_inverse=True)
@@ -125,13 +124,13 @@ def matches(
     distractors: Sequence[Regions],  # one per photo
     statics: Sequence[Regions],  # one per photo
 ) -> list[list[RegionMatch]]:
-    """For each distractor region the static region of another photo that is most like it.
+    """For each distractor region the most similar static region of another photo.
 
-    Other photos only: beside a distractor its own photo holds what its features bled into. A scene of one
-    photo is compared with itself. A region whose feature is zero has no direction and is left out.
+    Only other photos are used, because a distractor's features leak into its surroundings. A scene of one
+    photo is compared with itself. Regions with a zero feature are left out.
 
     Raises:
-        AwError: not one of each per photo.
+        AwError: the two sequences differ in length.
     """
     if len(distractors) != len(statics):
         raise AwError(f"{len(distractors)} photos of distractors, {len(statics)} of static regions")
@@ -152,34 +151,34 @@ def matches(
 
 
 def anchors(
-    statics: Sequence[Regions],  # what distractors are compared with, one per photo
-    every: Sequence[Regions] | None = None,  # all static regions, where that is more
+    statics: Sequence[Regions],  # the regions that distractors are compared with, one per photo
+    every: Sequence[Regions] | None = None,  # all static regions, if these are more
 ) -> Anchors:
-    """What static regions score against those of other photos; NaN where fewer than two photos have any."""
+    """Similarity of static regions of different photos; NaN if fewer than two photos have regions."""
     units, photo, _ = _stacked(statics)
     others, other_photo, _ = _stacked(statics if every is None else every)
     if len(np.unique(photo)) < 2 or len(np.unique(other_photo)) < 2:
         return Anchors(math.nan, math.nan)
     different = [(others @ units[k])[other_photo != photo[k]].mean() for k in _sampled(units)]
-    same = _best_elsewhere(units, photo)
+    same = _best_in_other_photos(units, photo)
     return Anchors(float(np.mean(same)), float(np.mean(different)))
 
 
 def usual_match(statics: Sequence[Regions]) -> float:
-    """The cosine that 95 % of static regions reach against their best match in another photo; NaN without."""
+    """The cosine that 95 % of static regions reach with their best match in another photo; NaN without."""
     units, photo, _ = _stacked(statics)
     if len(np.unique(photo)) < 2:
         return math.nan
-    return float(np.quantile(_best_elsewhere(units, photo), USUAL))
+    return float(np.quantile(_best_in_other_photos(units, photo), USUAL))
 
 
 def _sampled(units: np.ndarray) -> range:
-    """Rows that the anchors rest on, evenly chosen."""
+    """Rows used for the anchors, evenly chosen."""
     return range(0, len(units), max(len(units) // _ANCHOR_REGIONS, 1))
 
 
-def _best_elsewhere(units: np.ndarray, photo: np.ndarray) -> list[float]:
-    """Of the sampled regions the cosine of the most similar one of another photo."""
+def _best_in_other_photos(units: np.ndarray, photo: np.ndarray) -> list[float]:
+    """For each sampled region the cosine of its best match in another photo."""
     return [float((units @ units[k])[photo != photo[k]].max()) for k in _sampled(units)]
 
 
@@ -189,20 +188,20 @@ def photo_cosine(found: Sequence[RegionMatch]) -> float:
 
 
 def mean_cosine(found: Sequence[RegionMatch]) -> float:
-    """Mean cosine over distractor regions, by their pixels; NaN without regions."""
+    """Mean cosine over distractor regions, weighted by pixels; NaN without regions."""
     pixels = sum(m.pixels for m in found)
     return sum(m.pixels * m.cosine for m in found) / pixels if pixels else math.nan
 
 
 def _cells(shape: tuple[int, ...], h: int, w: int) -> np.ndarray:  # [H, W] int
-    """The cell of an h x w grid that each pixel of a picture falls into."""
+    """The cell of an h x w grid that contains each pixel."""
     rows = np.arange(shape[0]) * h // shape[0]
     cols = np.arange(shape[1]) * w // shape[1]
     return np.asarray(rows[:, None] * w + cols[None, :])
 
 
 def _stacked(statics: Sequence[Regions]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Unit features [S, C] of all photos' regions that have a direction, their photo [S], their label [S]."""
+    """Unit features [S, C] of all regions with a non-zero feature, their photos [S] and labels [S]."""
     if not any(len(s) for s in statics):
         return np.zeros((0, 1)), np.zeros(0, int), np.zeros(0, int)
     full = [(k, s) for k, s in enumerate(statics) if len(s)]

@@ -1,7 +1,7 @@
-"""Means and bootstrap intervals that keep what is missing missing.
+"""Means and bootstrap intervals; a missing value makes the result missing.
 
-A missing value is NaN (``None`` in a result file). A mean over cells of which one is missing is missing:
-a method must not gain by failing on the hard picture.
+A missing value is NaN (``None`` in a result file). A mean with one missing value is missing, so that a method
+does not gain by failing on a hard scene.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ class Interval:
     mean: float
     low: float
     high: float
-    count: int  # values it rests on
+    count: int  # number of values
 
 
 def mean(values: Sequence[float] | np.ndarray) -> float:
-    """Arithmetic mean; NaN if any value is, or if there is none; ``inf`` stays ``inf``."""
+    """Arithmetic mean; NaN if any value is NaN or there is none; ``inf`` stays ``inf``."""
     array = _checked(values)
     return float(array.mean()) if len(array) and not np.isnan(array).any() else math.nan
 
 
 def spread(values: Sequence[float] | np.ndarray) -> float:
-    """Sample standard deviation (n - 1); NaN for fewer than two values, or where one is not finite."""
+    """Sample standard deviation (n - 1); NaN for fewer than two values or if one is not finite."""
     array = _checked(values)
     if len(array) < 2 or not np.isfinite(array).all():
         return math.nan
@@ -48,23 +48,23 @@ def bootstrap_interval(
 ) -> Interval:
     """Percentile bootstrap interval of the mean over images (Efron 1979).
 
-    The ends are resampled means themselves, not interpolated, so that ``inf`` among the values needs no
-    special case. One image has a mean and no interval. Any NaN: everything is NaN.
+    The ends are resampled means, not interpolated, so that ``inf`` needs no special case. One image has a
+    mean but no interval. If any value is NaN, the result is NaN.
 
     Args:
         values: one per image.
         level: in (0, 1).
-        resamples: how many; at least 100.
-        seed: same values and seed, same interval.
+        resamples: at least 100.
+        seed: the same values and seed give the same interval.
 
     Raises:
-        AwError: no value, or a level or number of resamples that makes no sense.
+        AwError: no value, or an invalid level or number of resamples.
     """
     array = _checked(values)
     if not len(array):
         raise AwError("a bootstrap interval needs at least one value, got none")
     if not 0.0 < level < 1.0 or resamples < 100:
-        raise AwError(f"level must lie in (0, 1) and resamples be 100 or more, got {level}, {resamples}")
+        raise AwError(f"level must be in (0, 1) and resamples at least 100, got {level} and {resamples}")
     if np.isnan(array).any():
         return Interval(math.nan, math.nan, math.nan, len(array))
     if len(array) == 1:
@@ -92,8 +92,8 @@ def paired_interval(
     """
     first, second = _checked(a), _checked(b)
     if len(first) != len(second):
-        raise AwError(f"paired values must be of the same images: {len(first)} and {len(second)} values")
-    # inf - inf: both pictures are perfect, the difference is none.
+        raise AwError(f"paired values must be of the same images, got {len(first)} and {len(second)} values")
+    # inf - inf is 0 here: both images are identical to the truth.
     with np.errstate(invalid="ignore"):
         difference = np.where(first == second, 0.0, first - second)
     return bootstrap_interval(difference, level=level, resamples=resamples, seed=seed)

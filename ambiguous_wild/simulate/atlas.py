@@ -1,4 +1,4 @@
-"""Mip pyramids of all textures in one array, and the way between sRGB and linear light."""
+"""Mip pyramids of all textures in one array; conversion between sRGB and linear light."""
 
 from __future__ import annotations
 

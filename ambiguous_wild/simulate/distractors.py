@@ -1,8 +1,7 @@
-"""What moves between the shots: figures and parcels put into the world anew for every photo.
+"""Distractors: shapes that are placed in the world anew for every photo.
 
-They are shapes like any other, so that perspective, occlusion and the shadow that falls on them are
-right. They throw no shadow on the static world: outside their own pixels the clean and the
-distracted photo are the same.
+Perspective, occlusion and shadows on them are exact. They cast no shadow on the static world: outside their
+pixels the photo with distractors equals the clean photo.
 """
 
 from __future__ import annotations
@@ -12,8 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ambiguous_wild.core.camera import Camera
-from ambiguous_wild.simulate.effects import specular
 from ambiguous_wild.simulate.ground_plan import BACK_M, FRONT_M, HALF_WIDTH_M
+from ambiguous_wild.simulate.image_effects import specular
 from ambiguous_wild.simulate.kernels import BOX, ELLIPSOID
 from ambiguous_wild.simulate.shapes import Shape, banner, barrier, figure, placed, pole, shape_table
 from ambiguous_wild.simulate.spec import STATUES, CaptureSpec, Distractor
@@ -21,16 +20,16 @@ from ambiguous_wild.simulate.things import placard, statue
 from ambiguous_wild.simulate.tracer import ShapeTable, trace
 from ambiguous_wild.simulate.world import World
 
-_TRIES = 80  # layouts drawn for a photo before the best of them is taken
+_TRIES = 80  # layouts drawn for a photo, of which the best is taken
 _SAME_PLACE_M = 0.6  # closer than this is the same place
-_SAME_PLACE_SHARE = 0.15  # of the photos in which one distractor may stand at the same place
+_SAME_PLACE_SHARE = 0.15  # of the photos: the most with one distractor at the same place
 _APART_M = 0.75
 _PREVIEW_PX = 96
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Where one distractor stands in one photo."""
+    """One distractor in one photo."""
 
     which: int  # index into the spec's distractors
     x_m: float
@@ -74,7 +73,7 @@ def _parts(distractor: Distractor, pose: float) -> list[Shape]:
 
 
 def _tinted(shape: Shape, distractor: Distractor) -> Shape:
-    """What is of the distractor's own sheet takes its tint; a head of another sheet stays as it is."""
+    """Tint the parts with the distractor's texture; a head with another texture stays as it is."""
     if shape.texture != distractor.texture:
         return shape
     r, g, b = (x * y for x, y in zip(shape.tint, distractor.tint))
@@ -84,9 +83,9 @@ def _tinted(shape: Shape, distractor: Distractor) -> Shape:
 def movers(spec: CaptureSpec, placements: tuple[Placement, ...], world: World) -> ShapeTable:
     """All distractors of one photo as a table for the ray caster."""
     shapes = [s for p in placements for s in shapes_of(spec.distractors[p.which], p)]
-    polish = spec.effects.specular
-    if polish is not None:
-        shapes = specular.specular(shapes, polish.textures, polish.strength, polish.sharpness)
+    gloss = spec.effects.specular
+    if gloss is not None:
+        shapes = specular.specular(shapes, gloss.textures, gloss.strength, gloss.sharpness)
     return shape_table(shapes, world.atlas)
 
 
@@ -95,16 +94,15 @@ def lay_out(
 ) -> list[tuple[Placement, ...]]:
     """Place the distractors of every train photo.
 
-    Positions are drawn until the photo's occlusion (seen in a small preview) lies in ``spec.occlusion``;
-    where no draw does, the nearest one is taken. So presence is of a draw; where the band starts at 0 it is
-    of the photo, drawn once and kept. No distractor returns to one place in more than 15 %
-    of the photos: what stays is part of the scene.
+    Layouts are drawn until the occlusion, measured in a small preview, lies in ``spec.occlusion``; else the
+    nearest one is taken. Presence applies to each draw; where the range starts at 0, to the photo, drawn
+    once. No distractor is at one place in more than 15 % of the photos: it would be part of the scene.
     """
     chosen: list[tuple[Placement, ...]] = []
     static = world.table()
     light = replace(world.light, sun=np.ascontiguousarray(world.light.sun[:1]))  # one sample a pixel
     low, high = spec.occlusion
-    # Where all walk there is nothing to choose, and choosing who is there would bend the duty cycles.
+    # Walkers have no choice of place, and choosing who is present would change their duty cycles.
     tries = 1 if all(d.path == "walk" for d in spec.distractors) else _TRIES
     for camera in cameras:
         if not spec.distractors:
@@ -113,7 +111,7 @@ def lay_out(
         small = camera.resized(_PREVIEW_PX, max(1, round(_PREVIEW_PX * camera.height / camera.width)))
         best: tuple[Placement, ...] = ()
         best_gap = np.inf
-        aim = rng.uniform(low, high)  # so that the shares spread over the whole band
+        aim = rng.uniform(low, high)  # spreads the shares over the whole range
         here = [rng.random() <= d.presence for d in spec.distractors] if low == 0 and tries > 1 else None
         if here is not None and not any(here):
             chosen.append(())
@@ -138,28 +136,30 @@ def _draw(
     world: World,
     earlier: list[tuple[Placement, ...]],
     rng: np.random.Generator,
-    here: list[bool] | None = None,  # who is in the photo; None: drawn, too
+    here: list[bool] | None = None,  # present distractors; None: drawn too
 ) -> tuple[Placement, ...]:
     layout: list[Placement] = []
     for which, distractor in enumerate(spec.distractors):
         if not here[which] if here is not None else rng.random() > distractor.presence:
             continue
         if distractor.path == "walk":
-            place = _on_its_way(which, distractor, len(earlier) / max(spec.train_views - 1, 1))
+            place = _walker_placement(which, distractor, len(earlier) / max(spec.train_views - 1, 1))
             away = np.hypot(*(camera.center[:2] - (place.x_m, place.y_m)))
-            if away >= distractor.distance_m[0] and _free(place, world, []):
+            if away >= distractor.distance_m[0] and _is_free(place, world, []):
                 layout.append(place)
             continue
         for _ in range(12):
-            place = _place(which, distractor, camera, rng)
-            if _free(place, world, layout) and _fresh(place, earlier, spec.train_views):
+            place = _random_placement(which, distractor, camera, rng)
+            if _is_free(place, world, layout) and _is_fresh(place, earlier, spec.train_views):
                 layout.append(place)
                 break
     return tuple(layout)
 
 
-def _place(which: int, distractor: Distractor, camera: Camera, rng: np.random.Generator) -> Placement:
-    """A point on the ground somewhere across the picture, at the distractor's distance."""
+def _random_placement(
+    which: int, distractor: Distractor, camera: Camera, rng: np.random.Generator
+) -> Placement:
+    """A random point on the ground within the picture, at the distractor's distance."""
     column = rng.uniform(0.06, 0.94) * camera.width
     direction = camera.cam_from_world[:3, :3].T @ np.array([(column - camera.cx) / camera.fx, 0.0, 1.0])
     flat = direction[:2] / np.linalg.norm(direction[:2])
@@ -167,11 +167,11 @@ def _place(which: int, distractor: Distractor, camera: Camera, rng: np.random.Ge
     return Placement(which, float(x), float(y), float(rng.uniform(-180, 180)), float(rng.random()))
 
 
-def _on_its_way(which: int, distractor: Distractor, progress: float) -> Placement:
-    """Where a walker is at `progress` (0 to 1) of the capture; it turns at the ends and looks ahead."""
+def _walker_placement(which: int, distractor: Distractor, progress: float) -> Placement:
+    """A walker at `progress` (0 to 1) of the capture: to and fro along its waypoints, facing ahead."""
     corners = np.array(distractor.waypoints)
     legs = np.linalg.norm(np.diff(corners, axis=0), axis=1)
-    along = (2 * distractor.laps * progress) % 2.0  # 0 to 1 there, 1 to 2 back
+    along = (2 * distractor.laps * progress) % 2.0  # 0 to 1 forward, 1 to 2 back
     there = along <= 1.0
     gone = (along if there else 2.0 - along) * legs.sum()
     leg = min(int(np.searchsorted(np.cumsum(legs), gone)), len(legs) - 1)
@@ -183,7 +183,7 @@ def _on_its_way(which: int, distractor: Distractor, progress: float) -> Placemen
     return Placement(which, float(x), float(y), float(yaw), float(stride))
 
 
-def _free(place: Placement, world: World, others: list[Placement]) -> bool:
+def _is_free(place: Placement, world: World, others: list[Placement]) -> bool:
     if abs(place.x_m) > HALF_WIDTH_M - 0.6 or not FRONT_M + 0.6 < place.y_m < BACK_M - 0.6:
         return False
     away = np.hypot(world.keep_out[:, 0] - place.x_m, world.keep_out[:, 1] - place.y_m) - world.keep_out[:, 2]
@@ -192,7 +192,7 @@ def _free(place: Placement, world: World, others: list[Placement]) -> bool:
     return all(np.hypot(o.x_m - place.x_m, o.y_m - place.y_m) > _APART_M for o in others)
 
 
-def _fresh(place: Placement, earlier: list[tuple[Placement, ...]], photos: int) -> bool:
+def _is_fresh(place: Placement, earlier: list[tuple[Placement, ...]], photos: int) -> bool:
     same = [
         p
         for layout in earlier

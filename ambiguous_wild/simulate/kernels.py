@@ -1,6 +1,6 @@
-"""What one ray meets and what colour that is: the inner kernels of the ray caster.
+"""Inner kernels of the ray caster: intersection, texture lookup and shading.
 
-A table is `ShapeTable.columns()`, an atlas `(texels, offset, width, height, levels)`, a light
+Arguments: a table is `ShapeTable.columns()`, an atlas `(texels, offset, width, height, levels)`, a light
 `(sun directions, sun colour, sky colour, ground colour)`; points and directions are tuples of three.
 """
 
@@ -10,18 +10,18 @@ import math
 
 import numba
 
-from ambiguous_wild.io.compiled import forgiving
-from ambiguous_wild.simulate.marching import march, slope
+from ambiguous_wild.io.numba_cache import rebuild_damaged_cache
+from ambiguous_wild.simulate.sphere_tracing import sphere_trace, surface_normal
 
 QUAD, BOX, ELLIPSOID, CAPSULE, CYLINDER, VOLUME = range(6)
-PLANAR, BY_FACE, DOME = range(3)  # how a surface point becomes a texture coordinate
+PLANAR, BY_FACE, DOME = range(3)  # texture mapping
 FAR = 1e30
 
 
-@forgiving
+@rebuild_damaged_cache
 @numba.njit(cache=True, error_model="numpy", inline="never")
 def _intersect(kind, o, d, h, far):
-    """Distance along the local ray o + t d to the shape, or `far`. Rays inside an ellipsoid hit its wall."""
+    """Distance along the local ray o + t d to the shape, or `far`; an ellipsoid is also hit from inside."""
     ox, oy, oz = o
     dx, dy, dz = d
     hx, hy, hz = h
@@ -61,7 +61,7 @@ def _intersect(kind, o, d, h, far):
         if t < 1e-6:
             t = (-b + root) / a
         return t if t > 1e-6 and t < far else far
-    # Capsule and capped cylinder share the tube around local z.
+    # Capsule and capped cylinder have the same tube around local z.
     a = dx * dx + dy * dy
     b = ox * dx + oy * dy
     c = ox * ox + oy * oy - hx * hx
@@ -88,7 +88,7 @@ def _intersect(kind, o, d, h, far):
     return best
 
 
-@forgiving
+@rebuild_damaged_cache
 @numba.njit(cache=True, error_model="numpy", inline="always")
 def _local(table, s, px, py, pz, shift):
     r, c = table[1], table[2]
@@ -101,7 +101,7 @@ def _local(table, s, px, py, pz, shift):
     )
 
 
-@forgiving
+@rebuild_damaged_cache
 @numba.njit(cache=True, error_model="numpy", inline="never")
 def nearest(table, which, count, o, d, far):
     """Nearest hit among the listed shapes: (distance, shape or -1)."""
@@ -118,7 +118,7 @@ def nearest(table, which, count, o, d, far):
         h = (half[s, 0], half[s, 1], half[s, 2])
         lo, ld = _local(table, s, o[0], o[1], o[2], True), _local(table, s, d[0], d[1], d[2], False)
         if kind[s] == VOLUME:
-            t = march(table[13][table[12][s]], lo, ld, h[0], best)
+            t = sphere_trace(table[13][table[12][s]], lo, ld, h[0], best)
         else:
             t = _intersect(kind[s], lo, ld, h, best)
         if t < best:
@@ -126,7 +126,7 @@ def nearest(table, which, count, o, d, far):
     return best, hit
 
 
-@forgiving
+@rebuild_damaged_cache
 @numba.njit(cache=True, error_model="numpy", inline="never")
 def _shadowed(table, o, d):
     center, radius, half, kind, casts = table[2], table[4], table[3], table[0], table[9]
@@ -140,14 +140,14 @@ def _shadowed(table, o, d):
         h = (half[s, 0], half[s, 1], half[s, 2])
         lo, ld = _local(table, s, o[0], o[1], o[2], True), _local(table, s, d[0], d[1], d[2], False)
         if kind[s] == VOLUME:
-            if march(table[13][table[12][s]], lo, ld, h[0], FAR) < FAR:
+            if sphere_trace(table[13][table[12][s]], lo, ld, h[0], FAR) < FAR:
                 return True
         elif _intersect(kind[s], lo, ld, h, FAR) < FAR:
             return True
     return False
 
 
-@forgiving
+@rebuild_damaged_cache
 @numba.njit(cache=True, error_model="numpy", inline="never")
 def _normal(kind, p, h, d):
     """Unit normal at the local point, turned against the local ray."""
@@ -177,16 +177,16 @@ def _normal(kind, p, h, d):
     return nx * scale, ny * scale, nz * scale
 
 
-@forgiving
+@rebuild_damaged_cache
 @numba.njit(cache=True, error_model="numpy", inline="always")
 def _fold(u, size):
-    """Texture coordinate to texel, mirrored at the borders so that no seam shows."""
+    """Texture coordinate to texel; mirrored at the borders, without a seam."""
     u = u - 2.0 * math.floor(0.5 * u)
     u = 2.0 - u if u > 1.0 else u
     return min(max(u * size - 0.5, 0.0), size - 1.0)
 
 
-@forgiving
+@rebuild_damaged_cache
 @numba.njit(cache=True, error_model="numpy", inline="never")
 def _bilinear(atlas, t, level, u, v):
     texels, offset, width, height = atlas[0], atlas[1], atlas[2], atlas[3]
@@ -204,7 +204,7 @@ def _bilinear(atlas, t, level, u, v):
     )
 
 
-@forgiving
+@rebuild_damaged_cache
 @numba.njit(cache=True, error_model="numpy", inline="never")
 def _sample(atlas, t, u, v, lod):
     """Trilinear lookup: two mip levels around `lod`, blended."""
@@ -219,10 +219,10 @@ def _sample(atlas, t, u, v, lod):
     return r0 + f * (r1 - r0), g0 + f * (g1 - g0), b0 + f * (b1 - b0)
 
 
-@forgiving
+@rebuild_damaged_cache
 @numba.njit(cache=True, error_model="numpy", inline="never")
 def _gloss(strength, sharpness, n, d, sun, sunlit, light):
-    """What a polished surface adds: the sun's highlight (Blinn) and the sheen of the sky (Schlick)."""
+    """Specular light of a polished surface: highlight of the sun (Blinn), reflection of the sky (Schlick)."""
     facing = -(n[0] * d[0] + n[1] * d[1] + n[2] * d[2])
     lobe = 0.0
     if sunlit:
@@ -239,18 +239,18 @@ def _gloss(strength, sharpness, n, d, sun, sunlit, light):
     )
 
 
-@forgiving
+@rebuild_damaged_cache
 @numba.njit(cache=True, error_model="numpy", inline="never")
-def shade(table, s, t, o, d, spread, atlas, light, sun, blockers, others, use_others, thrown):
+def shade(table, s, t, o, d, spread, atlas, light, sun, blockers, others, use_others, shadow_casters):
     """Colour of shape s at distance t: texture, sun with shadow, sky light from above and below.
 
-    Twice: as it is, and as it were without the shadows of `thrown`; the same numbers where none falls.
+    Returns it with and without the shadows of `shadow_casters`; equal numbers where none falls.
     """
     kind, half, mapping, uv, tint = table[0][s], table[3], table[6][s], table[7], table[8]
     lo, ld = _local(table, s, o[0], o[1], o[2], True), _local(table, s, d[0], d[1], d[2], False)
     p = (lo[0] + t * ld[0], lo[1] + t * ld[1], lo[2] + t * ld[2])
     h = (half[s, 0], half[s, 1], half[s, 2])
-    n = slope(table[13][table[12][s]], p, h[0], ld) if kind == VOLUME else _normal(kind, p, h, ld)
+    n = surface_normal(table[13][table[12][s]], p, h[0], ld) if kind == VOLUME else _normal(kind, p, h, ld)
     cosine = -(n[0] * ld[0] + n[1] * ld[1] + n[2] * ld[2])
     texture = table[5][s]
     if mapping == DOME:
@@ -268,7 +268,7 @@ def shade(table, s, t, o, d, spread, atlas, light, sun, blockers, others, use_ot
         elif ay >= az:
             a, b_ = p[0], p[2]
     u, v = a * uv[s, 0] + uv[s, 2], b_ * uv[s, 1] + uv[s, 3]
-    # The footprint of a sample on the surface; its short and long side meet in the geometric mean.
+    # Footprint of a sample on the surface: geometric mean of its short and long side.
     footprint = t * spread / math.sqrt(max(cosine, 0.04))
     density = max(uv[s, 0] * atlas[2][texture, 0], uv[s, 1] * atlas[3][texture, 0])
     r, g, b = _sample(atlas, texture, u, v, math.log2(max(footprint * density, 1e-6)))
@@ -284,7 +284,7 @@ def shade(table, s, t, o, d, spread, atlas, light, sun, blockers, others, use_ot
         if _shadowed(blockers, q, sun) or (use_others and _shadowed(others, q, sun)):
             lit = 0.0
         else:
-            darkened = _shadowed(thrown, q, sun)
+            darkened = _shadowed(shadow_casters, q, sun)
     else:
         lit = 0.0
     base, tone, normal = (r, g, b), (tint[s, 0], tint[s, 1], tint[s, 2]), (wx, wy, wz)
@@ -295,10 +295,10 @@ def shade(table, s, t, o, d, spread, atlas, light, sun, blockers, others, use_ot
     return bright, bright
 
 
-@forgiving
+@rebuild_damaged_cache
 @numba.njit(cache=True, error_model="numpy", inline="never")
 def _lit(base, tone, polish, n, d, sun, lit, light):
-    """A surface of that texture, tint and polish under so much sun and the whole sky."""
+    """Colour of a surface under `lit` of the sun and the whole sky."""
     up = 0.5 + 0.5 * n[2]
     sun_colour, sky, ground = light[1], light[2], light[3]
     gr, gg, gb = 0.0, 0.0, 0.0

@@ -1,14 +1,11 @@
-"""Named captures: the courtyard's, the base of the others, and the way to each by its name."""
+"""Presets: those of the courtyard, and all of them by name."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 from ambiguous_wild.core.errors import AwError, unknown
-from ambiguous_wild.simulate.check import check_spec
-from ambiguous_wild.simulate.gallery import GALLERY
-from ambiguous_wild.simulate.spec import CaptureSpec
-from ambiguous_wild.simulate.stock import (
+from ambiguous_wild.simulate.preset_distractors import (
     BLUE,
     CRIMSON,
     GRAVEL,
@@ -22,6 +19,9 @@ from ambiguous_wild.simulate.stock import (
     near,
     thin,
 )
+from ambiguous_wild.simulate.preset_gallery import GALLERY
+from ambiguous_wild.simulate.spec import CaptureSpec
+from ambiguous_wild.simulate.spec_check import check_spec
 
 _THIN = (
     thin("wooden pole", "pole", "timber"),
@@ -51,7 +51,7 @@ PRESETS = {
         ),
         CaptureSpec(
             "courtyard-twin",
-            "two statues like the one that stands still",
+            "two copies of the static statue",
             (TWIN, replace(TWIN, name="third statue")),
             designed=designed("both"),
         ),
@@ -89,9 +89,9 @@ PRESETS = {
         ),
         CaptureSpec(
             "courtyard-clean",
-            "nobody there: the upper bound",
+            "no distractors: the upper bound",
             occlusion=(0.0, 0.0),
-            designed=designed("neither", anyone=False),
+            designed=designed("neither", distractors=False),
         ),
         CaptureSpec(
             "tiny",
@@ -111,10 +111,10 @@ PRESETS = {
 
 
 def preset(name: str) -> CaptureSpec:
-    """The named capture.
+    """The preset of that name.
 
     Raises:
-        AwError: there is none of that name; the nearest one is named.
+        AwError: unknown name; gives the nearest one.
     """
     if name not in PRESETS:
         raise unknown("capture", name, PRESETS, "'aw simulate --list' lists them")
@@ -122,7 +122,7 @@ def preset(name: str) -> CaptureSpec:
 
 
 def resized(spec: CaptureSpec, views: int | None = None, width: int | None = None) -> CaptureSpec:
-    """The spec with another number of train photos or another width (shape kept, textures to match).
+    """The spec with another number of train photos, or another width with the same aspect ratio.
 
     Raises:
         AwError: fewer than 3 photos, or a width outside 64 to 4096 px.

@@ -1,4 +1,4 @@
-"""Primitives and what is put together from them: capsules between points, a standing figure."""
+"""Primitives, and objects made of them: figure, pole, barrier, banner."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from ambiguous_wild.simulate.kernels import BOX, BY_FACE, CAPSULE, CYLINDER, ELL
 from ambiguous_wild.simulate.tracer import ShapeTable
 from ambiguous_wild.simulate.volumes import grids
 
-UNSEEN = -1  # owner of what throws a shadow and is not in the picture
-SHEET_M = 2.0  # side of the square that an object's texture covers before it mirrors
+UNSEEN = -1  # owner of an invisible shadow caster
+SHEET_M = 2.0  # side of the square that an object's texture covers before it is mirrored
 
 Vector = tuple[float, float, float]
 Axes = tuple[Vector, ...]
@@ -31,17 +31,17 @@ class Shape:
     texture: str
     axes: Axes = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
     mapping: int = BY_FACE
-    scale: tuple[float, float] = (1.0 / SHEET_M, 1.0 / SHEET_M)  # texture sizes a metre
-    offset: tuple[float, float] = (0.5, 0.5)  # the sheet's middle, far from where it mirrors
+    scale: tuple[float, float] = (1.0 / SHEET_M, 1.0 / SHEET_M)  # textures per m
+    offset: tuple[float, float] = (0.5, 0.5)  # the middle of the texture, far from the mirrored border
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
     casts: bool = True
     owner: int = 0  # 0: the static world, k: the k-th distractor, UNSEEN
     gloss: tuple[float, float] = (0.0, 0.0)  # strength and sharpness of the highlight
-    volume: str = ""  # the statue that a VOLUME is
+    volume: str = ""  # name of the statue, for VOLUME
 
 
 def bounding_radius(kind: int, half: Sequence[float]) -> float:
-    """Radius of the sphere around the shape's centre that holds it, m."""
+    """Radius of the bounding sphere around the shape's centre, m."""
     if kind == QUAD:
         return float(np.hypot(half[0], half[1]))
     if kind == ELLIPSOID:
@@ -54,7 +54,7 @@ def bounding_radius(kind: int, half: Sequence[float]) -> float:
 
 
 def shape_table(shapes: Iterable[Shape], atlas: Atlas) -> ShapeTable:
-    """Shapes as the columns that the ray caster reads; an empty list gives an empty table."""
+    """The shapes as columns for the ray caster."""
     listed = list(shapes)
     count = len(listed)
     names = sorted({s.volume for s in listed if s.volume})
@@ -102,7 +102,7 @@ def vector(values: Iterable[float]) -> Vector:
 
 
 def placed(shapes: Iterable[Shape], at: Sequence[float], yaw_deg: float, size: float = 1.0) -> list[Shape]:
-    """The shapes turned about z, scaled and moved to `at`; their texture goes with them."""
+    """The shapes turned about z, scaled and moved to `at`, with their textures."""
     c, s = np.cos(np.deg2rad(yaw_deg)), np.sin(np.deg2rad(yaw_deg))
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     moved = []
@@ -127,8 +127,8 @@ def figure(body: str, head: str, stride: float = 0.1, lift: float = 0.0, tint: f
         body: texture of clothes and limbs.
         head: texture of head and hands.
         stride: half the distance between the feet, m.
-        lift: how far the right arm is raised, 0 (hanging) to 1 (pointing forward).
-        tint: brightness of the legs against the coat.
+        lift: height of the right arm, 0 (hanging) to 1 (pointing forward).
+        tint: brightness of the legs relative to the coat.
     """
     legs: dict[str, Any] = {"tint": (tint, tint, tint)}
     hand = (0.32, -0.12 - 0.42 * lift, 0.82 + 0.5 * lift)

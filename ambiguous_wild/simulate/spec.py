@@ -1,11 +1,11 @@
-"""What a capture is: frozen dataclasses that a YAML spec fills. Nothing heavy is imported here."""
+"""The spec of a capture, as frozen dataclasses that a YAML file fills. Imports nothing heavy."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from typing import Literal
 
-from ambiguous_wild.simulate.effects.settings import Effects
+from ambiguous_wild.simulate.image_effects.settings import Effects
 
 Kind = Literal[
     "visitor",
@@ -30,38 +30,40 @@ STATUES = ("bust", "knot", "hound", "spire")  # signed-distance shapes, in the w
 
 @dataclass(frozen=True)
 class Designed:
-    """What a capture was made to show: the answer that a measurement of it should give."""
+    """Label of a capture: the result that a measurement of it should give."""
 
     ambiguity: Literal["colour", "semantic", "both", "neither", "unstated"] = "unstated"
     effects: tuple[
         Literal["masks", "local", "global", "entropy", "appearance", "antialiasing", "sh", "pose"], ...
-    ] = ()  # the trainer's effects that it calls for
+    ] = ()  # effects of the trainer that the capture needs
 
 
 @dataclass(frozen=True)
 class Distractor:
-    """Something that stands elsewhere in every photo, or walks through the capture."""
+    """Something that has another place in every photo, or walks through the capture."""
 
     name: str
     kind: Kind
-    texture: str  # a sheet of the world (stone, foliage, brick, ...), or for a placard any texture of it
+    texture: str  # stone, foliage, brick, ...; for a placard any texture of the world
     ambiguity: Ambiguity  # why it is hard: the background's colour, the statue's shape, or not at all
-    head: str = ""  # a visitor's head and hands, where they are not of the same sheet
-    # duty cycle: share of the train photos in which it is put; of one that stands elsewhere in each, of the
-    # layouts drawn, of which `occlusion` chooses, unless that starts at 0
+    head: str = ""  # texture of a visitor's head and hands; empty: the same
+    # share of the train photos that show it; with path "elsewhere" and `occlusion` above 0, share of the
+    # layouts drawn, from which `occlusion` chooses
     presence: float = 0.85
-    distance_m: tuple[float, float] = (1.9, 4.5)  # from the camera; of a walker the smallest alone counts
-    size: float = 1.0  # times its natural size: figures 1.75 m, ball 0.8 m, pole 2 m, statues 1.6 m
-    lift_m: float = 0.0  # how far above the ground it may fly
-    tint: Colour = (1.0, 1.0, 1.0)  # the texture is multiplied by it, in linear light
-    path: Literal["elsewhere", "walk"] = "elsewhere"  # a new place for every photo, or on along `waypoints`
+    distance_m: tuple[float, float] = (1.9, 4.5)  # from the camera; for a walker only the minimum counts
+    size: float = 1.0  # factor on the natural size: figures 1.75 m, ball 0.8 m, pole 2 m, statues 1.6 m
+    lift_m: float = 0.0  # greatest height above the ground
+    tint: Colour = (1.0, 1.0, 1.0)  # factor on the texture, in linear light
+    path: Literal["elsewhere", "walk"] = (
+        "elsewhere"  # elsewhere: a new place in every photo; walk: along `waypoints`
+    )
     waypoints: tuple[tuple[float, float], ...] = ()  # m: x and y of the corners of its walk
-    laps: float = 1.0  # how often it walks there and back during the capture
+    laps: float = 1.0  # times it walks there and back during the capture
 
 
 @dataclass(frozen=True)
 class Thing:
-    """Something that stands still in the courtyard, beside what is there anyway."""
+    """A static object that the spec adds to the courtyard."""
 
     kind: ThingKind
     texture: str
@@ -73,7 +75,7 @@ class Thing:
 
 @dataclass(frozen=True)
 class WorldSpec:
-    """The courtyard: ground, three walls with posters and a sky, and what stands in it."""
+    """The courtyard: ground, three walls with posters, a sky, and these objects."""
 
     furniture: bool = True  # planters, crates, bench, stone ball
     statue: bool = True  # the figure on its plinth
@@ -82,12 +84,12 @@ class WorldSpec:
 
 @dataclass(frozen=True)
 class CaptureSpec:
-    """A capture to make. The same spec and seed give the same bytes."""
+    """A capture. The same spec and seed give the same bytes."""
 
     name: str
     summary: str
     distractors: tuple[Distractor, ...] = ()
-    occlusion: tuple[float, float] = (0.10, 0.25)  # share of a train photo's pixels, between which it is kept
+    occlusion: tuple[float, float] = (0.10, 0.25)  # least and greatest share of a train photo's pixels
     train_views: int = 30
     test_views: int = 8
     width: int = 960  # px; a factor of 4 gives 240 x 135
@@ -95,10 +97,10 @@ class CaptureSpec:
     samples: int = 4  # rays a pixel, a square number
     detail_px_per_m: float = 110.0  # resolution of the textures
     focal_35mm: float = 26.0  # mm, the equivalent that phones state (CIPA: same diagonal angle)
-    arc_deg: float = 104.0  # how far around the statue the walk goes
+    arc_deg: float = 104.0  # arc around the statue that the cameras cover
     radius_m: tuple[float, float] = (4.2, 5.3)  # distance from the statue during the walk
     eye_m: tuple[float, float] = (1.3, 1.8)  # height of the phone
-    zoom: tuple[float, float] = (1.0, 1.0)  # the focal length varies between these times `focal_35mm`
+    zoom: tuple[float, float] = (1.0, 1.0)  # range of factors on `focal_35mm`
     world: WorldSpec = field(default_factory=WorldSpec)
     effects: Effects = field(default_factory=Effects)
     designed: Designed = field(default_factory=Designed)

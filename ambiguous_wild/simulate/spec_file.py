@@ -1,4 +1,4 @@
-"""Specs as YAML: read strictly, written so that what is read back is the same."""
+"""Specs as YAML: strict reading, lossless writing."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ import yaml
 from ambiguous_wild.core.config import from_plain, to_plain
 from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.io import plain_yaml
-from ambiguous_wild.simulate.check import check_spec
-from ambiguous_wild.simulate.effects.settings import KINDS, Effects
+from ambiguous_wild.simulate.image_effects.settings import KINDS, Effects
 from ambiguous_wild.simulate.spec import CaptureSpec
+from ambiguous_wild.simulate.spec_check import check_spec
 
 
 class _Dumper(yaml.SafeDumper):
-    """YAML's safe dumper; lists of numbers and words on one line, and no aliases."""
+    """YAML's safe dumper, with lists of scalars on one line and without aliases."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
@@ -38,7 +38,7 @@ def read_spec(path: Path | str) -> CaptureSpec:
     """The capture that a YAML file describes.
 
     Raises:
-        AwError: no such file, no YAML, or a spec that cannot be made: one line, with where it is.
+        AwError: no such file, no YAML, or a wrong value; names the place.
     """
     where = Path(path)
     text = plain_yaml.read_text(where)
@@ -70,7 +70,7 @@ def _built(data: dict[Any, Any], effects: Effects) -> CaptureSpec:
 
 
 def _lists(data: dict[Any, Any]) -> None:
-    """Refuse what `from_plain` would take for a list of one."""
+    """Refuse single values where lists are needed: `from_plain` would wrap them."""
     world = data.get("world", {})
     if not isinstance(world, Mapping):
         raise AwError(f"world: keys below it, got {world!r}")
@@ -101,12 +101,12 @@ def _effects(named: Any) -> Effects:
 
 
 def dump_spec(spec: CaptureSpec) -> str:
-    """The spec as YAML, every value of it; `parse_spec` gives the same spec back."""
+    """The spec as YAML with every value; `parse_spec` returns an equal spec."""
     return yaml.dump(plain_spec(spec), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=110)
 
 
 def plain_spec(spec: CaptureSpec) -> dict[str, Any]:
-    """The spec as dicts, lists and scalars; of the effects, those that are named."""
+    """The spec as dicts, lists and scalars; effects that are None are left out."""
     data: dict[str, Any] = to_plain(spec)
     data["effects"] = {name: value for name, value in data["effects"].items() if value is not None}
     return data

@@ -1,7 +1,7 @@
-"""Textures: photographs that scikit-image ships, baked into surfaces that never repeat.
+"""Textures from photographs that scikit-image ships, without repetition.
 
-Every surface gets its own picture. A tiled photograph would make COLMAP match one brick with its
-neighbour's copy; noise at three scales between the tiles makes each square metre its own.
+In a tiled photograph COLMAP would match a brick with its copy; blended layers and noise make every square
+metre different.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def photograph(name: str) -> np.ndarray:
 
 
 def noise(rng: np.random.Generator, height: int, width: int, cell_px: float) -> np.ndarray:
-    """Smooth value noise, [H, W] float32 in [0, 1]: a random grid of `cell_px` cells, cubic between."""
+    """Smooth value noise, [H, W] float32 in [0, 1]: a random grid of `cell_px` cells, cubic interpolation."""
     rows, cols = int(np.ceil(height / cell_px)) + 3, int(np.ceil(width / cell_px)) + 3
     grid = rng.random((rows, cols), dtype=np.float32)
     size = (round(cols * cell_px), round(rows * cell_px))
@@ -64,7 +64,7 @@ def noise(rng: np.random.Generator, height: int, width: int, cell_px: float) -> 
 
 
 def octaves(rng: np.random.Generator, height: int, width: int, cell_px: float, count: int = 4) -> np.ndarray:
-    """Value noise at `count` scales, each half the last in size and strength; [H, W] float32 in [0, 1]."""
+    """Value noise at `count` scales, halving in size, 0.6 in strength; [H, W] float32 in [0, 1]."""
     total = np.zeros((height, width), np.float32)
     weight = 0.0
     for k in range(count):
@@ -72,7 +72,7 @@ def octaves(rng: np.random.Generator, height: int, width: int, cell_px: float, c
             break
         total += noise(rng, height, width, cell_px / 2**k) * 0.6**k
         weight += 0.6**k
-    if weight == 0.0:  # finer than the picture shows: what is left of it is its mean
+    if weight == 0.0:  # finer than the texture: only the mean is left
         return np.full((height, width), 0.5, np.float32)
     return np.asarray(total / weight, dtype=np.float32)
 
@@ -89,7 +89,7 @@ def _laid(
     grey = photograph(name).mean(axis=2)
     grey = np.ascontiguousarray(grey / grey.mean())
     scale = grey.shape[1] / (tile_m * px_per_m)
-    if scale > 1:  # the surface is coarser than the photograph: blur first, or it would alias
+    if scale > 1:  # the surface is coarser than the photograph: blur against aliasing
         grey = cv2.GaussianBlur(grey, (0, 0), 0.5 * scale)
     v, u = np.mgrid[0:height, 0:width].astype(np.float32)
     c, s = np.cos(np.deg2rad(angle_deg)), np.sin(np.deg2rad(angle_deg))
@@ -108,7 +108,7 @@ def _mirrored(x: np.ndarray, size: int) -> np.ndarray:
 def _scattered(
     name: str, rng: np.random.Generator, height: int, width: int, px_per_m: float, tile_m: float
 ) -> np.ndarray:
-    """Three layings of one photograph at other angles and sizes, joined along noise: no two spots alike."""
+    """Three layers of one photograph at different angles and sizes, blended along noise: no repetition."""
     layers = [
         _laid(name, height, width, px_per_m, tile_m * size, angle + 40 * rng.random(), rng.random(2))
         for size, angle in ((1.0, 0), (1.27, 70), (0.85, 150))
@@ -153,9 +153,9 @@ def brick_wall(
     colour: Colour = (0.3, 0.14, 0.085),
     foot: bool = True,
 ) -> np.ndarray:
-    """Old brickwork: drifting colour, fallen plaster, moss from below, soot from above; row 0 is the foot.
+    """Old brickwork: varying colour, plaster, moss at the foot, soot at the top; row 0 is the foot.
 
-    Without `foot` it is a piece from the wall's middle: hardly any moss or plaster.
+    Without `foot` it is the middle of a wall: hardly any moss or plaster.
     """
     h, w = round(height_m * px_per_m), round(width_m * px_per_m)
     courses = _laid("brick", h, w, px_per_m, 1.9, 90.0, rng.random(2)) ** 1.2
@@ -218,19 +218,19 @@ def skin(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: fl
 
 
 def brick(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: float) -> np.ndarray:
-    """The walls' brickwork as cloth, [H, W, 3] linear light."""
+    """The walls' brickwork, for objects, [H, W, 3] linear light."""
     return brick_wall(rng, width_m, height_m, px_per_m, foot=False)
 
 
 def gravel(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: float) -> np.ndarray:
-    """The ground's gravel as cloth, [H, W, 3] linear light."""
+    """The ground's gravel, for objects, [H, W, 3] linear light."""
     h, w = round(height_m * px_per_m), round(width_m * px_per_m)
     stones = _scattered("gravel", rng, h, w, px_per_m, 2.2)
     return np.asarray(stones * _tint(rng, h, w, px_per_m, (0.36, 0.32, 0.26), 0.35), dtype=np.float32)
 
 
 def vivid(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: float) -> np.ndarray:
-    """Saturated bands of magenta, cyan and yellow that nothing in the place has, [H, W, 3] linear light."""
+    """Bands of magenta, cyan and yellow, which the world has nowhere else, [H, W, 3] linear light."""
     h, w = round(height_m * px_per_m), round(width_m * px_per_m)
     colours = np.array([[0.75, 0.03, 0.4], [0.02, 0.45, 0.75], [0.85, 0.6, 0.02]], np.float32)
     wave = np.arange(w, dtype=np.float32)[None] / px_per_m + 0.4 * octaves(rng, h, w, 0.3 * px_per_m, 3)
@@ -248,7 +248,7 @@ def cloth(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: f
 
 
 def sky(rng: np.random.Generator, height: int = 512, width: int = 2048) -> np.ndarray:
-    """A backdrop around the place: crowns of trees, haze, clouds; row 0 is the horizon's foot."""
+    """The background: trees, haze, clouds; row 0 is the horizon."""
     elevation = np.linspace(0.0, np.pi / 2, height, dtype=np.float32)[:, None]
     blue = np.array([0.20, 0.36, 0.66], np.float32) * (1 - 0.35 * elevation[..., None])
     haze = np.array([0.52, 0.56, 0.62], np.float32)
@@ -267,7 +267,7 @@ def sky(rng: np.random.Generator, height: int = 512, width: int = 2048) -> np.nd
 
 
 def _round(half: np.ndarray) -> np.ndarray:
-    """The left half and its mirror image, so that the seam of a full turn closes."""
+    """The left half and its mirror image: no seam after a full turn."""
     return np.concatenate([half, half[:, ::-1]], axis=1)
 
 

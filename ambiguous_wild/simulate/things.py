@@ -1,4 +1,4 @@
-"""What a spec puts into the world beside the courtyard's own: boxes, balls, columns, boards, statues."""
+"""Static objects that a spec adds to the courtyard: boxes, balls, columns, boards, statues."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from ambiguous_wild.simulate.spec import STATUES, Thing
 
 
 def statue(name: str, texture: str, height_m: float) -> Shape:
-    """A signed-distance statue that stands at the origin."""
+    """A signed-distance statue at the origin."""
     half = height_m / 1.8  # its foot is at -0.9 of the half size
     return Shape(VOLUME, (0, 0, 0.9 * half), (half, half, half), texture, mapping=BY_FACE, volume=name)
 
 
 def board(texture: str, width_m: float, height_m: float, thick_m: float, lift_m: float = 0.0) -> Shape:
-    """An upright board that faces -y: a picture covers it once, of anything else it shows a piece.
+    """An upright board that faces -y. A poster covers it once; of another texture it shows a part.
 
-    Of a wall the piece is one that is as high up as the board: what it covers looks like that.
+    Of a wall it shows the part at its own height, so it looks like the wall behind it.
     """
     half = (width_m / 2, thick_m / 2, height_m / 2)
     middle = (0.0, 0.0, lift_m + height_m / 2)
@@ -52,7 +52,7 @@ def shapes_of_thing(thing: Thing) -> list[Shape]:
     else:
         parts = [Shape(ELLIPSOID if thing.kind == "ball" else BOX, middle, half, thing.texture)]
     tint = thing.tint
-    # Each thing shows another part of its sheet, or all of one stone would look alike.
+    # Each object shows another part of its texture: two of the same stone differ.
     shift = (0.37 * thing.at_m[0], 0.29 * thing.at_m[1])
     parts = [
         replace(
@@ -66,7 +66,7 @@ def shapes_of_thing(thing: Thing) -> list[Shape]:
 
 
 def circle_of(thing: Thing) -> tuple[float, float, float]:
-    """x, y and radius on the ground of what nobody can walk through, m."""
+    """x, y and radius on the ground, m, where no distractor may stand."""
     width, depth, height = thing.size_m
     if thing.kind in STATUES or thing.kind == "figure":
         return (thing.at_m[0], thing.at_m[1], 0.3 * height)

@@ -1,8 +1,7 @@
-"""The ray caster: static shapes and movers in one pass, so that both pictures share every static sample.
+"""The ray caster: one pass renders the photo with distractors and the clean photo.
 
-A tile of the picture keeps the list of shapes whose bounding sphere its cone of rays can touch; each
-sample then tests a handful of shapes. The clean and the distracted picture differ only where a mover
-was hit or a thrown shadow falls: elsewhere the same number is written to both.
+Both share every static sample: they differ only where a ray hits a distractor or a moving shadow falls.
+Each tile lists the shapes whose bounding sphere its cone of rays can touch, so a sample tests few shapes.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import numba
 import numpy as np
 
 from ambiguous_wild.core.camera import Camera
-from ambiguous_wild.io.compiled import forgiving
+from ambiguous_wild.io.numba_cache import rebuild_damaged_cache
 from ambiguous_wild.simulate.atlas import Atlas
 from ambiguous_wild.simulate.kernels import FAR, nearest, shade
 
@@ -34,14 +33,14 @@ class ShapeTable:
     mapping: np.ndarray  # [S] int32
     uv: np.ndarray  # [S, 4] float64: scale u, scale v (texture sizes a metre), offset u, offset v
     tint: np.ndarray  # [S, 3] float64, linear light
-    casts: np.ndarray  # [S] bool, whether the shape throws shadows
-    owner: np.ndarray  # [S] int32, 0 = static, k = the k-th distractor of the photo, -1 = only a shadow
-    gloss: np.ndarray  # [S, 2] float64: strength and sharpness of the highlight, strength 0 = dull
-    volume: np.ndarray  # [S] int32, which of `grids` a volume is
+    casts: np.ndarray  # [S] bool: the shape casts a shadow
+    owner: np.ndarray  # [S] int32, 0 = static, k = the k-th distractor, -1 = invisible shadow caster
+    gloss: np.ndarray  # [S, 2] float64: strength and sharpness of the highlight; strength 0 = none
+    volume: np.ndarray  # [S] int32, index into `grids`
     grids: np.ndarray  # [V, N, N, N] float32, signed distances
 
     def columns(self) -> tuple[np.ndarray, ...]:
-        """The arrays in the order in which the kernel takes them."""
+        """The arrays in the order of the kernel's arguments."""
         return (
             self.kind,
             self.rotation,
@@ -62,7 +61,7 @@ class ShapeTable:
 
 @dataclass(frozen=True)
 class Light:
-    """A sun and a sky. Sample k of a pixel sees the sun at ``sun[k]``: that spread is the penumbra."""
+    """A sun and a sky. Sample k of a pixel is lit from ``sun[k]``; their spread gives soft shadows."""
 
     sun: np.ndarray  # [K, 3] float64, unit, towards the sun
     sun_colour: np.ndarray  # [3] float64
@@ -71,13 +70,13 @@ class Light:
 
 
 @dataclass(frozen=True)
-class Traced:
-    """What one camera sees, in linear light."""
+class TracedPhoto:
+    """The images of one camera, in linear light."""
 
     clean: np.ndarray  # [H, W, 3] float32
     distracted: np.ndarray  # [H, W, 3] float32
-    shadow: np.ndarray | None  # [H, W] bool: where `thrown` darkens the static world; None: there was none
-    owner: np.ndarray  # [H, W] uint8: the first distractor hit by any sample of the pixel, 0 = none
+    shadow: np.ndarray | None  # [H, W] bool: darkened by a shadow caster; None: no casters given
+    owner: np.ndarray  # [H, W] uint8: first distractor that a sample of the pixel hits, 0 = none
     depth_m: np.ndarray  # [H, W] float32: z of the static surface, mean over the samples
 
 
@@ -87,16 +86,17 @@ def trace(
     movers: ShapeTable,
     atlas: Atlas,
     light: Light,
-    thrown: ShapeTable | None = None,
-) -> Traced:
-    """Render static world and movers with as many samples a pixel as the light has sun directions.
+    shadow_casters: ShapeTable | None = None,
+) -> TracedPhoto:
+    """Render the static world and the distractors, with one sample a pixel per sun direction.
 
     Args:
-        camera: OpenCV axes; rays start at its centre, pixel centres at +0.5.
-        static: the world; movers: what stands in it for this photo only.
+        camera: OpenCV axes; pixel centres at +0.5.
+        static: the static world.
+        movers: the distractors of this photo.
+        atlas: textures.
         light: ``len(light.sun)`` must be a square number (the samples lie on a regular grid).
-        thrown: nobody sees it; its shadow falls on everything in the distracted picture, on nothing in the
-            clean one.
+        shadow_casters: invisible shapes; their shadow falls in the distracted image only.
     """
     side = math.isqrt(len(light.sun))
     shape = (camera.height, camera.width)
@@ -112,22 +112,22 @@ def trace(
         ),
         static.columns(),
         movers.columns(),
-        (_none_of(static) if thrown is None else thrown).columns(),
+        (_empty_table(static) if shadow_casters is None else shadow_casters).columns(),
         (atlas.texels, atlas.offset, atlas.width, atlas.height, atlas.levels),
         (light.sun, light.sun_colour, light.sky_colour, light.ground_colour),
         (clean, distracted, owner, depth, darkened),
     )
-    return Traced(clean, distracted, None if thrown is None else darkened, owner, depth)
+    return TracedPhoto(clean, distracted, None if shadow_casters is None else darkened, owner, depth)
 
 
-def _none_of(table: ShapeTable) -> ShapeTable:
+def _empty_table(table: ShapeTable) -> ShapeTable:
     return ShapeTable(*(column[:0] for column in table.columns()))
 
 
-@forgiving
+@rebuild_damaged_cache
 @numba.njit(cache=True, error_model="numpy", inline="never")
 def _cull(table, o, axis, spread, keep):
-    """List the shapes whose bounding sphere meets the cone around `axis`; returns how many."""
+    """List the shapes whose bounding sphere meets the cone around `axis`; returns their number."""
     center, radius = table[2], table[4]
     count = 0
     for s in range(len(radius)):
@@ -145,7 +145,7 @@ def _cull(table, o, axis, spread, keep):
     return count
 
 
-@forgiving
+@rebuild_damaged_cache
 @numba.njit(cache=True, error_model="numpy", inline="always")
 def _ray(rotation, k, u, v):
     x, y = (u - k[2]) / k[0], (v - k[3]) / k[1]
@@ -158,21 +158,21 @@ def _ray(rotation, k, u, v):
     ), z
 
 
-@forgiving
+@rebuild_damaged_cache
 @numba.njit(cache=True, error_model="numpy", parallel=True)
-def _trace(view, static, movers, thrown, atlas, light, frame):
+def _trace(view, static, movers, shadow_casters, atlas, light, frame):
     height, width = frame[2].shape
     across = (width + _TILE - 1) // _TILE
     down = (height + _TILE - 1) // _TILE
     for tile in numba.prange(across * down):
         x0, y0 = (tile % across) * _TILE, (tile // across) * _TILE
         x1, y1 = min(x0 + _TILE, width), min(y0 + _TILE, height)
-        _tile(view, (x0, y0, x1, y1), static, movers, thrown, atlas, light, frame)
+        _tile(view, (x0, y0, x1, y1), static, movers, shadow_casters, atlas, light, frame)
 
 
-@forgiving
+@rebuild_damaged_cache
 @numba.njit(cache=True, error_model="numpy", inline="never")
-def _tile(view, box, static, movers, thrown, atlas, light, frame):
+def _tile(view, box, static, movers, shadow_casters, atlas, light, frame):
     rotation, eye, k, side = view
     x0, y0, x1, y1 = box
     clean, distracted, owner, depth, darkened = frame
@@ -185,7 +185,7 @@ def _tile(view, box, static, movers, thrown, atlas, light, frame):
         edge, _ = _ray(rotation, k, float(x0 if corner % 2 else x1), float(y0 if corner // 2 else y1))
         cosine = axis[0] * edge[0] + axis[1] * edge[1] + axis[2] * edge[2]
         cone = max(cone, math.acos(min(max(cosine, -1.0), 1.0)))
-    cone += 1e-6  # acos near 1 is coarse: a sphere that only grazes the corner must stay in
+    cone += 1e-6  # acos near 1 is coarse; a sphere that touches the corner must stay in the list
     near_static = np.empty(len(static[0]), np.int32)
     near_movers = np.empty(len(movers[0]), np.int32)
     static_count = _cull(static, o, axis, cone, near_static)
@@ -194,7 +194,7 @@ def _tile(view, box, static, movers, thrown, atlas, light, frame):
         for j in range(x0, x1):
             cr, cg, cb, sr, sg, sb, mr, mg, mb = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
             z_sum = 0.0
-            who = 0
+            hit = 0
             for n in range(side * side):
                 u, v = j + (n % side + 0.5) / side, i + (n // side + 0.5) / side
                 d, z = _ray(rotation, k, u, v)
@@ -203,7 +203,7 @@ def _tile(view, box, static, movers, thrown, atlas, light, frame):
                 seen, bright = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
                 if s >= 0:
                     seen, bright = shade(
-                        static, s, t, o, d, spread, atlas, light, sun, static, static, False, thrown
+                        static, s, t, o, d, spread, atlas, light, sun, static, static, False, shadow_casters
                     )
                     z_sum += t * z
                 cr, cg, cb = cr + bright[0], cg + bright[1], cb + bright[2]
@@ -212,18 +212,30 @@ def _tile(view, box, static, movers, thrown, atlas, light, frame):
                     tm, m = nearest(movers, near_movers, mover_count, o, d, t)
                     if m >= 0:
                         seen, _ = shade(
-                            movers, m, tm, o, d, spread, atlas, light, sun, static, movers, True, thrown
+                            movers,
+                            m,
+                            tm,
+                            o,
+                            d,
+                            spread,
+                            atlas,
+                            light,
+                            sun,
+                            static,
+                            movers,
+                            True,
+                            shadow_casters,
                         )
-                        who = movers[10][m] if who == 0 else who
+                        hit = movers[10][m] if hit == 0 else hit
                 mr, mg, mb = mr + seen[0], mg + seen[1], mb + seen[2]
             clean[i, j, 0], clean[i, j, 1], clean[i, j, 2] = cr * share, cg * share, cb * share
-            # where nobody is, the same float, not one that should be equal
+            # Copied, not computed: equal bits where there is no distractor.
             distracted[i, j, 0], distracted[i, j, 1] = sr * share, sg * share
             distracted[i, j, 2] = sb * share
             for a in range(3):
                 darkened[i, j] |= distracted[i, j, a] != clean[i, j, a]
-            if who > 0:
+            if hit > 0:
                 distracted[i, j, 0], distracted[i, j, 1] = mr * share, mg * share
                 distracted[i, j, 2] = mb * share
             depth[i, j] = z_sum * share
-            owner[i, j] = who
+            owner[i, j] = hit

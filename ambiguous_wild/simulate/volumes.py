@@ -1,8 +1,8 @@
-"""Statues as signed distance functions, baked to grids that the ray caster marches through.
+"""Statues as signed distance functions, sampled on grids for sphere tracing.
 
-A volume lies in the cube [-1, 1]^3 around a shape's centre, z up, its foot at z = -0.9; the shape's half
-size scales it. Distances are those of a smooth union of primitives: a lower bound, close to
-exact near the surface (Quilez, "distance functions").
+A volume fills the cube [-1, 1]^3 around a shape's centre, z up, foot at z = -0.9; the shape's half size
+scales it. Distances of a smooth union of primitives are a lower bound, nearly exact at the surface (Quilez,
+"distance functions").
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def grid(name: str) -> np.ndarray:
 
 
 def grids(names: Iterable[str]) -> np.ndarray:
-    """The named volumes, [V, SIZE, SIZE, SIZE] float32; [0, 1, 1, 1] where there is none."""
+    """The named volumes, [V, SIZE, SIZE, SIZE] float32; [0, 1, 1, 1] without names."""
     listed = [grid(name) for name in names]
     return np.stack(listed) if listed else np.zeros((0, 1, 1, 1), np.float32)
 
@@ -83,7 +83,7 @@ def _bust(p: np.ndarray) -> np.ndarray:
 
 
 def _knot(p: np.ndarray) -> np.ndarray:
-    """A trefoil knot that stands on a slab."""
+    """A trefoil knot on a slab."""
     t = np.linspace(0, 2 * np.pi, 61)
     curve = 0.2 * np.stack(
         [np.sin(t) + 2 * np.sin(2 * t), -np.sin(3 * t), np.cos(t) - 2 * np.cos(2 * t)], axis=-1

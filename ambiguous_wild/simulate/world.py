@@ -23,7 +23,7 @@ from ambiguous_wild.simulate.tracer import Light, ShapeTable
 
 POSTERS = ("coffee", "rocket", "chelsea", "hubble", "coins", "camera", "retina")
 
-# What objects are made of and distractors may wear; `brick` and `gravel` are the walls' and the ground's own.
+# Textures of objects and distractors; `brick` and `gravel` are those of the walls and the ground.
 SHEETS = {
     "stone": tx.stone,
     "foliage": tx.foliage,
@@ -35,22 +35,22 @@ SHEETS = {
     "vivid": tx.vivid,
     "cloth": tx.cloth,
 }
-# Baked from a stream of their own: a sheet that comes later changes no bit of the captures before it.
+# With random streams of their own: a sheet that is added changes no bit of other captures.
 _LATER_SHEETS = ("cloth",)
 
 
 @dataclass(frozen=True)
 class World:
-    """What stands still, what it is painted with, how it is lit, and where no distractor may stand."""
+    """Static shapes, textures and light, and the circles in which no distractor may stand."""
 
     shapes: tuple[Shape, ...]
     atlas: Atlas
     light: Light
     keep_out: np.ndarray  # [N, 3] float64: x, y, radius in m
-    statue: tuple[float, float, float]  # m: where the statue's feet are
+    statue: tuple[float, float, float]  # m: foot of the statue
 
     def table(self) -> ShapeTable:
-        """The static shapes, ready to be traced."""
+        """The static shapes for the ray caster."""
         return shape_table(self.shapes, self.atlas)
 
 
@@ -61,7 +61,7 @@ def _surface(
     axes: Axes,
     casts: bool,
 ) -> Shape:
-    """A quad that its texture covers exactly once."""
+    """A quad that the texture covers once."""
     scale = (0.5 / half[0], 0.5 / half[1])
     return Shape(QUAD, center, (*half, 0.0), texture, axes, PLANAR, scale, (0.5, 0.5), casts=casts)
 
@@ -106,7 +106,7 @@ def _poster(name: str, at: tuple[float, float, float], axes: Axes) -> Shape:
 
 
 def _furniture(rng: np.random.Generator) -> tuple[list[Shape], list[tuple[float, float, float]]]:
-    """Planters with bushes, crates, a bench, a stone ball; with the circles that they stand on."""
+    """Planters with bushes, crates, a bench, a stone ball; and their circles on the ground."""
     shapes: list[Shape] = []
     circles: list[tuple[float, float, float]] = []
     for x, y in ((-3.1, 2.6), (3.0, 2.3), (-4.5, -0.6)):
@@ -143,7 +143,7 @@ def _furniture(rng: np.random.Generator) -> tuple[list[Shape], list[tuple[float,
 
 
 def _ambient_occlusion(ground: np.ndarray, circles: Iterable[Sequence[float]], px_per_m: float) -> None:
-    """Darken the ground in place where it meets walls and things: contact, without a ray."""
+    """Darken the ground, in place, at the foot of walls and objects; without rays."""
     h, w = ground.shape[:2]
     x = (np.arange(w, dtype=np.float32) + 0.5) / px_per_m - GROUND_M[0] / 2
     y = (np.arange(h, dtype=np.float32) + 0.5) / px_per_m - GROUND_M[1] / 2
@@ -157,15 +157,15 @@ def _ambient_occlusion(ground: np.ndarray, circles: Iterable[Sequence[float]], p
 def courtyard(
     rng: np.random.Generator, detail_px_per_m: float, samples: int = 4, what: WorldSpec | None = None
 ) -> World:
-    """Build the courtyard; the generator moves and repaints it moderately.
+    """Build the courtyard; positions and textures vary with the generator.
 
-    What is left out is drawn all the same, so that the rest stays as it is with it.
+    Objects that are left out use their random numbers all the same: the others do not change.
 
     Args:
-        rng: where the seed enters.
-        detail_px_per_m: resolution of the textures, px a metre.
+        rng: source of randomness.
+        detail_px_per_m: resolution of the textures, px per m.
         samples: rays a pixel, a square number.
-        what: what stands in it; None: furniture and statue.
+        what: its objects; None: furniture and statue.
     """
     what = WorldSpec() if what is None else what
     d = detail_px_per_m
@@ -210,7 +210,7 @@ def courtyard(
 
 
 def _light(rng: np.random.Generator, samples: int) -> Light:
-    """An afternoon sun from behind the walk's left, 0.024 rad wide, and a blue sky."""
+    """An afternoon sun from behind left, 0.024 rad wide, and a blue sky."""
     azimuth, elevation = np.deg2rad(rng.uniform(-150, -120)), np.deg2rad(rng.uniform(44, 54))
     side, spread, sun = math.isqrt(samples), 0.024, []
     for n in range(side * side):

@@ -6,8 +6,9 @@ Source: 3D Gaussian Splatting (Kerbl et al. 2023), section 5; constants as in gs
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.splat.density_log import DensityLog
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.rendered import Gradients
-from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step
+from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData
 
 if TYPE_CHECKING:
     from ambiguous_wild.splat.optim import SplatAdam
@@ -56,31 +57,52 @@ class DensityConfig:
         )  # fmt: skip
 
 
+@dataclass(frozen=True)
+class Growth:
+    """What one round of growth makes more of."""
+
+    clones: Tensor  # [a] int64, rows that are copied
+    splits: Tensor  # [b] int64, rows that two smaller samples replace
+
+
 class DensityControl:
     """Accumulates the screen-space statistic and changes the set of Gaussians on schedule.
 
-    Override `statistic` to decide by another gradient, `after_growth` to do more once a round is over.
+    Override `statistic` to decide by another gradient, `choose` to decide otherwise who grows,
+    `before_step` to add a regulariser, `refine` for a schedule of your own.
     """
+
+    # statistics of the backward pass beyond the signed sums, of `rendered.NEEDS`
+    needs: ClassVar[frozenset[str]] = frozenset()
+    # as WildGaussians: rows change before the optimiser moves, which then leaves out that step
+    before_optimiser: ClassVar[bool] = False
+    # sums of every Gaussian since the last round, by attribute, with what follows [N]
+    sums: ClassVar[Mapping[str, tuple[int, ...]]] = {"grad_sum": (), "seen": ()}
 
     def __init__(self, config: DensityConfig, extent: float, seed: int) -> None:
         self.config = config
         self.extent = extent
         self.rng = np.random.default_rng([seed, 0xD3])
-        self.grad_sum = torch.zeros(0)  # [N] sum of the statistic's norm over views that saw the row
-        self.seen = torch.zeros(0)  # [N] number of those views
+        self.grad_sum: Tensor  # [N] sum of the statistic's norm over views that saw the row
+        self.seen: Tensor  # [N] number of those views
+        for name, shape in self.sums.items():
+            setattr(self, name, torch.zeros(0, *shape))
         self.last_growth = 0  # iteration
         self.last_reset = 0  # iteration
         self.resets_done = 0
         self.log = DensityLog()  # for pictures; decides nothing
         self._halves: dict[tuple[int, int], Tensor] = {}
 
+    def setup(self, data: TrainData) -> None:
+        """Called once before the first step, and again when a run resumes."""
+
+    def before_step(self, step: Step, gradients: Gradients) -> Gradients:
+        """The gradients that the optimiser takes: a place for regularisers of the parameters."""
+        return gradients
+
     def statistic(self, gradients: Gradients) -> Tensor:
         """The screen-space gradient [N, 2] in 1/px that decides growth."""
         return gradients.screen
-
-    def wants_extra(self) -> bool:
-        """Whether `statistic` reads `screen_extra`."""
-        return False
 
     @torch.no_grad()
     def observe(self, step: Step, gradients: Gradients, keep: Tensor | None = None) -> None:
@@ -159,23 +181,24 @@ class DensityControl:
                 return True
         return False
 
-    def _grow(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> Gaussians:
-        config = self.config
+    def choose(self, step: Step, gaussians: Gaussians) -> Growth:
+        """The rows that grow in this round, no more than `room` says."""
         score = self.grad_sum / self.seen.clamp(min=1)
-        chosen = score > config.grow_grad
-        room = max(step.ceiling - len(gaussians), 0)
-        if int(chosen.sum()) > room:
-            # stable sort: ties are broken by row, so the same seed gives the same set
-            order = torch.argsort(
-                torch.where(chosen, score, torch.full_like(score, -1.0)), descending=True, stable=True
-            )
-            chosen = torch.zeros_like(chosen)
-            chosen[order[:room]] = True
-        largest = gaussians.log_scales.exp().amax(dim=1)
-        small = largest <= config.grow_scale * self.extent
-        clones = torch.nonzero(chosen & small).squeeze(1)
-        splits = torch.nonzero(chosen & ~small).squeeze(1)
+        chosen = largest(score, score > self.config.grow_grad, self.room(step, gaussians))
+        small = self.small(gaussians)
+        return Growth(*(torch.nonzero(chosen & rows).squeeze(1) for rows in (small, ~small)))
 
+    def room(self, step: Step, gaussians: Gaussians) -> int:
+        """Gaussians that may be added now."""
+        return max(step.ceiling - len(gaussians), 0)
+
+    def small(self, gaussians: Gaussians) -> Tensor:
+        """[N] bool, no larger than what growth clones; the others are split."""
+        return gaussians.log_scales.exp().amax(dim=1) <= self.config.grow_scale * self.extent
+
+    def _grow(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> Gaussians:
+        growth = self.choose(step, gaussians)
+        clones, splits = growth.clones, growth.splits
         copies = gaussians.select(clones)
         offset = self.clone_offset(gaussians, clones)
         if offset is not None:
@@ -219,23 +242,24 @@ class DensityControl:
         return gaussians.select(stay)
 
     def _select(self, stay: Tensor) -> None:
-        self.grad_sum, self.seen = self.grad_sum[stay], self.seen[stay]
+        for name in self.sums:
+            setattr(self, name, getattr(self, name)[stay])
 
     def _match(self, gaussians: Gaussians) -> None:
-        """Pad the statistics with zeros for new rows; after a resume, bring them to the device."""
+        """Pad the sums with zeros for new rows; after a resume, bring them to the device."""
         device = gaussians.device
-        pad = torch.zeros(max(len(gaussians) - len(self.seen), 0), device=device)
-        self.grad_sum = torch.cat([self.grad_sum.to(device), pad])
-        self.seen = torch.cat([self.seen.to(device), pad])
+        for name, shape in self.sums.items():
+            values = getattr(self, name)
+            pad = torch.zeros(max(len(gaussians) - len(values), 0), *shape, device=device)
+            setattr(self, name, torch.cat([values.to(device), pad]))
 
     def _clear(self, gaussians: Gaussians) -> None:
-        self.grad_sum = torch.zeros(len(gaussians), device=gaussians.device)
-        self.seen = torch.zeros(len(gaussians), device=gaussians.device)
+        for name, shape in self.sums.items():
+            setattr(self, name, torch.zeros(len(gaussians), *shape, device=gaussians.device))
 
     def state_dict(self) -> dict[str, Any]:
         return {
-            "grad_sum": self.grad_sum,
-            "seen": self.seen,
+            **{name: getattr(self, name) for name in self.sums},
             "last_growth": self.last_growth,
             "last_reset": self.last_reset,
             "resets_done": self.resets_done,
@@ -244,11 +268,25 @@ class DensityControl:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.grad_sum, self.seen = state["grad_sum"], state["seen"]
+        for name in self.sums:
+            setattr(self, name, state[name])
         self.last_growth, self.last_reset = state["last_growth"], state["last_reset"]
         self.resets_done = state["resets_done"]
         self.rng.bit_generator.state = state["rng"]
         self.log.load_state_dict(state["log"])
+
+
+def largest(score: Tensor, chosen: Tensor, room: int) -> Tensor:
+    """[N] bool: of the chosen rows the `room` with the largest score."""
+    if int(chosen.sum()) <= room:
+        return chosen
+    # stable sort: ties are broken by row, so the same seed gives the same set
+    order = torch.argsort(
+        torch.where(chosen, score, torch.full_like(score, -1.0)), descending=True, stable=True
+    )
+    kept = torch.zeros_like(chosen)
+    kept[order[:room]] = True
+    return kept
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -13,6 +13,8 @@ from torch import Tensor
 from ambiguous_wild.core import AwError
 from ambiguous_wild.splat.neighbours import nearest_three
 
+# what the renderer reads, in the order of its arguments
+PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "sh0", "sh_rest")
 SH_C0 = 0.28209479177387814  # zeroth real spherical harmonic, 1 / (2 sqrt(pi))
 
 
@@ -30,6 +32,8 @@ class Gaussians:
     opacity_logits: Tensor  # [N]
     sh0: Tensor  # [N, 3] coefficient of the constant harmonic
     sh_rest: Tensor  # [N, (D + 1)^2 - 1, 3] the others, D = largest degree (0 to 3)
+    # [N, ...] what a method carries with each Gaussian, by name; density control copies and drops it too
+    extra: Mapping[str, Tensor] = field(default_factory=dict)
 
     # Set on an instance by an optimiser that postpones updates of rows nobody sees: the renderer calls it
     # with the rows about to be drawn before it reads their harmonics. Copies do not carry it.
@@ -50,6 +54,11 @@ class Gaussians:
         rest = tuple(self.sh_rest.shape)
         if len(rest) != 3 or rest[0] != n or rest[1] not in (0, 3, 8, 15) or rest[2] != 3:
             raise AwError(f"sh_rest must be [{n}, 0|3|8|15, 3], got {list(rest)}")
+        for name, tensor in self.extra.items():
+            if name in PARAMETERS or tensor.shape[:1] != (n,):
+                raise AwError(
+                    f"extra {name!r} must be [{n}, ...] under a name of its own, got {list(tensor.shape)}"
+                )
 
     def __len__(self) -> int:
         return int(self.means.shape[0])
@@ -64,25 +73,51 @@ class Gaussians:
         return round((self.sh_rest.shape[1] + 1) ** 0.5) - 1
 
     def items(self) -> Iterator[tuple[str, Tensor]]:
-        """(name, tensor) in a fixed order."""
-        for f in fields(self):
-            yield f.name, getattr(self, f.name)
+        """(name, tensor) of what the renderer reads, in a fixed order."""
+        for name in PARAMETERS:
+            yield name, getattr(self, name)
+
+    def rows(self) -> Iterator[tuple[str, Tensor]]:
+        """(name, tensor) of everything that a Gaussian has: `items`, then `extra`."""
+        yield from self.items()
+        yield from self.extra.items()
+
+    def settle(self) -> None:
+        """Let an optimiser that postponed updates make them now, so that `sh_rest` may be read."""
+        if self.before_colours is not None:
+            self.before_colours()
 
     def select(self, rows: Tensor) -> Gaussians:
         """The rows given by a bool mask [N] or an index tensor, copied."""
-        return Gaussians(**{name: tensor[rows].contiguous() for name, tensor in self.items()})
+        return self._each(lambda name, tensor: tensor[rows].contiguous())
 
     def cat(self, other: Gaussians) -> Gaussians:
-        """These rows followed by the other's."""
-        return Gaussians(
-            **{name: torch.cat([tensor, getattr(other, name)]).contiguous() for name, tensor in self.items()}
-        )
+        """These rows followed by the other's.
+
+        Raises:
+            AwError: the other does not carry what these carry.
+        """
+        if self.extra.keys() != other.extra.keys():
+            differing = ", ".join(sorted(self.extra.keys() ^ other.extra.keys()))
+            raise AwError(f"cannot join Gaussians: one side alone carries {differing}")
+        theirs = dict(other.rows())
+        return self._each(lambda name, tensor: torch.cat([tensor, theirs[name]]).contiguous())
 
     def to(self, device: torch.device | str) -> Gaussians:
-        return Gaussians(**{name: tensor.to(device).contiguous() for name, tensor in self.items()})
+        return self._each(lambda name, tensor: tensor.to(device).contiguous())
 
     def clone(self) -> Gaussians:
-        return Gaussians(**{name: tensor.clone() for name, tensor in self.items()})
+        return self._each(lambda name, tensor: tensor.clone())
+
+    def carrying(self, extra: Mapping[str, Tensor]) -> Gaussians:
+        """The same rows with these as `extra` beside what they carry already."""
+        return replace(self, extra={**self.extra, **extra})
+
+    def _each(self, change: Callable[[str, Tensor], Tensor]) -> Gaussians:
+        return Gaussians(
+            **{name: change(name, tensor) for name, tensor in self.items()},
+            extra={name: change(name, tensor) for name, tensor in self.extra.items()},
+        )
 
     @classmethod
     def from_points(

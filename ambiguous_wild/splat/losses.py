@@ -63,7 +63,7 @@ def photometric(
     l1: float | Tensor
     dssim: float | Tensor
     if device.accelerated(render.device):
-        from ambiguous_wild.splat.fused_loss import photometric_fused
+        from ambiguous_wild.splat.gpu.fused_loss import photometric_fused
 
         l1, dssim, d_image = photometric_fused(render, photo, keep, lambda_dssim, weighting)
     else:
@@ -81,7 +81,7 @@ def ssim_map(
     if a.dim() != 3 or a.shape[2] != 3 or a.shape != b.shape:
         raise AwError(f"pictures must both be [H, W, 3], got {list(a.shape)} and {list(b.shape)}")
     if device.accelerated(a.device):
-        from ambiguous_wild.splat.fused_loss import ssim_map_fused
+        from ambiguous_wild.splat.gpu.fused_loss import ssim_map_fused
 
         return ssim_map_fused(a, b)
     from ambiguous_wild.splat.cpu.photometric import ssim_map_cpu

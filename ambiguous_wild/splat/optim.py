@@ -9,7 +9,7 @@ launch a tensor, and a flag there can call the step off without the host's knowi
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from torch import Tensor
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.splat import device
-from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.gaussians import PARAMETERS, Gaussians
 from ambiguous_wild.splat.rendered import Gradients
 
 _LAZY = "sh_rest"
@@ -36,7 +36,8 @@ class SplatAdam:
     def __init__(
         self,
         gaussians: Gaussians,
-        learning_rates: Mapping[str, float],  # one a tensor, names as Gaussians.items()
+        # one a tensor, names as Gaussians.rows(); what is carried (`extra`) and has none is not learnt
+        learning_rates: Mapping[str, float],
         betas: tuple[float, float] = (0.9, 0.999),
         eps: float = 1e-15,
         *,
@@ -48,7 +49,9 @@ class SplatAdam:
         self._count = torch.zeros((), device=gaussians.device)
         self._rates: dict[str, float] = {}
         self._moments = {
-            name: (torch.zeros_like(tensor), torch.zeros_like(tensor)) for name, tensor in gaussians.items()
+            name: (torch.zeros_like(tensor), torch.zeros_like(tensor))
+            for name, tensor in gaussians.rows()
+            if name in PARAMETERS or name in learning_rates
         }
         self._lazy = lazy and not self._accelerated
         self._taken = np.zeros(len(gaussians), np.int64)  # steps each row of sh_rest has taken
@@ -107,6 +110,11 @@ class SplatAdam:
         self._moments = {name: (longer(m), longer(v)) for name, (m, v) in self._moments.items()}
         self._rows += n
         self._taken = np.full(self._rows, self.steps, np.int64)
+
+    @property
+    def rates(self) -> Mapping[str, float]:
+        """Learning rates of the last step, or of the first before it."""
+        return self._rates
 
     def reset_moments(self, names: Iterable[str], rows: Tensor | None = None) -> None:
         """Zero the moments of these tensors, of all rows or of `rows` (mask or indices)."""
@@ -210,9 +218,9 @@ class SplatAdam:
             self._history = np.concatenate([self._history, np.zeros_like(self._history)], axis=1)
         self._history[:, now] = steps[_LAZY], root
         parts = 8 * threads()
-        for name, tensor in gaussians.items():
+        for name, tensor in self._learnt(gaussians):
             if name != _LAZY or not self._lazy:
-                gradient = getattr(grads, name).detach().to(torch.float32).contiguous().numpy().reshape(-1)
+                gradient = _of(grads, name, tensor).numpy().reshape(-1)
                 rate, scale = np.float32(steps[name]), np.float32(root)
                 adam.dense(*self._flat(name, tensor), gradient, rate, scale, *self._constants(), parts)
         if not self._lazy:
@@ -228,10 +236,10 @@ class SplatAdam:
     @torch.no_grad()
     def _step_fused(self, gaussians: Gaussians, grads: Gradients, called_off: Tensor | None) -> None:
         self._count += 1
-        for name, tensor in gaussians.items():
+        for name, tensor in self._learnt(gaussians):
             if tensor.numel() == 0:
                 continue
-            gradient = getattr(grads, name).detach().to(torch.float32).contiguous()
+            gradient = _of(grads, name, tensor)
             mean, square = self._moments[name]
             torch._fused_adam_(
                 [tensor], [gradient], [mean], [square], [], [self._count],
@@ -240,6 +248,9 @@ class SplatAdam:
             )  # fmt: skip
         if called_off is not None:
             self._count -= called_off.reshape(())
+
+    def _learnt(self, gaussians: Gaussians) -> Iterator[tuple[str, Tensor]]:
+        return ((name, tensor) for name, tensor in gaussians.rows() if name in self._moments)
 
     def _set_rates(self, rates: Mapping[str, float]) -> None:
         for name in rates:
@@ -270,7 +281,7 @@ class SplatAdam:
         """
         gaussians = self.gaussians
         moments = {}
-        for name, tensor in gaussians.items():
+        for name, tensor in self._learnt(gaussians):
             pair = tuple(
                 state[key][name].to(tensor.device, torch.float32).clone() for key in ("first", "second")
             )
@@ -288,3 +299,9 @@ class SplatAdam:
         while size <= self.steps:
             size *= 2
         self._history = np.zeros((2, size), np.float32)
+
+
+def _of(gradients: Gradients, name: str, tensor: Tensor) -> Tensor:
+    """float32 and contiguous; zero for what this render did not read."""
+    found = gradients.extra.get(name) if name not in PARAMETERS else getattr(gradients, name)
+    return torch.zeros_like(tensor) if found is None else found.detach().to(torch.float32).contiguous()

@@ -16,6 +16,10 @@ from torch import Tensor
 
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
 from ambiguous_wild.splat.effects.base import Effect
+from ambiguous_wild.splat.fields import Fields
+from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.render import BLUR
+from ambiguous_wild.splat.rendered import Cotangents, Gradients
 from ambiguous_wild.splat.step import Step, TrainData
 
 State = dict[str, Any]  # nested dicts of tensors and plain values, see checkpoint.py
@@ -35,13 +39,21 @@ class MaskPolicy:
         """The keep map that weighs this step's loss. May train nets of its own."""
         return None
 
-    def cotangent(self, step: Step, keep: Tensor | None) -> Tensor | None:
-        """dL/dimage [H, W, 3] of losses of the method's own; kept apart for density control."""
+    def cotangent(self, step: Step, keep: Tensor | None) -> Cotangents | Tensor | None:
+        """dL/d(picture) of losses of the method's own on the step's render.
+
+        A tensor [H, W, 3] is that of the image, kept apart for density control (`Cotangents.extra`).
+        """
+        return None
+
+    def gradients(self, step: Step, keep: Tensor | None) -> Gradients | None:
+        """Gradients of losses on other pictures of the static field (`Step.draw`), added to the step's."""
         return None
 
     def regularises(self) -> bool:
-        """Whether `cotangent` can return anything; where not, a graft leaves the policy out altogether."""
-        return type(self).cotangent is not MaskPolicy.cotangent
+        """Whether the policy has losses of its own; where not, a graft leaves it out altogether."""
+        own = type(self)
+        return own.cotangent is not MaskPolicy.cotangent or own.gradients is not MaskPolicy.gradients
 
     def predict(self, step: Step) -> Tensor | None:
         """The keep map for pictures and mask metrics: as `keep`, but nothing is learnt or cached."""
@@ -104,6 +116,23 @@ class Parts:
     antialias: bool = False
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     start_opacity: float = 0.1
+    # the first Gaussians; None = one at every point of the sparse model
+    start: Callable[[TrainData], Gaussians] | None = None
+    blur: float = BLUR  # px^2 added to both variances of a splat
+    fields: Fields | None = None  # other fields beside the static one, see fields.py
     # trains on something else than the capture's photos (references on clean ones); None = the capture
     train_data: Callable[[TrainData], TrainData] | None = None
     effects: tuple[Effect, ...] = ()  # optional ones, see effects/; none = that code is never reached
+
+    def first_gaussians(self, data: TrainData) -> Gaussians:
+        """What training starts from.
+
+        Raises:
+            AwError: fewer than 4 points.
+        """
+        if self.start is not None:
+            return self.start(data)
+        points = data.scene.points
+        return Gaussians.from_points(
+            points.xyz, points.rgb, sh_degree=self.sh_degree, opacity=self.start_opacity, device=data.device
+        )

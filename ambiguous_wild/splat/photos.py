@@ -1,9 +1,8 @@
-"""Train photos where the training reads them: all on the device, or in the host's memory and sent ahead.
+"""Train photos: all on the device, or in the host's memory and copied to the device ahead of time.
 
-Photos that fit into `RESIDENT` of a GPU's free memory lie there for the whole run. Others stay with the host
-in pinned memory, as the 8-bit codes of their files where they are such: a quarter of the bytes to send. The
-loop says which view comes next (`prefetch`), its photo travels while the GPU computes, and the GPU, not the
-host, waits for it when it is read.
+Photos that fit into `RESIDENT` of a GPU's free memory stay there for the whole run. Others stay in pinned
+memory of the host, as 8-bit codes if their files have 8 bits: a quarter of the bytes. The loop announces the
+next view (`prefetch`), its photo is copied while the GPU computes, and the GPU, not the host, waits for it.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ import torch
 from torch import Tensor
 
 RESIDENT = 0.25  # of a GPU's free memory; Gaussians, their moments and gsplat's lists need the rest
-READY = 3  # photos that lie on the device at a time: of this step, of the next, and one that is compared
+READY = 3  # photos on the device at a time: of this step, of the next, and one more for comparisons
 
 
 class Copies(Protocol):

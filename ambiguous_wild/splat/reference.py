@@ -6,6 +6,7 @@ Slow on purpose: nothing is tiled, sorted twice, approximated or written backwar
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -91,6 +92,8 @@ def render_reference(
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     antialias: bool = False,
     max_alpha: float = 0.99,  # the clamp; 0.999 judges gsplat up to 1.5.3
+    blur: float = 0.3,  # px^2
+    shade: Callable[[Tensor], Tensor] | None = None,  # colours [N, 3] of those of the harmonics, SH + 0.5
 ) -> Reference:
     """Render with autograd. Memory is H * W * N doubles a tensor: tens of Gaussians, tens of pixels."""
     pose = torch.tensor(camera.cam_from_world)
@@ -114,7 +117,7 @@ def render_reference(
     half = rotations(parameters["quats"]) * torch.exp(parameters["log_scales"])[:, None, :]
     spread = jacobian @ pose[:3, :3] @ half
     covariance = spread @ spread.transpose(1, 2)
-    blurred = covariance + 0.3 * torch.eye(2, dtype=torch.float64)
+    blurred = covariance + blur * torch.eye(2, dtype=torch.float64)
     determinant = torch.linalg.det(blurred)
     opacity = torch.sigmoid(parameters["opacity_logits"])
     if antialias:
@@ -125,9 +128,11 @@ def render_reference(
 
     direction = torch.nn.functional.normalize(means - torch.tensor(camera.center), dim=1)
     k = (sh_degree + 1) ** 2 - 1
-    shade = 0.28209479177387814 * parameters["sh0"] + 0.5
-    shade = shade + torch.einsum("nk,nkc->nc", harmonics(direction, sh_degree), parameters["sh_rest"][:, :k])
-    colour = shade.clamp(min=0.0)
+    harmonic = 0.28209479177387814 * parameters["sh0"] + 0.5
+    harmonic = harmonic + torch.einsum(
+        "nk,nkc->nc", harmonics(direction, sh_degree), parameters["sh_rest"][:, :k]
+    )
+    colour = (harmonic if shade is None else shade(harmonic)).clamp(min=0.0)
 
     rows, columns = torch.meshgrid(
         torch.arange(camera.height, dtype=torch.float64) + 0.5,

@@ -8,10 +8,14 @@ screen-space statistic is kept apart, which is what entropy-aware density contro
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from ambiguous_wild.core import Camera
 from ambiguous_wild.splat import device
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.rendered import Rendered
+from ambiguous_wild.splat.rendered import Rendered, Shade
+
+BLUR = 0.3  # px^2
 
 
 def render(
@@ -21,10 +25,12 @@ def render(
     sh_degree: int = 3,  # active degree, at most gaussians.sh_degree
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     antialias: bool = False,  # Mip-Splatting's 2D filter: opacity times sqrt(det ratio)
+    blur: float = BLUR,  # px^2 added to both variances of a splat; Mip-Splatting's own code has 0.1
+    shade: Shade | None = None,  # colours by a function of the visible rows; None = harmonics
 ) -> Rendered:
     """Render the Gaussians for one camera on the device they live on.
 
-    Conventions of both back ends: near plane 0.01, blur +0.3 px^2, alpha clamped at 0.99 (at 0.999 by
+    Conventions of both back ends: near plane 0.01, alpha clamped at 0.99 (at 0.999 by
     gsplat up to 1.5.3, see gsplat_seam.py), alpha below 1/255 skipped, a pixel stops before transmittance
     reaches 1e-4, colours max(SH + 0.5, 0).
 
@@ -34,7 +40,17 @@ def render(
     if not device.accelerated(gaussians.device):
         from ambiguous_wild.splat.cpu.render import render_cpu
 
-        return render_cpu(gaussians, camera, sh_degree=sh_degree, background=background, antialias=antialias)
-    from ambiguous_wild.splat.cuda import render_cuda
+        draw: Callable[..., Rendered] = render_cpu
+    else:
+        from ambiguous_wild.splat.gpu.render import render_cuda
 
-    return render_cuda(gaussians, camera, sh_degree=sh_degree, background=background, antialias=antialias)
+        draw = render_cuda
+    return draw(
+        gaussians,
+        camera,
+        sh_degree=sh_degree,
+        background=background,
+        antialias=antialias,
+        blur=blur,
+        shade=shade,
+    )

@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.splat.clock import clock_for
-from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.optim import SplatAdam
 
 if TYPE_CHECKING:
     from ambiguous_wild.splat.trainer import Trainer
@@ -17,14 +15,14 @@ if TYPE_CHECKING:
 def take(trainer: Trainer) -> dict[str, Any]:
     """Everything that decides how the run goes on; parts that are not there leave no key."""
     rollbacks = trainer.watchdog.state_dict()
+    others = trainer.drawing.state_dict()
     return {
         "iteration": trainer.iteration,
         "elapsed_s": trainer.clock.now(),
         "setup_s": trainer.setup_s,
         "parts_s": trainer.clock.parts_s,
-        "gaussians": dict(trainer.gaussians.items()),
-        "optimiser": trainer.optimiser.state_dict(),
-        "density": trainer.density.state_dict(),
+        **trainer.field.state_dict(),
+        **({"fields": others} if others else {}),
         "mask": trainer.parts.mask.state_dict(),
         **({} if trainer.effects is None else {"effects": trainer.effects.state_dict()}),
         "timeline": trainer.timeline.rows,
@@ -41,10 +39,10 @@ def restore(trainer: Trainer, state: dict[str, Any], path: Path) -> None:
         AwError: a key is missing; names the file.
     """
     try:
-        trainer.gaussians = Gaussians(**state["gaussians"]).to(trainer.data.device)
-        trainer.optimiser = SplatAdam(trainer.gaussians, trainer.pace.learning_rates(0.0))
-        trainer.optimiser.load_state_dict(state["optimiser"])
-        trainer.density.load_state_dict(state["density"])
+        device = trainer.data.device
+        trainer.field.load_state_dict(state, device)
+        if trainer.drawing.others:
+            trainer.drawing.load_state_dict(state["fields"], device)
         trainer.parts.mask.load_state_dict(state["mask"])
         if trainer.effects is not None:
             trainer.effects.load_state_dict(state["effects"])

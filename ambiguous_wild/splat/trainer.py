@@ -3,33 +3,33 @@
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable, Iterable
-from functools import partial
+from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError, Camera
-from ambiguous_wild.splat import checkpoint, device, snapshot
-from ambiguous_wild.splat.clock import clock_for
-from ambiguous_wild.splat.data import shrink, shrink_camera, shrink_keep
+from ambiguous_wild.splat import device, snapshot
+from ambiguous_wild.splat.data import shrink_keep
+from ambiguous_wild.splat.density import DensityControl
+from ambiguous_wild.splat.drawing import Drawing
 from ambiguous_wild.splat.effects.chain import Chain
+from ambiguous_wild.splat.field import Field, rates_with
 from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.gpu.sentinel import Sentinel
 from ambiguous_wild.splat.losses import PhotometricLoss, photometric
 from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.pace import Pace, TrainConfig
 from ambiguous_wild.splat.parts import Parts
-from ambiguous_wild.splat.render import render
-from ambiguous_wild.splat.rendered import Rendered
-from ambiguous_wild.splat.sentinel import Sentinel
-from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData
-from ambiguous_wild.splat.timeline import ROWS, Timeline
-from ambiguous_wild.splat.watchdog import NonFinite, Watchdog
+from ambiguous_wild.splat.pyramid import Pyramid
+from ambiguous_wild.splat.rendered import Cotangents, Gradients, Rendered, as_cotangents, check_needs
+from ambiguous_wild.splat.run import Probe, Run
+from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Shot, Step, TrainData
 
 
-class Trainer:
+class Trainer(Run):
     """Trains one model on one scene; stops and resumes at any iteration with the same bits."""
 
     def __init__(
@@ -39,7 +39,7 @@ class Trainer:
         config: TrainConfig,
         *,
         folder: Path,
-        probe: Callable[[Callable[[Camera], Tensor]], float] | None = None,
+        probe: Probe | None = None,
     ) -> None:
         """
         Args:
@@ -52,112 +52,110 @@ class Trainer:
         torch.set_num_threads(config.torch_threads)
         if parts.train_data is not None:
             data = parts.train_data(data)
-        self.data, self.parts, self.config, self.folder = data, parts, config, folder
-        self.probe = probe
-        names = [view.name for view in data.scene.train]
-        self.watchdog = Watchdog(folder, config.on_nonfinite, config.seed, names)
-        self.clock = clock_for(data.device)
-        self.setup_s = 0.0  # seconds before the first step, of the process that began the run
-        self.iteration = 0
-        self.timeline = Timeline()
-        self._skipped: set[int] = set()  # views that were all masked at some step
-        self._pyramid: dict[tuple[int, int], Tensor] = {}
-        self._cameras: dict[tuple[int, int], Camera] = {}
+        super().__init__(data, config, folder, probe)
+        self.parts = parts
+        self.pyramid = Pyramid(data)
+        self._divisors: dict[int, int] = {}  # of the steps since the sentinel's last look
         # where the host must not wait, what would make it wait is written down there and looked at later
         on = device.accelerated(data.device)
         self.sentinel = Sentinel(data.device, len(data.photos)) if on else None
+        check_needs(parts.density.needs, accelerated=on)
         if on:
-            from ambiguous_wild.splat import fused_loss
+            from ambiguous_wild.splat.gpu import fused_loss
 
             size = data.photos[0].shape[:2]
             fused_loss.prepare(data.device, *size, parts.lambda_dssim, parts.weighting)
-        self._prefetch = getattr(data.photos, "prefetch", None)
-
-        points = data.scene.points
-        self.gaussians = Gaussians.from_points(
-            points.xyz, points.rgb, sh_degree=parts.sh_degree, opacity=parts.start_opacity, device=data.device
-        )
-        start, most = len(self.gaussians), parts.density_config.max_gaussians
+        gaussians = parts.first_gaussians(data)
+        start, most = len(gaussians), parts.density_config.max_gaussians
         self.pace = Pace(config, parts.schedule, data, start=start, most=most)
-        self.optimiser = SplatAdam(self.gaussians, self.pace.learning_rates(0.0))
-        self.density = parts.density(parts.density_config, data.scene.extent, config.seed)
-        parts.mask.setup(data)
         self.effects = Chain(parts.effects, data) if parts.effects else None
+        rows = {} if self.effects is None else self.effects.rows(gaussians)
+        if rows:
+            gaussians = gaussians.carrying({name: row.values for name, row in rows.items()})
+        density = parts.density(parts.density_config, data.scene.extent, config.seed)
+        density.setup(data)
+        self.field = Field(gaussians, rates_with(rows, self.pace.learning_rates), density)
+        self.drawing = Drawing(data, parts, self.field, self.effects)
+        parts.mask.setup(data)
 
-    def progress(self, iteration: int) -> float:
-        """Share of the run that lies behind after `iteration` steps, in [0, 1]."""
-        return self.pace.progress(iteration, self.clock.now())
+    # The first field, the one that is the result.
+    @property
+    def gaussians(self) -> Gaussians:
+        return self.field.gaussians
+
+    @gaussians.setter
+    def gaussians(self, gaussians: Gaussians) -> None:
+        self.field.gaussians = gaussians
 
     @property
-    def done(self) -> bool:
-        return self.progress(self.iteration) >= 1.0
+    def optimiser(self) -> SplatAdam:
+        return self.field.optimiser
 
-    def _photo(self, view: int, divisor: int) -> Tensor:
-        if divisor == 1:
-            return self.data.photos[view]
-        key = (view, divisor)
-        if self._prefetch is not None:  # photos do not fit on the device: neither would smaller ones beside
-            return shrink(self.data.photos[view], divisor)
-        if key not in self._pyramid:
-            self._pyramid[key] = shrink(self.data.photos[view], divisor)
-        return self._pyramid[key]
+    @optimiser.setter
+    def optimiser(self, optimiser: SplatAdam) -> None:
+        self.field.optimiser = optimiser
 
-    def _camera(self, view: int, divisor: int) -> Camera:
-        """Made once: what a back end keeps of a camera it finds again by the object."""
-        if (view, divisor) not in self._cameras:
-            self._cameras[view, divisor] = shrink_camera(self.data.cameras[view], divisor)
-        return self._cameras[view, divisor]
+    @property
+    def density(self) -> DensityControl:
+        assert self.field.density is not None
+        return self.field.density
 
-    def render(self, camera: Camera, nominal: float | None = None, view: int | None = None) -> Rendered:
-        """The model as it stands, for one camera; `view` says which train photo's effects apply."""
-        nominal = self.progress(self.iteration) * NOMINAL_ITERATIONS if nominal is None else nominal
-        if self.effects is None:
-            return self._draw(nominal)(self.gaussians, camera)
-        return self.effects.render(self.gaussians, camera, view, self.iteration, self._draw(nominal))
+    def state(self) -> dict[str, Any]:
+        return snapshot.take(self)
 
-    def _draw(self, nominal: float) -> Callable[[Gaussians, Camera], Rendered]:
-        return partial(
-            render,
-            sh_degree=min(int(nominal // self.parts.schedule.sh_every), self.parts.sh_degree),
-            background=self.parts.background,
-            antialias=self.parts.antialias,
+    def restore(self, state: dict[str, Any], path: Path) -> None:
+        snapshot.restore(self, state, path)
+
+    def shot(self, camera: Camera, *, fitting: bool = False) -> Shot:
+        """A picture of the model as it stands, of a camera that is no train photo's."""
+        progress = self.progress(self.iteration)
+        nominal = progress * NOMINAL_ITERATIONS
+        return Shot(
+            iteration=0 if fitting else self.iteration,
+            nominal=nominal,
+            progress=progress,
+            view=None,
+            camera=camera,
+            fitting=fitting,
         )
+
+    def render(self, camera: Camera) -> Rendered:
+        """The model as it stands, for any camera: no photo's own light, the static field alone."""
+        return self.drawing(self.gaussians, self.shot(camera))
 
     def neutral_model(self) -> Gaussians:
         """The Gaussians for any viewer: what effects do to them for every camera is part of them."""
-        if self.effects is None:
-            return self.gaussians
-        return self.effects.model(self.gaussians, None, self.iteration)
+        return self.drawing.neutral_model(self.gaussians, self.iteration)
 
     def render_fitted(self, camera: Camera, photo: Tensor, keep: Tensor) -> Tensor:
         """A test view after its colour effects were fitted to the part of its photo that `keep` shows."""
         self.optimiser.flush()
-        if self.effects is None:
-            return self.render(camera).image
-        draw = self._draw(self.progress(self.iteration) * NOMINAL_ITERATIONS)
-        return self.effects.fit_view(self.gaussians, camera, photo, keep, draw)
+        return self.drawing.fit(self.gaussians, self.shot(camera, fitting=True), photo, keep)
 
     def make_step(self, iteration: int, view: int, divisor: int | None = None) -> Step:
         """Render a train view as the loop does; also used to predict masks afterwards."""
         progress = self.progress(iteration)
         divisor = self.pace.divisor(progress) if divisor is None else divisor
-        camera = self._camera(view, divisor)
-        if self.effects is not None:
-            camera = self.effects.camera(view, camera)
-        nominal = progress * NOMINAL_ITERATIONS
-        with self.clock.part("render"):
-            self.optimiser.prepare(camera)
-            rendered = self.render(camera, nominal, view)
-        return Step(
+        shot = Shot(
             iteration=iteration,
-            nominal=nominal,
+            nominal=progress * NOMINAL_ITERATIONS,
+            progress=progress,
             view=view,
             divisor=divisor,
-            ceiling=self.pace.ceiling(divisor, progress),
-            photo=self._photo(view, divisor),
-            camera=camera,
-            rendered=rendered,
-            gaussians=self.gaussians,
+            photo=self.pyramid.photo(view, divisor),
+            camera=self.pyramid.camera(view, divisor),
+        )
+        if self.effects is not None:
+            shot = replace(shot, camera=self.effects.camera(shot))
+        with self.clock.part("render"):
+            self.optimiser.prepare(shot.camera)
+            rendered = self.drawing(self.gaussians, shot)
+        return self._step_of(shot, rendered, self.pace.ceiling(divisor, progress))
+
+    def _step_of(self, shot: Shot, rendered: Rendered, ceiling: int) -> Step:
+        known = {f.name: getattr(shot, f.name) for f in fields(Shot)}
+        return Step(
+            **known, ceiling=ceiling, rendered=rendered, gaussians=self.gaussians, drawer=self.drawing.again
         )
 
     def _photometric(self, step: Step, keep: Tensor | None) -> PhotometricLoss:
@@ -215,34 +213,18 @@ class Trainer:
             self.iteration = iteration
             return loss.value
         with part("backward"):
-            gradients = step.rendered.backward(loss.d_image, d_image_extra=extra)
+            gradients = self._gradients(step, keep, as_cotangents(loss.d_image, extra))
         called_off = None
         with part("watchdog"):
             if self.sentinel is None:
                 self.watchdog.look_at_gradients(step, keep, loss, gradients)
             else:
-                looked_at = list(self.watchdog.looked_at(gradients).values())
-                called_off = self.sentinel.watch(
-                    iteration, view, torch.as_tensor(loss.value), looked_at, keep
-                )
-                # such a step counts for nobody: statistics of growth take neither its zeros nor its NaN
-                step.rendered.visible = step.rendered.visible & (called_off == 0)
-        with part("optimiser"):
-            rates = self.pace.learning_rates(self.progress(iteration))
-            self.optimiser.step(gradients, step.rendered.visible, rates, called_off=called_off)
-        with part("density"):
-            self.density.observe(step, gradients, keep)
-            self.gaussians, events = self.density.refine(step, self.gaussians, self.optimiser)
-            self.optimiser.bind(self.gaussians)
-        if self.effects is not None:
-            with part("effects"):
-                self.effects.step(step.view, self.progress(iteration), called_off)
-                if events:
-                    self.effects.rows_changed()
+                called_off = self._watch(step, keep, extra, loss, gradients)
+        events = self._learn(step, keep, gradients, called_off)
         if "reset" in events:
             self.parts.mask.on_opacity_reset(step)
-        if self._prefetch is not None:
-            self._prefetch(self.pace.view(iteration + 1))
+        if self.pyramid.prefetch is not None:
+            self.pyramid.prefetch(self.pace.view(iteration + 1))
         if events or self.watchdog.due(iteration):
             with part("watchdog"):
                 self._look_back()
@@ -250,130 +232,83 @@ class Trainer:
         self.iteration = iteration
         return loss.value
 
+    def _gradients(self, step: Step, keep: Tensor | None, cotangents: Cotangents) -> Gradients:
+        """Of the step's own render, and of those that the method drew beside it."""
+        gradients = step.rendered.backward(cotangents, self.density.needs)
+        more = self.parts.mask.gradients(step, keep)
+        if more is not None:
+            gradients = gradients + more
+        gradients = self.drawing.with_other_pictures(step, keep, gradients)
+        return self.density.before_step(step, gradients)
+
+    def _watch(
+        self,
+        step: Step,
+        keep: Tensor | None,
+        extra: Cotangents | Tensor | None,
+        loss: PhotometricLoss,
+        gradients: Gradients,
+    ) -> Tensor:
+        """Whether the optimiser is not to move, [1] on the device; nobody waits for it."""
+        assert self.sentinel is not None
+        looked_at = list(self.watchdog.looked_at(gradients).values())
+        value = torch.as_tensor(loss.value)
+        self._divisors[step.iteration] = step.divisor
+        called_off = self.sentinel.watch(step.iteration, step.view, value, looked_at, keep, extra)
+        # statistics of growth leave out such a step: neither its zeros nor its NaN are added
+        going = called_off == 0
+        step.rendered.visible = step.rendered.visible & going
+        if gradients.visible is not None:
+            gradients.visible = gradients.visible & going
+        return called_off
+
+    def _learn(
+        self, step: Step, keep: Tensor | None, gradients: Gradients, called_off: Tensor | None
+    ) -> list[str]:
+        """The optimiser, density control and effects; returns what density control did."""
+        part, progress, events = self.clock.part, self.progress(step.iteration), []
+        if self.density.before_optimiser:
+            with part("density"):
+                events = self.field.refine(step, gradients, keep)
+        if not events:  # rows that have just changed have no gradients yet
+            with part("optimiser"):
+                self.field.learn(gradients, progress, called_off)
+        if not self.density.before_optimiser:
+            with part("density"):
+                events = self.field.refine(step, gradients, keep)
+        if gradients.fields:
+            with part("fields"):
+                self.drawing.learn(step, gradients.fields, progress, called_off)
+        if self.effects is not None:
+            with part("effects"):
+                self.effects.step(gradients, replace(step, progress=progress), called_off)
+                if events:
+                    self.effects.rows_changed()
+                self.effects.after_step(step, self.gaussians)
+        return events
+
     def _look_back(self) -> None:
         """What the sentinel wrote down since the last look: the step is made again, to show what was wrong.
 
         Raises:
             NonFinite: as the step would have raised it, had anybody waited for it.
         """
-        iteration = None if self.sentinel is None else self.sentinel.first_broken()
-        if iteration is None:
+        broken = None if self.sentinel is None else self.sentinel.first_broken()
+        divisors, self._divisors = self._divisors, {}
+        if broken is None:
             return
-        step = self.make_step(iteration, self.pace.view(iteration))
-        keep = self.combine_user_keep(step, self.parts.mask.predict(step))
+        # at the size of that step: under a budget the schedule has gone on with the clock
+        view, divisor = self.pace.view(broken.iteration), divisors.get(broken.iteration)
+        step = self.make_step(broken.iteration, view, divisor)
+        keep = broken.keep
         loss = self._photometric(step, keep)
         self.watchdog.look_at_loss(step, keep, loss)
-        extra = self.parts.mask.cotangent(step, keep)
-        gradients = step.rendered.backward(loss.d_image, d_image_extra=extra)
+        gradients = step.rendered.backward(as_cotangents(loss.d_image, broken.extra))
         self.watchdog.look_at_gradients(step, keep, loss, gradients)
         raise self.watchdog.not_seen_again(step, keep, loss)
-
-    def train(self, *, tick: Callable[[Trainer], None] | None = None) -> None:
-        """Run to the end; saves as it goes, probes on schedule.
-
-        Args:
-            tick: called after every iteration with the clock stopped (progress bars).
-
-        Raises:
-            NonFinite: names view, iteration and parameters.
-        """
-        if self.config.on_nonfinite == "rollback" and not self.checkpoint_path.exists():
-            self.save()  # something to go back to, from the first iteration on
-        last_save = time.monotonic()
-        while True:
-            if self.done:
-                if self._save_if_sound():
-                    return
-                continue  # rolled back: there is more to do
-            self._advance(tick)
-            if time.monotonic() - last_save > self.config.checkpoint_every_s and not self.done:
-                self._save_if_sound()
-                last_save = time.monotonic()
-
-    def _advance(self, tick: Callable[[Trainer], None] | None) -> None:
-        """One iteration with its bookkeeping, or one step back."""
-        before = self.progress(self.iteration)
-        self.clock.start()
-        try:
-            loss = self.step()
-        except NonFinite as error:
-            self.clock.stop()
-            self.watchdog.handle(self, error)
-            return
-        after = self.progress(self.iteration)
-        due = int(after * ROWS) > int(before * ROWS)
-        if due:
-            self.clock.settle()
-        self.clock.stop()
-        self.timeline.loss(loss)
-        if due:
-            probes = self.config.probes
-            self._log(probing=probes > 0 and int(after * probes) > int(before * probes))
-        if tick is not None:
-            tick(self)
 
     def check_parameters(self) -> None:
         """Raise NonFinite, as of the last step, where a parameter is not finite."""
         self._look_back()
         view = self.pace.view(max(self.iteration, 1))
         self.watchdog.look_at_parameters(self.iteration, view, self.gaussians)
-
-    def _save_if_sound(self) -> bool:
-        """Save, unless a parameter is not finite: then it is as if the last step had found that."""
-        try:
-            self.check_parameters()
-        except NonFinite as error:
-            self.watchdog.handle(self, error)
-            return False
-        self.save()
-        return True
-
-    def _log(self, probing: bool) -> None:
-        row = self.timeline.add(self.iteration, len(self.gaussians), self.clock)
-        if probing and self.probe is not None:
-            spent = dict(self.clock.parts_s)
-            row["psnr_probe"] = self.probe(self._probe_image)
-            self.clock.parts_s = spent
-
-    @torch.no_grad()
-    def _probe_image(self, camera: Camera) -> Tensor:
-        # Rows the optimiser has put off are brought up to date first; it computes what a later step
-        # would have computed, so that probing changes nothing (a test compares the bits).
-        self.optimiser.prepare(camera)
-        return self.render(camera).image
-
-    @property
-    def ms_per_iteration(self) -> float:
-        return 1e3 * self.clock.now() / max(self.iteration, 1)
-
-    @property
-    def skipped_views(self) -> list[str]:
-        """Train photos that were all masked at some step and taught nothing then."""
-        return sorted(self.data.scene.train[i].name for i in self.skipped)
-
-    @property
-    def skipped(self) -> set[int]:
-        """Those photos' indices."""
-        return self._skipped | (self.sentinel.empty_views() if self.sentinel is not None else set())
-
-    def note_skipped(self, views: Iterable[int]) -> None:
-        """Of the part of the run before it was resumed."""
-        self._skipped = set(views)
-
-    @property
-    def checkpoint_path(self) -> Path:
-        return self.folder / "checkpoint" / "last.safetensors"
-
-    def save(self) -> None:
-        """Write the whole state and the timeline, each atomically."""
-        checkpoint.save(self.checkpoint_path, snapshot.take(self))
-        self.timeline.write(self.folder / "timeline.csv")
-
-    def resume(self) -> bool:
-        """Go on from the last checkpoint, if there is one; returns whether there was."""
-        if not self.checkpoint_path.exists():
-            return False
-        snapshot.restore(self, checkpoint.load(self.checkpoint_path), self.checkpoint_path)
-        if self.sentinel is not None:
-            self.sentinel.reset()
-        return True

@@ -29,7 +29,7 @@ from ambiguous_wild.splat.rendered import Gradients
 from ambiguous_wild.splat.step import Step
 
 if TYPE_CHECKING:
-    from ambiguous_wild.splat.trainer import Trainer
+    from ambiguous_wild.splat.run import Run
 
 OnNonFinite = Literal["stop", "rollback"]
 FOLDER = "nonfinite"
@@ -100,12 +100,12 @@ class Watchdog:
         if not _finite(named):
             bad = _bad_rows(named)
             if bad:
-                found = {f"d_{name}": getattr(gradients, name) for name in bad}
+                found = {f"d_{name}": named[name] for name in bad}
                 raise self._found("gradient", step.iteration, step.view, bad, _seen(step, keep, loss) | found)
 
     def looked_at(self, gradients: Gradients) -> dict[str, Tensor]:
         """Those that are looked at in every step."""
-        return {name: getattr(gradients, name) for name in _LOOKED_AT}
+        return {name: getattr(gradients, name) for name in _LOOKED_AT} | dict(gradients.extra)
 
     def not_seen_again(self, step: Step, keep: Tensor | None, loss: PhotometricLoss) -> NonFinite:
         """A finding that the step did not show when it was made again: sums come in another order there."""
@@ -117,7 +117,7 @@ class Watchdog:
 
     def look_at_parameters(self, iteration: int, view: int, gaussians: Gaussians) -> None:
         """Raise NonFinite if a parameter is not finite: now and then, after growth, before a checkpoint."""
-        named = dict(gaussians.items())
+        named = dict(gaussians.rows())
         if not _finite(named):
             bad = _bad_rows(named)
             if bad:
@@ -137,35 +137,35 @@ class Watchdog:
         """Whether this photo is left out in this epoch: what it did there was undone."""
         return any(r["epoch"] == epoch and r["view"] == view for r in self.rollbacks)
 
-    def handle(self, trainer: Trainer, error: NonFinite) -> None:
+    def handle(self, run: Run, error: NonFinite) -> None:
         """Keep what reproduces the finding; then roll back, or raise it with where that lies.
 
         Rolling back restores the last checkpoint and leaves the photo out for the rest of its epoch. The
         seconds spent stay spent.
         """
-        where = self._keep(trainer.checkpoint_path, error)
+        where = self._keep(run.checkpoint_path, error)
         if self.action == "rollback" and len(self.rollbacks) < MOST_ROLLBACKS:
-            spent, rollbacks = trainer.clock, list(self.rollbacks)
-            trainer.resume()
+            spent, rollbacks = run.clock, list(self.rollbacks)
+            run.resume()
             back = {
                 "iteration": error.finding.iteration,
-                "epoch": trainer.pace.epoch(error.finding.iteration),
+                "epoch": run.pace.epoch(error.finding.iteration),
                 "view": error.view,
                 "photo": error.finding.view,
                 "what": str(error),
-                "to": trainer.iteration,
+                "to": run.iteration,
             }
-            trainer.clock, self.rollbacks, self.every = spent, [*rollbacks, back], 1
-            trainer.save()
+            run.clock, self.rollbacks, self.every = spent, [*rollbacks, back], 1
+            run.save()
             return
         tried = f" after {len(self.rollbacks)} rollbacks" if self.rollbacks else ""
-        run = shlex.quote(str(self.folder))
+        folder = shlex.quote(str(self.folder))
         raise NonFinite(
             error.finding,
             error.view,
             error.seen,
-            f"{error}{tried}; what the step saw is in {where}, and 'aw stress --replay {run}' runs up to it "
-            f"again from the last good state; --on-nonfinite rollback leaves such a photo out and goes on",
+            f"{error}{tried}; what the step saw is in {where}, and 'aw stress --replay {folder}' runs up to "
+            f"it again from the last good state; --on-nonfinite rollback leaves such a photo out and goes on",
         )
 
     def _keep(self, good: Path, error: NonFinite) -> Path:

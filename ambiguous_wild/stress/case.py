@@ -1,4 +1,4 @@
-"""A hard case: what it measures, what it may be, and where that bound comes from."""
+"""A stress test: a measured error, its tolerance, and the reason for the tolerance."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ UNIT = 2.0**-24  # relative rounding error of one float32 operation (Higham's u)
 
 @dataclass(frozen=True)
 class Measured:
-    """What one case gave."""
+    """The result of one case."""
 
-    error: float  # worst relative error against float64, or the number of things that are wrong
+    error: float  # worst relative error against float64, or the number of failed checks
     tolerance: float
-    why: str  # where the tolerance comes from
-    comes_out: str  # what the right answer is
-    condition: float | None = None  # relative change of the result over that of the input; None = no meaning
+    why: str  # reason for the tolerance
+    comes_out: str  # the correct result
+    condition: float | None = None  # condition number: relative change of the result over that of the input
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Case:
     row: int  # of docs/numerics.md
     name: str
     measure: Callable[[str], Measured]  # argument: the device
-    devices: tuple[str, ...]  # where it says anything
+    devices: tuple[str, ...]  # that the case applies to
 
     @property
     def key(self) -> str:
@@ -51,10 +51,10 @@ class Outcome:
     comes_out: str
     condition: float | None
     passed: bool
-    failure: str = ""  # of the case itself, where it raised
+    failure: str = ""  # the error, if the case raised one
 
     def plain(self) -> dict[str, Any]:
-        """For JSON, which has no NaN and no infinity: a figure that is none is missing."""
+        """Plain data for JSON: NaN and infinity become null."""
         missing = {k: None for k, v in asdict(self).items() if isinstance(v, float) and not math.isfinite(v)}
         return asdict(self) | missing
 
@@ -62,30 +62,30 @@ class Outcome:
 def case(
     row: int, name: str, *, devices: tuple[str, ...] = ("cpu",)
 ) -> Callable[[Callable[[str], Measured]], Case]:
-    """Make a case of a function that measures; the module's other cases stand beside it."""
+    """Decorator that makes a case of a measuring function."""
     return lambda measure: Case(row, name, measure, devices)
 
 
 def run(chosen: Case, device: str) -> Outcome:
-    """Measure; an exception is a failure of the case and not of the caller."""
+    """Measure a case; an exception counts as its failure."""
     try:
         m = chosen.measure(device)
     except Exception as error:
         text = str(error) if isinstance(error, AwError) else traceback.format_exc(limit=-2)
         return Outcome(chosen.key, device, float("nan"), 0.0, "", "", None, False, text)
-    passed = m.error <= m.tolerance  # NaN is on no side of it: that fails
+    passed = m.error <= m.tolerance  # false for NaN
     return Outcome(chosen.key, device, m.error, m.tolerance, m.why, m.comes_out, m.condition, bool(passed))
 
 
-def wrong(checks: dict[str, bool], comes_out: str) -> Measured:
-    """A case of yes and no: the error is how many of the checks do not hold; none may."""
+def failed_checks(checks: dict[str, bool], comes_out: str) -> Measured:
+    """A case of exact checks: the error is the number of checks that fail; the tolerance is 0."""
     bad = [name for name, holds in checks.items() if not holds]
     why = "exact" + (f"; wrong: {', '.join(bad)}" if bad else f", {len(checks)} checks")
     return Measured(float(len(bad)), 0.0, why, comes_out)
 
 
 def worst(parts: Iterable[Measured]) -> Measured:
-    """The one of several that is furthest beyond, or least below, its tolerance."""
+    """The result with the largest ratio of error to tolerance."""
 
     def share(m: Measured) -> float:
         if m.error != m.error:

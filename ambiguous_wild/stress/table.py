@@ -1,4 +1,4 @@
-"""All cases, run and printed."""
+"""Run and print the stress tests."""
 
 from __future__ import annotations
 
@@ -6,19 +6,22 @@ import fnmatch
 from collections.abc import Callable, Iterable, Sequence
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.stress import masking, measuring, rendering, training
+from ambiguous_wild.stress import mask_cases, metric_cases, render_cases, training_cases
 from ambiguous_wild.stress.case import Case, Outcome, run
 
 CASES: tuple[Case, ...] = tuple(
-    sorted((*rendering.CASES, *training.CASES, *masking.CASES, *measuring.CASES), key=lambda c: c.row)
+    sorted(
+        (*render_cases.CASES, *training_cases.CASES, *mask_cases.CASES, *metric_cases.CASES),
+        key=lambda c: c.row,
+    )
 )
 
 
 def chosen(only: Sequence[str]) -> list[Case]:
-    """The cases that match any of these: a row ("4"), a key, or a part of one with * and ?.
+    """The cases that match any of: a row ("4"), a key, a part of a key, or a pattern with * and ?.
 
     Raises:
-        AwError: one of them matches none.
+        AwError: an entry matches no case.
     """
     if not only:
         return list(CASES)
@@ -37,7 +40,7 @@ def chosen(only: Sequence[str]) -> list[Case]:
 def run_all(
     cases: Iterable[Case], devices: Sequence[str], each: Callable[[Outcome], None] | None = None
 ) -> list[Outcome]:
-    """Every case on every device it says something on."""
+    """Run every case on every device it applies to."""
     outcomes = []
     for one in cases:
         for device in devices:
@@ -49,9 +52,9 @@ def run_all(
 
 
 def to_markdown(outcomes: Sequence[Outcome]) -> str:
-    """case | device | what comes out | error | tolerance and where it comes from | condition | verdict."""
+    """A table with one row per outcome."""
     lines = [
-        "| case | device | what comes out | worst error | tolerance | from | condition | verdict |",
+        "| case | device | correct result | worst error | tolerance | reason | condition | verdict |",
         "|---|---|---|---:|---:|---|---:|---|",
     ]
     for o in outcomes:

@@ -1,1 +1,1 @@
-"""Human studies: a page that asks, a key that stays at home, and scores with intervals."""
+"""User studies: an HTML page with questions, a private key, and scores with intervals."""

@@ -1,4 +1,4 @@
-"""Do raters agree with each other? Krippendorff's alpha (NLTK), and the plain share of equal answers."""
+"""Agreement between raters: Krippendorff's alpha (NLTK) and the share of equal answers."""
 
 from __future__ import annotations
 
@@ -13,18 +13,20 @@ from ambiguous_wild.core.extras import install_command
 
 @dataclass(frozen=True)
 class Agreement:
-    alpha: float | None  # 1: as one, 0: as by chance; None: not defined
-    equal: float | None  # share of pairs of raters that gave the same answer to a question
-    questions: int  # that two raters or more answered
+    """Agreement over all questions that two or more raters answered."""
+
+    alpha: float | None  # 1 = full agreement, 0 = chance; None = not defined
+    equal: float | None  # share of rater pairs with the same answer to a question
+    questions: int  # answered by two or more raters
     note: str = ""  # why alpha is not defined
 
 
 def agreement(
     answers: Iterable[tuple[str, str, Any]],  # (rater, question, answer)
     *,
-    ordered: bool,  # answers are numbers, and 1 is farther from 5 than from 2
+    ordered: bool,  # answers are numbers with distances: 1 is closer to 2 than to 5
 ) -> Agreement:
-    """Krippendorff's alpha, nominal or (`ordered`) with the interval metric, over what two or more answered.
+    """Krippendorff's alpha, nominal or (`ordered`) interval, over questions with two or more answers.
 
     Source: Krippendorff, Computing Krippendorff's Alpha-Reliability (2011); computed by NLTK.
 
@@ -39,7 +41,7 @@ def agreement(
         return Agreement(None, None, 0, "no question was answered by two raters")
     equal = _equal(rows)
     if len({answer for _, _, answer in rows}) == 1:
-        # 0/0: without any difference there is no chance agreement to correct for.
+        # alpha is 0/0 if all answers are equal
         return Agreement(None, equal, questions, "all answers are equal, so alpha is not defined")
     task, nominal, interval = _nltk()
     return Agreement(
@@ -61,5 +63,7 @@ def _nltk() -> tuple[Callable[..., Any], Callable[..., float], Callable[..., flo
         from nltk.metrics.agreement import AnnotationTask
         from nltk.metrics.distance import binary_distance, interval_distance
     except ImportError as error:
-        raise AwError(f"scoring a study needs NLTK ({error}): {install_command('study')}") from None
+        raise AwError(
+            f"scoring a study needs NLTK ({error}); install it with: {install_command('study')}"
+        ) from None
     return AnnotationTask, binary_distance, interval_distance

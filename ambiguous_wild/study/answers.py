@@ -1,4 +1,4 @@
-"""Answer files: checked against the key, one file a rater, nothing believed that is not asked for."""
+"""Read answer files, one per rater, and check them against the key."""
 
 from __future__ import annotations
 
@@ -18,23 +18,27 @@ from ambiguous_wild.study.key import KIND_PAIR, KIND_PHOTO, Key
 
 FORMAT, VERSION = "aw-study-answers", 1
 CHOICES = {KIND_PAIR: ("x", "y", "tie"), KIND_PHOTO: ("1", "2", "3", "4", "5", "none")}
-LARGEST = 5_000_000  # bytes; a study of a thousand questions is below a tenth of it
-LONGEST = 80  # characters of a rater's id or name, as the page has it
+LARGEST = 5_000_000  # bytes; ten times the size of a thousand answers
+LONGEST = 80  # characters of a rater's id or name, as in the page
 _COLUMNS = ("study", "rater", "name", "question", "answer", "left", "ms")
 
 
 @dataclass(frozen=True)
 class Answer:
+    """One answer of one rater."""
+
     question: str  # token of the key
     answer: str  # one of `CHOICES`
-    left: str  # "x" or "y": which render stood on the left; empty for photos
-    seconds: float  # from showing to answering
+    left: str  # "x" or "y": the render shown on the left; empty for photos
+    seconds: float  # from the question to the answer
 
 
 @dataclass(frozen=True)
 class Rater:
-    rater: str  # random identity, made by the page
-    name: str  # as typed: anybody's text
+    """One answer file."""
+
+    rater: str  # random id, made by the page
+    name: str  # as typed; may be any text
     path: Path
     answers: tuple[Answer, ...]
 
@@ -42,24 +46,24 @@ class Rater:
 def read_answers(
     paths: Sequence[Path], key: Key, notice: Callable[[str], None] = lambda text: None
 ) -> list[Rater]:
-    """Read the answer files (JSON or CSV; a folder stands for those in it), ordered by rater.
+    """Read the answer files (JSON or CSV, or folders of them), ordered by rater.
 
     Args:
         paths: files and folders.
         key: of the study.
-        notice: told what of a folder is not read.
+        notice: called with a message about ignored files of a folder.
 
     Raises:
-        AwError: no file, or one that is empty, malformed, of another study, twice of the same rater, or
-            that answers what was not asked; names the file.
+        AwError: no file; or a file that is empty, malformed, of another study or of a repeated rater, or that
+            answers an unknown question; names the file.
     """
     raters: dict[str, Rater] = {}
     for path in _files(paths, notice):
         rater = _read(path, key)
         if rater.rater in raters:
             raise AwError(
-                f"{raters[rater.rater].path} and {path} are both of rater {rater.rater!a}: leave one out "
-                "(the one saved last holds all answers)"
+                f"{raters[rater.rater].path} and {path} are both of rater {rater.rater!a}: give only one "
+                "(the one saved last has all answers)"
             )
         raters[rater.rater] = rater
     return [raters[name] for name in sorted(raters)]
@@ -71,7 +75,7 @@ def _files(paths: Sequence[Path], notice: Callable[[str], None]) -> list[Path]:
         if not path.is_dir():
             found.append(path)
             continue
-        # Keys and scores of our own may lie beside the answers.
+        # The folder may also hold the key and earlier scores.
         inside = [
             p
             for p in sorted(path.iterdir())
@@ -80,61 +84,67 @@ def _files(paths: Sequence[Path], notice: Callable[[str], None]) -> list[Path]:
             and not p.name.startswith(("scores.", "."))
         ]
         if not inside:
-            raise AwError(f"no answer file (*.json, *.csv) in {path}")
+            raise AwError(f"no answer file (*.json, *.csv) in {path}; copy the raters' files there")
         found += inside
         ours = (".key.json", ".html", ".htm")
-        left = [
+        ignored = [
             p.name
             for p in sorted(path.iterdir())
             if p not in inside and not p.name.startswith((".", "scores.")) and not p.name.endswith(ours)
         ]
-        if left:
+        if ignored:
             notice(
-                f"{path}: left out {shortlist(left)}; answers end in .json or .csv "
-                "and lie in the folder itself"
+                f"{path}: ignored {shortlist(ignored)}; answer files are *.json or *.csv in the folder itself"
             )
     twice = {p.resolve() for p in found if sum(p.resolve() == q.resolve() for q in found) > 1}
     if twice:
-        raise AwError(f"given twice: {shortlist(sorted(map(str, twice)))}; name each answer file once")
+        raise AwError(f"given twice: {shortlist(sorted(map(str, twice)))}; give each answer file once")
     if not found:
-        raise AwError("no answer files given: name the files raters handed in, or a folder of them")
+        raise AwError("no answer files given: name the files that raters saved, or a folder of them")
     return found
 
 
 def _read(path: Path, key: Key) -> Rater:
     try:
         if path.stat().st_size > LARGEST:
-            raise AwError(f"{path} is larger than {LARGEST // 1_000_000} MB: no answer file")
+            raise AwError(
+                f"{path} is larger than {LARGEST // 1_000_000} MB, so it is no answer file; leave it out"
+            )
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
-        raise AwError(f"{path} is no text in UTF-8: no answer file of 'aw study make'") from None
+        raise AwError(f"{path} is not UTF-8 text, so it is no answer file; leave it out") from None
     except OSError as error:
         raise AwError(f"cannot read {path}: {error.strerror}") from None
     if not text.strip():
         raise AwError(f"{path} is empty: ask the rater to save again")
-    # By content: mail programs and phones rename what they like.
+    # Detect the format by content, since mail programs and phones rename files.
     data = _json(path, text) if text.lstrip()[:1] in ("{", "[") else _csv(path, text)
     if data["study"] != key.study:
         raise AwError(
-            f"{path} answers study {_short(data['study'])}, the key is of study {key.study}: another page, "
-            "or a page made again since"
+            f"{path} answers study {_short(data['study'])}, but the key is of study {key.study}: the page is "
+            "another one or was made again; give the key of its page"
         )
     rater, name = data["rater"], data["name"]
     if isinstance(rater, str):
-        rater = rater.strip()  # a blank more is no second rater
+        rater = rater.strip()  # ignore blanks, so that a copy is recognised
     if not isinstance(rater, str) or not rater.strip() or len(rater) > LONGEST or not isinstance(name, str):
-        raise AwError(f"{path} has no fit rater ({_short(rater)}): it was changed by hand; save it again")
+        raise AwError(
+            f"{path} has no valid rater ({_short(rater)}): it was edited; ask the rater to save again"
+        )
     if not is_text(rater) or not is_text(name):
         raise AwError(
-            f"{path} has half a character in its rater or name: it was changed by hand; save it again"
+            f"{path} has half a character in its rater or name: it was edited; ask the rater to save again"
         )
     answers = tuple(_answer(path, row, key) for row in data["answers"])
     if not answers:
-        raise AwError(f"{path} holds no answer: leave it out")
+        raise AwError(f"{path} contains no answer: leave it out")
     asked = [a.question for a in answers]
     if len(set(asked)) < len(asked):
         double = sorted({q for q in asked if asked.count(q) > 1})
-        raise AwError(f"{path} answers a question twice ({shortlist(double)}): it was changed by hand")
+        raise AwError(
+            f"{path} answers a question twice ({shortlist(double)}): it was edited; ask the rater to save "
+            "again"
+        )
     return Rater(rater, name[:LONGEST], path, answers)
 
 
@@ -142,7 +152,7 @@ def _json(path: Path, text: str) -> dict[str, Any]:
     try:
         data = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise AwError(f"{path} is cut short or malformed ({error}): ask the rater to save again") from None
+        raise AwError(f"{path} is truncated or malformed ({error}): ask the rater to save again") from None
     if isinstance(data, dict) and data.get("format") == KEY_FORMAT:
         raise AwError(f"{path} is the key, not an answer file: give it with --key")
     if (
@@ -150,9 +160,11 @@ def _json(path: Path, text: str) -> dict[str, Any]:
         or data.get("format") != FORMAT
         or not isinstance(data.get("answers"), list)
     ):
-        raise AwError(f"{path} is no answer file of a study page")
+        raise AwError(f"{path} is no answer file of a study page; leave it out")
     if data.get("version") != VERSION:
-        raise AwError(f"{path} has version {_short(data.get('version'))}, this program reads {VERSION}")
+        raise AwError(
+            f"{path} has version {_short(data.get('version'))}, this program reads {VERSION}; update it"
+        )
     return {k: data.get(k, "") for k in ("study", "rater", "name", "answers")}
 
 
@@ -163,14 +175,14 @@ def _csv(path: Path, text: str) -> dict[str, Any]:
         raise AwError(f"{path} is malformed CSV ({error}): ask the rater to save again") from None
     if not rows or tuple(rows[0]) != _COLUMNS:
         raise AwError(
-            f"{path} is no answer file: its first line must be {','.join(_COLUMNS)}, and rows follow"
+            f"{path} is no answer file: its first line must be {','.join(_COLUMNS)}, followed by rows"
         )
     if any(None in row or None in row.values() for row in rows):
         raise AwError(f"{path} has a row with too few or too many cells: ask the rater to save again")
     for column in ("study", "rater", "name"):
         if len({row[column] for row in rows}) > 1:
-            raise AwError(f"{path} holds more than one {column}: keep one file a rater")
-    # The page writes '=x for a name =x, so that no spreadsheet computes it.
+            raise AwError(f"{path} contains more than one {column}: give one file per rater")
+    # The page writes '=x for a name =x, so that spreadsheets do not evaluate it.
     name = rows[0]["name"]
     name = name[1:] if name[:1] == "'" and name[1:].lstrip()[:1] in ("=", "+", "-", "@") else name
     return {"study": rows[0]["study"], "rater": rows[0]["rater"], "name": name, "answers": rows}
@@ -182,21 +194,22 @@ def _answer(path: Path, row: Any, key: Key) -> Answer:
     question, answer = row.get("question"), row.get("answer")
     entry = key.questions.get(question) if isinstance(question, str) else None
     if entry is None:
-        raise AwError(f"{path} answers a question the study never asked: {_short(question)}")
+        raise AwError(f"{path} answers a question that is not in the study: {_short(question)}")
     choices = CHOICES[entry["kind"]]
     if not isinstance(answer, str) or answer not in choices:
-        raise AwError(f"{path} answers {_short(answer)} to {question}; there is: {', '.join(choices)}")
+        raise AwError(f"{path} answers {_short(answer)} to {question}; allowed: {', '.join(choices)}")
     left = row.get("left") or ""
     if left not in (("x", "y") if entry["kind"] == KIND_PAIR else ("",)):
-        raise AwError(f"{path} says {_short(left)} stood on the left of {question}: it was changed by hand")
+        raise AwError(
+            f"{path} has {_short(left)} as the left image of {question}: it was edited; ask the rater to "
+            "save again"
+        )
     try:
         seconds = -1.0 if isinstance(row.get("ms"), bool) else float(row.get("ms")) / 1000  # type: ignore[arg-type]
     except (TypeError, ValueError, OverflowError):
         seconds = -1.0
     if not 0 <= seconds < 1e7:
-        raise AwError(
-            f"{path} has no fit time for {question} ({_short(row.get('ms'))}): it was changed by hand"
-        )
+        raise AwError(f"{path} has no valid time for {question} ({_short(row.get('ms'))}): it was edited")
     return Answer(str(question), answer, left, seconds)
 
 

@@ -1,4 +1,4 @@
-"""The key of a study: which method stood behind which picture."""
+"""The key of a study: the method of each image."""
 
 from __future__ import annotations
 
@@ -6,25 +6,28 @@ import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.names import is_text
 
 FORMAT, VERSION = "aw-study-key", 1
-KIND_PHOTO, KIND_PAIR = "ambiguity", "preference"
+KIND_PHOTO: Final = "ambiguity"
+KIND_PAIR: Final = "preference"
 _FIELDS = {KIND_PHOTO: ("scene", "view"), KIND_PAIR: ("scene", "view", "x", "y")}
 
 
 @dataclass(frozen=True)
 class Key:
-    study: str  # identity of the study
+    """What is needed to score answers."""
+
+    study: str  # id of the study
     title: str
     questions: dict[str, dict[str, str]]  # token -> kind, scene, view and, for pairs, the methods x and y
 
 
 def study_id(*parts: Any) -> str:
-    """Sixteen hexadecimal digits that change with anything in `parts`."""
+    """Hash of `parts`, 16 hexadecimal digits."""
     text = json.dumps(parts, sort_keys=True, ensure_ascii=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -33,36 +36,42 @@ def read_key(path: Path) -> Key:
     """Read and check a key.
 
     Raises:
-        AwError: unreadable, no key, of a newer version, or damaged.
+        AwError: unreadable, not a key, of another version, or damaged.
     """
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise AwError(
-            f"cannot read the key {path}: {error.strerror}; 'aw study make' wrote it beside the page"
+            f"cannot read the key {path}: {error.strerror}; 'aw study make' wrote it next to the page"
         ) from None
     except (ValueError, RecursionError) as error:
-        raise AwError(f"the key {path} is damaged ({error}); take the one 'aw study make' wrote") from None
+        raise AwError(
+            f"the key {path} is damaged ({error}); use the one that 'aw study make' wrote"
+        ) from None
     if not isinstance(data, dict) or data.get("format") != FORMAT:
-        raise AwError(f"{path} is no key of a study; 'aw study make' wrote it beside the page (*.key.json)")
+        raise AwError(f"{path} is no key of a study; 'aw study make' wrote it next to the page (*.key.json)")
     if data.get("version") != VERSION:
-        raise AwError(f"the key {path} has version {data.get('version')!r}, this program reads {VERSION}")
+        raise AwError(
+            f"the key {path} has version {data.get('version')!r}, this program reads {VERSION}; update it"
+        )
     questions = data.get("questions")
-    whole = (
+    complete = (
         isinstance(data.get("study"), str)
         and isinstance(data.get("title"), str)
         and isinstance(questions, dict)
         and bool(questions)
-        and all(_whole(entry) for entry in questions.values())
+        and all(_complete(entry) for entry in questions.values())
     )
-    if not whole:
-        raise AwError(f"the key {path} is damaged (a field is absent); take the one 'aw study make' wrote")
+    if not complete:
+        raise AwError(
+            f"the key {path} is damaged (a field is missing); use the one that 'aw study make' wrote"
+        )
     if not is_text(json.dumps(data, ensure_ascii=False)):
-        raise AwError(f"the key {path} is damaged (half a character); take the one 'aw study make' wrote")
+        raise AwError(f"the key {path} is damaged (half a character); use the one that 'aw study make' wrote")
     return Key(data["study"], data["title"], data["questions"])
 
 
-def _whole(entry: Any) -> bool:
+def _complete(entry: Any) -> bool:
     kind = entry.get("kind") if isinstance(entry, dict) else None
     if not isinstance(kind, str) or kind not in _FIELDS:
         return False

@@ -1,4 +1,4 @@
-"""A study: one HTML file that asks, and the key without which its answers mean nothing."""
+"""Make a study: an HTML page with the questions, and the key that is needed to score the answers."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from ambiguous_wild.io.atomic import write_json, write_text
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.study.key import FORMAT, KIND_PAIR, KIND_PHOTO, VERSION, study_id
 from ambiguous_wild.study.pictures import data_uri, outlined, same_size
-from ambiguous_wild.study.questions import Pair, Photo, Question, draw
+from ambiguous_wild.study.questions import PairQuestion, PhotoQuestion, Question, sample_questions
 
 Bar = Callable[[list[Question]], Iterable[Question]]
 
 
 @dataclass(frozen=True)
-class Settings:
-    """How a study is made."""
+class StudySettings:
+    """Settings of a study."""
 
     title: str = "Picture study"  # shown to raters
-    limit: int = 40  # questions of each kind at most
-    side: int = 1000  # px, longer side of a picture at most
+    limit: int = 40  # most questions of each kind
+    side: int = 1000  # px, most of an image's longer side
     quality: int = 92  # of JPEG
-    seed: int = 0  # which questions, and which render is called x
+    seed: int = 0  # of the choice of questions, and of which render is x
 
 
 @dataclass(frozen=True)
-class Made:
-    """What was written."""
+class StudyFiles:
+    """The files of a study and what they contain."""
 
     page: Path
     key: Path
@@ -46,19 +46,19 @@ class Made:
     megabytes: float  # of the page
 
 
-def make(
-    questions: Sequence[Question], page: Path, key: Path, settings: Settings, progress: Bar = iter
-) -> Made:
-    """Draw questions, encode their pictures, write page and key.
+def make_study(
+    questions: Sequence[Question], page: Path, key: Path, settings: StudySettings, progress: Bar = iter
+) -> StudyFiles:
+    """Choose questions, encode their images, write the page and the key.
 
-    The page knows pictures and questions by random tokens alone: no method, scene, file or path.
+    The page contains only random tokens for images and questions: no method, scene, file or path.
 
     Raises:
-        AwError: nothing to ask, an unreadable picture, pictures of one question that differ in size.
+        AwError: no question, an unreadable image, or images of one question that differ in size.
     """
     rng = np.random.default_rng(settings.seed)
-    photos = draw([q for q in questions if isinstance(q, Photo)], settings.limit, rng)
-    pairs = draw([q for q in questions if isinstance(q, Pair)], settings.limit, rng)
+    photos = sample_questions([q for q in questions if isinstance(q, PhotoQuestion)], settings.limit, rng)
+    pairs = sample_questions([q for q in questions if isinstance(q, PairQuestion)], settings.limit, rng)
     chosen = [*photos, *pairs]
     if not chosen:
         raise AwError("a study needs at least one question: give --scene, --runs or both")
@@ -66,14 +66,17 @@ def make(
     asked, answers = [], {}
     for question in progress(chosen):
         token = album.token()
-        shown, entry = _photo(question, album) if isinstance(question, Photo) else _pair(question, album, rng)
+        if isinstance(question, PhotoQuestion):
+            shown, entry = _photo(question, album)
+        else:
+            shown, entry = _pair(question, album, rng)
         asked.append({"id": token, **shown})
         answers[token] = entry
-    # The pictures' hashes are part of the identity: the same questions on other renders are another study.
+    # The id depends on the images: the same questions on other renders are another study.
     identity = study_id(settings.title, asked, answers, album.hashes)
     data = {"study": identity, "title": settings.title, "questions": asked, "images": album.images}
-    text = page_of(data)
-    write_text(page, text)  # first: a key without its page would be of nothing
+    text = page_html(data)
+    write_text(page, text)  # first, so that there is no key without its page
     write_json(
         key,
         {
@@ -86,13 +89,13 @@ def make(
         },
     )
     size = len(text.encode()) / 1e6
-    return Made(page, key, identity, len(photos), len(pairs), len(album.images), size)
+    return StudyFiles(page, key, identity, len(photos), len(pairs), len(album.images), size)
 
 
 class _Album:
-    """Pictures by random token; one that is asked for twice is stored once."""
+    """Images by random token; an image that is used twice is stored once."""
 
-    def __init__(self, settings: Settings, rng: np.random.Generator) -> None:
+    def __init__(self, settings: StudySettings, rng: np.random.Generator) -> None:
         self._settings, self._rng = settings, rng
         self._tokens: dict[str, str] = {}
         self._used: set[str] = set()
@@ -115,7 +118,8 @@ class _Album:
         return {t: hashlib.sha256(uri.encode()).hexdigest() for t, uri in self.images.items()}
 
 
-def _photo(question: Photo, album: _Album) -> tuple[dict[str, Any], dict[str, Any]]:
+def _photo(question: PhotoQuestion, album: _Album) -> tuple[dict[str, Any], dict[str, str]]:
+    """What the page shows, and the entry of the key."""
     shown = {"photo": album.add(str(question.photo), read_png_rgb(question.photo))}
     if question.mask is not None:
         shown["outline"] = album.add(f"{question.mask} outlined", outlined(question.photo, question.mask))
@@ -123,7 +127,10 @@ def _photo(question: Photo, album: _Album) -> tuple[dict[str, Any], dict[str, An
     return {"kind": KIND_PHOTO, "images": shown}, entry
 
 
-def _pair(question: Pair, album: _Album, rng: np.random.Generator) -> tuple[dict[str, Any], dict[str, Any]]:
+def _pair(
+    question: PairQuestion, album: _Album, rng: np.random.Generator
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """What the page shows, and the entry of the key."""
     order = [1, 0] if rng.integers(2) else [0, 1]
     paths = tuple(question.renders[i] for i in order)
     sources = paths if question.truth is None else (*paths, question.truth)
@@ -134,8 +141,8 @@ def _pair(question: Pair, album: _Album, rng: np.random.Generator) -> tuple[dict
     return {"kind": KIND_PAIR, "images": shown}, entry
 
 
-def page_of(data: dict[str, Any]) -> str:
-    """The page around its data; nothing in the data can end the script element it stands in."""
+def page_html(data: dict[str, Any]) -> str:
+    """The HTML page with its data, escaped so that it cannot end its script element."""
     here = files("ambiguous_wild.study")
     text = json.dumps(data, ensure_ascii=True, allow_nan=False)
     text = text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")

@@ -3,23 +3,23 @@ const data = JSON.parse(document.getElementById("data").textContent);
 const $ = (id) => document.getElementById(id);
 const SLOT = "aw-study:" + data.study;
 const TEXTS = {
-  preference: "Which picture is better?",
-  preferenceTruth: "Which picture, A or B, is closer to the photo?",
-  ambiguity: "How hard is it to tell what moved through from the scene itself?",
+  preference: "Which image is better?",
+  preferenceTruth: "Which image, A or B, is closer to the photo?",
+  ambiguity: "How hard is it to tell the moving object from the scene?",
 };
 const SCALE = [
-  ["1", "1", "stands out"], ["2", "2", ""], ["3", "3", "takes a look"], ["4", "4", ""],
-  ["5", "5", "looks like the scene"], ["none", "0", "see nothing move"],
+  ["1", "1", "easy to see"], ["2", "2", ""], ["3", "3", "needs a closer look"], ["4", "4", ""],
+  ["5", "5", "looks like the scene"], ["none", "0", "I see no moving object"],
 ];
 
-// --- what is kept: a lost tab or a flat battery loses no answer -------------------------------------------
+// --- storage: answers survive a closed tab ------------------------------------------------------------------
 let keeps = true;
 let state = load();
 function load() {
   try {
     const found = JSON.parse(localStorage.getItem(SLOT));
     if (found && typeof found.rater === "string" && found.answers && typeof found.answers === "object") return found;
-  } catch (error) { /* no storage, or not ours: begin anew */ }
+  } catch (error) { /* no storage, or not our data: start again */ }
   return fresh();
 }
 function fresh() {
@@ -31,7 +31,7 @@ function keep() {
   try { localStorage.setItem(SLOT, JSON.stringify(state)); keeps = true; } catch (error) { keeps = false; }
 }
 
-// --- order: random, another one for every rater, and the same one again for the same rater -----------------
+// --- order: random per rater, and always the same for one rater ---------------------------------------------
 function generator(text) {
   let h = 2166136261; // FNV-1a into mulberry32
   for (const c of text) h = Math.imul(h ^ c.charCodeAt(0), 16777619);
@@ -136,7 +136,7 @@ function answer(value) {
   dirty = true;
   keep();
   index += 1;
-  // After a correction go on where the answers end.
+  // After a correction continue at the first open question.
   if (index < order.length && order[index].id in state.answers) index = firstOpen();
   ask();
 }
@@ -161,7 +161,7 @@ function asJson() {
   return JSON.stringify(file, null, 1) + "\n";
 }
 function asCsv() {
-  // A leading formula character would make a spreadsheet compute it.
+  // Spreadsheets evaluate a cell that starts with a formula character.
   const cell = (v) => {
     const s = String(v === undefined ? "" : v).replace(/^(\s*[=+\-@])/, "'$1");
     return '"' + s.replace(/"/g, '""') + '"';
@@ -179,7 +179,7 @@ function save(text, suffix, type) {
   link.remove();
   setTimeout(() => URL.revokeObjectURL(link.href), 10000);
   dirty = false;
-  $("saved").textContent = "Saved as " + link.download + ". Hand this file to whoever asked you.";
+  $("saved").textContent = "Saved as " + link.download + ". Send this file to the organiser.";
 }
 function finish() {
   show("done");
@@ -187,7 +187,7 @@ function finish() {
   const all = count === order.length;
   $("thanks").textContent = all ? "Thank you, that was all." : "Thank you so far.";
   $("state").textContent = all
-    ? "Save your answers to a file and hand it over."
+    ? "Save your answers to a file and send it to the organiser."
     : count + " of " + order.length + " questions are answered. You can save these, or go on" +
       (keeps ? ", now or another day on this device." : ".");
   $("resume").hidden = all && order.length === 0;
@@ -205,10 +205,10 @@ function intro() {
   $("what").textContent = data.questions.length + " questions, about " +
     Math.max(1, Math.round(data.questions.length * 8 / 60)) + " minutes.";
   const lines = [];
-  if (photos) lines.push("Photos of a place that stood still while something moved through it: say how hard the two are to tell apart.");
-  if (pairs) lines.push("Two computed pictures of the same place: say which is better, or that there is no difference.");
-  lines.push("Answer by button or by key. A click on a picture shows it at full size.");
-  lines.push("You can go back, and stop and come back later.");
+  if (photos) lines.push("Photos of a static scene with a moving object: rate how hard it is to tell the object from the scene.");
+  if (pairs) lines.push("Two rendered images of the same scene: choose the better one, or no difference.");
+  lines.push("Answer with the buttons or keys. Click an image to see it at full size.");
+  lines.push("You can go back, or stop and continue later.");
   $("how").replaceChildren(...lines.map((t) => Object.assign(document.createElement("li"), { textContent: t })));
   const begun = Object.keys(state.answers).length > 0;
   $("start").textContent = begun ? "Go on (" + answered() + " of " + order.length + " answered)" : "Start";

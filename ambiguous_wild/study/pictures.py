@@ -1,4 +1,4 @@
-"""Pictures for the page: bounded in size, encoded alike, without what a file says about itself."""
+"""Images for the page: limited in size, encoded alike, without metadata."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ import numpy as np
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.images import read_gray, read_png_rgb
 
-OUTLINE = (255, 220, 0)  # sRGB; over a black edge, so that it shows on any ground
+OUTLINE = (255, 220, 0)  # sRGB; drawn over a black edge, to be visible on any background
 
 
 def data_uri(
     image: np.ndarray,  # [H, W, 3] uint8
     *,
-    side: int,  # px, the longer one at most
+    side: int,  # px, most of the longer side
     quality: int,  # of JPEG
 ) -> str:
-    """The picture as a JPEG data URI; re-encoded from pixels, so neither EXIF nor a name comes along."""
+    """The image as a JPEG data URI, encoded from pixels, so without EXIF or file name."""
     longest = max(image.shape[:2])
     if longest > side:
         size = tuple(max(1, round(n * side / longest)) for n in image.shape[1::-1])
         image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    # 4:4:4: halved colour would blur exactly what a rater may look at.
+    # 4:4:4, since chroma subsampling would blur details that raters compare.
     settings = [cv2.IMWRITE_JPEG_QUALITY, quality,
                 cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]  # fmt: skip
     done, data = cv2.imencode(".jpg", image[:, :, ::-1], settings)
     if not done:
-        raise AwError(f"OpenCV could not encode a picture of {list(image.shape)} as JPEG")
+        raise AwError(f"OpenCV could not encode an image of {list(image.shape)} as JPEG")
     return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode("ascii")
 
 
@@ -47,7 +47,7 @@ def outlined(photo: Path, mask: Path) -> np.ndarray:  # [H, W, 3] uint8
 
 
 def same_size(paths: tuple[Path, ...]) -> list[np.ndarray]:
-    """The pictures; refused where their sizes differ, for size would tell methods apart.
+    """The images of one question; their sizes must be equal, or size would reveal the method.
 
     Raises:
         AwError: unreadable, or of different sizes.
@@ -56,5 +56,7 @@ def same_size(paths: tuple[Path, ...]) -> list[np.ndarray]:
     sizes = {f"{i.shape[1]}x{i.shape[0]}" for i in images}
     if len(sizes) > 1:
         listed = ", ".join(f"{p} ({i.shape[1]}x{i.shape[0]})" for p, i in zip(paths, images))
-        raise AwError(f"pictures of one question differ in size: {listed}; make the runs at the same factor")
+        raise AwError(
+            f"images of one question differ in size: {listed}; run all methods with the same --factor"
+        )
     return images

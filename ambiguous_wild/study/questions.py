@@ -1,4 +1,4 @@
-"""What a study asks: pairs of renders of a test view, and photos whose distractor may be hard to see."""
+"""The questions of a study: pairs of renders of a test view, and photos with distractors."""
 
 from __future__ import annotations
 
@@ -12,49 +12,49 @@ import numpy as np
 
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.errors import shortlist, unknown
-from ambiguous_wild.harness.store import read_config, read_runs
+from ambiguous_wild.harness.running.store import read_config, read_runs
 from ambiguous_wild.io.images import read_gray
 from ambiguous_wild.io.scene_folder import load_scene
 
 
 @dataclass(frozen=True)
-class Photo:
-    """How hard is the distractor to tell from the scene?"""
+class PhotoQuestion:
+    """How hard is it to tell the distractor from the scene?"""
 
     scene: str
     view: str
     photo: Path
-    mask: Path | None  # PNG, white = distractor; outlined on demand
+    mask: Path | None  # PNG, white = distractor; raters can show its outline
 
     @property
     def group(self) -> str:
-        """Questions of one group are drawn evenly."""
+        """Questions are chosen evenly over the groups."""
         return self.scene
 
 
 @dataclass(frozen=True)
-class Pair:
+class PairQuestion:
     """Which of two renders is better?"""
 
     scene: str
     view: str
     methods: tuple[str, str]
     renders: tuple[Path, Path]
-    truth: Path | None  # the photo, shown beside
+    truth: Path | None  # the test photo, shown next to the renders
 
     @property
     def group(self) -> str:
         return f"{self.scene}\n{self.methods[0]}\n{self.methods[1]}"
 
 
-Question = Photo | Pair
+Question = PhotoQuestion | PairQuestion
 
 
-def photos_of_scene(folder: Path, *, outline: bool = True) -> list[Photo]:
-    """Every training photo of a scene; where the truth says that nothing moves in one, it is left out.
+def scene_photos(folder: Path, *, outline: bool = True) -> list[PhotoQuestion]:
+    """All training photos of a scene, except those without distractors in the ground truth.
 
     Raises:
-        AwError: no scene, or no photo in which anything moves.
+        AwError: no scene, or no photo with distractors.
     """
     scene = load_scene(folder, verify="quick")
     found = []
@@ -63,24 +63,26 @@ def photos_of_scene(folder: Path, *, outline: bool = True) -> list[Photo]:
         known = mask.is_file()
         if known and not (read_gray(mask) >= 128).any():
             continue
-        found.append(Photo(scene.name, view.name, view.image_path, mask if known and outline else None))
+        shown = mask if known and outline else None
+        found.append(PhotoQuestion(scene.name, view.name, view.image_path, shown))
     if not found:
         raise AwError(
-            f"nothing moves in any train photo of {folder}, says its truth: there is nothing to ask"
+            f"no training photo of {folder} has a distractor in the ground truth: there is nothing to ask; "
+            "give a scene with distractors"
         )
     return found
 
 
-def pairs_of_runs(
+def render_pairs(
     folder: Path, *, methods: Sequence[str] = (), scenes: Sequence[str] = (), truth: bool = True
-) -> list[Pair]:
-    """Every pair of methods on every test view that both rendered; of several seeds the first.
+) -> list[PairQuestion]:
+    """All pairs of methods on all test views that both rendered; of several seeds the first is used.
 
     Args:
-        folder: what `aw bench -o` wrote.
-        methods: only these; empty: all.
-        scenes: only these; empty: all.
-        truth: show the test photo beside.
+        folder: output of `aw bench -o`.
+        methods: only these; empty = all.
+        scenes: only these; empty = all.
+        truth: show the test photo next to the renders.
 
     Raises:
         AwError: no runs, an unknown name, fewer than two methods on a scene, renders or photos missing.
@@ -96,31 +98,36 @@ def pairs_of_runs(
         frame = frame[frame["method"].isin(methods)]
     if scenes:
         frame = frame[frame["scene"].isin(scenes)]
-    pairs: list[Pair] = []
+    pairs: list[PairQuestion] = []
     for scene, rows in frame.groupby("scene", sort=True):
         first = rows.sort_values("seed").drop_duplicates("method").sort_values("method")
         folders = {str(r["method"]): Path(str(r["folder"])) for r in first.to_dict("records")}
         pairs += _pairs_of_scene(str(scene), folders, truth)
     if not pairs:
-        raise AwError(f"{folder} has no scene with finished runs of two methods: there is nothing to compare")
+        raise AwError(
+            f"{folder} has no scene with finished runs of two methods: there is nothing to compare; "
+            "run a second method with 'aw bench'"
+        )
     return pairs
 
 
-def _pairs_of_scene(scene: str, folders: dict[str, Path], truth: bool) -> list[Pair]:
+def _pairs_of_scene(scene: str, folders: dict[str, Path], truth: bool) -> list[PairQuestion]:
     if len(folders) < 2:
         return []
     renders = {m: {p.stem: p for p in sorted((f / "renders/test").glob("*.png"))} for m, f in folders.items()}
     common = set.intersection(*(set(r) for r in renders.values()))
     if not common:
-        lacking = [m for m, r in renders.items() if not r]
-        which = f"{shortlist(lacking)} lacks renders/test" if lacking else "they share no test view"
+        without = [m for m, r in renders.items() if not r]
+        which = f"{shortlist(without)} lacks renders/test" if without else "they share no test view"
         raise AwError(f"the runs on {scene} cannot be compared: {which}; make them again with 'aw bench'")
     photos = _test_photos(scene, next(iter(folders.values()))) if truth else {}
-    lost = sorted(common - set(photos)) if truth else []
-    if lost:
-        raise AwError(f"{scene} has no test photo for {shortlist(lost)}: restore the scene, or --no-truth")
+    missing = sorted(common - set(photos)) if truth else []
+    if missing:
+        raise AwError(
+            f"{scene} has no test photo for {shortlist(missing)}: restore the scene, or give --no-truth"
+        )
     return [
-        Pair(scene, stem, (a, b), (renders[a][stem], renders[b][stem]), photos.get(stem))
+        PairQuestion(scene, stem, (a, b), (renders[a][stem], renders[b][stem]), photos.get(stem))
         for a, b in combinations(sorted(folders), 2)
         for stem in sorted(common)
     ]
@@ -131,15 +138,15 @@ def _test_photos(name: str, run: Path) -> dict[str, Path]:
     where = settings.get("path") if isinstance(settings, dict) else None
     if not isinstance(where, str) or not Path(where).is_dir():
         raise AwError(
-            f"the runs on {name} were made from {where or 'an unknown folder'}, which is not there: "
-            "move the scene back, or ask without the photo (--no-truth)"
+            f"the runs on {name} were made from {where or 'an unknown folder'}, which does not exist: "
+            "move the scene back, or leave the photo out (--no-truth)"
         )
     scene: Scene = load_scene(where, factor=settings.get("factor"), verify=False)
     return {_stem(v.name): v.image_path for v in scene.test}
 
 
-def draw(questions: Sequence[Question], limit: int, rng: np.random.Generator) -> list[Question]:
-    """At most `limit` questions, as even over their groups as can be, in random order."""
+def sample_questions(questions: Sequence[Question], limit: int, rng: np.random.Generator) -> list[Question]:
+    """At most `limit` questions, spread evenly over their groups, in random order."""
     groups: dict[str, list[Question]] = {}
     for question in questions:
         groups.setdefault(question.group, []).append(question)

@@ -9,36 +9,36 @@ import numpy as np
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.extras import install_command
 
-# Pulls towards "all equal" like a fraction of one more answer for each pair and side: keeps a method that
-# won every answer at a finite strength, and moves the others by less than the printed digits.
+# Regularisation, as if each pair had this fraction of one more answer for each side. It keeps the strength of
+# a method that won every answer finite, and changes others by less than the printed digits.
 PRIOR = 0.1
 
 
 @dataclass(frozen=True)
 class Strength:
-    """One method's place."""
+    """One method of the ranking."""
 
     method: str
     strength: float  # log odds against an average method; the mean over methods is 0
     low: float  # 95 % over raters; NaN for a single rater
     high: float
     rank: int  # 1 = best
-    rank_low: int  # the best place it may have: 1 + methods surely better
-    rank_high: int  # the worst
+    rank_low: int  # best possible rank: 1 + number of significantly better methods
+    rank_high: int  # worst possible rank
 
 
 def bradley_terry(
     methods: list[str],
-    wins: np.ndarray,  # [raters, methods, methods], wins[r, i, j]: r preferred i to j; ties are halves
+    wins: np.ndarray,  # [raters, methods, methods], wins[r, i, j]: r preferred i to j; a tie is 0.5 each
 ) -> tuple[list[Strength], str]:
-    """Maximum-likelihood strengths (choix), intervals by leaving out one rater at a time.
+    """Maximum-likelihood strengths (choix); intervals by leaving out one rater at a time.
 
-    Answers of one rater resemble each other, so raters are what is resampled (jackknife, Student's t with
-    raters - 1 degrees of freedom).
+    Raters are resampled, because answers of one rater are correlated (jackknife, Student's t with raters - 1
+    degrees of freedom).
 
     Returns:
-        The methods from best to worst, and a note ("" where there is nothing to say). No strengths where
-        methods fall into groups that were never compared.
+        The methods from best to worst, and a note ("" = none). No strengths if some groups of methods were
+        never compared.
 
     Raises:
         AwError: choix is not installed.
@@ -49,7 +49,7 @@ def bradley_terry(
     total = wins.sum(axis=0)
     parts, _ = connected_components(total > 0, directed=True, connection="weak")
     if parts > 1:
-        return [], f"no ranking: the methods fall into {parts} groups that no answer compares"
+        return [], f"no ranking: no answer compares the methods of {parts} groups with each other"
     strong, _ = connected_components(total > 0, directed=True, connection="strong")
     theta = _fit(total)
     count = len(wins)
@@ -61,7 +61,7 @@ def bradley_terry(
         own = factor * np.sqrt(((left_out - left_out.mean(axis=0)) ** 2).sum(axis=0))
         differences = left_out[:, :, None] - left_out[:, None, :]
         spread = factor * np.sqrt(((differences - differences.mean(axis=0)) ** 2).sum(axis=0))
-    surely = (theta[:, None] - theta[None, :]) > spread  # [i, j]: i is better than j; False where NaN
+    better = (theta[:, None] - theta[None, :]) > spread  # [i, j]: i is better than j; False where NaN
     order = np.argsort(-theta, kind="stable")
     ranked = [
         Strength(
@@ -70,16 +70,16 @@ def bradley_terry(
             float(theta[i] - own[i]),
             float(theta[i] + own[i]),
             place,
-            1 + int(surely[:, i].sum()),
-            len(methods) - int(surely[i].sum()),
+            1 + int(better[:, i].sum()),
+            len(methods) - int(better[i].sum()),
         )
         for place, i in enumerate(order, start=1)
     ]
     notes = []
     if strong > 1:
-        notes.append("one side won every answer between some methods: their distance is a lower bound")
+        notes.append("some methods won every answer against others: their distance is a lower bound")
     if count < 2:
-        notes.append("one rater: no intervals")
+        notes.append("no intervals, because there is only one rater")
     return ranked, "; ".join(notes)
 
 
@@ -87,6 +87,8 @@ def _fit(wins: np.ndarray) -> np.ndarray:
     try:
         import choix
     except ImportError as error:
-        raise AwError(f"ranking a study needs choix ({error}): {install_command('study')}") from None
+        raise AwError(
+            f"ranking a study needs choix ({error}); install it with: {install_command('study')}"
+        ) from None
     theta = choix.ilsr_pairwise_dense(wins, alpha=PRIOR, max_iter=1000)
     return theta - theta.mean()

@@ -1,4 +1,4 @@
-"""Scores as Markdown, CSV and JSON."""
+"""Write the scores as Markdown, CSV and JSON."""
 
 from __future__ import annotations
 
@@ -9,9 +9,19 @@ from pathlib import Path
 from typing import Any
 
 from ambiguous_wild.core.errors import counted
-from ambiguous_wild.harness.render_tables import csv_text, markdown_text
+from ambiguous_wild.harness.tables.render import csv_text, markdown_text
 from ambiguous_wild.io.atomic import atomic_dir, write_json, write_text
 from ambiguous_wild.study.key import KIND_PAIR, KIND_PHOTO
+from ambiguous_wild.study.records import (
+    AgreementScore,
+    Ambiguity,
+    Counted,
+    Preference,
+    Ranked,
+    Ratings,
+    Scores,
+    Share,
+)
 from ambiguous_wild.study.scores import HARD
 
 SCORE_FILES = ("scores.json", "scores.csv", "scores.md")
@@ -30,8 +40,8 @@ COLUMNS = (
 )
 
 
-def write_scores(scores: dict[str, Any], out: Path) -> None:
-    """Write scores.json, scores.csv and scores.md into the folder `out`, replacing what was there."""
+def write_scores(scores: Scores, out: Path) -> None:
+    """Write scores.json, scores.csv and scores.md into the folder `out`, which is replaced."""
     with atomic_dir(out) as folder:
         write_json(folder / "scores.json", scores)
         write_text(folder / "scores.md", to_markdown(scores))
@@ -41,8 +51,8 @@ def write_scores(scores: dict[str, Any], out: Path) -> None:
             writer.writerows(_rows(scores))
 
 
-def to_markdown(scores: dict[str, Any]) -> str:
-    """The scores for people: names of methods, scenes and raters stay text."""
+def to_markdown(scores: Scores) -> str:
+    """The scores as Markdown; names of methods, scenes and raters are escaped."""
     raters = scores["raters"]
     answers = sum(r["answers"] for r in raters)
     parts = [f"# {markdown_text(scores['title'])}", ""]
@@ -55,45 +65,54 @@ def to_markdown(scores: dict[str, Any]) -> str:
     rows = [(r["rater"], r["name"], f"{r['answers']} of {r['asked']}", r["median_s"]) for r in raters]
     parts += ["", "## Raters", "", *_table(head, rows), ""]
     parts.append(
-        "Intervals are 95 %: [a, b] Wilson's, as if answers were independent; {a, b} a bootstrap over "
-        f"raters, seed {scores['seed']}; of strengths a jackknife over raters."
+        "Intervals are 95 %: [a, b] is Wilson's, for independent answers; {a, b} is a bootstrap over "
+        f"raters, seed {scores['seed']}; intervals of strengths are a jackknife over raters."
     )
     return "\n".join(parts) + "\n"
 
 
-def _preference(found: dict[str, Any]) -> list[str]:
-    parts = ["", "## Which is better", "", f"{found['questions']} questions, {found['answers']} answers.", ""]
+def _preference(found: Preference) -> list[str]:
+    parts = [
+        "",
+        "## Which render is better",
+        "",
+        f"{found['questions']} questions, {found['answers']} answers.",
+        "",
+    ]
     if found["ranking"]:
         rows = [
-            (r["rank"], r["method"], _with(r["strength"], r["low"], r["high"], 2), _places(r))
+            (r["rank"], r["method"], _with(r["strength"], r["low"], r["high"], 2), _ranks(r))
             for r in found["ranking"]
         ]
         parts += _table(("rank", "method", "Bradley-Terry strength (log odds)", "possible ranks"), rows)
     parts += ["", found["ranking_note"].capitalize() + "."] if found["ranking_note"] else []
-    shares = [(m["method"], _share(m), m["n"], m["ties"]) for m in found["methods"]]
-    parts += ["", "Preferred in what share of the decided answers:", ""]
+    shares = [(m["method"], _share(m["share"], m), m["n"], m["ties"]) for m in found["methods"]]
+    parts += ["", "Share of the decided answers that prefer the method:", ""]
     parts += _table(("method", "share", "decided", "ties"), shares)
-    pairs = [(p["method"], p["against"], _share(p), p["n"], p["ties"]) for p in found["pairs"]]
+    pairs = [(p["method"], p["against"], _share(p["share"], p), p["n"], p["ties"]) for p in found["pairs"]]
     parts += ["", *_table(("method", "against", "share", "decided", "ties"), pairs)]
     if len({s["scene"] for s in found["scenes"]}) > 1:
-        by_scene = [(s["scene"], s["method"], _share(s), s["n"], s["ties"]) for s in found["scenes"]]
+        by_scene = [
+            (s["scene"], s["method"], _share(s["share"], s), s["n"], s["ties"]) for s in found["scenes"]
+        ]
         parts += ["", *_table(("scene", "method", "share", "decided", "ties"), by_scene)]
-    parts += ["", f"Agreement: {_agreement(found['agreement'], 'nominal')}.",
-              f"The left one was preferred in {_share(found['left'])} of the decided answers."]  # fmt: skip
+    left = found["left"]
+    parts += ["", f"Agreement: {_agreement(found['agreement'], 'nominal')}."]
+    parts += [f"The left image was preferred in {_share(left['share'], left)} of the decided answers."]
     return parts
 
 
-def _ambiguity(found: dict[str, Any]) -> list[str]:
+def _ambiguity(found: Ambiguity) -> list[str]:
     rows = [
         (s["scene"], _with(s["mean"], s["mean_low"], s["mean_high"], 2, "{}"),
-         _share({**s, "share": s["hard"]}), s["n"], s["none"])
+         _share(s["hard"], s), s["n"], s["none"])
         for s in found["scenes"]
     ]  # fmt: skip
     return [
-        "", "## How hard to tell apart", "",
-        f"{found['questions']} questions, {found['answers']} answers; 1 stands out, 5 looks like the scene.",
+        "", "## How hard the distractor is to see", "",
+        f"{found['questions']} questions, {found['answers']} answers; 1: easy to see, 5: like the scene.",
         "",
-        *_table(("scene", "mean", f"share rated {HARD} or 5", "ratings", "saw nothing move"), rows),
+        *_table(("scene", "mean", f"share rated {HARD} or 5", "ratings", "no moving object seen"), rows),
         "", f"Agreement: {_agreement(found['agreement'], 'interval metric')}.",
     ]  # fmt: skip
 
@@ -104,17 +123,19 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> list[str]:
 
 
 def _cell(text: str) -> str:
-    """Numbers as they are, intervals and all; names escaped."""
+    """Numbers and intervals unchanged; names escaped."""
     return text if re.fullmatch(r"[-\d.,%\[\]{}— ]*", text) else markdown_text(text)
 
 
-def _share(cell: dict[str, Any]) -> str:
-    if cell["share"] is None:
-        return "—"
-    text = _with(100 * cell["share"], 100 * cell["low"], 100 * cell["high"], 1, unit=" %")
-    if cell["raters_low"] is None:
-        return text
-    return f"{text} {{{100 * cell['raters_low']:.1f}, {100 * cell['raters_high']:.1f}}}"
+def _share(share: float | None, cell: Counted) -> str:
+    """A share in percent with the intervals of its cell."""
+    text = _with(_percent(share), _percent(cell["low"]), _percent(cell["high"]), 1, unit=" %")
+    low, high = _percent(cell["raters_low"]), _percent(cell["raters_high"])
+    return text if share is None or low is None else f"{text} {{{low:.1f}, {high:.1f}}}"
+
+
+def _percent(share: float | None) -> float | None:
+    return None if share is None else 100 * share
 
 
 def _with(
@@ -126,7 +147,7 @@ def _with(
     return text if low is None else f"{text} {marks[0]}{low:.{digits}f}, {high:.{digits}f}{marks[1]}"
 
 
-def _places(row: dict[str, Any]) -> str:
+def _ranks(row: Ranked) -> str:
     return (
         str(row["rank_low"])
         if row["rank_low"] == row["rank_high"]
@@ -134,42 +155,56 @@ def _places(row: dict[str, Any]) -> str:
     )
 
 
-def _agreement(found: dict[str, Any], kind: str) -> str:
-    if found["alpha"] is None:
+def _agreement(found: AgreementScore, kind: str) -> str:
+    if found["alpha"] is None or found["equal"] is None:
         return f"Krippendorff's alpha is missing: {found['note']}"
     return (
         f"Krippendorff's alpha {found['alpha']:.3f} ({kind}), {100 * found['equal']:.0f} % of pairs of "
-        f"answers equal, over {found['questions']} questions that two raters or more answered"
+        f"answers equal, over {found['questions']} questions with two or more raters"
     )
 
 
-def _rows(scores: dict[str, Any]) -> Iterable[dict[str, Any]]:
-    """One row a number, names guarded against spreadsheets."""
+def _rows(scores: Scores) -> Iterable[dict[str, Any]]:
+    """One row per number; names are escaped for spreadsheets."""
     pairs, photos = scores[KIND_PAIR], scores[KIND_PHOTO]
-    keep = ("low", "high", "raters_low", "raters_high", "n", "ties")
     if pairs is not None:
-        for r in pairs["ranking"]:
-            yield _row(KIND_PAIR, "strength", r["method"], value=r["strength"], low=r["low"], high=r["high"])
-        for level, key in (("methods", "method"), ("pairs", "method"), ("scenes", "scene")):
-            for m in pairs[level]:
-                other = m["method"] if level == "scenes" else m.get("against", "")
-                yield _row(KIND_PAIR, level, m[key], other, value=m["share"], **{k: m[k] for k in keep})
+        for one in pairs["ranking"]:
+            yield _row(
+                KIND_PAIR, "strength", one["method"], value=one["strength"], low=one["low"], high=one["high"]
+            )
+        for m in pairs["methods"]:
+            yield _share_row("methods", m["method"], "", m, m["ties"])
+        for p in pairs["pairs"]:
+            yield _share_row("pairs", p["method"], p["against"], p, p["ties"])
+        for s in pairs["scenes"]:
+            yield _share_row("scenes", s["scene"], s["method"], s, s["ties"])
         yield _row(KIND_PAIR, "alpha", value=pairs["agreement"]["alpha"])
     if photos is not None:
-        for level, name in (("scenes", "scene"), ("photos", "view")):
-            for s in photos[level]:
-                where = s["scene"] if level == "photos" else ""
-                yield _row(KIND_PHOTO, f"{level} mean", s[name], where, value=s["mean"], n=s["n"],
-                           raters_low=s["mean_low"], raters_high=s["mean_high"])  # fmt: skip
-                yield _row(
-                    KIND_PHOTO,
-                    f"{level} hard",
-                    s[name],
-                    where,
-                    value=s["hard"],
-                    **{k: s[k] for k in keep[:-1]},
-                )
+        for r in photos["scenes"]:
+            yield from _rating_rows("scenes", r["scene"], "", r)
+        for photo in photos["photos"]:
+            yield from _rating_rows("photos", photo["view"], photo["scene"], photo)
         yield _row(KIND_PHOTO, "alpha", value=photos["agreement"]["alpha"])
+
+
+def _share_row(level: str, name: str, against: str, found: Share, ties: int) -> dict[str, Any]:
+    return _row(KIND_PAIR, level, name, against, value=found["share"], **_intervals(found), ties=ties)
+
+
+def _rating_rows(level: str, name: str, scene: str, found: Ratings) -> Iterable[dict[str, Any]]:
+    means = {"raters_low": found["mean_low"], "raters_high": found["mean_high"]}
+    yield _row(KIND_PHOTO, f"{level} mean", name, scene, value=found["mean"], n=found["n"], **means)
+    yield _row(KIND_PHOTO, f"{level} hard", name, scene, value=found["hard"], **_intervals(found))
+
+
+def _intervals(found: Counted) -> dict[str, float | None]:
+    return {
+        "n": found["n"],
+        "low": found["low"],
+        "high": found["high"],
+        "raters_low": found["raters_low"],
+        "raters_high": found["raters_high"],
+    }
 
 
 def _row(kind: str, level: str, name: str = "", against: str = "", **numbers: Any) -> dict[str, Any]:

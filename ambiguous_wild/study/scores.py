@@ -1,10 +1,9 @@
-"""From answers and key to scores: shares, ranking, ratings, agreement."""
+"""Scores from answers and key: shares, ranking, ratings, agreement."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import asdict
 from itertools import combinations
 from statistics import median
 from typing import Any
@@ -15,14 +14,26 @@ from ambiguous_wild.metrics.ambiguity import ratio_interval
 from ambiguous_wild.study.agreement import agreement
 from ambiguous_wild.study.answers import Answer, Rater
 from ambiguous_wild.study.key import KIND_PAIR, KIND_PHOTO, Key
-from ambiguous_wild.study.ranking import bradley_terry
+from ambiguous_wild.study.ranking import Strength, bradley_terry
+from ambiguous_wild.study.records import (
+    AgreementScore,
+    Ambiguity,
+    MethodShare,
+    PairShare,
+    Preference,
+    Ranked,
+    RaterSummary,
+    Ratings,
+    Scores,
+    Share,
+)
 
-HARD = 4  # of 5: from here on a photo counts as hard
-Counts = np.ndarray  # [raters, 2]: how often, of how many
+HARD = 4  # of 5: a photo rated this or more is hard
+Counts = np.ndarray  # [raters, 2]: successes, trials
 
 
-def score(key: Key, raters: list[Rater], seed: int = 0) -> dict[str, Any]:
-    """All scores of a study as one JSON-ready dict; what is not defined is None.
+def score(key: Key, raters: list[Rater], seed: int = 0) -> Scores:
+    """All scores of a study, as written to scores.json; None = not defined.
 
     Args:
         key: of the study.
@@ -39,7 +50,7 @@ def score(key: Key, raters: list[Rater], seed: int = 0) -> dict[str, Any]:
     }
 
 
-def _rater(rater: Rater, key: Key) -> dict[str, Any]:
+def _rater(rater: Rater, key: Key) -> RaterSummary:
     return {
         "rater": rater.rater,
         "name": rater.name,
@@ -50,11 +61,11 @@ def _rater(rater: Rater, key: Key) -> dict[str, Any]:
     }
 
 
-def share(counts: Counts, seed: int) -> dict[str, Any]:
-    """A share with two 95 % intervals: Wilson's (answers independent) and a bootstrap over raters.
+def share(counts: Counts, seed: int) -> Share:
+    """A share with two 95 % intervals: Wilson's (independent answers) and a bootstrap over raters.
 
     Args:
-        counts: per rater how often, of how many.
+        counts: successes and trials of each rater.
         seed: of the bootstrap.
     """
     from scipy.stats import binomtest
@@ -74,7 +85,7 @@ def share(counts: Counts, seed: int) -> dict[str, Any]:
     }
 
 
-def _preference(key: Key, raters: list[Rater], seed: int) -> dict[str, Any] | None:
+def _preference(key: Key, raters: list[Rater], seed: int) -> Preference | None:
     entries = {q: e for q, e in key.questions.items() if e["kind"] == KIND_PAIR}
     if not entries:
         return None
@@ -93,18 +104,33 @@ def _preference(key: Key, raters: list[Rater], seed: int) -> dict[str, Any] | No
             for m in methods
         ],
         "pairs": [_pair(a, b, votes, seed) for a, b in combinations(methods, 2)],
-        "ranking": [{k: _number(v) for k, v in asdict(s).items()} for s in ranking],
+        "ranking": [_ranked(s) for s in ranking],
         "ranking_note": note,
         "left": share(_counts(mine, lambda a: a.answer == a.left, lambda a: a.answer != "tie"), seed),
-        "agreement": asdict(
-            agreement(
-                ((r.rater, a.question, a.answer) for r, one in zip(raters, mine) for a in one), ordered=False
-            )
+        "agreement": _agreement(
+            ((r.rater, a.question, a.answer) for r, one in zip(raters, mine) for a in one), ordered=False
         ),
     }
 
 
-# (winner or first method, loser or second, scene, tie)
+def _ranked(found: Strength) -> Ranked:
+    return {
+        "method": found.method,
+        "strength": found.strength,
+        "low": _number(found.low),
+        "high": _number(found.high),
+        "rank": found.rank,
+        "rank_low": found.rank_low,
+        "rank_high": found.rank_high,
+    }
+
+
+def _agreement(answers: Iterable[tuple[str, str, Any]], *, ordered: bool) -> AgreementScore:
+    found = agreement(answers, ordered=ordered)
+    return {"alpha": found.alpha, "equal": found.equal, "questions": found.questions, "note": found.note}
+
+
+# (winner, loser, scene, tie); for a tie the methods x and y
 Vote = tuple[str, str, str, bool]
 
 
@@ -124,12 +150,12 @@ def _matrix(methods: list[str], votes: list[list[Vote]]) -> np.ndarray:
     return wins
 
 
-def _method(method: str, votes: list[list[Vote]], seed: int) -> dict[str, Any]:
+def _method(method: str, votes: list[list[Vote]], seed: int) -> MethodShare:
     counts = _counts(votes, lambda v: v[0] == method, lambda v: method in v[:2] and not v[3])
     return {"method": method, "ties": _ties(votes, {method}), **share(counts, seed)}
 
 
-def _pair(a: str, b: str, votes: list[list[Vote]], seed: int) -> dict[str, Any]:
+def _pair(a: str, b: str, votes: list[list[Vote]], seed: int) -> PairShare:
     counts = _counts(votes, lambda v: v[0] == a, lambda v: {a, b} == set(v[:2]) and not v[3])
     return {"method": a, "against": b, "ties": _ties(votes, {a, b}), **share(counts, seed)}
 
@@ -138,7 +164,7 @@ def _ties(votes: list[list[Vote]], methods: set[str]) -> int:
     return sum(v[3] and methods <= set(v[:2]) for one in votes for v in one)
 
 
-def _ambiguity(key: Key, raters: list[Rater], seed: int) -> dict[str, Any] | None:
+def _ambiguity(key: Key, raters: list[Rater], seed: int) -> Ambiguity | None:
     entries = {q: e for q, e in key.questions.items() if e["kind"] == KIND_PHOTO}
     if not entries:
         return None
@@ -156,11 +182,11 @@ def _ambiguity(key: Key, raters: list[Rater], seed: int) -> dict[str, Any] | Non
              **_ratings([[a for a in one if a.question == q] for one in mine], seed)}
             for q, e in sorted(entries.items(), key=lambda item: (item[1]["scene"], item[1]["view"]))
         ],
-        "agreement": asdict(agreement(rows, ordered=True)),
+        "agreement": _agreement(rows, ordered=True),
     }  # fmt: skip
 
 
-def _ratings(answers: list[list[Answer]], seed: int) -> dict[str, Any]:
+def _ratings(answers: list[list[Answer]], seed: int) -> Ratings:
     rated = [[int(a.answer) for a in one if a.answer != "none"] for one in answers]
     mean = ratio_interval([sum(one) for one in rated], [len(one) for one in rated], seed=seed)
     hard = share(_counts(rated, lambda v: v >= HARD, lambda v: True), seed)
@@ -168,8 +194,12 @@ def _ratings(answers: list[list[Answer]], seed: int) -> dict[str, Any]:
         "mean": _number(mean.mean),
         "mean_low": _number(mean.low),
         "mean_high": _number(mean.high),
-        "hard": hard.pop("share"),
-        **hard,
+        "hard": hard["share"],
+        "n": hard["n"],
+        "low": hard["low"],
+        "high": hard["high"],
+        "raters_low": hard["raters_low"],
+        "raters_high": hard["raters_high"],
         "none": sum(a.answer == "none" for one in answers for a in one),
     }
 
@@ -182,5 +212,5 @@ def _counts(groups: list[list[Any]], hit: Callable[[Any], bool], of: Callable[[A
     return np.array([two(one) for one in groups], dtype=int).reshape(-1, 2)
 
 
-def _number(value: Any) -> Any:
-    return None if isinstance(value, float) and math.isnan(value) else value
+def _number(value: float) -> float | None:
+    return None if math.isnan(value) else value

@@ -12,7 +12,7 @@ from ambiguous_wild.core.config import with_options
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.vision.protocols import Features, Instances
 
-# what one writes: the weight's name, see vision/weights.py
+# name in a spec: name of the weights, see vision/weights.py
 DINO = {
     "dinov2-small": "dinov2-small",
     "dinov2-base": "dinov2-base",
@@ -54,29 +54,29 @@ class Spec:
 
 
 def parse(text: str) -> Spec:
-    """Take a spec apart; options are read from its end, so that prompts may hold commas.
+    """Parse a spec; options are read from its end, so that prompts may contain commas.
 
     Raises:
-        AwError: the size is no number, or an option comes twice.
+        AwError: the size is not a number, or an option is given twice.
     """
     rest, options = text.strip(), dict[str, str]()
     while match := _OPTION.search(rest):
         if match[1] in options:
-            raise AwError(f"back end {text!r}: option {match[1]!r} comes twice")
+            raise AwError(f"back end {text!r}: option {match[1]!r} is given twice; give it once")
         options[match[1]] = match[2].strip()
         rest = rest[: match.start()].rstrip()
     head, _, argument = rest.partition(":")
     name, at, size = head.partition("@")
     if at and not size.isdecimal():
-        raise AwError(f"back end {text!r}: {size!r} is no size; write whole px, as in dinov2-small@252")
+        raise AwError(f"back end {text!r}: {size!r} is not a size; write whole px, as in dinov2-small@252")
     return Spec(name.strip(), int(size) if at else None, argument.strip(), dict(reversed(options.items())))
 
 
 def check_features(spec: str) -> None:
-    """Refuse features that do not exist, by their name alone: nothing is loaded.
+    """Check that the name of the features is known; nothing is loaded.
 
     Raises:
-        AwError: an unknown name (names the nearest), or a spec that cannot be taken apart.
+        AwError: an unknown name (names the nearest), or an invalid spec.
     """
     found = parse(spec)
     if found.name not in FEATURES:
@@ -84,7 +84,7 @@ def check_features(spec: str) -> None:
 
 
 def check_instances(spec: str) -> None:
-    """`check_features`, of instances."""
+    """As `check_features`, for instances."""
     found = parse(spec)
     if found.name not in INSTANCES:
         raise unknown("instances", found.name, INSTANCES)
@@ -93,17 +93,16 @@ def check_instances(spec: str) -> None:
 def make_features(spec: str) -> Features:
     """Features by name.
 
-    ``labhog``; ``sceneconv``, trained on the scene; or one of `DINO`, with
-    ``@px`` (longer side), ``blocks=``, ``normalise=``, ``fit_photos=`` and
-    ``weights=FOLDER``.
+    ``labhog``; ``sceneconv``, trained on the scene; or one of `DINO`, with ``@px`` (longer side),
+    ``blocks=``, ``normalise=``, ``fit_photos=`` and ``weights=FOLDER``.
 
     Raises:
-        AwError: unknown name (names the nearest) or option; the weights are not here.
+        AwError: unknown name (names the nearest) or option; the weights are missing.
     """
     check_features(spec)
     found = parse(spec)
     if found.argument:
-        raise AwError(f"features {spec!r}: {found.name} takes nothing after a colon")
+        raise AwError(f"features {spec!r}: {found.name} takes nothing after a colon; remove it")
     if found.name == "labhog":
         from ambiguous_wild.vision.labhog import LabHog
 
@@ -126,20 +125,20 @@ def make_features(spec: str) -> Features:
 
 
 def make_instances(spec: str) -> Instances:
-    """Instances by name; what comes back may offer `NamedInstances` or `SceneInstances` as well.
+    """Instances by name; the result may also implement `NamedInstances` or `SceneInstances`.
 
-    ``graph``; one of `SAM` (``@n`` = points along a side) or `SAM_VIDEO`; ``grounded:PROMPT`` and, followed
-    through a sequence, ``grounded-video:PROMPT``; ``labels:FOLDER`` (``scene_wide=true`` where its ids mean
-    the same thing in every photo). Options are the fields of the back end's config, and ``weights=FOLDER``.
+    ``graph``; one of `SAM` (``@n`` = points along a side) or `SAM_VIDEO`; ``grounded:PROMPT`` and, tracked
+    over a sequence, ``grounded-video:PROMPT``; ``labels:FOLDER`` (``scene_wide=true`` if all photos share its
+    ids). Options are the fields of the back end's config, and ``weights=FOLDER``.
 
     Raises:
-        AwError: unknown name (names the nearest) or option; the weights or the folder are not here.
+        AwError: unknown name (names the nearest) or option; the weights or the folder are missing.
     """
     check_instances(spec)
     found = parse(spec)
     if found.argument and found.name not in ("grounded", "grounded-video", "labels"):
-        raise AwError(f"instances {spec!r}: {found.name} takes nothing after a colon")
-    return _MAKERS.get(found.name, _sam)(found, spec)
+        raise AwError(f"instances {spec!r}: {found.name} takes nothing after a colon; remove it")
+    return _BUILDERS.get(found.name, _sam)(found, spec)
 
 
 def _graph(found: Spec, spec: str) -> Instances:
@@ -168,10 +167,10 @@ def _grounded(found: Spec, spec: str) -> Instances:
 
     folder, options = _weights(found.options)
     sam_folder, options = _weights(options, "sam_weights")
-    following = {}
+    tracking = {}
     if found.name == "grounded-video":
-        following = {k: v for k, v in options.items() if k in ("every", "most", "known")}
-        options = {k: v for k, v in options.items() if k not in following}
+        tracking = {k: v for k, v in options.items() if k in ("every", "most", "known")}
+        options = {k: v for k, v in options.items() if k not in tracking}
     config = with_options(GroundedConfig(), options, "option of grounded")
     if found.size is not None:
         config = dataclasses.replace(config, shorter=found.size)
@@ -180,7 +179,7 @@ def _grounded(found: Spec, spec: str) -> Instances:
         return instances
     from ambiguous_wild.vision.sam_video import SamVideoConfig, SamVideoInstances
 
-    video = with_options(SamVideoConfig(sam=config.sam), following, "option of grounded-video")
+    video = with_options(SamVideoConfig(sam=config.sam), tracking, "option of grounded-video")
     return SamVideoInstances(SAM_VIDEO["sam2-video"], video, sam_folder, instances)
 
 
@@ -202,7 +201,7 @@ def _sam(found: Spec, spec: str) -> Instances:
     return SamVideoInstances(SAM_VIDEO[found.name], video, folder)
 
 
-_MAKERS: dict[str, Callable[[Spec, str], Instances]] = {
+_BUILDERS: dict[str, Callable[[Spec, str], Instances]] = {
     "graph": _graph,
     "labels": _labels,
     "grounded": _grounded,

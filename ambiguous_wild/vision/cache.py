@@ -1,4 +1,4 @@
-"""Frozen inputs on disk: computed once a photo, shared between runs, never trusted blindly."""
+"""Cache of features and masks on disk: computed once a photo, shared between runs, checked when read."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from ambiguous_wild.io.atomic import atomic_path
 from ambiguous_wild.io.hashing import sha256_array
 
 Arrays = dict[str, np.ndarray]
-STALE_S = 24 * 3600.0  # age at which a temporary file belongs to nobody any more
+STALE_S = 24 * 3600.0  # older temporary files are leftovers of a killed process
 
 
 def cache_key(kind: str, backend: str, settings: Any, *arrays: np.ndarray) -> str:
-    """What an entry is known by: the exact pixels, the back end's name and version, every setting.
+    """Key of an entry: hash of the pixels, the back end's name and version, and every setting.
 
     Args:
-        kind: what is stored, e.g. ``"segments"``; the first part of the file's name.
+        kind: of the content, e.g. ``"segments"``; the first part of the file's name.
         backend: name of the back end, with its version.
-        settings: dataclass or plain data; anything that changes the result.
+        settings: dataclass or plain data; everything that changes the result.
         arrays: the inputs, hashed with shape and dtype.
     """
     digest = hashlib.sha256()
@@ -40,13 +40,13 @@ def cache_key(kind: str, backend: str, settings: Any, *arrays: np.ndarray) -> st
 def cached(
     folder: Path, key: str, expected: Mapping[str, type | str], compute: Callable[[], Arrays]
 ) -> Arrays:
-    """The arrays stored under `key`, or computed and stored.
+    """Load the arrays stored under `key`, else compute and store them.
 
     Args:
-        folder: of the cache; made when needed.
+        folder: of the cache; created if needed.
         key: from `cache_key`.
-        expected: name and dtype of every array. An entry that is corrupt or differs is computed anew.
-        compute: makes the arrays.
+        expected: name and dtype of every array. A damaged or different entry is computed again.
+        compute: computes the arrays.
     """
     _tidy(folder)
     path = folder / f"{key}.npz"
@@ -59,9 +59,9 @@ def cached(
     return arrays
 
 
-@functools.cache  # once a process and folder: it lists every entry
+@functools.cache  # once per process and folder, because it lists every entry
 def _tidy(folder: Path) -> None:
-    """Remove what killed writes left; a younger one may still be somebody's."""
+    """Remove temporary files of killed processes; a recent one may still be in use."""
     for left in folder.glob(".*.tmp*"):
         with contextlib.suppress(OSError):
             if time.time() - left.stat().st_mtime > STALE_S:
@@ -74,10 +74,10 @@ def _load(path: Path, expected: Mapping[str, type | str]) -> Arrays | None:
             if set(entry.files) != set(expected):
                 return None
             arrays = {name: entry[name] for name in entry.files}
-    # np.load, zipfile, zlib and tokenize have a dozen ways to say that an entry is cut or overwritten
+    # np.load, zipfile, zlib and tokenize raise many types for a damaged entry
     except Exception:
         return None
-    # a member that has lost its first bytes comes as bytes, not as an array
+    # np.load returns a member with damaged first bytes as bytes, not as an array
     if any(getattr(a, "dtype", None) != np.dtype(expected[name]) for name, a in arrays.items()):
         return None
     return arrays

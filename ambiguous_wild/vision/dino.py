@@ -1,9 +1,9 @@
 """DINO features: DINOv2 with and without registers, DINOv1; frozen, differentiable in the image.
 
-The image is resized to whole patches, never cut: the library drops the last rows and columns of an image that
-is no multiple of the patch, without a word. So the grid covers exactly the image, at any size.
+The image is resized to whole patches, since the library silently drops rows and columns beyond the last whole
+patch. So the grid covers the whole image.
 
-On an NVIDIA GPU the net's products are in bfloat16; photos and renders go the same way (`precision`).
+On an NVIDIA GPU the net multiplies in bfloat16, for photos and renders alike (`precision`).
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from torch import Tensor, nn
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash
-from ambiguous_wild.vision.labhog import _degrade
+from ambiguous_wild.vision.labhog import blurred_noisy_copy
 from ambiguous_wild.vision.pretrained import Pretrained, load, locate
 
 
 @dataclass(frozen=True)
 class _Family:
-    """How the library spells one architecture, and what its config.json may leave unsaid."""
+    """The library's class for one architecture, and defaults for values that config.json may omit."""
 
     class_name: str
     patch: int
     registers: int = 0
-    options: dict[str, Any] = field(default_factory=dict)  # of the class
-    call: dict[str, Any] = field(default_factory=dict)
+    options: dict[str, Any] = field(default_factory=dict)  # of the class's constructor
+    call: dict[str, Any] = field(default_factory=dict)  # of each forward call
 
 
 _FAMILIES = {  # by model_type
@@ -42,17 +42,17 @@ _FAMILIES = {  # by model_type
     "vit": _Family("ViTModel", 16, 0, {"add_pooling_layer": False}, {"interpolate_pos_encoding": True}),
 }
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-MIXED = torch.bfloat16  # the range of float32, so that no gradient needs scaling
+MIXED = torch.bfloat16  # has the range of float32, so gradients need no scaling
 
 
 @dataclass(frozen=True)
 class DinoConfig:
-    """A ViT-S/14 costs 0.1 s forward and 0.25 s with backward at 252x140 on two cores, half with 6 blocks."""
+    """A ViT-S/14 at 252x140 on two cores takes 0.1 s forward, 0.25 s with backward; 6 blocks take half."""
 
-    size: int = 252  # px, longer side of what the net sees, rounded to whole patches; 0 = the image's own
-    blocks: int = 0  # the first ones, the rest is cut off; 0 = all
+    size: int = 252  # px, longer side of the net's input, rounded to whole patches; 0 = the image's size
+    blocks: int = 0  # number of blocks to run, from the first; 0 = all
     normalise: Literal["imagenet", "raw"] = "imagenet"  # raw: as RobustSplat feeds it
-    fit_photos: int = 8  # photos that `fit` looks at
+    fit_photos: int = 8  # photos that `fit` uses
 
 
 class DinoFeatures:
@@ -61,15 +61,15 @@ class DinoFeatures:
     def __init__(
         self, name: str = "dinov2-small", config: DinoConfig | None = None, folder: str | Path | None = None
     ) -> None:
-        """Find and check the weights; they are loaded when the first features are asked for.
+        """Find and check the weights; they are loaded at the first call.
 
         Args:
-            name: of the weight, see `vision.weights`; any label where `folder` is given.
+            name: of the weights, see `vision.weights`; any label if `folder` is given.
             config: see `DinoConfig`.
-            folder: of the weights, in place of the search.
+            folder: of the weights; nothing is searched.
 
         Raises:
-            AwError: no weights, see `pretrained.locate`; a setting that cannot be.
+            AwError: no weights, see `pretrained.locate`; an invalid setting.
         """
         self.config = config or DinoConfig()
         self.source: Pretrained = locate(name, tuple(_FAMILIES), folder)
@@ -77,9 +77,9 @@ class DinoFeatures:
         layers = int(facts.get("num_hidden_layers", 12))
         self.patch = int(facts.get("patch_size", family.patch))
         self.channels = int(facts.get("hidden_size", 768))
-        self.extra_tokens = 1 + int(facts.get("num_register_tokens", family.registers))  # and the class token
+        self.extra_tokens = 1 + int(facts.get("num_register_tokens", family.registers))  # + class token
         if not 0 <= self.config.blocks <= layers:
-            raise AwError(f"{name} has {layers} blocks, cannot run the first {self.config.blocks}")
+            raise AwError(f"{name} has {layers} blocks, got blocks={self.config.blocks}; 0 means all")
         if self.config.size < 0 or 0 < self.config.size < self.patch or self.config.fit_photos < 1:
             raise AwError(
                 f"{name}: size must be 0 or at least one patch of {self.patch} px and fit_photos at least 1, "
@@ -88,15 +88,15 @@ class DinoFeatures:
         self.name = f"dino-1-{name}-{self.source.digest}-{config_hash(self.config)[:8]}"
         self.unit = 0.1  # until `fit`
         self._model: nn.Module | None = None
-        self._place: torch.device | None = None  # where the net lies
-        self._halved = False  # its weights are bfloat16
+        self._device: torch.device | None = None  # of the net
+        self._halved = False  # the weights are bfloat16
 
     @property
     def model(self) -> nn.Module:
         """The net, loaded at first use."""
         if self._model is None:
             family = _FAMILIES[self.source.model_type]
-            # a pooler is no part of the features; some checkpoints carry one
+            # some checkpoints hold a pooler, which features do not use
             model = load(self.source, family.class_name, harmless=("pooler.",), **family.options)
             if self.config.blocks:
                 holder, attribute = (
@@ -120,13 +120,13 @@ class DinoFeatures:
         chosen = sorted({round(k * (len(photos) - 1) / max(most - 1, 1)) for k in range(most)})
         means = []
         for index in chosen:
-            one, two = self(photos[index]), self(_degrade(photos[index], index))
+            one, two = self(photos[index]), self(blurred_noisy_copy(photos[index], index))
             means.append((1.0 - F.cosine_similarity(one, two, dim=2)).double().mean().item())
-        # rounded: it is part of cache keys, and its last bits depend on the number of threads
+        # rounded, because it is part of cache keys and its last bits depend on the number of threads
         self.unit = float(f"{max(sum(means) / len(means), 1e-6):.4g}")
 
     def grid(self, height: int, width: int) -> tuple[int, int]:
-        """Rows and columns of patches for an image of that size in px."""
+        """Rows and columns of patches for an image of this size in px."""
         scale = self.config.size / max(height, width) if self.config.size else 1.0
         return (
             max(round(height * scale / self.patch), 1),
@@ -134,11 +134,11 @@ class DinoFeatures:
         )
 
     def precision(self, device: torch.device) -> str:
-        """As `stage.PreciseFeatures`."""
+        """See `precompute.PreciseFeatures`."""
         return str(MIXED).removeprefix("torch.") if mixed(device) else ""
 
     def __call__(self, image: Tensor) -> Tensor:
-        """Features [h, w, C] of an image [H, W, 3] in [0, 1]; cell (r, c) covers its share of the image.
+        """Features [h, w, C] of an image [H, W, 3] in [0, 1]; the cells divide the image evenly.
 
         Raises:
             AwError: the image is not [H, W, 3] or smaller than 8 px.
@@ -149,7 +149,7 @@ class DinoFeatures:
         rows, columns = self.grid(image.shape[0], image.shape[1])
         size = (rows * self.patch, columns * self.patch)
         graph = torch.is_grad_enabled() and image.requires_grad
-        with torch.set_grad_enabled(graph):  # the net is frozen: the image's gradient is the only one
+        with torch.set_grad_enabled(graph):  # the net is frozen: only the image has a gradient
             pixels = image.permute(2, 0, 1)[None].to(next(model.parameters()).dtype)
             if size != tuple(image.shape[:2]):
                 pixels = F.interpolate(
@@ -165,12 +165,12 @@ class DinoFeatures:
             return tokens.reshape(rows, columns, self.channels)
 
     def _model_on(self, device: torch.device) -> nn.Module:
-        """The net there; `Module.to` goes through all its layers even where nothing is to be moved."""
-        if self._place != device:
+        """The net on the device; skips `Module.to`, which visits every layer, if nothing moves."""
+        if self._device != device:
             if self._halved and not mixed(device):
-                self._model = None  # read again: its weights have lost their last digits
+                self._model = None  # load again: the bfloat16 weights have lost digits
             self.model.to(device)
-            self._place, self._halved = device, mixed(device)
+            self._device, self._halved = device, mixed(device)
             if self._halved:
                 _halve(self.model)
         return self.model
@@ -183,25 +183,25 @@ class DinoFeatures:
 
 
 def normalised(pixels: Tensor) -> Tensor:
-    """[B, 3, H, W] in [0, 1] less ImageNet's mean, over its standard deviation."""
+    """Pixels [B, 3, H, W] in [0, 1] minus ImageNet's mean, divided by its standard deviation."""
     mean, std = _imagenet(pixels.dtype, pixels.device)
     return (pixels - mean) / std
 
 
 @functools.cache
 def _imagenet(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Mean and deviation [1, 3, 1, 1] there, copied once: in every step the copy would be waited for."""
+    """Mean and deviation [1, 3, 1, 1] on the device; cached, because each copy makes the host wait."""
     mean, std = (torch.tensor(v, dtype=dtype, device=device) for v in (IMAGENET_MEAN, IMAGENET_STD))
     return mean.reshape(1, 3, 1, 1), std.reshape(1, 3, 1, 1)
 
 
 def _halve(model: nn.Module) -> None:
-    """Weights of products as they are multiplied: autocast would cast each of them anew in every call."""
+    """Convert the weights of products to bfloat16 once; autocast would convert them in every call."""
     for module in model.modules():
         if isinstance(module, (nn.Linear, nn.Conv2d)):
             module.to(MIXED)
 
 
 def mixed(device: torch.device) -> bool:
-    """Whether the net runs in mixed precision there: a CPU has no gain from it, and results to keep."""
+    """Whether the net runs in mixed precision on the device: only on a GPU; a CPU is not faster with it."""
     return device.type == "cuda"

@@ -1,4 +1,4 @@
-"""Instances by prompt: Grounding DINO finds a box for every phrase, SAM 2 the instance in each box."""
+"""Instances by prompt: Grounding DINO finds boxes for each phrase, SAM 2 the instance in each box."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash
-from ambiguous_wild.vision.masks import box_nms, paint
+from ambiguous_wild.vision.mask_ops import box_nms, paint
 from ambiguous_wild.vision.pretrained import load, locate, model_class
 from ambiguous_wild.vision.sam import SamConfig, SamInstances, fit_to
 
-# A table of 0, 1, 2 ... that older checkpoints of BERT carry along.
+# A constant table 0, 1, 2 ... in older checkpoints of BERT.
 _HARMLESS = ("model.text_backbone.embeddings.position_ids",)
 
 
 @dataclass(frozen=True)
 class GroundedConfig:
-    """Full size Grounding DINO tiny at 800x1066 takes 16 s a photo on two cores, SAM's encoder 3 s more."""
+    """Grounding DINO tiny at 800x1066 takes 16 s a photo on two cores; SAM's encoder 3 s more."""
 
     least_score: float = 0.35  # of a box
     least_text: float = 0.25  # of a token, to be part of the box's label
-    nms: float = 0.7  # IoU from which on two boxes are one
+    nms: float = 0.7  # boxes with a larger IoU are duplicates
     shorter: int = 800  # px the photo's shorter side is resized to
-    longer: int = 1333  # px its longer side has at most
+    longer: int = 1333  # px, limit of the longer side
     sam: SamConfig = field(default_factory=SamConfig)
 
 
 @dataclass(frozen=True)
 class Detection:
-    """One box and what it was found for."""
+    """One box and the phrase it matches."""
 
     box: tuple[float, float, float, float]  # xyxy, px of the photo
     score: float
@@ -53,13 +53,13 @@ class GroundedInstances:
         folder: str | Path | None = None,
         sam_folder: str | Path | None = None,
     ) -> None:
-        """Find and check both weights; they are loaded when the first labels are asked for.
+        """Find and check the weights of both models; they are loaded at first use.
 
         Args:
             prompt: phrases, each ended by a full stop or a comma: ``"person. car."``.
             config: thresholds and sizes.
-            name: of the detector's weights, `sam` of the segmenter's.
-            folder: of the detector's weights in place of the search, `sam_folder` of the segmenter's.
+            name: of the detector's weights; `sam`: of the segmenter's.
+            folder: of the detector's weights; `sam_folder`: of the segmenter's; nothing is searched.
 
         Raises:
             AwError: an empty prompt; no weights, see `pretrained.locate`.
@@ -71,10 +71,10 @@ class GroundedInstances:
                 f"{name}: need 0 < shorter <= longer, got {self.config.shorter}, {self.config.longer}"
             )
         self.source = locate(name, ("grounding-dino",), folder)
-        # without them the library makes a tokenizer that knows no word, and says nothing
+        # without them the library silently builds a tokenizer without vocabulary
         if not any((self.source.folder / file).is_file() for file in ("tokenizer.json", "vocab.txt")):
             raise AwError(
-                f"{self.source.folder} has no tokenizer.json: {name} cannot read a prompt; bring that "
+                f"{self.source.folder} has no tokenizer.json: {name} cannot read a prompt; download that "
                 "file and tokenizer_config.json"
             )
         self.sam = SamInstances(sam, self.config.sam, sam_folder)
@@ -99,7 +99,7 @@ class GroundedInstances:
 
     @torch.no_grad()
     def detect(self, photo: Tensor) -> list[Detection]:
-        """Boxes of what the prompt names, the surest first, doubles dropped."""
+        """Boxes of the prompt's phrases by decreasing score, without duplicates."""
         model, tokenizer = self._nets()
         model.to(photo.device)
         height, width = int(photo.shape[0]), int(photo.shape[1])
@@ -120,7 +120,7 @@ class GroundedInstances:
         for k in box_nms(boxes, values, self.config.nms):
             x0, y0, x1, y1 = (float(v) for v in boxes[k])
             words = said[k].clone()
-            words[0] = words[-1] = False  # the tokens that begin and end every text
+            words[0] = words[-1] = False  # the start and end tokens
             label = str(tokenizer.decode(ids[words], skip_special_tokens=True)).strip(" .")
             found.append(Detection((x0, y0, x1, y1), float(values[k]), label))
         return found
@@ -132,15 +132,15 @@ class GroundedInstances:
                 tokenizer = model_class("BertTokenizer").from_pretrained(str(folder), local_files_only=True)
             except (OSError, ValueError, TypeError) as error:
                 raise AwError(
-                    f"{folder} has no usable tokenizer: {str(error).splitlines()[0]}; bring tokenizer.json "
-                    "and tokenizer_config.json"
+                    f"{folder} has no usable tokenizer: {str(error).splitlines()[0]}; download "
+                    "tokenizer.json and tokenizer_config.json"
                 ) from error
             self._loaded = load(self.source, "GroundingDinoForObjectDetection", harmless=_HARMLESS), tokenizer
         return self._loaded
 
 
 def normal_prompt(prompt: str) -> str:
-    """The prompt as the net was trained on: lower case, a full stop after each phrase.
+    """The prompt in the format of the training data: lower case, a full stop after each phrase.
 
     Raises:
         AwError: there is no phrase.

@@ -1,4 +1,4 @@
-"""Instance masks that the user made: a folder with one label map a photo, from any tool."""
+"""Instance masks from the user: a folder with one label map a photo, made with any tool."""
 
 from __future__ import annotations
 
@@ -18,38 +18,38 @@ from ambiguous_wild.io.images import decode
 from ambiguous_wild.vision.progress import Bar, no_bar
 
 SUFFIXES = (".png", ".npy")
-_ASPECT = 0.02  # relative difference of width / height from which on a map is another photo's
+_ASPECT = 0.02  # a map is rejected if its aspect ratio differs from the photo's by more
 
 
 class LabelMaps:
-    """Label maps found by the photo's name; ids of different photos have nothing to do with each other.
+    """Label maps found by the photo's name; ids in different photos are unrelated.
 
-    A file is a PNG of one channel (8 or 16 bits), a colour PNG (every colour is a label, black is none), or
-    a .npy of integers [H, W]; 0 and below = none. Another size than the photo's is resized, nearest.
+    A file is a PNG of one channel (8 or 16 bits), a colour PNG (each colour is a label, black is none), or a
+    .npy of integers [H, W]; 0 and below = none. A map of another size is resized (nearest).
     """
 
     def __init__(self, folder: str | Path) -> None:
-        """Check that the folder is there.
+        """Check the folder.
 
         Raises:
-            AwError: it is not, or holds no label map.
+            AwError: it does not exist, or holds no label map.
         """
         self.folder = Path(folder).expanduser()
         if not self.folder.is_dir():
-            raise AwError(f"no folder {self.folder} with label maps; give one with a PNG or npy a photo")
+            raise AwError(f"no folder {self.folder} with label maps; give one with a .png or .npy per photo")
         if not any(p.suffix.lower() in SUFFIXES for p in self.folder.rglob("*")):
             raise AwError(
-                f"{self.folder} holds no label map (.png, .npy); one a photo is needed, of its name"
+                f"{self.folder} holds no label map (.png, .npy); add one per photo, named like the photo"
             )
         self.name = f"labels-1-{self.folder.name}"
 
     def labels(self, photo: Tensor) -> np.ndarray:
-        """Refused: a photo's pixels do not say which file is its own.
+        """Not available: a label map is found by the photo's name.
 
         Raises:
-            AwError: always; `labels_of` takes the names as well.
+            AwError: always; use `labels_of`, which takes names.
         """
-        raise AwError(f"label maps in {self.folder} are found by the photo's name: ask labels_of")
+        raise AwError(f"label maps in {self.folder} are found by the photo's name; call labels_of")
 
     def labels_of(self, photos: Sequence[Tensor], names: Sequence[str]) -> list[np.ndarray]:
         """Labels [H, W] int32 of every photo, 1..K without gaps; 0 = none.
@@ -59,29 +59,29 @@ class LabelMaps:
             names: of the photos; the map of ``a/b.jpg`` is ``a/b.png`` or ``b.png`` (or .npy).
 
         Raises:
-            AwError: photos without a map; a map that does not decode or is of another shape than its photo.
+            AwError: photos without a map; a map that cannot be read or whose shape differs from the photo's.
         """
-        # the zero put in front makes 0 the first of the sorted ids, also where every pixel has a label
+        # the added 0 is always the first sorted id, even if every pixel has a label
         return [
             np.searchsorted(np.unique(np.r_[0, m.ravel()]), m).astype(np.int32)
             for m in self._raw(photos, names)
         ]
 
     def _raw(self, photos: Sequence[Tensor], names: Sequence[str]) -> list[np.ndarray]:
-        """[H, W] int64 of every photo at its size, ids as in the files."""
+        """[H, W] int64 of every photo, at the photo's size, with the ids of the files."""
         paths = [self._path(name) for name in names]
         missing = [name for name, path in zip(names, paths) if path is None]
         if missing:
             raise AwError(
                 f"{len(missing)} of {len(names)} photos have no label map in {self.folder}: "
-                f"{shortlist(missing)}; add a PNG or npy of the same name for each"
+                f"{shortlist(missing)}; add a .png or .npy of the same name for each"
             )
         sizes = [(int(p.shape[0]), int(p.shape[1])) for p in photos]
         return [_resized(read_labels(path), *size, path) for path, size in zip(paths, sizes) if path]
 
     def _path(self, name: str) -> Path | None:
         stem = Path(name).with_suffix("")
-        if stem.is_absolute() or ".." in stem.parts:  # a name never leads out of the folder
+        if stem.is_absolute() or ".." in stem.parts:  # a name must not lead out of the folder
             return None
         for base in (self.folder / stem, self.folder / stem.name):
             for suffix in SUFFIXES:
@@ -92,7 +92,7 @@ class LabelMaps:
 
 
 class SceneLabelMaps(LabelMaps):
-    """Label maps whose ids mean the same thing in every photo, as a video tracker writes them."""
+    """Label maps whose ids are shared by all photos, as a video tracker writes them."""
 
     def __init__(self, folder: str | Path) -> None:
         super().__init__(folder)
@@ -101,17 +101,17 @@ class SceneLabelMaps(LabelMaps):
     def identities(
         self, photos: Sequence[Tensor], names: Sequence[str], folder: Path | None = None, bar: Bar = no_bar
     ) -> list[np.ndarray]:
-        """As `labels_of`, with the files' ids numbered 1..P without gaps over the whole scene."""
+        """As `labels_of`, with ids 1..P without gaps over the whole scene."""
         maps = self._raw(photos, names)
         ids = np.unique(np.concatenate([np.zeros(1, np.int64), *(np.unique(m) for m in maps)]))
         return [np.searchsorted(ids, m).astype(np.int32) for m in maps]
 
 
 def read_labels(path: Path) -> np.ndarray:
-    """Ids [H, W] int64 >= 0 of a label map as it lies in the file.
+    """Ids [H, W] int64 >= 0 of a label map, as in the file.
 
     Raises:
-        AwError: the file does not decode, or holds something else than labels.
+        AwError: the file cannot be read or does not hold labels.
     """
     if path.suffix.lower() == ".npy":
         return _checked(_load_npy(path), path)
@@ -120,7 +120,7 @@ def read_labels(path: Path) -> np.ndarray:
     except OSError:
         image = None
     if image is None:
-        raise AwError(f"cannot read label map {path}: it is empty, cut short or no image; restore it")
+        raise AwError(f"cannot read label map {path}: it is empty, truncated or not an image; save it again")
     if image.ndim == 3:
         if image.dtype != np.uint8:
             raise AwError(f"label map {path} has {image.shape[2]} channels of 16 bits; save one channel")
@@ -133,22 +133,22 @@ def _load_npy(path: Path) -> np.ndarray:
     try:
         with open(path, "rb") as f:
             return _read_array(f, path.stat().st_size)
-    # a damaged header is parsed as Python: what the parser says of it has no common base class
+    # a damaged header is parsed as Python; the parser's errors have no common base class
     except (OSError, ValueError, EOFError, SyntaxError, tokenize.TokenError, OverflowError) as error:
         raise AwError(f"cannot read label map {path}: {error}; save integers [H, W] with np.save") from error
 
 
 def _read_array(f: BinaryIO, size: int) -> np.ndarray:
-    """The array of a .npy file; a header that announces more than the file holds is refused unallocated."""
+    """The array of a .npy file; refuses a header that claims more data than the file."""
     version = np.lib.format.read_magic(f)
     if version not in ((1, 0), (2, 0)):
-        raise ValueError(f"format {version} is not read")
+        raise ValueError(f"format {version} is not supported")
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, _, dtype = read(f)
     if dtype.hasobject:
         raise ValueError("it holds Python objects")
     if any(side < 0 for side in shape) or math.prod(shape) * dtype.itemsize > size - f.tell():
-        raise ValueError(f"cut short: {dtype} {list(shape)} announced")
+        raise ValueError(f"truncated: the header says {dtype} {list(shape)}")
     f.seek(0)
     return np.lib.format.read_array(f, allow_pickle=False)
 
@@ -157,7 +157,7 @@ def _checked(array: np.ndarray, path: Path) -> np.ndarray:
     if array.ndim != 2 or array.size == 0 or array.dtype.kind not in "bui":
         raise AwError(f"label map {path} is {array.dtype} {list(array.shape)}; integers [H, W] are needed")
     if array.dtype == np.uint64 and int(array.max()) > np.iinfo(np.int64).max:
-        raise AwError(f"label map {path} holds ids of 2^63 and more; number its instances from 1")
+        raise AwError(f"label map {path} holds ids of 2^63 or more; number its instances from 1")
     return np.maximum(array.astype(np.int64), 0)
 
 
@@ -166,7 +166,7 @@ def _resized(labels: np.ndarray, height: int, width: int, path: Path) -> np.ndar
     if abs(w / h - width / height) > _ASPECT * width / height:
         raise AwError(
             f"label map {path} is {w}x{h}, its photo {width}x{height}: not the same shape; make it from the "
-            "scene's own undistorted photo"
+            "scene's undistorted photo"
         )
     if (h, w) == (height, width):
         return labels

@@ -1,9 +1,9 @@
-"""Dense features without weights: Lab colour means at three scales beside HOG at two.
+"""Dense features without pretrained weights: Lab colour means at three scales and HOG at two.
 
-A measured stand-in for DINO where no weights are at hand. Telling pasted objects from a render that is
-blurred and noisy (cosine distance, per-pixel AUC, 16 photos): 0.948, against 0.939 for Lab alone, 0.895
-for HOG alone, 0.905 for the boxed L1 residual; on objects in the background's own colours 0.884, 0.864,
-0.870 and 0.830. Lab is *not* standardised (its plain cosine is nearly immune to gain), HOG is.
+A substitute for DINO where no weights are available. Per-pixel AUC of detecting pasted objects in a blurred,
+noisy render (cosine distance, 16 photos): 0.948; Lab alone 0.939, HOG alone 0.895, boxed L1 residual 0.905.
+On objects in the background's colours: 0.884, 0.864, 0.870 and 0.830. HOG is standardised. Lab is *not*,
+since its cosine is nearly invariant to gain.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError
 
-STRIDE = 4  # px of the image to a cell of the grid
-BINS = 9  # orientations over half a turn
+STRIDE = 4  # px of the image per cell of the grid
+BINS = 9  # orientations over 180 degrees
 LAB_CHANNELS, HOG_CHANNELS = 9, 2 * BINS
-_BLUR_PX, _NOISE = 1.5, 0.02  # the imitated render that weighs the blocks
-_FLAT = 0.05  # HOG cells of less contrast than this fade out instead of showing amplified noise
+_BLUR_PX, _NOISE = 1.5, 0.02  # of the degraded copies that set the block weights
+_FLAT = 0.05  # HOG cells with less contrast are damped, so that noise is not amplified
 
-# linear sRGB (D65) to XYZ over the white point: rows of f's arguments
+# linear sRGB (D65) to XYZ divided by the white point: the arguments of f, one row each
 _XYZ = (
     (0.4124564 / 0.95047, 0.3575761 / 0.95047, 0.1804375 / 0.95047),
     (0.2126729, 0.7151522, 0.0721750),
@@ -36,8 +36,8 @@ _XYZ = (
 class LabHog:
     """Lab means (4, 12, 20 px) and HOG (9 bins, full and half size) on a grid of 4 px.
 
-    Each block has unit length times sqrt(weight); weight = 1 / mean cosine distance between the scene's
-    photos and their own blurred, noisy copies, so that one unit of distance is one unit of nuisance.
+    Each block has length sqrt(weight), with weight = 1 / mean cosine distance between the scene's photos and
+    their blurred, noisy copies. So blur and noise alone give a distance of about one per block.
     """
 
     name = "labhog-1"
@@ -46,16 +46,16 @@ class LabHog:
     def __init__(self) -> None:
         self.hog_mean = torch.zeros(HOG_CHANNELS)
         self.hog_std = torch.ones(HOG_CHANNELS)
-        self.weights = torch.tensor([1000.0, 4.0])  # Lab, HOG: typical values, until `fit`
+        self.weights = torch.tensor([1000.0, 4.0])  # Lab, HOG: typical values; `fit` sets them
         self.unit = float(2.0 / self.weights.sum())
 
     @torch.no_grad()
     def fit(self, photos: Sequence[Tensor], most: int = 24) -> None:
-        """Channel statistics and block weights of the scene.
+        """Measure channel statistics and block weights of the scene.
 
         Args:
             photos: training photos, [H, W, 3] in [0, 1].
-            most: photos to look at, evenly spaced.
+            most: photos to use, evenly spaced.
 
         Raises:
             AwError: there is no photo.
@@ -73,12 +73,12 @@ class LabHog:
         sums = torch.zeros(2, dtype=torch.float64)
         cells = 0
         for index, (photo, pair) in enumerate(zip(chosen, pairs)):
-            other = _blocks(_degrade(photo, index))
+            other = _blocks(blurred_noisy_copy(photo, index))
             for block in range(2):
                 one, two = self._unit_block(pair[block], block), self._unit_block(other[block], block)
                 sums[block] += (1.0 - (one * two).sum(2)).double().sum().cpu()
             cells += pair[0].shape[0] * pair[0].shape[1]
-        # a scene of one colour has no distance at all: the floor keeps the weights finite
+        # a scene of one colour has distance 0: the floor keeps the weights finite
         self.weights = (1.0 / (sums / cells).clamp(min=1e-6)).float().to(device)
         self.unit = float(2.0 / self.weights.double().sum())
 
@@ -99,7 +99,7 @@ class LabHog:
     def _unit_block(self, block: Tensor, which: int) -> Tensor:
         if which == 1:
             block = (block - self.hog_mean.to(block.dtype)) / self.hog_std.to(block.dtype)
-        # rsqrt of a sum with a floor: defined, with a finite gradient, for black cells as well
+        # the floor gives black cells a finite value and gradient
         return block * torch.rsqrt((block * block).sum(2, keepdim=True) + 1e-6)
 
     def state_dict(self) -> dict[str, Any]:
@@ -116,10 +116,10 @@ class LabHog:
 
 
 def lab_image(image: Tensor) -> Tensor:
-    """CIE Lab (D65) over 100, [3, H, W], of sRGB [H, W, 3] in [0, 1]; values outside are clamped."""
+    """CIE Lab (D65) divided by 100, [3, H, W], of sRGB [H, W, 3]; clamped to [0, 1] first."""
     # channels first: every later step is per channel
     rgb = image.permute(2, 0, 1).clamp(0.0, 1.0)
-    # both branches of each `where` get arguments on which they are smooth: no NaN leaks backward
+    # clamp the argument of each branch of `where`, so that no NaN enters the gradient
     high = ((rgb.clamp(min=0.04045) + 0.055) / 1.055) ** 2.4
     linear = torch.where(rgb > 0.04045, high, rgb / 12.92)
     xyz = (_matrix(linear.dtype, linear.device) @ linear.reshape(3, -1)).reshape(linear.shape)
@@ -130,7 +130,7 @@ def lab_image(image: Tensor) -> Tensor:
 
 @functools.cache
 def _matrix(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """`_XYZ` there, copied once: a copy in every step would make the host of an accelerator wait."""
+    """`_XYZ` on the device; cached, because each copy makes the host wait."""
     return torch.tensor(_XYZ, dtype=dtype, device=device)
 
 
@@ -148,8 +148,8 @@ def _blocks(image: Tensor) -> tuple[Tensor, Tensor]:
 def _hog(grey: Tensor, cell: int) -> Tensor:
     """Orientation histograms [9, h, w] of a grey image [1, H, W], over 3x3 cells, contrast-normalised.
 
-    A pixel votes for bin k with |g| max(cos 2(theta - theta_k) - cos 40 deg, 0): soft, smooth, and without
-    atan2, since |g| cos 2(theta - theta_k) is linear in (gx^2 - gy^2, 2 gx gy) / |g|.
+    A pixel votes for bin k with |g| max(cos 2(theta - theta_k) - cos 40 deg, 0). This needs no atan2, since
+    |g| cos 2(theta - theta_k) is linear in (gx^2 - gy^2, 2 gx gy) / |g|.
     """
     padded = F.pad(grey[None], (1, 1, 1, 1), mode="replicate")[0, 0]
     gx = padded[1:-1, 2:] - padded[1:-1, :-2]
@@ -166,17 +166,17 @@ def _hog(grey: Tensor, cell: int) -> Tensor:
 
 
 def _pool(maps: Tensor, size: int) -> Tensor:
-    """Means over size x size blocks; blocks cut by the border average what is there."""
+    """Means over size x size blocks; at the border over the pixels inside."""
     return F.avg_pool2d(maps[None], size, stride=size, ceil_mode=True)[0]
 
 
 def _box(maps: Tensor, size: int) -> Tensor:
-    """Running mean over size x size cells; at the border over what is there."""
+    """Running mean over size x size cells; at the border over the cells inside."""
     return F.avg_pool2d(maps[None], size, stride=1, padding=size // 2, count_include_pad=False)[0]
 
 
-def _degrade(photo: Tensor, seed: int) -> Tensor:
-    """The photo blurred and with noise: what a good render of it looks like."""
+def blurred_noisy_copy(photo: Tensor, seed: int) -> Tensor:
+    """The photo blurred and with noise, similar to a good render of it."""
     radius = math.ceil(3 * _BLUR_PX)
     taps = torch.arange(-radius, radius + 1, dtype=photo.dtype, device=photo.device)
     kernel = torch.exp(-0.5 * (taps / _BLUR_PX) ** 2)

@@ -1,4 +1,4 @@
-"""Pretrained models from a folder: found or brought, checked, loaded whole - or refused in one line."""
+"""Pretrained models: find the folder or download it, check it, load every tensor, else a one-line error."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ TENSORS = "model.safetensors"
 
 @dataclass(frozen=True)
 class Pretrained:
-    """A folder that holds one whole model of an expected kind."""
+    """A folder with one complete model of an expected type."""
 
     name: str
     folder: Path
     config: dict[str, Any]  # config.json
-    digest: str  # of the tensors and the config, 12 hex digits: part of cache keys
+    digest: str  # of the tensors and config.json, 12 hex digits; part of cache keys
 
     @property
     def model_type(self) -> str:
@@ -38,18 +38,18 @@ class Pretrained:
 
 
 def locate(name: str, model_types: Sequence[str], explicit: str | Path | None = None) -> Pretrained:
-    """The model's folder, checked without loading it.
+    """Find the model's folder and check it without loading it.
 
-    Looks at the explicit folder, else AW_WEIGHTS/name, else the hub's cache, else downloads it.
+    Uses the explicit folder, else AW_WEIGHTS/name, else the hub's cache, else downloads it.
 
     Args:
-        name: of the weight, e.g. ``"dinov2-small"``.
-        model_types: what its config.json may say it is.
-        explicit: a folder of the user's that takes the place of the search.
+        name: of the weights, e.g. ``"dinov2-small"``.
+        model_types: allowed values of model_type in config.json.
+        explicit: the user's folder; nothing is searched.
 
     Raises:
-        AwError: transformers is absent; there is no such weight; it is not here and cannot be brought; the
-            folder lacks a file, holds another kind of model, or no safetensors.
+        AwError: transformers is not installed; the name is unknown; the weights are missing and cannot be
+            downloaded; the folder lacks a file, holds another type of model, or no safetensors.
     """
     if importlib.util.find_spec("transformers") is None:
         raise AwError(
@@ -63,29 +63,29 @@ def locate(name: str, model_types: Sequence[str], explicit: str | Path | None = 
 
 
 def offline() -> bool:
-    """Whether the user told the hub's library to stay off the network."""
+    """Whether the user has set the hub's library to offline."""
     on = ("1", "true", "yes", "on")
     return any(os.environ.get(name, "").lower() in on for name in ("HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE"))
 
 
 def load(source: Pretrained, class_name: str, harmless: Sequence[str] = (), **options: Any) -> Any:
-    """The model in float32, frozen and in evaluation mode; every tensor of it comes from the file.
+    """Load the model in float32, frozen, in evaluation mode; every tensor must come from the file.
 
-    By default the library only logs a missing tensor and draws it at random; here that is an error.
+    By default the library only logs a missing tensor and fills it with random values; here it is an error.
 
     Args:
         source: from `locate`.
-        class_name: the library's concrete class.
-        harmless: prefixes of tensors in the file that the class has no use for.
-        options: for the class.
+        class_name: name of the library's class.
+        harmless: prefixes of tensors in the file that the class may ignore.
+        options: of the class.
 
     Raises:
-        AwError: a tensor lacks, is left over or has another shape; a file is damaged.
+        AwError: a tensor is missing, unexpected or of another shape; a file is damaged.
     """
     import torch
 
     cls = model_class(class_name)
-    # building a net draws random numbers: the caller's generator must not notice
+    # building a net draws random numbers; keep the caller's generator unchanged
     with _quiet(), torch.random.fork_rng(devices=[]):
         try:
             model, report = cls.from_pretrained(
@@ -96,23 +96,23 @@ def load(source: Pretrained, class_name: str, harmless: Sequence[str] = (), **op
                 dtype=torch.float32,
                 **options,
             )
-        # what the library and safetensors raise for damaged files, other shapes and impossible configs
+        # no common base class for damaged files, other shapes and invalid configs
         except Exception as error:
             first = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
             raise AwError(
-                f"{source.folder} could not be loaded as {class_name}: {first}; bring it anew"
+                f"{source.folder} could not be loaded as {class_name}: {first}; download it again"
             ) from error
     left_over = [k for k in report["unexpected_keys"] if not k.startswith(tuple(harmless))]
     wrong = {
         "missing": list(report["missing_keys"]),
-        "left over": left_over,
+        "unexpected": left_over,
         "of another shape": [str(k[0] if isinstance(k, tuple) else k) for k in report["mismatched_keys"]],
     }
     if any(wrong.values()):
         what = "; ".join(f"{len(k)} {kind}: {shortlist(sorted(k), 3)}" for kind, k in wrong.items() if k)
         raise AwError(
-            f"{source.folder} is no whole {class_name} (tensors {what}); a net that is partly random is not"
-            " used: bring it anew"
+            f"{source.folder} is not a complete {class_name} (tensors {what}); the rest would be random: "
+            "download it again"
         )
     return model.eval().requires_grad_(False)
 
@@ -121,7 +121,7 @@ def model_class(name: str) -> Any:
     """A class of transformers by name.
 
     Raises:
-        AwError: importing it fails, most often because of a torchvision that does not fit torch.
+        AwError: the import fails, most often because torchvision does not match torch.
     """
     try:
         import transformers
@@ -131,11 +131,11 @@ def model_class(name: str) -> Any:
         cause = str(error).strip().splitlines()[-1] if str(error).strip() else type(error).__name__
         if importlib.util.find_spec("torchvision") is not None and not _imports("torchvision"):
             raise AwError(
-                "transformers cannot be used: the installed torchvision does not fit torch, and nothing here "
-                "needs it; remove it with: pip uninstall torchvision"
+                "transformers cannot be imported: the installed torchvision does not match torch. It is not "
+                "needed; remove it with: pip uninstall -y torchvision"
             ) from error
         raise AwError(
-            f"transformers has no usable {name}: {cause}; mend it with: {install_command('masks')}"
+            f"transformers has no usable {name}: {cause}; reinstall it with: {install_command('masks')}"
         ) from error
 
 
@@ -150,24 +150,24 @@ def _imports(name: str) -> bool:
 def _inspect(name: str, folder: Path, model_types: Sequence[str]) -> Pretrained:
     if not folder.is_dir():
         raise AwError(
-            f"no folder {folder} with the weights of {name}; give one with config.json and {TENSORS}"
+            f"no folder {folder} with the weights of {name}; give a folder with config.json and {TENSORS}"
         )
     path = folder / "config.json"
     try:
         config = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise AwError(
-            f"{folder} has no config.json: it is no folder of a pretrained model; {name} needs config.json"
+            f"{folder} has no config.json, so it is not a pretrained model; {name} needs config.json"
             f" and {TENSORS}"
         ) from error
     except (OSError, ValueError) as error:
-        raise AwError(f"cannot read {path}: {error}; bring {name} anew") from error
+        raise AwError(f"cannot read {path}: {error}; download {name} again") from error
     found = config.get("model_type") if isinstance(config, dict) else None
     if found not in model_types:
         raise AwError(f"{folder} holds a model of type {found!r}, {name} needs {' or '.join(model_types)}")
     if not (folder / TENSORS).is_file():
         pickle = (folder / "pytorch_model.bin").is_file()
-        why = "pytorch_model.bin only, a pickle that may run code" if pickle else f"no {TENSORS}"
+        why = "pytorch_model.bin only, a pickle that can run code" if pickle else f"no {TENSORS}"
         raise AwError(f"{folder} has {why}; {name} needs {TENSORS}")
     return Pretrained(name, folder, config, _digest(folder))
 
@@ -177,16 +177,16 @@ def _digest(folder: Path) -> str:
     return hashlib.sha256("".join(parts).encode()).hexdigest()[:12]
 
 
-@functools.lru_cache(maxsize=64)  # a hundred megabytes are hashed once a process, not once a back end
+@functools.lru_cache(maxsize=64)  # hash large files once a process, not once a back end
 def _file_digest(path: str, changed_ns: int) -> str:
     return sha256_file(path)
 
 
 def _download(weight: weights.Weight, reason: str) -> Path:
-    """Bring the weight from the hub, into AW_WEIGHTS where that is set, else into the hub's cache."""
-    how = f"bring it with: {weights.bring(weight)}"
+    """Download the weights from the hub into AW_WEIGHTS if it is set, else into the hub's cache."""
+    how = f"download them with: {weights.download_command(weight)}"
     if offline():
-        raise AwError(f"the weights of {weight.name} are not here ({reason}); {how}")
+        raise AwError(f"the weights of {weight.name} are missing ({reason}); {how}")
     from huggingface_hub import snapshot_download
 
     own = weights.weights_folder()
@@ -198,16 +198,16 @@ def _download(weight: weights.Weight, reason: str) -> Path:
                 local_dir=None if own is None else own / weight.name,
             )
         )
-    except Exception as error:  # no network, no rights, no such repository, a full disk
+    except Exception as error:  # no network, no permission, no such repository, disk full
         cause = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise AwError(
-            f"the weights of {weight.name} are not here ({reason}) and could not be downloaded "
+            f"the weights of {weight.name} are missing ({reason}) and could not be downloaded "
             f"({cause}); {how}"
         ) from error
     missing = [name for name in weight.files if not (folder / name).is_file()]
     if missing:
         raise AwError(
-            f"the hub's {weight.hub_id} has no {shortlist(missing)}; put a copy that has it into AW_WEIGHTS/"
+            f"{weight.hub_id} on the hub has no {shortlist(missing)}; put a copy with it into AW_WEIGHTS/"
             f"{weight.name} (save_pretrained writes {TENSORS})"
         )
     return folder
@@ -215,7 +215,7 @@ def _download(weight: weights.Weight, reason: str) -> Path:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """The library's report and bars are ours to give: what is wrong becomes one error."""
+    """Silence the library's report and bars: `load` reports problems as one error."""
     from transformers.utils import logging as library
 
     root = logging.getLogger("transformers")

@@ -1,4 +1,4 @@
-"""A bar for stages that take minutes a photo: on a terminal, and nowhere else."""
+"""A progress bar for slow stages, shown only on a terminal."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ Bar: TypeAlias = Callable[[Sequence[Any]], Iterable[Any]]
 
 
 def no_bar(items: Sequence[Any]) -> Iterable[Any]:
-    """The items as they are."""
+    """The items, without a bar."""
     return items
 
 
 def terminal_bar(what: str, unit: str = "photo") -> Bar:
-    """Wraps a list so that a terminal shows a bar while it is gone through.
+    """A function that wraps a list so that a terminal shows a bar during iteration.
 
     Args:
-        what: is done, e.g. ``"instance masks"``.
-        unit: one item.
+        what: name of the stage, e.g. ``"instance masks"``.
+        unit: name of one item.
     """
 
     def wrap(items: Sequence[Any]) -> Iterable[Any]:
         try:
             from tqdm import tqdm
-        except ImportError:  # a machine that only trains has little installed
+        except ImportError:  # tqdm is optional on a machine that only trains
             return items
         return tqdm(items, desc=what, unit=unit, disable=None, leave=False)  # None: only on a terminal
 

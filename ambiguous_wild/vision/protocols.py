@@ -1,4 +1,4 @@
-"""What the methods ask of vision: dense frozen features and per-photo instance labels."""
+"""Interfaces that methods use: dense frozen features and per-photo instance labels."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ class Features(Protocol):
 
     name: str  # part of every cache key
     channels: int  # C
-    unit: float  # cosine distance that blur and noise alone make, mean over the scene; set by `fit`
+    unit: float  # mean cosine distance that blur and noise alone cause; set by `fit`
 
     def fit(self, photos: Sequence[Tensor]) -> None:
-        """Measure per-scene statistics on the training photos [H, W, 3]; no truth is used."""
+        """Measure statistics of the scene on the training photos [H, W, 3], without ground truth."""
         ...
 
     def __call__(self, image: Tensor) -> Tensor:
@@ -34,7 +34,7 @@ class Features(Protocol):
 
 @runtime_checkable
 class SceneFeatures(Protocol):
-    """Features that learn from the scene: `fit_scene` takes the place of `fit` the first time."""
+    """Features that are trained on the scene: call `fit_scene` in place of `fit` the first time."""
 
     def fit_scene(
         self,
@@ -58,20 +58,20 @@ class Instances(Protocol):
 
 @runtime_checkable
 class NamedInstances(Protocol):
-    """Instances that are found by the photo's name; a back end offers this beside `Instances`."""
+    """Instances that are found by the photo's name; optional, in addition to `Instances`."""
 
     name: str
 
     def labels_of(self, photos: Sequence[Tensor], names: Sequence[str]) -> list[np.ndarray]:
-        """Labels [H, W] int32 of every photo, each with ids of its own; 0 = none."""
+        """Labels [H, W] int32 of every photo, with ids per photo; 0 = none."""
         ...
 
 
 @runtime_checkable
 class SceneInstances(Protocol):
-    """Instances that know what is the same thing in different photos; offered beside `Instances`.
+    """Instances with one id per object over all photos; optional, in addition to `Instances`.
 
-    Where a back end has this, its ids are the scene's identities and nothing is associated.
+    The ids are used as the scene's identities, without association.
     """
 
     name: str
@@ -79,12 +79,12 @@ class SceneInstances(Protocol):
     def identities(
         self, photos: Sequence[Tensor], names: Sequence[str], folder: Path | None = None, bar: Bar = no_bar
     ) -> list[np.ndarray]:
-        """Labels [H, W] int32 of every photo, one id for one thing in the scene; 0 = none, gaps allowed.
+        """Labels [H, W] int32 of every photo, one id per object of the scene; 0 = none, gaps allowed.
 
         Args:
             photos: [H, W, 3] float32 in [0, 1].
             names: of the photos, with a suffix; their natural order is the order of a sequence.
-            folder: of the cache (`vision.cache`), for what a stopped stage shall not do again.
-            bar: wraps a list of what is gone through.
+            folder: of the cache (`vision.cache`), from which a stopped stage resumes.
+            bar: wraps the list of items, for a progress bar.
         """
         ...

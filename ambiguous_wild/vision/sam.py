@@ -1,8 +1,8 @@
-"""Segment Anything, version 1 and 2: every instance of a photo from a grid of points, or one a box.
+"""Segment Anything, version 1 and 2: all instances of a photo from a grid of points, or one per box.
 
-An own loop: the library's pipeline needs torchvision at its last step. The photo is encoded once, the points
-go through the mask decoder in batches (the decoder is the cost), and masks that are unsure, unstable or
-doubles are dropped before anything is enlarged to the photo's size.
+We do not use the library's pipeline, because its last step needs torchvision. The photo is encoded once. The
+points go through the mask decoder in batches, which takes most of the time. Masks of low quality, unstable
+masks and duplicates are dropped before the rest is enlarged to the photo's size.
 """
 
 from __future__ import annotations
@@ -20,48 +20,48 @@ from torch import Tensor
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash
 from ambiguous_wild.vision.dino import normalised
-from ambiguous_wild.vision.masks import box_nms, mask_boxes, paint
+from ambiguous_wild.vision.mask_ops import box_nms, mask_boxes, paint
 from ambiguous_wild.vision.pretrained import Pretrained, load, locate
 
-# A SAM 2 checkpoint is one of the video model; the image model takes its part of it.
+# SAM 2 checkpoints are of the video model; the image model loads a part of them.
 _CLASSES = {"sam": "SamModel", "sam2": "Sam2Model", "sam2_video": "Sam2Model"}
 
 
 @dataclass(frozen=True)
 class SamConfig:
-    """Full size SAM 2 tiny, 1024 px, two cores: 3.3 s to encode a photo, 15 s for 64 points."""
+    """SAM 2 tiny at 1024 px on two cores: 3.3 s to encode a photo, 15 s for 64 points."""
 
-    grid: int = 16  # points along each side; 32 is the authors', and four times the time
+    grid: int = 16  # points along each side; the authors use 32, which takes four times as long
     batch: int = 64  # points decoded at once
-    least_iou: float = 0.8  # the net's own guess of a mask's quality; SAM 1's authors use 0.88
-    least_stability: float = 0.95  # area above logit 1 over area above logit -1
-    nms: float = 0.7  # IoU of boxes from which on two masks are one
-    least_area: float = 2e-4  # of the photo; smaller masks are dropped
+    least_iou: float = 0.8  # predicted IoU of a mask; SAM 1's authors use 0.88
+    least_stability: float = 0.95  # area above logit 1 divided by area above logit -1
+    nms: float = 0.7  # masks whose boxes have a larger IoU are duplicates
+    least_area: float = 2e-4  # share of the photo; smaller masks are dropped
 
 
 @dataclass(frozen=True)
 class _Embedded:
-    """A photo as the net sees it."""
+    """An encoded photo."""
 
-    embeddings: Any  # of the net
+    embeddings: Any  # from the net's encoder
     height: int  # px of the photo
     width: int
-    side: int  # px of the square the net sees
-    inner: tuple[int, int]  # rows and columns of it that the photo fills; the rest is padding
+    side: int  # px of the net's square input
+    inner: tuple[int, int]  # rows and columns of the input that the photo fills; the rest is padding
 
     @property
     def scale(self) -> tuple[float, float]:
-        """Px of the net to a px of the photo, in x and y."""
+        """Input px per photo px, in x and y."""
         return self.inner[1] / self.width, self.inner[0] / self.height
 
-    def seen(self, low: Tensor) -> Tensor:
-        """Logits [n, h, w] without what is padding."""
+    def without_padding(self, low: Tensor) -> Tensor:
+        """Logits [n, h, w] without padding."""
         rows = max(round(low.shape[1] * self.inner[0] / self.side), 1)
         columns = max(round(low.shape[2] * self.inner[1] / self.side), 1)
         return low[:, :rows, :columns]
 
     def enlarged(self, low: Tensor) -> np.ndarray:
-        """A mask [H, W] bool at the photo's size of logits [h, w]; padding is cut off where it is exact."""
+        """A mask [H, W] bool at the photo's size from logits [h, w]; crops padding at the input's size."""
         full = low[None, None].float()
         if self.inner != (self.side, self.side):
             full = F.interpolate(full, size=(self.side, self.side), mode="bilinear", align_corners=False)
@@ -80,10 +80,10 @@ class SamInstances:
         config: SamConfig | None = None,
         folder: str | Path | None = None,
     ) -> None:
-        """Find and check the weights; they are loaded when the first labels are asked for.
+        """Find and check the weights; they are loaded at first use.
 
         Raises:
-            AwError: no weights, see `pretrained.locate`; a setting that cannot be.
+            AwError: no weights, see `pretrained.locate`; an invalid setting.
         """
         self.config = config or SamConfig()
         if self.config.grid < 1 or self.config.batch < 1:
@@ -103,19 +103,19 @@ class SamInstances:
 
     @property
     def side(self) -> int:
-        """Px of the square the net sees."""
+        """Px of the net's square input."""
         return int(self.model.config.prompt_encoder_config.image_size)
 
     @torch.no_grad()
     def labels(self, photo: Tensor) -> np.ndarray:
-        """Labels [H, W] int32 of a photo [H, W, 3] in [0, 1], 1..K by falling area; 0 = none."""
+        """Labels [H, W] int32 of a photo [H, W, 3] in [0, 1], 1..K by decreasing area; 0 = none."""
         embedded = self._embed(photo)
         config, steps = self.config, (torch.arange(self.config.grid) + 0.5) / self.config.grid
         y, x = torch.meshgrid(steps * embedded.height, steps * embedded.width, indexing="ij")
         points = torch.stack([x.reshape(-1), y.reshape(-1)], dim=1).to(photo.device)
         logits, scores = [], []
         for low, quality in self._decode_points(embedded, points):
-            seen = embedded.seen(low)
+            seen = embedded.without_padding(low)
             stable = (seen > 1.0).sum((1, 2)) / (seen > -1.0).sum((1, 2)).clamp(min=1)
             area = (seen > 0.0).float().mean((1, 2))
             good = (quality > config.least_iou) & (stable >= config.least_stability)
@@ -123,13 +123,13 @@ class SamInstances:
             logits.append(low[good])
             scores.append(quality[good])
         found, score = torch.cat(logits), torch.cat(scores).double().cpu().numpy()
-        keep = box_nms(mask_boxes((embedded.seen(found) > 0.0).cpu().numpy()), score, config.nms)
+        keep = box_nms(mask_boxes((embedded.without_padding(found) > 0.0).cpu().numpy()), score, config.nms)
         masks = [embedded.enlarged(found[k]) for k in keep]
         return paint(masks, embedded.height, embedded.width)[0]
 
     @torch.no_grad()
     def in_boxes(self, photo: Tensor, boxes: np.ndarray) -> np.ndarray:
-        """Masks [n, H, W] bool, the instance in each box [n, 4] xyxy in px of the photo [H, W, 3]."""
+        """Mask [n, H, W] bool of the instance in each box [n, 4], xyxy in px of the photo [H, W, 3]."""
         embedded = self._embed(photo)
         result = np.zeros((len(boxes), embedded.height, embedded.width), dtype=bool)
         if not len(boxes):
@@ -147,7 +147,7 @@ class SamInstances:
         return result
 
     def _decode_points(self, embedded: _Embedded, points: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-        """Logits [3 n, h, w] on the net's grid and quality [3 n], of each batch."""
+        """For each batch, logits [3 n, h, w] on the net's grid and predicted IoU [3 n]."""
         scaled = points * points.new_tensor(embedded.scale)
         for start in range(0, len(scaled), self.config.batch):
             part = scaled[start : start + self.config.batch][None, :, None]
@@ -159,7 +159,7 @@ class SamInstances:
         return {"image_embeddings": embedded.embeddings}
 
     def _embed(self, photo: Tensor) -> _Embedded:
-        """SAM 1 sees the photo at one scale, padded right and below; SAM 2 sees it stretched to a square."""
+        """Encode a photo: SAM 1 keeps its aspect and pads right and below, SAM 2 stretches it to a square."""
         height, width = int(photo.shape[0]), int(photo.shape[1])
         self.model.to(photo.device)
         side = self.side

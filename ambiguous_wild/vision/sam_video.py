@@ -1,8 +1,8 @@
-"""Identities across an ordered sequence: SAM 2 follows what it found in one photo through the next ones.
+"""Identities across an ordered sequence: SAM 2 tracks the instances of one photo through the next ones.
 
-Every few photos all instances are looked for anew; those that no followed one covers get ids of their own.
-The sequence is cut there into chunks, each with a memory of its own, so that a chunk is a cache entry and a
-stopped stage goes on where it was. What leaves the sight for a whole chunk comes back under a new id.
+Every few photos all instances are detected again; those that no tracked instance covers get new ids. The
+sequence is divided there into chunks, each with its own memory. A chunk is a cache entry, so that a stopped
+stage resumes. An object that is out of view for a whole chunk returns with a new id.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from torch import Tensor
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash
 from ambiguous_wild.vision.cache import cache_key, cached
-from ambiguous_wild.vision.masks import add_new
+from ambiguous_wild.vision.mask_ops import add_new
 from ambiguous_wild.vision.pretrained import load, locate
 from ambiguous_wild.vision.progress import Bar, no_bar
 from ambiguous_wild.vision.protocols import Instances
@@ -30,16 +30,16 @@ from ambiguous_wild.vision.sam import SamConfig, SamInstances, fit_to
 
 @dataclass(frozen=True)
 class SamVideoConfig:
-    """Cost grows with the objects: each has a memory of its own."""
+    """Cost grows with the number of objects: each has its own memory."""
 
-    every: int = 8  # photos from one look for new instances to the next
-    most: int = 32  # instances followed at a time, the largest
-    known: float = 0.5  # share of an instance under followed ones from which on it is nothing new
+    every: int = 8  # photos between two detections of new instances
+    most: int = 32  # most instances tracked at a time; the largest are kept
+    known: float = 0.5  # an instance is not new if tracked ones cover at least this share of it
     sam: SamConfig = field(default_factory=SamConfig)
 
 
 class SamVideoInstances:
-    """Instances with ids that mean the same thing in every photo of a sequence."""
+    """Instances with one id per object over a whole photo sequence."""
 
     def __init__(
         self,
@@ -48,16 +48,16 @@ class SamVideoInstances:
         folder: str | Path | None = None,
         single: Instances | None = None,
     ) -> None:
-        """Find and check the weights; they are loaded when the first identities are asked for.
+        """Find and check the weights; they are loaded at first use.
 
         Args:
-            name: of the weight, see `vision.weights`; any label where `folder` is given.
+            name: of the weights, see `vision.weights`; any label if `folder` is given.
             config: see `SamVideoConfig`.
-            folder: of the weights, in place of the search.
-            single: finds the instances that are followed; by default SAM 2 itself, everything there is.
+            folder: of the weights; nothing is searched.
+            single: detects the instances to track; by default SAM 2, all instances.
 
         Raises:
-            AwError: no weights, see `pretrained.locate`; a setting that cannot be.
+            AwError: no weights, see `pretrained.locate`; an invalid setting.
         """
         self.config = config or SamVideoConfig()
         if self.config.every < 1 or self.config.most < 1:
@@ -78,39 +78,39 @@ class SamVideoInstances:
         return self._model
 
     def labels(self, photo: Tensor) -> np.ndarray:
-        """Labels [H, W] int32 of one photo [H, W, 3] by itself: no identities."""
+        """Labels [H, W] int32 of one photo [H, W, 3], without identities."""
         return self.single.labels(photo)
 
     def identities(
         self, photos: Sequence[Tensor], names: Sequence[str], folder: Path | None = None, bar: Bar = no_bar
     ) -> list[np.ndarray]:
-        """Labels [H, W] int32 of every photo, one id for one thing in the whole sequence; 0 = none.
+        """Labels [H, W] int32 of every photo, one id per object over the whole sequence; 0 = none.
 
         Args:
             photos: [H, W, 3] in [0, 1].
             names: of the photos; their natural order (a2 before a10) is the order of the sequence.
-            folder: of the cache; every photo's instances and every chunk are an entry of it.
+            folder: of the cache; each photo's instances and each chunk are one entry.
             bar: wraps the chunks, for a progress bar.
         """
         order = sorted(range(len(photos)), key=lambda i: (natural(names[i]), i))
         result: list[np.ndarray] = [np.zeros(tuple(p.shape[:2]), dtype=np.int32) for p in photos]
-        carried: np.ndarray | None = None  # ids that reached the next chunk's first photo
+        carried: np.ndarray | None = None  # ids in the next chunk's first photo
         next_id = 1
         for start in bar(list(range(0, len(order), self.config.every))):
             chunk = order[start : start + self.config.every + 1]
             frames = [photos[i] for i in chunk]
-            found = self._found(frames[0], folder)
+            found = self._detected(frames[0], folder)
             empty = np.zeros_like(found)
             first, next_id = add_new(
                 empty if carried is None else carried, found, next_id, self.config.most, self.config.known
             )
-            maps = self._followed(frames, first, folder)
+            maps = self._tracked(frames, first, folder)
             for i, ids in zip(chunk[: self.config.every], maps):
                 result[i] = ids
             carried = maps[-1]
         return result
 
-    def _found(self, photo: Tensor, folder: Path | None) -> np.ndarray:
+    def _detected(self, photo: Tensor, folder: Path | None) -> np.ndarray:
         if folder is None:
             return self.single.labels(photo)
         key = cache_key("instances", self.single.name, None, photo.detach().cpu().numpy())
@@ -118,7 +118,7 @@ class SamVideoInstances:
             "labels"
         ]
 
-    def _followed(self, frames: list[Tensor], first: np.ndarray, folder: Path | None) -> list[np.ndarray]:
+    def _tracked(self, frames: list[Tensor], first: np.ndarray, folder: Path | None) -> list[np.ndarray]:
         names = [f"frame{k:04d}" for k in range(len(frames))]
 
         def compute() -> dict[str, np.ndarray]:
@@ -134,7 +134,7 @@ class SamVideoInstances:
 
     @torch.no_grad()
     def follow(self, frames: Sequence[Tensor], first: np.ndarray) -> list[np.ndarray]:
-        """The ids of `first` [H, W] int32 through all frames [H, W, 3]; the first map is `first` itself."""
+        """Track the ids of `first` [H, W] int32 through all frames [H, W, 3]; the first map is `first`."""
         ids = [int(k) for k in np.unique(first) if k > 0]
         if not ids or len(frames) == 1:
             return [first, *(np.zeros(tuple(f.shape[:2]), dtype=np.int32) for f in frames[1:])]
@@ -159,8 +159,8 @@ class SamVideoInstances:
         session.obj_with_new_inputs = list(ids)
         model(inference_session=session, frame_idx=0)
         outs = model.propagate_in_video_iterator(session)
-        followed = [_painted(out, tuple(frames[out.frame_idx].shape[:2])) for out in outs if out.frame_idx]
-        return [first, *followed]
+        tracked = [_painted(out, tuple(frames[out.frame_idx].shape[:2])) for out in outs if out.frame_idx]
+        return [first, *tracked]
 
 
 def _painted(out: Any, size: tuple[int, int]) -> np.ndarray:
@@ -180,6 +180,6 @@ def _painted(out: Any, size: tuple[int, int]) -> np.ndarray:
 
 
 def natural(name: str) -> tuple[tuple[int, int, str], ...]:
-    """Key that sorts numbers inside names by value: frame2 before frame10."""
+    """Sort key that orders numbers inside names by value: frame2 before frame10."""
     parts = re.split(r"(\d+)", name)
     return tuple((0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts)

@@ -1,7 +1,7 @@
-"""Dense features trained on the scene itself: a small conv net that tells the scene's places apart.
+"""Dense features trained on the scene: a small convolutional net that separates places of the scene.
 
-What `labhog` cannot: a grey coat before a grey wall. The net sees photos through imitated renders and learns
-from structure from motion which places are the same (see `sceneconv_train`); it needs no weights.
+Unlike `labhog`, it can separate a grey coat in front of a grey wall. It is trained on SfM tracks and degraded
+photos (see `sceneconv_train`) and needs no pretrained weights.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from torch import Tensor, nn
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.vision.cache import cache_key, cached
-from ambiguous_wild.vision.labhog import STRIDE, _degrade, lab_image
+from ambiguous_wild.vision.labhog import STRIDE, blurred_noisy_copy, lab_image
 from ambiguous_wild.vision.sceneconv_train import SceneConvConfig, Tracks, train
 
 
 class ConvNet(nn.Module):
     """[B, 3, H, W] sRGB in [0, 1] to unit features [B, C, ceil(H / 4), ceil(W / 4)].
 
-    A cell sees 34 px around it. Even kernels with stride 2 keep its centre at the centre of its 4x4 pixels.
+    The receptive field of a cell is 34 px; even kernels with stride 2 keep it centred on the cell.
     """
 
     def __init__(self, widths: tuple[int, int, int], channels: int) -> None:
@@ -39,7 +39,7 @@ class ConvNet(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         lab = torch.stack([lab_image(image.permute(1, 2, 0)) for image in images])
-        # lightness and colour at about unit spread
+        # scale lightness and colour to about unit spread
         middle, gain = _lab_scale(lab.dtype, lab.device)
         lab = (lab - middle) * gain
         height, width = lab.shape[2:]
@@ -53,7 +53,7 @@ class ConvNet(nn.Module):
 
 @functools.cache
 def _lab_scale(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """[2, 3, 1, 1] middle and gain of Lab, copied there once: in every step the copy would be waited for."""
+    """Middle and gain of Lab [2, 3, 1, 1] on the device; cached, because each copy makes the host wait."""
     return torch.tensor([[0.5, 0.0, 0.0], [3.0, 6.0, 6.0]], dtype=dtype, device=device)[:, :, None, None]
 
 
@@ -68,16 +68,16 @@ class SceneConv:
         self.net: ConvNet | None = None
 
     def fit_scene(self, photos: Sequence[Tensor], tracks: Tracks, folder: Path | None = None) -> None:
-        """Train on the scene, or take the trained net from the cache.
+        """Train on the scene, or load the trained net from the cache.
 
         Args:
             photos: training photos, [H, W, 3] in [0, 1].
             tracks: SfM observations in them: point [L] int, photo index [L] int, xy px [L, 2], where the
                 centre of the first pixel is (0.5, 0.5).
-            folder: of the cache (`vision.cache`); None = train anew.
+            folder: of the cache (`vision.cache`); None = always train.
 
         Raises:
-            AwError: no photos, tracks that do not fit them, or too few tracks to learn from.
+            AwError: no photos, tracks of other photos, or too few tracks.
         """
         arrays = [photo.detach().cpu().numpy() for photo in photos]
 
@@ -97,7 +97,7 @@ class SceneConv:
 
     @torch.no_grad()
     def fit(self, photos: Sequence[Tensor], most: int = 24) -> None:
-        """The unit, as `LabHog` measures it; the net itself needs tracks: `fit_scene`.
+        """Measure `unit` as `LabHog` does; the net itself is trained by `fit_scene`.
 
         Raises:
             AwError: there is no photo, or no trained net.
@@ -107,9 +107,9 @@ class SceneConv:
         chosen = sorted({round(k * (len(photos) - 1) / max(most - 1, 1)) for k in range(most)})
         distances = []
         for index, k in enumerate(chosen):
-            one, two = self(photos[k]), self(_degrade(photos[k], index))
+            one, two = self(photos[k]), self(blurred_noisy_copy(photos[k], index))
             distances.append(float((1.0 - (one * two).sum(2)).double().mean()))
-        # a scene of one colour has no distance at all
+        # a scene of one colour has distance 0
         self.unit = max(float(np.mean(distances)), 1e-6)
 
     def __call__(self, image: Tensor) -> Tensor:
@@ -120,19 +120,19 @@ class SceneConv:
         """
         if self.net is None:
             raise AwError(
-                "sceneconv is not trained: it learns from the scene's SfM tracks; call fit_scene, "
-                "or use features that need no tracks, such as labhog"
+                "sceneconv is not trained: it needs the scene's SfM tracks; call fit_scene, "
+                "or use features without training, such as labhog"
             )
         if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < 8:
             raise AwError(f"features need an image of [H, W, 3], at least 8x8 px, got {list(image.shape)}")
         return self.net(image.permute(2, 0, 1)[None])[0].permute(1, 2, 0)
 
     def precision(self, device: torch.device) -> str:
-        """As `stage.PreciseFeatures`: convolutions are in TF32 on a GPU unless torch is told otherwise."""
+        """See `precompute.PreciseFeatures`: torch's default for convolutions on a GPU is TF32."""
         return "tf32" if device.type == "cuda" and torch.backends.cudnn.allow_tf32 else ""
 
     def _new_net(self) -> ConvNet:
-        with torch.random.fork_rng(devices=[]):  # its first weights shall not move anybody's random numbers
+        with torch.random.fork_rng(devices=[]):  # keep the caller's random numbers unchanged
             return ConvNet(self.config.widths, self.config.channels)
 
     def _take(self, state: dict[str, Tensor]) -> None:

@@ -1,10 +1,10 @@
-"""Training features on a scene: the same 3D point in two photos is the same, other points are not.
+"""Contrastive training of features on a scene: a 3D point in two photos is a positive pair.
 
-InfoNCE (van den Oord et al. 2018) over the tracks that two photos share, one of them seen through an imitated
-render. The negatives are the other points of the same photos. Measured on renders of two simulated captures
-without masks at 600 and 3000 iterations: a temperature of 0.07 is better than 0.2; training on photos and
-their own imitated renders, without tracks, ends below no training at all (3000: per-pixel AUC 0.965 against
-0.974 and 0.970).
+InfoNCE (van den Oord et al. 2018) over the tracks that two photos share, one of them degraded like a render.
+The negatives are the other points of the same photos. Measured on renders of two simulated captures without
+masks at 600 and 3000 iterations: temperature 0.07 is better than 0.2; training on photos and their own
+degraded copies, without tracks, is worse than no training (3000: per-pixel AUC 0.965; tracks 0.974, no
+training 0.970).
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ class SceneConvConfig:
     widths: tuple[int, int, int] = (16, 32, 48)  # channels at half size, at quarter size, of the wide layers
     channels: int = 32  # of the features
     steps: int = 600  # Adam steps, two photos each
-    rate: float = 3e-3  # Adam's at its highest: one cycle, up in a tenth of the steps
+    rate: float = 3e-3  # Adam's highest rate; one cycle, rising over a tenth of the steps
     temperature: float = 0.07  # of the softmax over cosines
-    anchors: int = 256  # points a step at most
-    fewest: int = 32  # points two photos must share to be a pair
-    far_px: float = 10.0  # points closer than this to each other are no negatives
-    window: int = 240  # px, longest side that is looked at; larger photos are cut around a shared point
+    anchors: int = 256  # most points a step
+    fewest: int = 32  # shared points that make two photos a pair
+    far_px: float = 10.0  # points closer than this are not negatives
+    window: int = 240  # px, longest side used; larger photos are cropped around a shared point
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -52,18 +52,18 @@ def train(make: Callable[[], Net], photos: Sequence[Tensor], tracks: Tracks, con
     """Train a net on the CPU and freeze it; the same input gives the same bits, whatever the thread count.
 
     Args:
-        make: makes the net, [B, 3, H, W] to unit features [B, C, h, w] on a grid of 4 px.
+        make: builds the net, [B, 3, H, W] to unit features [B, C, h, w] on a grid of 4 px.
         photos: [H, W, 3] float32 in [0, 1], on the CPU.
         tracks: SfM observations; see `SceneConv.fit_scene`.
         config: of the training.
 
     Raises:
-        AwError: no photos, tracks that do not fit them, or too few tracks to learn from.
+        AwError: no photos, tracks of other photos, or too few tracks.
     """
     pairs = Pairs(tracks, [(p.shape[1], p.shape[0]) for p in photos], config.fewest)
     images = [photo.permute(2, 0, 1).contiguous() for photo in photos]
     threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # sums of several threads round differently with their number
+    torch.set_num_threads(1)  # the rounding of sums depends on the number of threads
     try:
         with torch.random.fork_rng(devices=[]), torch.enable_grad():
             torch.manual_seed(config.seed)
@@ -93,7 +93,7 @@ def _train(net: Net, images: list[Tensor], pairs: Pairs, config: SceneConvConfig
 
 
 class Pairs:
-    """Which photos share which points."""
+    """Pairs of photos and the points they share."""
 
     def __init__(self, tracks: Tracks, sizes: Sequence[tuple[int, int]], fewest: int) -> None:
         if not sizes:
@@ -108,7 +108,7 @@ class Pairs:
         _, point = np.unique(point, return_inverse=True)
         self.points, self.xy = [], []
         for index in range(len(sizes)):
-            # a point found twice in a photo counts once
+            # a point found twice in a photo is used once
             ids, first = np.unique(point[photo == index], return_index=True)
             self.points.append(ids)
             self.xy.append(xy[photo == index][first].astype(np.float64))
@@ -123,11 +123,11 @@ class Pairs:
         if not len(self.usable):
             raise AwError(
                 f"no two of {len(sizes)} train photos share {fewest} SfM points (the most is "
-                f"{int(shared.max(initial=0))}): too few to train features on; use labhog"
+                f"{int(shared.max(initial=0))}): too few to train features; use labhog"
             )
 
     def draw(self, rng: np.random.Generator) -> tuple[int, int, np.ndarray, np.ndarray]:
-        """Two photos and the places [n, 2] px of the points that both see."""
+        """Two photos and the positions [n, 2] px of their shared points."""
         i = int(rng.choice(self.usable))
         j = int(rng.choice(self.partners[i]))
         _, a, b = np.intersect1d(self.points[i], self.points[j], assume_unique=True, return_indices=True)
@@ -143,12 +143,12 @@ def info_nce(
     temperature: float,
     far_px: float,
 ) -> Tensor:
-    """Mean cross-entropy of finding each point among the others, both ways; neighbours are left out."""
+    """Mean cross-entropy of finding each point among the others, both ways; neighbours are ignored."""
     logits = first @ second.T / temperature
     same = np.eye(len(xy_first), dtype=bool)
     target = torch.arange(len(xy_first))
     total = logits.new_zeros(())
-    # row k asks in the other photo: what lies close to its answer there is not wrong
+    # row k searches the other photo; points close to its match there are no errors
     for scores, xy in ((logits, xy_second), (logits.T, xy_first)):
         close = np.abs(xy[:, None] - xy[None]).max(2) <= far_px
         ignored = torch.from_numpy(close & ~same)
@@ -157,7 +157,7 @@ def info_nce(
 
 
 def sample(features: Tensor, xy: np.ndarray) -> Tensor:
-    """Unit features [n, C] at places [n, 2] px of a map [1, C, h, w] with cells of 4 px, bilinear."""
+    """Unit features [n, C] at positions [n, 2] px of a map [1, C, h, w] with cells of 4 px, bilinear."""
     size = 4.0 * np.array([features.shape[3], features.shape[2]])
     grid = torch.from_numpy((xy / size * 2.0 - 1.0).astype(np.float32))[None, None]
     found = F.grid_sample(features, grid, mode="bilinear", padding_mode="border", align_corners=False)
@@ -165,10 +165,10 @@ def sample(features: Tensor, xy: np.ndarray) -> Tensor:
 
 
 def imitated_render(image: Tensor, rng: np.random.Generator) -> Tensor:
-    """What an unfinished splat render makes of a photo [3, H, W]: uneven blur and shift, noise, gain.
+    """A photo [3, H, W] degraded like an unfinished splat render: uneven blur and shift, noise, gain.
 
-    Blur of 0.6 to 3.5 px that changes over the picture, shift up to 1.5 px, smooth noise up to 0.03, in half
-    of the cases gain 0.85 to 1.12 with 4 % of it between the channels.
+    Blur of 0.6 to 3.5 px that varies over the image, shift up to 1.5 px, smooth noise up to 0.03; in half of
+    the cases a gain of 0.85 to 1.12 that varies by 4 % between channels.
     """
     height, width = image.shape[1:]
     sharp, soft = np.sort(rng.uniform(0.6, 3.5, 2))
@@ -199,7 +199,7 @@ def _field(height: int, width: int, knots: int, rng: np.random.Generator) -> Ten
 
 
 def _blur(image: Tensor, sigma: float) -> Tensor:
-    """Gaussian blur of [3, H, W]; the border goes on as it ends."""
+    """Gaussian blur of [3, H, W]; border pixels are repeated."""
     radius = max(math.ceil(3.0 * sigma), 1)
     taps = torch.arange(-radius, radius + 1, dtype=torch.float32)
     kernel = torch.exp(-0.5 * (taps / sigma) ** 2)
@@ -209,7 +209,7 @@ def _blur(image: Tensor, sigma: float) -> Tensor:
 
 
 def _window(image: Tensor, xy: np.ndarray, most: int) -> tuple[Tensor, np.ndarray, np.ndarray]:
-    """The part of [3, H, W] around the first place, places in it, and which of them lie inside."""
+    """A crop of [3, H, W] around the first position, the positions in it, and which lie inside."""
     extent = np.array([image.shape[2], image.shape[1]])
     size = np.minimum(extent, most)
     start = np.clip(np.floor(xy[0] - size / 2), 0, extent - size).astype(np.int64)
@@ -219,7 +219,7 @@ def _window(image: Tensor, xy: np.ndarray, most: int) -> tuple[Tensor, np.ndarra
 
 
 def _cycle(step: int, steps: int) -> float:
-    """Share of the highest rate: cosine up over a tenth of the steps, cosine down to nothing."""
+    """Share of the highest rate: cosine rise over a tenth of the steps, then cosine decay to 0."""
     rise = max(0.1 * steps, 1.0)
     if step < rise:
         return 0.04 + 0.96 * 0.5 * (1.0 - math.cos(math.pi * step / rise))

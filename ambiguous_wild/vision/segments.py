@@ -1,4 +1,4 @@
-"""Segments that need no weights: OpenCV's graph segmentation in Lab (Felzenszwalb and Huttenlocher 2004)."""
+"""Segments without weights: OpenCV's graph segmentation in Lab (Felzenszwalb and Huttenlocher 2004)."""
 
 from __future__ import annotations
 
@@ -12,22 +12,23 @@ from torch import Tensor
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import check_limits, config_hash
 
-_REFERENCE_PIXELS = 240 * 135  # k and min_size are stated for this size and grow with the pixel count
+_REFERENCE_PIXELS = 240 * 135  # k and min_size are for this size and scale with the pixel count
 
 
 @dataclass(frozen=True)
 class SegmentConfig:
-    """More and smaller segments than look right: one that holds a distractor and the background behind it, in
-    the same colours, cannot be judged. Best IoU with the truth that whole segments can reach, on 30 simulated
-    photos of 240x135: 0.57 for 30 to 70 segments, 0.76 for 70 to 140, 0.77 for 120 to 240.
+    """Many small segments, because one that mixes a distractor and background of the same colour is useless.
+
+    Best IoU with the true mask that whole segments can reach, on 30 simulated photos of 240x135: 0.57 for 30
+    to 70 segments, 0.76 for 70 to 140, 0.77 for 120 to 240.
     """
 
     sigma: float = 0.5  # px, smoothing before the graph is built
-    k: float = 100.0  # first guess of the scale, at 240x135
+    k: float = 100.0  # initial scale, at 240x135
     min_size: int = 30  # px at 240x135; smaller segments are merged away
-    fewest: int = 70  # segments wanted: at least
-    most: int = 140  # and at most
-    tries: int = 3  # steps of the bisection on k; the closest one is kept
+    fewest: int = 70  # least wanted number of segments
+    most: int = 140  # most
+    tries: int = 3  # steps of the bisection on k; the closest result is kept
 
     def __post_init__(self) -> None:
         check_limits(
@@ -43,7 +44,7 @@ class SegmentConfig:
 
 
 class GraphSegments:
-    """Many small segments a photo. None is a whole object: residuals and features vote and merge."""
+    """Many small segments a photo, none a whole object; residuals and features merge them later."""
 
     def __init__(self, config: SegmentConfig | None = None) -> None:
         self.config = config or SegmentConfig()
@@ -51,17 +52,17 @@ class GraphSegments:
         self.name = "graph-lab-1" + (f"-{config_hash(self.config)[:8]}" if own else "")
 
     def labels(self, photo: Tensor) -> np.ndarray:
-        """Segments [H, W] int32 from 1 of a photo [H, W, 3] in [0, 1]; the same photo, the same labels."""
+        """Segments [H, W] int32 from 1 of a photo [H, W, 3] in [0, 1]; deterministic."""
         rgb = (photo.detach().cpu().numpy().clip(0.0, 1.0) * 255.0).round().astype(np.uint8)
         lab = cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2LAB)
         return segment(lab, self.config)
 
 
 def segment(lab: np.ndarray, config: SegmentConfig) -> np.ndarray:
-    """Labels [H, W] int32 from 1 of an 8-bit image [H, W, 3], k bisected for the wanted count.
+    """Labels [H, W] int32 from 1 of an 8-bit image [H, W, 3]; bisects k for the wanted count.
 
-    The count falls as k grows. Three tries reach the range on most photos; a photo without structure
-    stays below it, which is right: it has no segments to find.
+    The count decreases with k. Three tries reach the range on most photos; a photo without structure stays
+    below it.
     """
     growth = lab.shape[0] * lab.shape[1] / _REFERENCE_PIXELS
     smallest = max(round(config.min_size * growth), 1)

@@ -1,6 +1,6 @@
-"""Static surfaces from the sparse points alone: what lies behind a pixel before anything was trained.
+"""Depth of static surfaces from the sparse SfM points alone, before training.
 
-Inverse depth is linear between the points, which is exact on planes.
+Inverse depth is interpolated linearly between the points, which is exact on planes.
 """
 
 from __future__ import annotations
@@ -16,31 +16,31 @@ from scipy.spatial import QhullError
 
 from ambiguous_wild.core import Camera
 
-BEHIND = 1.15  # times the depth of the nearest static surface: behind it
-_PIXELS = 20_000  # of a map at most; what is computed on it is brought to the photo's size
-_CELLS = 32  # a side; of points in one cell or the next, those behind are seen through something
+BEHIND = 1.15  # a point deeper than this times the nearest static depth is behind the surface
+_PIXELS = 20_000  # most pixels of a map; results are enlarged to the photo's size
+_CELLS = 32  # cells along a side; within a cell, points far behind the nearest one are occluded
 _LEAST_POINTS = 8
-_FRAME_PIXELS = 1000  # of a map that counts who else has a place in the frame
-_MOST_POINTS = 4000  # drawn at random; more are slow and tell no more (see docs/metrics.md)
+_FRAME_PIXELS = 1000  # of a map that counts the cameras that have a place in their frame
+_MOST_POINTS = 4000  # a random subset; more points are slower and not better (see docs/metrics.md)
 
 
 def some_points(xyz: np.ndarray) -> np.ndarray:
-    """As many of the points [M, 3] as surfaces need, the same every time."""
+    """A fixed random subset of the points [M, 3], large enough for surfaces."""
     if len(xyz) <= _MOST_POINTS:
         return xyz
     return xyz[np.random.default_rng(0).permutation(len(xyz))[:_MOST_POINTS]]
 
 
 def inverse_depth(camera: Camera, points: np.ndarray) -> np.ndarray | None:
-    """1/z of the static surface, [h, w] float32, from sparse points [M, 3]; NaN outside them.
+    """Inverse depth 1/z of the static surface, [h, w] float32, from sparse points [M, 3]; NaN outside them.
 
-    The map covers the camera's frame with some 20 000 pixels or fewer. None: too few points in the frame.
+    The map covers the camera's frame with at most about 20 000 pixels. None: too few points in the frame.
     """
     h, w = _map_size(camera)
     xyz = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
     xyz = xyz[xyz[:, 2] > 0]
     x, y = in_map(camera, xyz, (h, w))
-    # What lies a little outside the frame says how the surface goes on at its border.
+    # Points a little outside the frame define the surface at its border.
     near = (x > -0.25 * w) & (x < 1.25 * w) & (y > -0.25 * h) & (y < 1.25 * h)
     x, y, z = x[near], y[near], xyz[near, 2]
     front = _in_front(x / w, y / h, z)
@@ -48,7 +48,7 @@ def inverse_depth(camera: Camera, points: np.ndarray) -> np.ndarray | None:
         return None
     try:
         surface = LinearNDInterpolator(np.column_stack([x, y])[front], 1.0 / z[front])
-    except QhullError:  # all on one line
+    except QhullError:  # all points on one line
         return None
     columns, rows = np.meshgrid(np.arange(w), np.arange(h))
     return surface(columns, rows).astype(np.float32)
@@ -63,17 +63,17 @@ def static_surfaces(cameras: Sequence[Camera], xyz: np.ndarray) -> list[np.ndarr
 def seldom_seen(
     cameras: Sequence[Camera], surfaces: Sequence[np.ndarray | None], least: int
 ) -> list[np.ndarray | None]:
-    """Which places fewer than `least` of the other cameras have in their frame, whatever stands before them.
+    """Which places lie in the frame of fewer than `least` other cameras; occlusion is ignored.
 
-    Outside the sparse points the nearest known depth holds: it is good enough to say who looks that way.
+    Outside the sparse points the nearest known depth is used, which is accurate enough for this.
 
     Args:
         cameras: of one scene.
         surfaces: their inverse depths [h, w], from `static_surfaces`.
-        least: cameras; no more are asked for than there are others.
+        least: number of cameras, limited to the number of other cameras.
 
     Returns:
-        bool maps of some 1000 pixels, spread evenly over each frame; None where a surface is.
+        bool maps of about 1000 pixels, spread evenly over each frame; None where a surface is None.
     """
     least = min(least, len(cameras) - 1)
     centres = np.stack([c.center for c in cameras])
@@ -89,8 +89,8 @@ def seldom_seen(
         )
         inverse = cv2.resize(surface[rows, columns], size, interpolation=cv2.INTER_NEAREST)
         world = world_points(cameras[view], inverse).reshape(-1, 3)
-        missing = np.full(len(world), least)  # cameras that must still be found
-        # near ones first: most places are settled after a few
+        missing = np.full(len(world), least)  # cameras still to find
+        # nearest cameras first: most places are decided after a few
         for other in np.argsort(np.linalg.norm(centres - centres[view], axis=1), kind="stable"):
             open_ = np.flatnonzero(missing > 0)
             if not len(open_):
@@ -120,7 +120,7 @@ def world_points(camera: Camera, inverse: np.ndarray) -> np.ndarray:
 
 
 def in_map(camera: Camera, local: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Columns and rows, whole numbers at pixel centres, of camera points in a map of the camera's frame."""
+    """Columns and rows of camera points in a map of the frame; pixel centres are whole numbers."""
     z = np.where(local[..., 2] > 1e-9, local[..., 2], np.nan)
     x = (local[..., 0] / z * camera.fx + camera.cx) * (shape[1] / camera.width) - 0.5
     y = (local[..., 1] / z * camera.fy + camera.cy) * (shape[0] / camera.height) - 0.5
@@ -128,12 +128,12 @@ def in_map(camera: Camera, local: np.ndarray, shape: tuple[int, ...]) -> tuple[n
 
 
 def inside(x: np.ndarray, y: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Which places of `in_map` the map holds, bool; NaN is nowhere."""
+    """Which positions from `in_map` lie inside the map, bool; NaN is outside."""
     return (x >= -0.5) & (x < shape[1] - 0.5) & (y >= -0.5) & (y < shape[0] - 0.5)
 
 
 def _in_front(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Which points are not seen through a nearer surface, [M] bool; x and y are shares of the frame."""
+    """Which points no nearer surface occludes, [M] bool; x and y are shares of the frame."""
     column, row = ((np.floor(v * _CELLS).astype(np.intp) + _CELLS // 2) for v in (x, y))
     nearest = np.full((2 * _CELLS + 2, 2 * _CELLS + 2), np.inf)
     np.minimum.at(nearest, (row, column), z)

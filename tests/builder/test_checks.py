@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
+from ambiguous_wild.builder.capture_report import check_capture, noise, refuse_failed
 from ambiguous_wild.builder.checks import Check
-from ambiguous_wild.builder.shared_points import compare, partners_of, signature
-from ambiguous_wild.builder.survey import noise, refuse, survey
+from ambiguous_wild.builder.photo_comparison import candidate_pairs, compare_photos, photo_features
 from ambiguous_wild.core import AwError
 from tests.builder.capture_maker import eyes, render, texture, write_capture
 
@@ -27,7 +27,7 @@ def checks(folder: Path, photos: list[np.ndarray]) -> dict[str, Check]:
     folder.mkdir()
     for i, photo in enumerate(photos):
         cv2.imwrite(str(folder / f"p{i:02d}.png"), photo[:, :, ::-1])
-    return {c.name: c for c in survey(folder).checks}
+    return {c.name: c for c in check_capture(folder).checks}
 
 
 def lit(photo: np.ndarray, stops: np.ndarray | float) -> np.ndarray:
@@ -99,12 +99,12 @@ def test_walking_where_one_looks_is_told(clean: list[np.ndarray], tmp_path: Path
 
 def test_strict_names_every_failed_check(clean: list[np.ndarray], tmp_path: Path) -> None:
     checks(tmp_path / "raw", clean)
-    refuse(survey(tmp_path / "raw"))
+    refuse_failed(check_capture(tmp_path / "raw"))
     (tmp_path / "raw/z.png").write_bytes(b"no photo")
     with pytest.raises(
         AwError, match=r"fails 1 of 10 capture checks: files: 1 of 9 photos are left out: z\.png"
     ):
-        refuse(survey(tmp_path / "raw"))
+        refuse_failed(check_capture(tmp_path / "raw"))
 
 
 def test_exif_decides_where_it_speaks(tmp_path: Path) -> None:
@@ -121,7 +121,7 @@ def test_exif_decides_where_it_speaks(tmp_path: Path) -> None:
         camera[0x8827] = 100 * (i + 1)
         camera[0xA403], camera[0x920A] = 1, rational(4 + i, 1)
         image.save(path, quality=95, exif=exif)
-    found = {c.name: c for c in survey(tmp_path / "raw").checks}
+    found = {c.name: c for c in check_capture(tmp_path / "raw").checks}
     # The photos are equally bright: the settings followed the light.
     said = "automatic: settings span 5.0 stops, the same surfaces differ by 0.0"
     assert found["exposure"] == Check("exposure", "ok", "EXIF and pixels", said)
@@ -134,14 +134,14 @@ def test_exif_decides_where_it_speaks(tmp_path: Path) -> None:
 
 def test_pairs_of_a_large_capture_grow_with_its_length() -> None:
     rng = np.random.default_rng(0)
-    signs = [signature(rng.integers(0, 255, (40, 60, 3)).astype(np.uint8)) for _ in range(40)]
-    pairs = partners_of(signs)
+    signs = [photo_features(rng.integers(0, 255, (40, 60, 3)).astype(np.uint8)) for _ in range(40)]
+    pairs = candidate_pairs(signs)
     assert len(pairs) <= 40 * 12 and {(i, i + 1) for i in range(39)} <= set(pairs)
-    assert len(partners_of(signs[:5])) == 10
+    assert len(candidate_pairs(signs[:5])) == 10
 
 
 def test_featureless_photos_are_unknown_not_an_error() -> None:
-    got = compare([signature(np.full((60, 80, 3), 90, np.uint8))] * 3)
+    got = compare_photos([photo_features(np.full((60, 80, 3), 90, np.uint8))] * 3)
     assert np.isnan(got.offsets).all() and got.partners.tolist() == [0, 0, 0] and got.group.max() == 2
 
 

@@ -12,6 +12,7 @@ import pytest
 
 from ambiguous_wild.builder import report, stages
 from ambiguous_wild.builder.pipeline import build_scene
+from ambiguous_wild.builder.records import SceneRecord
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.images import image_size, read_gray, read_png_rgb, write_png
@@ -101,6 +102,26 @@ def test_scene_json_tells_what_was_done(scene):
     assert set(info["seconds"]) >= {"screen", "features", "matches", "mapping", "undistort", "package"}
     assert 0 < report.sfm_share(info) < 1
     assert "6 of 6" in report.verdict(info, (160, 120), scene)
+
+
+def test_scene_json_keeps_its_keys_and_their_order(scene):
+    info = json.loads((scene / "scene.json").read_text())
+    assert list(info) == [
+        "schema", "schema_version", "name", "license", "factor", "images", "split", "seed", "settings",
+        "chosen", "counts", "reprojection_error_px", "mean_track_length", "models", "lost", "skipped",
+        "warnings", "photos", "masks", "truth", "build_key", "inputs", "seconds", "files",
+    ]  # fmt: skip
+    assert set(info) == SceneRecord.__required_keys__
+    assert list(info["inputs"]) == ["photos", "masks", "truth", "test_list", "settings", "versions"]
+    assert list(info["chosen"]) == ["camera", "matcher", "mapper", "model"]
+    assert list(info["counts"]) == [
+        "photos", "readable", "registered", "train", "test", "cameras", "points", "points_seen_in_test_only",
+        "points_of_track_length_2", "pairs", "pairs_verified",
+    ]  # fmt: skip
+    assert list(info["models"][0]) == ["model", "images", "points", "error_px", "track_length"]
+    assert list(info["photos"]["p01.png"]) == [
+        "source", "sha256", "split", "width", "height", "blur", "mean_luma", "features", "notes", "exif",
+    ]  # fmt: skip
 
 
 def test_truth_comes_along_at_the_size_of_the_photos(scene):
@@ -250,9 +271,9 @@ def test_a_mistyped_option_does_not_cost_the_work_of_a_stopped_build(raw, tmp_pa
     assert "features" in build_scene(raw, out, SETTINGS).reused
 
 
-def test_what_lies_in_a_scene_and_is_not_the_builds_is_never_removed(raw, tmp_path):
+def test_what_lies_in_a_scene_and_is_not_the_builds_is_never_removed(raw, scene, tmp_path):
     out = tmp_path / "scene"
-    build_scene(raw, out, SETTINGS)
+    shutil.copytree(scene, out)
     (out / "runs").mkdir()
     (out / "runs" / "notes.txt").write_text("mine")
     other = BuildSettings(**{**vars(SETTINGS), "factor": 4})

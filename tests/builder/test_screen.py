@@ -29,6 +29,11 @@ def test_plain_photos_are_linked_and_others_converted(tmp_path):
         np.abs(read_png_rgb(photos / "p01.png")[..., 0].astype(int) - cv2.imread(str(paths[1]), 0)).max() <= 1
     )
     assert any("grey" in w for w in facts["warnings"])
+    assert list(facts) == ["photos", "skipped", "warnings"]
+    assert list(facts["photos"][0]) == [
+        "source", "stem", "side", "sha256", "width", "height", "exif", "camera", "blur", "mean_luma", "notes",
+        "work_name", "copies",
+    ]  # fmt: skip
 
 
 def test_turned_photo_is_upright_and_keeps_its_focal_length(tmp_path):

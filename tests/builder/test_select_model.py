@@ -4,7 +4,7 @@ import sqlite3
 import numpy as np
 import pytest
 
-from ambiguous_wild.builder.report import _turned, parallax_deg
+from ambiguous_wild.builder.report import _parallax_warnings, parallax_deg
 from ambiguous_wild.builder.select_model import (
     PairFacts,
     check_registered,
@@ -127,5 +127,8 @@ def test_parallax_is_the_angle_under_which_points_are_seen():
     for image in still.images.values():
         image.tvec[:] *= 1e-3
     assert parallax_deg(still) < 0.01
-    assert _turned(model) == [] and "hardly moved" in _turned(still)[0]
-    assert np.isnan(parallax_deg(make_model(names, points=0))) and _turned(make_model(names, points=0)) == []
+    assert _parallax_warnings(model) == [] and "hardly moved" in _parallax_warnings(still)[0]
+    assert (
+        np.isnan(parallax_deg(make_model(names, points=0)))
+        and _parallax_warnings(make_model(names, points=0)) == []
+    )

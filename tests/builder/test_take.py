@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from ambiguous_wild.builder import take
+from ambiguous_wild.builder import capture_photos
 from ambiguous_wild.cli.capture import command
 from ambiguous_wild.core import AwError
 from tests.builder.capture_maker import texture, write_capture
@@ -48,6 +48,17 @@ def test_frames_are_the_sharp_ones_and_evenly_spaced(tmp_path: Path) -> None:
     facts = json.loads(done.stdout)
     assert [p["frame"] for p in facts["photos"]] == list(range(4, FRAMES, SHARP_EVERY))
     assert facts["photos"][1]["time_s"] == pytest.approx(12 / 24)
+    record = json.loads((out / "capture.json").read_text())
+    assert list(record) == [
+        "version",
+        "kind",
+        "source",
+        "frames_read",
+        "frames_announced",
+        "photos",
+        "left_out",
+    ]
+    assert list(record["photos"][0]) == ["photo", "frame", "time_s", "sharpness"]
     assert sorted(p.name for p in out.iterdir()) == [
         "capture.json",
         *(f"frame_{k:05d}.jpg" for k in range(1, 7)),
@@ -59,9 +70,9 @@ def test_frames_are_the_sharp_ones_and_evenly_spaced(tmp_path: Path) -> None:
 def test_stretches_of_equals_keep_their_distance() -> None:
     flat = np.full((16, 16, 3), 7, np.uint8)
     frames = ((i, i / 10, flat) for i in range(40))
-    got = [f.index for f in take.sharpest(frames, [0, 10, 20, 30, 40])]
+    got = [f.index for f in capture_photos.sharpest(frames, [0, 10, 20, 30, 40])]
     assert len(got) == 4 and np.diff(got).min() >= 5
-    one_each = [f.index for f in take.sharpest(((i, 0.0, flat) for i in range(4)), [0, 1, 2, 3, 4])]
+    one_each = [f.index for f in capture_photos.sharpest(((i, 0.0, flat) for i in range(4)), [0, 1, 2, 3, 4])]
     assert one_each == [0, 1, 2, 3]
 
 
@@ -132,11 +143,11 @@ def test_a_camera_that_stops_leaves_nothing(tmp_path: Path, monkeypatch: pytest.
         def release(self) -> None:
             pass
 
-    monkeypatch.setattr(take, "_open", lambda _: Camera())
-    facts = take.take_camera(0, tmp_path / "ok", frames=4, every_s=1.0)
+    monkeypatch.setattr(capture_photos, "_open", lambda _: Camera())
+    facts = capture_photos.photos_from_camera(0, tmp_path / "ok", frames=4, every_s=1.0)
     assert [p["frame"] // 10 for p in facts["photos"]] == [0, 1, 2, 3]
     with pytest.raises(AwError, match="stopped after 4 of 9"):
-        take.take_camera(0, tmp_path / "raw", frames=9, every_s=1.0)
+        capture_photos.photos_from_camera(0, tmp_path / "raw", frames=9, every_s=1.0)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["ok"]
 
 

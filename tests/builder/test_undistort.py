@@ -6,7 +6,8 @@ import pytest
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.undistort import make_lens, undistort
 from ambiguous_wild.core import AwError
-from ambiguous_wild.io.colmap_model import ModelCamera, read_model
+from ambiguous_wild.io.colmap_model import read_model
+from ambiguous_wild.io.colmap_records import ModelCamera
 from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 from tests.builder.capture_maker import render

@@ -4,13 +4,12 @@ import csv
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
+from tests.command_line import aw
 from tests.tiny_scene import write_tiny_scene
 
-ROOT = Path(__file__).parents[2]
 PLUGIN = """
 from ambiguous_wild.methods.ablation import Group, Variant
 from ambiguous_wild.methods.registry import MethodEntry, register
@@ -26,9 +25,8 @@ register(MethodEntry(
 """
 
 
-def aw(*arguments) -> subprocess.CompletedProcess:
-    command = [sys.executable, "-m", "ambiguous_wild.cli.main", "ablate", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+def ablate(*arguments) -> subprocess.CompletedProcess:
+    return aw("ablate", *arguments)
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +58,7 @@ def test_listing_shows_every_group_and_variant_and_imports_no_torch():
         "union",
         "fused",
     ]
-    plain = aw("--list", "--group", "alpha1").stdout
+    plain = ablate("--list", "--group", "alpha1").stdout
     assert "lambda_cr=0.3" in plain and "mask." not in plain
 
 
@@ -75,7 +73,7 @@ def test_listing_shows_every_group_and_variant_and_imports_no_torch():
     ],
 )
 def test_mistakes_get_one_line_and_exit_code_2(scene, tmp_path, arguments, message):
-    done = aw("-o", tmp_path / "out", *[scene if a == "SCENE" else a for a in arguments])
+    done = ablate("-o", tmp_path / "out", *[scene if a == "SCENE" else a for a in arguments])
     assert done.returncode == 2, done.stderr
     assert message in done.stderr
     assert done.stderr.count("\n") == 1 and "Traceback" not in done.stderr
@@ -85,7 +83,7 @@ def test_mistakes_get_one_line_and_exit_code_2(scene, tmp_path, arguments, messa
 def test_a_study_is_trained_once_and_tabulated(scene, plugin, tmp_path):
     words = ["--method", "mine", "--plugin", plugin, "--scene", scene, "--iterations", "20", "-o", tmp_path]
     words += ["--group", "size"]
-    first = aw(*words)
+    first = ablate(*words)
     assert first.returncode == 0, first.stderr
     assert (tmp_path / "scene" / "mine@size-few" / "seed0" / "metrics.json").is_file()
     rows = {row["variant"]: row for row in csv.DictReader((tmp_path / "ablation.csv").open())}
@@ -93,10 +91,10 @@ def test_a_study_is_trained_once_and_tabulated(scene, plugin, tmp_path):
     assert float(rows["few"]["psnr"]) > 10 and float(rows["default"]["difference_psnr"]) == 0
     assert rows["peer"]["status"] == "missing" and "not-here" in rows["peer"]["reason"]
     assert "| few |" in first.stdout and "- peer missing" in first.stdout
-    again = aw(*words)
+    again = ablate(*words)
     assert again.stderr.count("finished before, kept") == 2
     assert list(csv.DictReader((tmp_path / "ablation.csv").open())) == list(rows.values())
-    joined = aw(*words[:-1], "length")
+    joined = ablate(*words[:-1], "length")
     assert joined.returncode == 0 and "with what" in joined.stderr, joined.stderr
     together = list(csv.DictReader((tmp_path / "ablation.csv").open()))
     assert [(row["group"], row["variant"]) for row in together] == [
@@ -104,5 +102,5 @@ def test_a_study_is_trained_once_and_tabulated(scene, plugin, tmp_path):
     ]  # fmt: skip
     made_by = json.loads((tmp_path / "ablation.json").read_text())["made_by"]
     assert made_by.endswith("--group length --group size")
-    other = aw(*words[:-1], "length", "--set", "mine.stop=700")  # of other settings: a report of its own
+    other = ablate(*words[:-1], "length", "--set", "mine.stop=700")  # of other settings: a report of its own
     assert "with what" not in other.stderr

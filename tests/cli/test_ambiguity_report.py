@@ -102,10 +102,10 @@ def test_no_distractor_pixels_give_no_verdict(scene: Path, tmp_path: Path) -> No
         facts = report(scene, "-o", tmp_path / "out")
     assert facts["occlusion"]["value"] == 0
     assert facts[COLOUR_METRIC]["value"] is None and facts[SEMANTIC_METRIC]["ambiguous"] is None
-    assert facts["class"] == "nobody there"
+    assert facts["class"] == "no distractors"
     done = CliRunner().invoke(command, [str(scene), "-o", str(tmp_path / "again")], catch_exceptions=False)
     assert "photos are empty" in done.stdout and "missing" not in done.stdout
-    assert "nobody there" in (tmp_path / "again/index.html").read_text()
+    assert "no distractors" in (tmp_path / "again/index.html").read_text()
 
 
 def test_what_white_means_is_asked_of_a_folder_alone(scene: Path, tmp_path: Path) -> None:

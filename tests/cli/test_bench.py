@@ -6,20 +6,13 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 
 from ambiguous_wild.cli.bench import parse_budget
 from ambiguous_wild.core import AwError
+from tests.command_line import ROOT, aw
 from tests.tiny_scene import write_tiny_scene
-
-ROOT = Path(__file__).parents[2]
-
-
-def aw(*arguments, **kw) -> subprocess.CompletedProcess:
-    command = [sys.executable, "-m", "ambiguous_wild.cli.main", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, **kw)
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +76,7 @@ def test_an_output_that_cannot_be_is_one_line(scene, tmp_path, output):
 
 def test_killed_in_mid_training_the_same_command_ends_with_the_same_renders(scene, tmp_path):
     """kill -9 once a checkpoint is there; the second command resumes and equals an undisturbed run."""
-    arguments = ["bench", "--method", "3dgs", "--scene", scene, "--iterations", "1500"]
+    arguments = ["bench", "--method", "3dgs", "--scene", scene, "--iterations", "650"]
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     assert aw(*arguments, "-o", whole).returncode == 0
 

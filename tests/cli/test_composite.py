@@ -29,7 +29,7 @@ def aw_composite(*words: object) -> str:
 
 def test_counts_and_the_next_command(base: Path, tmp_path: Path) -> None:
     said = aw_composite(base, "-o", tmp_path / "my out", "--patches", "--coverage", 0.1, "--pose", "lying")
-    assert "8 train photos, 3 things cover" in said
+    assert "8 train photos, 3 distractors cover" in said
     assert f"--scene '{tmp_path / 'my out'}'" in said.splitlines()[-1]
     assert len(load_scene(tmp_path / "my out").train) == 8
 

@@ -9,7 +9,7 @@ from ambiguous_wild.cli import checks, devices, main
 from ambiguous_wild.cli.bench import command as bench
 from ambiguous_wild.cli.probes import Probe
 from ambiguous_wild.core import AwError
-from ambiguous_wild.splat import cuda_ready
+from ambiguous_wild.splat.gpu import readiness
 from tests.splat.test_cuda_ready import CASES, TORCH, found
 from tests.tiny_scene import write_tiny_scene
 
@@ -19,7 +19,7 @@ def here(monkeypatch):
     """Makes this machine the one that is given."""
 
     def be(machine):
-        monkeypatch.setattr(cuda_ready, "look", lambda torch=None: machine)
+        monkeypatch.setattr(readiness, "look", lambda torch=None: machine)
 
     return be
 
@@ -50,7 +50,8 @@ def test_cuda_is_refused_with_exit_code_2_before_anything_is_made(here, tmp_path
 
 
 def test_a_grid_falls_back_and_runs(here, tmp_path, monkeypatch):
-    monkeypatch.setattr("ambiguous_wild.cli.bench.prepare_cpu", lambda threads: None)  # compiles all kernels
+    # it compiles all kernels
+    monkeypatch.setattr("ambiguous_wild.harness.running.prepare.prepare_cpu", lambda *_: None)
     here(CASES["old gpu"][0])
     scene = write_tiny_scene(tmp_path / "scene")
     words = [
@@ -87,7 +88,7 @@ def test_doctor_says_it_in_the_same_words(here, case):
 def test_doctor_says_where_the_kernels_are(here):
     states = {
         "compiled, in": {},
-        "part of its wheel": {"prebuilt": True},
+        "prebuilt in the wheel": {"prebuilt": True},
         "not compiled yet": {"compiled": False},
     }
     for words, machine in states.items():

@@ -1,4 +1,4 @@
-"""`aw doctor`: what it says is so, and what lacks comes with a way to get it."""
+"""`aw doctor`: what it reports is true, and missing parts come with a command to paste."""
 
 from __future__ import annotations
 
@@ -35,6 +35,18 @@ def test_whatever_lacks_comes_with_a_way_to_get_it(report: list[Check]) -> None:
     for c in report:
         assert c.detail
         assert bool(c.fix) is (not c.ok and c.group != "planned"), c
+        if c.name not in ("torch cuda", "gsplat kernels"):  # their words are those of --device
+            assert subprocess.run(["bash", "-n", "-c", c.fix]).returncode == 0, c.fix
+
+
+@pytest.mark.parametrize("tool", ["apt-get", "brew", ""])
+def test_a_system_package_comes_with_the_command_of_the_machine(
+    tool: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(checks.shutil, "which", lambda name: f"/bin/{name}" if name == tool else None)
+    monkeypatch.setattr(checks.readiness, "first_line", lambda *words: None)
+    fix = checks._git().fix
+    assert fix.startswith("# install git from https://") if not tool else f"{tool} install" in fix
 
 
 def test_what_no_code_uses_yet_is_said_so_and_not_asked_for(report: list[Check]) -> None:
@@ -69,13 +81,20 @@ def test_the_way_to_lpips_can_be_pasted(monkeypatch: pytest.MonkeyPatch, tmp_pat
     for name in ("AW_WEIGHTS", "TORCH_HOME", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("HOME", str(tmp_path))
+    fake_curl = tmp_path / "bin" / "curl"  # writes an empty file in place of a download
+    fake_curl.parent.mkdir()
+    fake_curl.write_text('#!/bin/sh\n[ "$1 $2" = "-fL -o" ] && : > "$3"\n')
+    fake_curl.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{fake_curl.parent}:/usr/bin:/bin")
     fix = checks._metrics()[0].fix
     assert "alexnet" in fix and "lpips_alex.pth" in fix
     assert subprocess.run(["bash", "-c", fix]).returncode == 0
-    assert (tmp_path / ".cache/ambiguous_wild/weights").is_dir()
+    monkeypatch.setenv("AW_WEIGHTS", str(tmp_path / ".cache/ambiguous_wild/weights"))
+    assert checks._metrics()[0].ok
     monkeypatch.setenv("AW_WEIGHTS", str(tmp_path / "my weights"))
+    assert not checks._metrics()[0].ok
     assert subprocess.run(["bash", "-c", checks._metrics()[0].fix]).returncode == 0
-    assert (tmp_path / "my weights").is_dir()
+    assert checks._metrics()[0].ok
 
 
 def test_the_report_prints_every_check(monkeypatch: pytest.MonkeyPatch, report: list[Check]) -> None:
@@ -143,7 +162,11 @@ def test_a_probe_that_fails_says_how(code: str, words: str, monkeypatch: pytest.
 def test_a_broken_torchvision_is_named_and_an_absent_one_is_fine() -> None:
     assert checks._torchvision(None).ok
     broken = checks._torchvision(Probe(None, "operator torchvision::nms does not exist"))
-    assert not broken.ok and broken.group == "optional" and broken.fix == "pip uninstall torchvision"
+    assert (
+        not broken.ok
+        and broken.group == "optional"
+        and broken.fix.endswith("-m pip uninstall -y torchvision")
+    )
 
 
 def test_a_cache_that_cannot_be_written_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -10,24 +10,23 @@ import pytest
 
 from ambiguous_wild import __version__
 from ambiguous_wild.cli.main import COMMANDS
+from tests.command_line import aw
 
 
-def aw(*words: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "ambiguous_wild.cli.main", *words],
-        capture_output=True,
-        text=True,
-        cwd=cwd,
-        check=False,
-    )
+def typed(*words: str) -> subprocess.CompletedProcess[str]:
+    """In a process of its own, as a shell starts it."""
+    command = [sys.executable, "-m", "ambiguous_wild.cli.main", *words]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
 def test_help_lists_every_command_and_version_prints() -> None:
-    done = aw("--help")
+    done = typed("--help")
     assert done.returncode == 0
     for name, (_, text) in COMMANDS.items():
         assert name in done.stdout and text.split()[0] in done.stdout
-    assert __version__ in aw("--version").stdout
+    assert __version__ in typed("--version").stdout
+    wrong = typed("tabel")
+    assert wrong.returncode == 2 and wrong.stderr.startswith("error: ") and wrong.stdout == ""
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -1,20 +1,11 @@
 """`aw plan` and `aw bench --effects` as they are typed."""
 
 import json
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
+from tests.command_line import aw
 from tests.tiny_scene import write_tiny_scene
-
-ROOT = Path(__file__).parents[2]
-
-
-def aw(*arguments) -> subprocess.CompletedProcess:
-    command = [sys.executable, "-m", "ambiguous_wild.cli.main", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +35,7 @@ def test_a_plan_is_a_table_and_a_file_and_leaves_the_scene_alone(scene, tmp_path
     # made again without a probe it would lose what the probe found
     kept = (tmp_path / "plan.json").read_bytes()
     done = aw("plan", scene, "-o", tmp_path / "plan.json", "--no-probe")
-    assert done.returncode == 2 and "what a probe found" in done.stderr
+    assert done.returncode == 2 and "the result of a probe" in done.stderr
     assert (tmp_path / "plan.json").read_bytes() == kept
 
 
@@ -52,7 +43,7 @@ def test_a_file_that_is_no_plan_is_not_replaced(scene, tmp_path):
     photo = tmp_path / "photo.jpg"
     photo.write_bytes(b"\xff\xd8 mine")
     done = aw("plan", scene, "-o", photo, "--no-probe")
-    assert done.returncode == 2 and "is no plan of 'aw plan'; choose another -o" in done.stderr
+    assert done.returncode == 2 and "is not a plan of 'aw plan'; choose another -o" in done.stderr
     assert photo.read_bytes() == b"\xff\xd8 mine"
     for _ in range(2):  # an earlier plan is
         assert aw("plan", scene, "-o", tmp_path / "plan.json", "--no-probe").returncode == 0

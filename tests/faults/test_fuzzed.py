@@ -17,8 +17,8 @@ import torch
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.planning.decide import SCHEMA
 from ambiguous_wild.harness.planning.file import read_plan
-from ambiguous_wild.harness.result_file import read_result
-from ambiguous_wild.harness.store import read_config
+from ambiguous_wild.harness.running.result_file import read_result
+from ambiguous_wild.harness.running.store import read_config
 from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.image_header import header_size
 from ambiguous_wild.io.images import read_png_rgb, write_png
@@ -114,7 +114,7 @@ def test_an_answer_that_took_longer_than_any_number(tmp_path):
     (name, data), *_ = panel(key, dict.fromkeys(METHODS, 0.0), 1, np.random.default_rng(0)).items()
     data["answers"][0]["ms"] = 10**400
     (tmp_path / name).write_text(json.dumps(data))
-    with pytest.raises(AwError, match="no fit time"):
+    with pytest.raises(AwError, match="no valid time"):
         read_answers([tmp_path / name], key)
 
 
@@ -202,7 +202,7 @@ def test_an_interrupted_download_of_weights_is_never_taken_for_whole(tmp_path, s
     torch.save({"a.weight": torch.zeros(40, 40)}, tmp_path / "whole.pth")
     data = (tmp_path / "whole.pth").read_bytes()
     (tmp_path / "part.pth").write_bytes(data[: int(len(data) * share)])
-    with pytest.raises(AwError, match=r"part\.pth cannot be read as weights.*replace the file"):
+    with pytest.raises(AwError, match=r"part\.pth cannot be read as weights.*download it again"):
         lpips._read(tmp_path / "part.pth")
     checkpoint.save(tmp_path / "a.safetensors", {"means": torch.zeros(40, 40)})
     data = (tmp_path / "a.safetensors").read_bytes()

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from ambiguous_wild.builder.workspace import Workspace
-from ambiguous_wild.harness.grid import cell_folder, plan_cells, run_cells
+from ambiguous_wild.harness.running.grid import cell_folder, plan_cells, run_cells
 from ambiguous_wild.io.atomic import write_json
 from ambiguous_wild.io.images import write_png
 from ambiguous_wild.splat.pace import TrainConfig

@@ -15,7 +15,7 @@ from ambiguous_wild.cli.ambiguity_report import command
 from ambiguous_wild.core import AwError, Camera
 from ambiguous_wild.harness.ambiguity.run_background import RunBackground, sees, unproject
 from ambiguous_wild.harness.ambiguity.sources import find_masks
-from ambiguous_wild.harness.run import scene_identity
+from ambiguous_wild.harness.running.identity import scene_identity
 from ambiguous_wild.io.ply import write_splat_ply
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.metrics.ambiguity import COLOUR_METRIC

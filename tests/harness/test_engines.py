@@ -12,12 +12,12 @@ from click.testing import CliRunner
 
 from ambiguous_wild.cli.bench import command as bench
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.engines import job as jobs
-from ambiguous_wild.harness.engines.processes import run_in_processes
-from ambiguous_wild.harness.engines.ray_cluster import RayOptions
-from ambiguous_wild.harness.engines.transfer import receive, run_sent, send_scene, stays
-from ambiguous_wild.harness.grid import cell_folder, plan_cells
-from ambiguous_wild.harness.result_file import read_result
+from ambiguous_wild.harness.running.engines import job as jobs
+from ambiguous_wild.harness.running.engines.processes import run_in_processes
+from ambiguous_wild.harness.running.engines.ray_cluster import RayOptions
+from ambiguous_wild.harness.running.engines.transfer import receive, run_sent, send_scene, stays
+from ambiguous_wild.harness.running.grid import cell_folder, plan_cells
+from ambiguous_wild.harness.running.result_file import read_result
 from ambiguous_wild.methods import registry
 from ambiguous_wild.splat.pace import TrainConfig
 from tests.tiny_scene import write_tiny_scene
@@ -127,7 +127,7 @@ def cell(scene, frail, tmp_path):
     (cell,) = plan_cells([frail[0]], [scene], [0], SHORT)
     sources = jobs.read_sources([], [frail[0]])
     return cell, jobs.make_job(
-        cell, cell_folder(tmp_path / "runs", cell), jobs.Shared(tmp_path / "c", sources=sources)
+        cell, cell_folder(tmp_path / "runs", cell), jobs.JobSettings(tmp_path / "c", sources=sources)
     )
 
 
@@ -163,7 +163,7 @@ def test_what_differs_where_it_runs_is_refused(cell, tmp_path):
     registry._registered.clear()
     assert "makes another run of it" in jobs.run_job(replace(job, sources=tuple(changed))).error
     with pytest.raises(AwError, match=r"does not see .*--transfer store"):
-        jobs.check_shared(replace(job, token=str(tmp_path / "absent")), wait_s=0.0)
+        jobs.check_storage(replace(job, token=str(tmp_path / "absent")), wait_s=0.0)
 
 
 def test_a_scene_travels_and_a_run_folder_comes_back(scene, tmp_path, monkeypatch):
@@ -176,7 +176,7 @@ def test_a_scene_travels_and_a_run_folder_comes_back(scene, tmp_path, monkeypatc
         yaml.safe_dump({"name": "copy", "renders": "{output}/{index}.png", "train": ["sh", "-c", copy]})
     )
     (cell,) = plan_cells([f"external:{method}"], [scene], [0], SHORT)
-    shared = jobs.Shared(tmp_path / "c", sources=jobs.read_sources([], [f"external:{method}"]))
+    shared = jobs.JobSettings(tmp_path / "c", sources=jobs.read_sources([], [f"external:{method}"]))
     job = jobs.make_job(cell, cell_folder(tmp_path / "runs", cell), shared)
     assert stays(job) is None
     key, content = send_scene(scene, 10.0)

@@ -16,9 +16,9 @@ from click.testing import CliRunner
 
 from ambiguous_wild.cli.bench import command as bench
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.grid import plan_cells, run_cells
-from ambiguous_wild.harness.result_file import read_result
-from ambiguous_wild.harness.store import read_runs
+from ambiguous_wild.harness.running.grid import plan_cells, run_cells
+from ambiguous_wild.harness.running.result_file import read_result
+from ambiguous_wild.harness.running.store import read_runs
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.io.ply import write_splat_ply
 from ambiguous_wild.methods import registry

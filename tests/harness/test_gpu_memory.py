@@ -4,10 +4,10 @@ import pytest
 import torch
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness import run as run_module
-from ambiguous_wild.harness.grid import plan_cells, run_cells
-from ambiguous_wild.harness.memory import is_out_of_gpu_memory, out_of_gpu_memory
-from ambiguous_wild.harness.result_file import read_result
+from ambiguous_wild.harness.running import training
+from ambiguous_wild.harness.running.grid import plan_cells, run_cells
+from ambiguous_wild.harness.running.memory import is_out_of_gpu_memory, out_of_gpu_memory
+from ambiguous_wild.harness.running.result_file import read_result
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
 from tests.tiny_scene import write_tiny_scene
@@ -44,7 +44,7 @@ def test_what_helps_is_said_with_the_numbers_of_the_run():
 def test_the_cell_fails_with_one_line_and_the_next_one_runs(where, tmp_path, monkeypatch):
     scene = write_tiny_scene(tmp_path / "scene")
     cells = plan_cells(["3dgs"], [scene], [0, 1], TrainConfig(iterations=5, probes=0))
-    owner = run_module if where == "load_train_data" else Trainer
+    owner = training if where == "load_train_data" else Trainer
     real, calls = getattr(owner, where), []
 
     def full(*words, **options):

@@ -6,11 +6,12 @@ from typing import ClassVar
 
 import pytest
 
-from ambiguous_wild.cli.engines import Engine, Grid, Session
-from ambiguous_wild.harness.cell import CellReport
-from ambiguous_wild.harness.engines import processes
-from ambiguous_wild.harness.engines.gpu_slots import VISIBLE, sharing, slot_environment, visible_gpus
-from ambiguous_wild.harness.engines.processes import run_in_processes
+from ambiguous_wild.harness.running.callbacks import Lines
+from ambiguous_wild.harness.running.cell import CellReport
+from ambiguous_wild.harness.running.engines import processes
+from ambiguous_wild.harness.running.engines.gpu_slots import VISIBLE, sharing, slot_environment, visible_gpus
+from ambiguous_wild.harness.running.engines.processes import run_in_processes
+from ambiguous_wild.harness.running.engines.session import Engine, Grid, Session
 
 
 @pytest.mark.parametrize(
@@ -207,18 +208,17 @@ def test_ray_shares_gpus_out_itself(four_gpus):
 
 
 @pytest.mark.parametrize(("jobs", "warned"), [(6, True), (4, False)])
-def test_the_session_hands_the_gpus_on_and_warns_where_they_are_shared(
-    four_gpus, monkeypatch, capsys, jobs, warned
-):
+def test_the_session_hands_the_gpus_on_and_warns_where_they_are_shared(four_gpus, monkeypatch, jobs, warned):
     given = {}
     monkeypatch.setattr(
         processes, "run_in_processes", lambda made, count, **rest: given.update(rest, count=count) or []
     )
     monkeypatch.setattr(Grid, "jobs", lambda self, threads: [None] * 9)
-    session = Session(Engine(jobs=jobs), None)
+    said = []
+    session = Session(Engine(jobs=jobs), None, Lines(said.append))
     cells = [FakeCell()] * 9
     session.in_process(cells)
     session.run(Grid(cells, None, "missing", None, False, (), ()))
     assert given["gpus"] == ["4", "5", "6", "7"] and given["count"] == jobs
-    said = capsys.readouterr().err
-    assert (f"warning: {jobs} cells at a time share 4 GPUs" in said) is warned
+    begins = f"warning: {jobs} cells at a time share 4 GPUs"
+    assert any(line.startswith(begins) for line in said) is warned

@@ -16,15 +16,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.layouts import build, plain_formats
-from ambiguous_wild.harness.layouts.ablation import ablation
-from ambiguous_wild.harness.layouts.grid import Column, Entry, Layout, Line, ranked
-from ambiguous_wild.harness.layouts.html_page import to_html
-from ambiguous_wild.harness.layouts.latex import latex_text, to_latex
-from ambiguous_wild.harness.layouts.reported import datasets_of, read_reported, with_reported
-from ambiguous_wild.harness.layouts.significance import difference_interval
 from ambiguous_wild.harness.measures import MEASURES
-from ambiguous_wild.harness.store import Runs, read_runs
+from ambiguous_wild.harness.running.store import Runs, read_runs
+from ambiguous_wild.harness.tables.layouts import build, plain_formats
+from ambiguous_wild.harness.tables.layouts.ablation import ablation
+from ambiguous_wild.harness.tables.layouts.grid import Column, Layout, LayoutCell, Line, ranked
+from ambiguous_wild.harness.tables.layouts.html_page import to_html
+from ambiguous_wild.harness.tables.layouts.latex import latex_text, to_latex
+from ambiguous_wild.harness.tables.layouts.reported import datasets_of, read_reported, with_reported
+from ambiguous_wild.harness.tables.layouts.significance import difference_interval
 from ambiguous_wild.metrics import stats
 from tests.harness.fake_runs import failed, fake_result, save
 
@@ -43,7 +43,7 @@ def runs_of(root: Path, *results: dict) -> Runs:  # type: ignore[type-arg]
     return read_runs(save(root, *results))
 
 
-def entry(layout: Layout, method: str, group: str, key: str = "psnr", kind: str = "measured") -> Entry:
+def entry(layout: Layout, method: str, group: str, key: str = "psnr", kind: str = "measured") -> LayoutCell:
     line = next(line for line in layout.lines if line.name == method and line.kind == kind)
     at = [(c.group, c.measure.key) for c in layout.columns].index((group, key))
     return line.entries[at]
@@ -294,6 +294,6 @@ def test_every_column_is_under_its_heading_in_text(tmp_path: Path) -> None:
 
 
 def test_a_line_of_notes_says_what_a_reported_row_is() -> None:
-    line = Line("x", (Entry(printed="1.0"),), kind="reported")
+    line = Line("x", (LayoutCell(printed="1.0"),), kind="reported")
     layout = Layout("t", (Column("s", MEASURES["psnr"], "s"),), (line,))
     assert any(text.startswith("reported:") for text in layout.legend)

@@ -190,12 +190,12 @@ def who_knows_the_truth_is_not_ranked(page: Browser) -> None:
     first = f"{psnr}.parentElement.querySelector('button').textContent"
     assert page.run(first) == "refinesplat"
     assert page.run("document.querySelectorAll('#table .badge').length") == 0
-    page.run("DATA.bounds.push('refinesplat'); drawMeasured()")
+    page.run("DATA.oracles.push('refinesplat'); drawMeasured()")
     assert page.run(first) == HOSTILE
     assert page.run("document.querySelector('#table .badge').closest('tr').textContent").startswith(
         "refinesplat"
     )
-    page.run("DATA.bounds.pop(); drawMeasured()")
+    page.run("DATA.oracles.pop(); drawMeasured()")
 
 
 def sorts(page: Browser) -> None:
@@ -293,11 +293,11 @@ def plot(page: Browser) -> None:
         page.run("document.querySelectorAll('#plot .bar').length") == 4
     )  # two seeds: two methods, both ways
     front = page.run("document.getElementById('plot-said').textContent")
-    assert f"Not beaten in both: 3dgs, {HOSTILE}, refinesplat" in front and "logarithmic" in page.run(
+    assert f"Pareto-optimal: 3dgs, {HOSTILE}, refinesplat" in front and "logarithmic" in page.run(
         "document.getElementById('plot').textContent"
     )
     choose(page, "plot-x", "model MB")
-    assert f"Not beaten in both: {HOSTILE}, refinesplat" in page.run(
+    assert f"Pareto-optimal: {HOSTILE}, refinesplat" in page.run(
         "document.getElementById('plot-said').textContent"
     )
 

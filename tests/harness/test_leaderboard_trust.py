@@ -16,13 +16,13 @@ from click.testing import CliRunner, Result
 
 from ambiguous_wild.cli.leaderboard import command
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.identity import config_identity
 from ambiguous_wild.harness.leaderboard.board import read_board, write_board
 from ambiguous_wild.harness.leaderboard.check import check
 from ambiguous_wild.harness.leaderboard.publish import publish
 from ambiguous_wild.harness.leaderboard.remove import remove
 from ambiguous_wild.harness.leaderboard.settings import command as command_of
-from ambiguous_wild.harness.regions import find_regions
+from ambiguous_wild.harness.running.identity import config_identity
+from ambiguous_wild.harness.running.regions import find_regions
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.metrics.flip import flip

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.grid import plan_cells, run_cells
+from ambiguous_wild.harness.running.grid import plan_cells, run_cells
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.methods import registry
 from ambiguous_wild.methods.external import nerfbaselines

@@ -11,11 +11,11 @@ import pytest
 import torch
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness import strips
-from ambiguous_wild.harness.contact import write_contact
-from ambiguous_wild.harness.density_picture import draw_density
-from ambiguous_wild.harness.grid import plan_cells, run_cells
-from ambiguous_wild.harness.pictures import CELL, MOMENTS, ROWS, VIEWS, Recorder, draw_all, strip
+from ambiguous_wild.harness.pictures import strips
+from ambiguous_wild.harness.pictures.density import draw_density
+from ambiguous_wild.harness.pictures.mask_sheet import write_contact
+from ambiguous_wild.harness.pictures.training import CELL, MOMENTS, ROWS, VIEWS, Recorder, draw_all, strip
+from ambiguous_wild.harness.running.grid import plan_cells, run_cells
 from ambiguous_wild.io.images import read_png_rgb, write_png
 from ambiguous_wild.io.palette import ramp, tint
 from ambiguous_wild.io.scene_folder import load_scene

@@ -15,7 +15,9 @@ from hypothesis import strategies as st
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.measures import MEASURES, measure
-from ambiguous_wild.harness.render_tables import (
+from ambiguous_wild.harness.running.store import read_runs
+from ambiguous_wild.harness.tables.comparison import Table, TableCell, comparison
+from ambiguous_wild.harness.tables.render import (
     RENDERERS,
     plain,
     to_csv,
@@ -23,14 +25,12 @@ from ambiguous_wild.harness.render_tables import (
     to_markdown,
     to_text,
 )
-from ambiguous_wild.harness.store import read_runs
-from ambiguous_wild.harness.tables import Cell, Table, comparison
 from tests.harness.fake_runs import failed, fake_result, save, start
 
 HOSTILE = '<script>|\\input{x}$&%#_^~"*`[a](http://b)\x1b[31m\u202e'
 
 
-def cell(table: Table, method: str, key: str, block: int = 0) -> Cell:
+def cell(table: Table, method: str, key: str, block: int = 0) -> TableCell:
     row = next(r for r in table.blocks[block].rows if r.method == method)
     return row.cells[[c.key for c in table.columns].index(key)]
 
@@ -172,7 +172,7 @@ def test_who_knows_the_truth_is_not_ranked(tmp_path: Path) -> None:
     table = table_of(tmp_path, *(fake_result(m, psnr=(p,)) for m, p in (best | rest).items()))
     assert [cell(table, m, "psnr").rank for m in best] == [None] * 3
     assert [cell(table, m, "psnr").rank for m in rest] == [1, 2]
-    (note,) = [n for n in table.notes if n.startswith("not ranked")]
+    (note,) = [n for n in table.notes if n.startswith("oracle (not ranked)")]
     assert all(m in note for m in best)
 
 
@@ -287,7 +287,7 @@ def test_hostile_names_stay_text_in_every_format(tmp_path: Path) -> None:
 
 @given(st.text(max_size=30))
 def test_latex_and_markdown_of_any_name_have_no_open_special(name: str) -> None:
-    from ambiguous_wild.harness.render_tables import latex_text, markdown_text
+    from ambiguous_wild.harness.tables.render import latex_text, markdown_text
 
     assert "\n" not in latex_text(name) + markdown_text(name)
     rest = re.sub(r"\\text\w+\{\}|\\[&%$#_{}]|\{(?:[\[*]|'')\}", "", latex_text(name))

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ambiguous_wild.io import colmap_binary
-from ambiguous_wild.io.colmap_model import Model, ModelCamera, ModelImage, ModelPoints
+from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage, ModelPoints
 from ambiguous_wild.io.images import write_png
 
 WIDTH, HEIGHT, FX, FY = 64, 48, 60.0, 62.0

@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.io.colmap_model import read_model, rotation_from_quaternion
+from ambiguous_wild.io.colmap_model import read_model
+from ambiguous_wild.io.colmap_records import rotation_from_quaternion
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 from tests.io.model_maker import make_model, write_binary
 
@@ -137,8 +138,8 @@ def _no_lens(model):
     [
         (lambda m: _first(m.images).tvec.__setitem__(0, np.nan), "translation"),
         (lambda m: _first(m.images).tvec.__setitem__(2, 1e20), "translation"),
-        (lambda m: m.points.xyz.__setitem__((3, 1), np.inf), "1 points are nowhere, the first is"),
-        (lambda m: m.points.xyz.__setitem__((slice(2, 4), 1), 1e200), "2 points are nowhere"),
+        (lambda m: m.points.xyz.__setitem__((3, 1), np.inf), "1 points have no valid position, the first is"),
+        (lambda m: m.points.xyz.__setitem__((slice(2, 4), 1), 1e200), "2 points have no valid position"),
         (_same_name, "there twice"),
         (_no_lens, "parameters"),
     ],

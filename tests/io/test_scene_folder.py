@@ -280,5 +280,5 @@ def test_photos_whose_renders_would_be_one_file_are_refused(tmp_path):
     (root / "images" / "test_1.png").rename(root / "images" / "test_0.jpg")
     for name in ("sparse/0/images.txt", "test_list.txt"):
         (root / name).write_text((root / name).read_text().replace("test_1.png", "test_0.jpg"))
-    with pytest.raises(AwError, match=r"'test_0\.jpg' and 'test_0\.png' differ in their extension alone"):
+    with pytest.raises(AwError, match=r"'test_0\.jpg' and 'test_0\.png' differ in their extension only"):
         load_scene(root)

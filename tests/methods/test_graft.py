@@ -11,15 +11,18 @@ from ambiguous_wild.cli.bench import command as bench
 from ambiguous_wild.cli.table import command as table
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import with_options
-from ambiguous_wild.harness.grid import plan_cells
+from ambiguous_wild.harness.running.grid import plan_cells
 from ambiguous_wild.methods import MethodEntry, get_method, register, registry
 from ambiguous_wild.methods.graft import compose, graft_name, idle_regulariser
 from ambiguous_wild.methods.grafted_policy import GraftedPolicy
 from ambiguous_wild.methods.refinesplat.density import EntropyAwareDensity
 from ambiguous_wild.methods.refinesplat.policy import RefineSplatMask
+from ambiguous_wild.methods.robustsplat.config import RobustSplatConfig
 from ambiguous_wild.methods.robustsplat.policy import RobustSplatMask
 from ambiguous_wild.methods.truth import TruthMask
 from ambiguous_wild.splat.density import DensityControl
+from ambiguous_wild.splat.effects import with_effects
+from ambiguous_wild.splat.effects.exposure import AffineExposure
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.parts import MaskPolicy, Parts
 from tests.methods.baselines import bits, parts_of, resumed_equals_whole, trained
@@ -127,6 +130,51 @@ def test_a_donors_plugin_is_part_of_the_identity(monkeypatch):
         hashes.append(get_method("refinesplat@mask=mine").source_hash)
     assert len({*hashes, ""}) == 3
     assert get_method("refinesplat@mask=3dgs").source_hash == ""
+
+
+# -- effects ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def toned(monkeypatch):
+    """A method whose recipe brings an effect of its own, an affine exposure per photo."""
+    monkeypatch.setattr(registry, "_registered", {})
+
+    def build(options):
+        return Parts(mask=RobustSplatMask(RobustSplatConfig()), effects=(AffineExposure(),))
+
+    return register(MethodEntry("toned", "", build))
+
+
+@pytest.mark.parametrize("place", ["mask", "density", "regulariser"])
+def test_a_donors_effects_that_are_left_out_are_named(toned, place):
+    with pytest.warns(UserWarning, match=r"leaves out toned's effects \(exposure\): add effects=toned"):
+        parts = parts_of(f"3dgs@{place}=toned")
+    assert parts.effects == ()
+
+
+def test_the_effects_of_a_donor_are_taken_where_they_are_asked_for(toned, recwarn):
+    parts = parts_of("3dgs@effects=toned, mask=toned")
+    assert [effect.name for effect in parts.effects] == ["exposure"]
+    assert parts_of("3dgs@mask=toned,effects=none").effects == ()
+    assert len(parts_of("toned@mask=3dgs").effects) == 1  # a host's own stay
+    assert parts_of("toned@effects=none").effects == ()
+    assert len(parts_of("toned@mask=toned").effects) == 1
+    assert not recwarn.list
+
+
+def test_effects_that_are_taken_change_what_they_need_of_the_renderer(monkeypatch):
+    monkeypatch.setattr(registry, "_registered", {})
+    register(MethodEntry("filtered", "", lambda options: with_effects(Parts(), ["antialias"])))
+    assert not parts_of("3dgs").antialias
+    parts = parts_of("3dgs@effects=filtered")
+    assert parts.antialias and [effect.name for effect in parts.effects] == ["antialias"]
+
+
+def test_a_graft_trains_with_the_effects_it_takes(toned, scene, tmp_path):
+    trainer = trained(scene, tmp_path / "run", parts_of("3dgs@effects=toned"), 8)
+    assert trainer.effects is not None and "exposure" in trainer.effects.facts()
+    assert bits(trainer) != bits(trained(scene, tmp_path / "plain", Parts(), 8))
 
 
 # -- runs ---------------------------------------------------------------------------------------------

@@ -8,12 +8,13 @@ import pytest
 import torch
 
 from ambiguous_wild.methods import dronesplat
-from ambiguous_wild.methods.later import later
+from ambiguous_wild.methods.deferred import deferred
 from ambiguous_wild.methods.robustsplat import policy as robustsplat
 from ambiguous_wild.methods.robustsplat import supervision
 from ambiguous_wild.methods.robustsplat.config import RobustSplatConfig
 from ambiguous_wild.methods.robustsplat.net import MaskNet, adam_of, adam_state, enlarged, load_adam_state
 from ambiguous_wild.splat import checkpoint, device
+from ambiguous_wild.splat.step import Step
 from tests.host_reads import READ, moved, no_transfers
 from tests.methods.baselines import _same, data_of, parts_of, step_of
 from tests.tiny_scene import TRAIN, write_tiny_scene
@@ -44,13 +45,13 @@ def drawn(monkeypatch):
     """The coarse render, without a renderer: its cameras are kept, its picture is grey."""
     cameras = []
 
-    def render(gaussians, camera, *, sh_degree):
+    def draw(step, camera=None, gaussians=None, *, without=()):
         cameras.append(camera)
-        like = gaussians.means
+        like = step.gaussians.means
         grey = torch.full((camera.height, camera.width, 3), 0.5, dtype=like.dtype, device=like.device)
         return SimpleNamespace(image=grey)
 
-    monkeypatch.setattr(robustsplat, "render", render)
+    monkeypatch.setattr(Step, "draw", draw)
     return cameras
 
 
@@ -169,9 +170,9 @@ def test_dronesplat_masks_what_it_masks_on_the_cpu(scene, cache, monkeypatch):
 
 def test_a_number_for_later_is_the_number(monkeypatch):
     value = torch.tensor(0.1)
-    assert later(value) == float(value)
+    assert deferred(value) == float(value)
     on_accelerator(monkeypatch)
-    kept = later(value.requires_grad_(True) * 1)
+    kept = deferred(value.requires_grad_(True) * 1)
     assert isinstance(kept, torch.Tensor) and not kept.requires_grad and float(kept) == float(value.detach())
 
 

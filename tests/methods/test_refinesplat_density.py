@@ -25,7 +25,6 @@ def test_the_deciding_gradient_is_selectable():
     assert torch.equal(control("entropy").statistic(gradients), extra)
     assert torch.equal(control("total").statistic(plain), screen)
     assert not control("entropy").statistic(plain).any()
-    assert [control(d).wants_extra() for d in ("total", "photometric", "entropy")] == [True, False, True]
     with pytest.raises(AwError, match="total"):
         control("totl")
 

@@ -7,17 +7,17 @@ from ambiguous_wild.core import AwError, Camera
 from ambiguous_wild.methods.refinesplat import masking
 from ambiguous_wild.methods.refinesplat.agreement import (
     agree,
+    agreement_weight,
     colour_difference,
     common_offset,
     quantile_of,
-    word_weight,
 )
 from ambiguous_wild.methods.refinesplat.config import MaskConfig
 from ambiguous_wild.methods.refinesplat.evidence import Maps, make_masks
 from ambiguous_wild.methods.refinesplat.multiview import (
-    Elsewhere,
-    Hearsay,
     MultiViewConfig,
+    MultiViewEvidence,
+    OtherViews,
     discount,
     nearest_views,
 )
@@ -76,14 +76,14 @@ def test_a_blurred_render_is_less_evidence_than_another_texture_of_the_same_resi
 def test_other_views_are_read_where_they_show_the_same_surface():
     """A mark on a plane, put into every view's evidence at its projection, is found where a view shows it."""
     cameras = [camera(x) for x in (0.0, 0.5, 1.0)]
-    elsewhere = Elsewhere(cameras, plain(3), MultiViewConfig(views=2))
+    other_views = OtherViews(cameras, plain(3), MultiViewConfig(views=2))
     depth = np.full((H, W), PLANE, np.float32)
     for view in range(len(cameras)):
         column = int(FOCAL * (1.0 - (view * 0.5)) / PLANE + W / 2)  # of the world point (1, 0, PLANE)
         evidence = np.zeros((H, W), np.float32)
         evidence[:, max(column - 1, 0) : column + 2] = 1.0
-        elsewhere.remember(view, evidence, depth)
-    found = elsewhere.ask(0).evidence
+        other_views.remember(view, evidence, depth)
+    found = other_views.ask(0).evidence
     assert found.shape == (H // 2, W // 2)
     expected = (FOCAL * 1.0 / PLANE + W / 2) / 2
     assert abs(int(np.nanargmax(found[H // 4])) - expected) <= 1.0
@@ -91,14 +91,14 @@ def test_other_views_are_read_where_they_show_the_same_surface():
 
 def test_a_surface_at_another_depth_or_outside_says_nothing():
     cameras = [camera(0.0), camera(0.1)]
-    elsewhere = Elsewhere(cameras, plain(2), MultiViewConfig())
-    elsewhere.remember(0, np.ones((H, W)), np.full((H, W), PLANE))
-    assert elsewhere.ask(0) is None  # nobody else was asked
-    elsewhere.remember(1, np.ones((H, W)), np.full((H, W), 2 * PLANE))
-    assert np.isnan(elsewhere.ask(0).evidence).all()
-    elsewhere.remember(1, np.ones((H, W)), np.full((H, W), 1.05 * PLANE))
-    assert np.nanmin(elsewhere.ask(0).evidence) == pytest.approx(1.0)
-    far = Elsewhere([camera(0.0), camera(1000.0)], plain(2), MultiViewConfig())
+    other_views = OtherViews(cameras, plain(2), MultiViewConfig())
+    other_views.remember(0, np.ones((H, W)), np.full((H, W), PLANE))
+    assert other_views.ask(0) is None  # nobody else was asked
+    other_views.remember(1, np.ones((H, W)), np.full((H, W), 2 * PLANE))
+    assert np.isnan(other_views.ask(0).evidence).all()
+    other_views.remember(1, np.ones((H, W)), np.full((H, W), 1.05 * PLANE))
+    assert np.nanmin(other_views.ask(0).evidence) == pytest.approx(1.0)
+    far = OtherViews([camera(0.0), camera(1000.0)], plain(2), MultiViewConfig())
     far.remember(0, np.ones((H, W)), np.full((H, W), PLANE))
     far.remember(1, np.ones((H, W)), np.full((H, W), PLANE))
     assert np.isnan(far.ask(0).evidence).all()
@@ -119,11 +119,15 @@ def test_discount_by_hand():
     evidence = np.full((4, 6), 10.0, np.float32)
     said = np.full((2, 3), 0.6)  # 6 units: 4 above what is free
     whole, half = np.ones((2, 3), np.float32), np.full((2, 3), 0.5, np.float32)
-    assert np.allclose(discount(evidence, Hearsay(said, whole), 0.1, config), 10.0 / np.sqrt(1 + 2 * 4))
-    assert np.allclose(discount(evidence, Hearsay(said, half), 0.1, config), 10.0 / np.sqrt(1 + 2 * 2))
-    assert np.array_equal(discount(evidence, Hearsay(said, 0 * whole), 0.1, config), evidence)
-    assert np.array_equal(discount(evidence, Hearsay(said * np.nan, whole), 0.1, config), evidence)
-    assert np.array_equal(discount(evidence, Hearsay(said * 0.1, whole), 0.1, config), evidence)
+    assert np.allclose(
+        discount(evidence, MultiViewEvidence(said, whole), 0.1, config), 10.0 / np.sqrt(1 + 2 * 4)
+    )
+    assert np.allclose(
+        discount(evidence, MultiViewEvidence(said, half), 0.1, config), 10.0 / np.sqrt(1 + 2 * 2)
+    )
+    assert np.array_equal(discount(evidence, MultiViewEvidence(said, 0 * whole), 0.1, config), evidence)
+    assert np.array_equal(discount(evidence, MultiViewEvidence(said * np.nan, whole), 0.1, config), evidence)
+    assert np.array_equal(discount(evidence, MultiViewEvidence(said * 0.1, whole), 0.1, config), evidence)
     assert discount(evidence, None, 0.1, config) is evidence
 
 
@@ -134,15 +138,15 @@ def test_views_that_show_another_colour_have_no_word():
     photos[0][:, 3 * W // 4 :] = 0.9  # what stands before view 0 no other photo shows
     for photo in photos[1:4]:
         photo[:, : W // 5] = 0.1
-    elsewhere = Elsewhere(cameras, photos, MultiViewConfig(views=6, agreeing=0.5))
+    other_views = OtherViews(cameras, photos, MultiViewConfig(views=6, agreeing=0.5))
     for view in range(7):
-        elsewhere.remember(view, np.ones((H, W)), np.full((H, W), PLANE))
-    weight = elsewhere.ask(0).weight
+        other_views.remember(view, np.ones((H, W)), np.full((H, W), PLANE))
+    weight = other_views.ask(0).weight
     middle = weight[H // 4]
     assert middle[3 * W // 8 + 3 :].max() == 0.0
     assert middle[W // 10 + 3 : 3 * W // 8 - 3].min() == 1.0  # all others agree
     assert middle[2 : W // 10 - 3].min() == 1.0  # three of six do: half is enough
-    never = Elsewhere(cameras, photos, MultiViewConfig(views=6, agree=0.0))
+    never = OtherViews(cameras, photos, MultiViewConfig(views=6, agree=0.0))
     for view in range(7):
         never.remember(view, np.ones((H, W)), np.full((H, W), PLANE))
     assert (never.ask(0).weight == 1.0).all()
@@ -152,8 +156,8 @@ def test_weight_is_the_share_of_those_who_see_it_and_few_are_always_heard():
     seen = np.array([[[True, True, True]]] * 2 + [[[True, True, False]]] * 2)  # 4, 4, 2 views
     agreeing = np.array([[[True, False, False]]] + [[[False, False, False]]] * 3)
     few = seen.sum(axis=0) < 3
-    assert word_weight(seen, agreeing, 0.5, few).tolist() == [[0.5, 0.0, 1.0]]
-    assert word_weight(seen, agreeing, 0.5, ~few).tolist() == [[1.0, 1.0, 0.0]]
+    assert agreement_weight(seen, agreeing, 0.5, few).tolist() == [[0.5, 0.0, 1.0]]
+    assert agreement_weight(seen, agreeing, 0.5, ~few).tolist() == [[1.0, 1.0, 0.0]]
 
 
 def test_exposure_and_white_balance_are_no_other_content():

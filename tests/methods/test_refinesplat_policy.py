@@ -219,7 +219,7 @@ def test_the_first_look_the_ceiling_and_the_sparse_points_reach_the_masks(scene)
     assert factor.max() > 1.4 and factor.min() < 0.7
     _, alone, _ = examined(first_look=dataclasses.replace(look, weight=1.0))
     assert np.allclose(maps.statistic, alone.statistic * factor, rtol=1e-5)
-    assert policy.pixels.elsewhere.static[0] is not None and 0 in policy.pixels.alone
+    assert policy.pixels.other_views.static[0] is not None and 0 in policy.pixels.alone
     low = dataclasses.replace(FAST.mask, ceiling=1e-6, least=50.0)
     for least in (7.0, 9.0):
         _, _, masks = examined(mask=dataclasses.replace(low, ceiling_least=least))

@@ -6,7 +6,7 @@ import pytest
 from ambiguous_wild.core import Camera
 from ambiguous_wild.methods.refinesplat.config import MaskConfig
 from ambiguous_wild.methods.refinesplat.evidence import Maps, make_masks
-from ambiguous_wild.methods.refinesplat.multiview import Elsewhere, MultiViewConfig
+from ambiguous_wild.methods.refinesplat.multiview import MultiViewConfig, OtherViews
 from ambiguous_wild.methods.refinesplat.pixels import PixelEvidence
 from ambiguous_wild.vision.sparse_surface import seldom_seen, static_surfaces
 from tests.methods.test_refinesplat_pixels import PLANE, H, W, camera, noise
@@ -27,10 +27,10 @@ def told(renders, *, known=True, size=(H // 2, W // 2), **config):
     cameras = [camera(0.1 * i) for i in range(len(renders))]
     surfaces = [(1.0 / slope(c, size)).astype(np.float32) for c in cameras] if known else ()
     photos = [np.full((H, W, 3), 0.5, np.float32)] * len(renders)
-    elsewhere = Elsewhere(cameras, photos, MultiViewConfig(**config), surfaces)
+    other_views = OtherViews(cameras, photos, MultiViewConfig(**config), surfaces)
     for view, factor in enumerate(renders):
-        elsewhere.remember(view, noise(view, H, W), factor * slope(cameras[view], (H, W)))
-    return elsewhere.ask(0)
+        other_views.remember(view, noise(view, H, W), factor * slope(cameras[view], (H, W)))
+    return other_views.ask(0)
 
 
 @pytest.mark.parametrize("others", [1.0, 3.0])  # whether their renders know the surface
@@ -57,12 +57,12 @@ def test_where_the_render_is_seen_by_enough_nobody_is_asked_again():
         cameras = [camera(0.1 * i) for i in range(views)]
         far = [np.full((H // 2, W // 2), 1.0 / (4 * PLANE), np.float32)] * views
         with_, without = (
-            Elsewhere(cameras, [np.full((H, W, 3), 0.5, np.float32)] * views, MultiViewConfig(), s)
+            OtherViews(cameras, [np.full((H, W, 3), 0.5, np.float32)] * views, MultiViewConfig(), s)
             for s in (far, ())
         )
         for view in range(views):
-            for elsewhere in (with_, without):
-                elsewhere.remember(view, noise(view, H, W), np.full((H, W), PLANE))
+            for other_views in (with_, without):
+                other_views.remember(view, noise(view, H, W), np.full((H, W), PLANE))
         a, b = with_.ask(1), without.ask(1)
         middle = np.s_[:, 6:-6]  # which all see
         assert np.isfinite(b.evidence[middle]).all()
@@ -78,13 +78,13 @@ def test_a_car_before_a_field_that_is_not_learnt_is_not_excused(views, plain):
     photos[0][CAR] = [0.8, 0.15, 0.15] if plain else noise(9, 16, 24, 3).round()
     cameras = [camera(0.02 * i) for i in range(views)]
     surfaces = [np.full((H // 2, W // 2), 1.0 / PLANE, np.float32)] * views
-    elsewhere = Elsewhere(cameras, photos, MultiViewConfig(), surfaces)
+    other_views = OtherViews(cameras, photos, MultiViewConfig(), surfaces)
     for view in range(views):
         depth = np.full((H, W), PLANE)
         if view == 0:
             depth[CAR] = 2.5 * PLANE
-        elsewhere.remember(view, np.ones((H, W)), depth)
-    found = elsewhere.ask(0)
+        other_views.remember(view, np.ones((H, W)), depth)
+    found = other_views.ask(0)
     car = np.s_[8:12, 12:20]
     assert np.isfinite(found.evidence[car]).all()  # they do see what is behind it
     assert found.weight[car].mean() < 0.1  # a pixel may look like the field by chance

@@ -16,13 +16,17 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.simulate import capture
 from ambiguous_wild.simulate import world as world_module
-from ambiguous_wild.simulate.check import PICTURES
 from ambiguous_wild.simulate.distractors import Placement, movers, shapes_of
 from ambiguous_wild.simulate.ground_plan import SURFACES
 from ambiguous_wild.simulate.presets import PRESETS, TWIN, preset, resized
+from ambiguous_wild.simulate.spec_check import PICTURES
 from ambiguous_wild.simulate.tracer import trace
 
 SMALL = replace(resized(preset("tiny"), views=6, width=128), detail_px_per_m=20.0)
+COARSE = 5.0  # texels a metre where shapes matter; the same everywhere, so that worlds are built once
+LITTLE = replace(
+    SMALL, train_views=3, test_views=2, width=64, height=36, distractors=(), detail_px_per_m=COARSE
+)
 
 
 @pytest.fixture(scope="module")
@@ -52,9 +56,22 @@ def test_folder_holds_a_photo_a_mask_and_a_clean_view_of_every_shot(raw: Path) -
     }
 
 
+def test_the_records_keep_their_keys_and_their_order(raw: Path) -> None:
+    said = json.loads((raw / "truth/capture.json").read_text())
+    assert list(said) == [
+        "schema", "preset", "seed", "identity", "version", "spec", "designed", "mask", "clean", "test",
+        "occlusion", "photos", "licence", "files",
+    ]  # fmt: skip
+    placed = [d for photo in said["photos"].values() for d in photo["distractors"]]
+    assert list(placed[0]) == ["distractor", "occlusion", "which", "x_m", "y_m", "yaw_deg", "pose"]
+    cameras = json.loads((raw / "truth/cameras.json").read_text())
+    keys = ["width", "height", "fx", "fy", "cx", "cy", "cam_from_world"]
+    assert all(list(camera) == keys for camera in cameras.values())
+
+
 def test_same_seed_same_bytes_on_any_number_of_threads(raw: Path, tmp_path: Path) -> None:
     before = numba.get_num_threads()
-    numba.set_num_threads(1)
+    numba.set_num_threads(1 if before > 1 else numba.config.NUMBA_NUM_THREADS)
     try:
         again = capture.simulate(SMALL, tmp_path / "again", seed=4, depth=True)
     finally:
@@ -64,7 +81,8 @@ def test_same_seed_same_bytes_on_any_number_of_threads(raw: Path, tmp_path: Path
 
 
 def test_another_seed_moves_distractors_cameras_and_paint(raw: Path) -> None:
-    one, two = capture.plan(SMALL, 4), capture.plan(SMALL, 5)
+    spec = replace(SMALL, detail_px_per_m=COARSE)
+    one, two = capture.plan(spec, 4), capture.plan(spec, 5)
     for a, b in zip(one[1], two[1]):
         assert not np.allclose(a.camera.cam_from_world, b.camera.cam_from_world, atol=1e-3)
         assert a.placements != b.placements or a.split == "test"
@@ -128,7 +146,7 @@ def test_exif_states_the_true_focal_length(raw: Path) -> None:
 
 def test_test_viewpoints_are_new_and_inside_the_walk() -> None:
     for seed in range(5):
-        world, shots = capture.plan(replace(SMALL, distractors=()), seed)
+        world, shots = capture.plan(replace(SMALL, distractors=(), detail_px_per_m=COARSE), seed)
         hub = np.array([world.statue[0], world.statue[1] - 0.3])
         around = {"train": [], "test": []}
         for shot in shots:
@@ -144,7 +162,7 @@ def test_test_viewpoints_are_new_and_inside_the_walk() -> None:
 
 
 def test_no_distractor_keeps_its_place_and_none_stands_in_the_scenery() -> None:
-    spec = replace(resized(preset("tiny"), views=14, width=96), detail_px_per_m=12.0, distractors=(TWIN,))
+    spec = replace(resized(preset("tiny"), views=14, width=96), detail_px_per_m=COARSE, distractors=(TWIN,))
     world, shots = capture.plan(spec, 1)
     spots = np.array([(p.x_m, p.y_m) for s in shots for p in s.placements])
     assert len(spots) > 7
@@ -163,18 +181,17 @@ def test_an_identical_capture_is_left_alone_and_another_is_refused(raw: Path) ->
 
 
 def test_overwrite_replaces_captures_only(tmp_path: Path) -> None:
-    spec = replace(SMALL, train_views=3, test_views=2, width=64, height=36, distractors=())
-    capture.simulate(spec, tmp_path / "raw")
+    capture.simulate(LITTLE, tmp_path / "raw")
     (tmp_path / "raw/train/IMG_0001.jpg").write_bytes(b"spoilt")
     with pytest.raises(AwError, match="changed since"):
-        capture.simulate(spec, tmp_path / "raw")
-    made = capture.simulate(spec, tmp_path / "raw", overwrite=True)
+        capture.simulate(LITTLE, tmp_path / "raw")
+    made = capture.simulate(LITTLE, tmp_path / "raw", overwrite=True)
     assert sha256_file(tmp_path / "raw/train/IMG_0001.jpg") == made["files"]["train/IMG_0001.jpg"]
     foreign = tmp_path / "holiday"
     foreign.mkdir()
     (foreign / "me.jpg").write_bytes(b"x")
     with pytest.raises(AwError, match="not a simulated capture"):
-        capture.simulate(spec, foreign, overwrite=True)
+        capture.simulate(LITTLE, foreign, overwrite=True)
     assert (foreign / "me.jpg").read_bytes() == b"x"
 
 
@@ -184,7 +201,7 @@ def test_a_run_that_breaks_leaves_nothing(tmp_path: Path) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        capture.simulate(replace(SMALL, distractors=()), tmp_path / "raw", progress=breaks)
+        capture.simulate(LITTLE, tmp_path / "raw", progress=breaks)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -218,28 +235,11 @@ def test_presets_name_what_they_use() -> None:
         resized(preset("tiny"), width=10)
 
 
-@pytest.mark.parametrize(
-    ("name", "low", "high"),
-    [("courtyard-sparse", 0.03, 0.07), ("courtyard", 0.14, 0.22), ("courtyard-crowd", 0.41, 0.49)],
-)
-def test_presets_cover_what_they_say(name: str, low: float, high: float) -> None:
-    """Mean share of distractor pixels over the train photos, at a size where all is quick to trace."""
-    spec = replace(resized(preset(name), views=12, width=96), detail_px_per_m=12.0)
-    world, shots = capture.plan(spec, 3)
-    shares = []
-    for shot in (s for s in shots if s.split == "train"):
-        seen = trace(
-            shot.camera, world.table(), movers(spec, shot.placements, world), world.atlas, world.light
-        )
-        shares.append(float((seen.owner > 0).mean()))
-    assert low < np.mean(shares) < high
-
-
 def test_thin_distractors_are_a_few_pixels_wide() -> None:
     """Opening the mask with a square of 3.5 % of the width leaves little of thin things, most of figures."""
     left = {}
     for name in ("courtyard-thin", "courtyard"):
-        spec = replace(resized(preset(name), views=6, width=320), detail_px_per_m=12.0)
+        spec = replace(resized(preset(name), views=6, width=320), detail_px_per_m=COARSE, samples=1)
         world, shots = capture.plan(spec, 2)
         kernel, inside, total = np.ones((11, 11), np.uint8), 0, 0
         for shot in (s for s in shots if s.split == "train"):
@@ -270,7 +270,7 @@ def test_size_and_lift_move_a_ball_off_the_ground() -> None:
 
 def test_a_sheet_that_came_later_changes_no_earlier_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     """World of the same seed with and without it: the same light, the same texels under the same names."""
-    spec = replace(SMALL, detail_px_per_m=12.0, distractors=())
+    spec = replace(SMALL, detail_px_per_m=COARSE, distractors=())
     now, _ = capture.plan(spec, 5)
     monkeypatch.delitem(world_module.SHEETS, "cloth")
     before, _ = capture.plan(spec, 5)
@@ -293,9 +293,8 @@ def test_a_record_nested_without_end_is_named(tmp_path: Path) -> None:
 
 
 def test_overwrite_removes_nothing_of_the_users(tmp_path: Path) -> None:
-    spec = replace(SMALL, train_views=3, test_views=2, width=64, height=36, distractors=())
-    capture.simulate(spec, tmp_path / "raw")
+    capture.simulate(LITTLE, tmp_path / "raw")
     (tmp_path / "raw/train/mine.jpg").write_bytes(b"x")
     with pytest.raises(AwError, match=r"also holds train/mine\.jpg"):
-        capture.simulate(spec, tmp_path / "raw", seed=1, overwrite=True)
+        capture.simulate(LITTLE, tmp_path / "raw", seed=1, overwrite=True)
     assert (tmp_path / "raw/train/mine.jpg").read_bytes() == b"x"

@@ -15,16 +15,16 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
 from ambiguous_wild.io.scene_folder import load_scene, read_scene_json
+from ambiguous_wild.simulate.composite.composite_scene import composite
 from ambiguous_wild.simulate.composite.cutouts import blobs, read_cutouts
 from ambiguous_wild.simulate.composite.layers import project
-from ambiguous_wild.simulate.composite.placing import (
+from ambiguous_wild.simulate.composite.placement import (
     CompositeConfig,
     local_colours,
     place,
     scene_spread,
-    sites,
+    visible_points,
 )
-from ambiguous_wild.simulate.composite.scene import composite
 from tests.io.model_maker import HEIGHT, WIDTH, write_scene
 
 NAMES = [f"p{i:02d}.png" for i in range(18)]  # every eighth is a test photo: p00, p08, p16
@@ -100,6 +100,9 @@ def test_truth_lies_beside_every_train_photo_and_tells_the_truth(base: Path, mad
     for part in ("distractor", "clean"):
         assert sorted(p.stem for p in (made / "truth" / part).iterdir()) == stems
     facts = json.loads((made / "truth/composite.json").read_text())
+    assert list(facts) == [
+        "schema", "version", "source", "config", "mask", "poses", "cutouts", "occlusion", "photos",
+    ]  # fmt: skip
     for view in scene.train:
         photo = read_png_rgb(view.image_path)
         clean = read_png_rgb(made / "truth/clean" / Path(view.name).name)
@@ -151,6 +154,7 @@ def test_scene_json_says_how_it_was_made_and_is_not_a_builds(
     assert (
         info is not None and "build_key" not in info and info["factor"] == 2 and info["images"] == "images_2"
     )
+    assert list(info["composite"]) == ["source", "config", "cutouts", "occlusion", "poses"]
     assert info["composite"]["source"]["scene_json"] == sha256_file(tmp_path / "base/scene.json")
     assert {c["sha256"] for c in info["composite"]["cutouts"]} == {sha256_file(p) for p in cutouts.iterdir()}
     assert info["composite"]["config"]["seed"] == 3 and info["license"].startswith("CC0-1.0; cut-outs")
@@ -178,7 +182,7 @@ def test_nothing_stays_where_it_was(tmp_path: Path) -> None:
     write_scene(tmp_path / "base", names, points=400)
     scene = load_scene(tmp_path / "base")
     config = replace(CONFIG, presence=1.0)
-    stands = place(sites(scene), scene_spread(scene), config, np.random.default_rng(0), 2)
+    stands = place(visible_points(scene), scene_spread(scene), config, np.random.default_rng(0), 2)
     for which in range(2):
         spots = np.array([s.position for photo in stands for s in photo if s.which == which])
         assert len(spots) > 0.8 * len(stands)
@@ -192,7 +196,7 @@ def test_nothing_stays_where_it_was(tmp_path: Path) -> None:
 
 def test_presence_is_the_share_of_photos(base: Path) -> None:
     scene = load_scene(base)
-    places = sites(scene) * 12
+    places = visible_points(scene) * 12
     stands = place(places, 1e-3, replace(CONFIG, presence=0.4), np.random.default_rng(1), 3)
     share = np.mean([len(s) for s in stands]) / 3
     assert share == pytest.approx(0.4, abs=4 * math.sqrt(0.24 / (3 * len(places))))
@@ -211,7 +215,7 @@ def test_patches_of_a_scene_of_one_colour_cannot_be_seen(tmp_path: Path) -> None
 
 def test_patches_go_where_the_photo_is_like_them(base: Path) -> None:
     """Of photos dark on the left and bright on the right, a dark patch goes left, a bright one right."""
-    places, rng = sites(load_scene(base)), np.random.default_rng(0)
+    places, rng = visible_points(load_scene(base)), np.random.default_rng(0)
     middles = [float(np.median(site.uv[:, 0])) for site in places]  # as many points on either side
     around = [np.zeros((HEIGHT, WIDTH, 3)) for _ in places]
     for background, middle in zip(around, middles, strict=True):
@@ -240,7 +244,7 @@ def test_local_colours_are_means_around_a_place() -> None:
 
 def test_a_patch_is_never_put_back_where_it_is_from(base: Path) -> None:
     scene = load_scene(base)
-    places, spread = sites(scene), scene_spread(scene)
+    places, spread = visible_points(scene), scene_spread(scene)
     photo = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
     origin, around = places[0].xyz[0], [local_colours(photo)] * len(places)
     colours = {0: around[0][0, 0]}
@@ -332,7 +336,7 @@ def test_a_taken_output_and_a_scene_that_will_not_do_are_refused(
 ) -> None:
     with pytest.raises(AwError, match="exists"):
         composite(base, made, CONFIG, cutouts)
-    with pytest.raises(AwError, match="in one another"):
+    with pytest.raises(AwError, match="inside each other"):
         composite(base, base / "inside", CONFIG, cutouts)
     with pytest.raises(AwError, match="has distractors already"):
         composite(made, tmp_path / "twice", CONFIG, cutouts)
@@ -342,7 +346,7 @@ def test_a_taken_output_and_a_scene_that_will_not_do_are_refused(
     with pytest.raises(AwError, match="has no points"):
         composite(tmp_path / "bare", tmp_path / "out", CONFIG, cutouts)
     write_scene(tmp_path / "twins", ["a/x.png", "b/x.png", "b/y.png"], points=60)
-    with pytest.raises(AwError, match="photos of one name"):
+    with pytest.raises(AwError, match="photos of the same name"):
         composite(tmp_path / "twins", tmp_path / "out", CONFIG, cutouts)
     with pytest.raises(AwError, match="there is no scene folder"):
         composite(tmp_path / "none", tmp_path / "out", CONFIG, cutouts)

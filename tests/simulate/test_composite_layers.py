@@ -7,7 +7,7 @@ import pytest
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.simulate.composite.cutouts import Cutout, premultiplied
-from ambiguous_wild.simulate.composite.layers import Stand, composed, layer, resized, truth
+from ambiguous_wild.simulate.composite.layers import CutoutPlacement, composed, layer, resized, truth
 
 
 def test_half_of_white_over_black_is_188() -> None:
@@ -29,7 +29,7 @@ CAMERA = Camera(320, 240, 300.0, 300.0, 160.0, 120.0, np.eye(4))
 @pytest.mark.parametrize("turn", [0.0, 30.0, 135.0])
 def test_a_lying_thing_has_its_place_and_size(depth: float, turn: float) -> None:
     position = (0.1 * depth, -0.05 * depth, depth)
-    over = layer([square()], [0.5], [Stand(0, position, turn, standing=False)], CAMERA)
+    over = layer([square()], [0.5], [CutoutPlacement(0, position, turn, standing=False)], CAMERA)
     alpha = over[..., 3].astype(float)
     rows, columns = np.mgrid[:240, :320] + 0.5
     assert (alpha * columns).sum() / alpha.sum() == pytest.approx(160 + 30, abs=0.02)
@@ -39,7 +39,7 @@ def test_a_lying_thing_has_its_place_and_size(depth: float, turn: float) -> None
 
 
 def test_a_standing_thing_has_its_foot_at_its_place() -> None:
-    over = layer([square()], [0.6], [Stand(0, (0.0, 0.3, 3.0), 0.0, standing=True)], CAMERA)
+    over = layer([square()], [0.6], [CutoutPlacement(0, (0.0, 0.3, 3.0), 0.0, standing=True)], CAMERA)
     rows, columns = np.nonzero(over[..., 3] > 0.5)
     tall = 300 * 0.6 / 3.0
     assert rows.max() + 1 == pytest.approx(120 + 30, abs=2) and np.ptp(rows) + 1 == pytest.approx(
@@ -52,21 +52,21 @@ def test_the_nearer_thing_covers_the_farther_whatever_the_order() -> None:
     red, blue = (
         Cutout(n, square().light * np.float32(c)) for n, c in (("r", [1, 0, 0, 1]), ("b", [0, 0, 1, 1]))
     )
-    stands = [Stand(0, (0, 0, 2.0), 0, False), Stand(1, (0, 0, 4.0), 0, False)]
+    stands = [CutoutPlacement(0, (0, 0, 2.0), 0, False), CutoutPlacement(1, (0, 0, 4.0), 0, False)]
     for order in (stands, stands[::-1]):
         over = layer([red, blue], [0.3, 3.0], order, CAMERA)
         assert over[120, 160].tolist() == [1, 0, 0, 1] and over[120, 100].tolist() == [0, 0, 1, 1]
 
 
 def test_a_smaller_layer_keeps_its_light_and_alpha() -> None:
-    over = layer([square()], [0.5], [Stand(0, (0.1, 0, 3.0), 20, False)], CAMERA)
+    over = layer([square()], [0.5], [CutoutPlacement(0, (0.1, 0, 3.0), 20, False)], CAMERA)
     small = resized(over, 107, 80)  # not a whole factor
     np.testing.assert_allclose(small.mean((0, 1)), over.mean((0, 1)), rtol=1e-4)
 
 
 @pytest.mark.parametrize("standing", [True, False])
 def test_a_shadow_only_darkens_and_is_part_of_the_truth(standing: bool) -> None:
-    stand = [Stand(0, (0.0, 0.2, 3.0), 0.0, standing)]
+    stand = [CutoutPlacement(0, (0.0, 0.2, 3.0), 0.0, standing)]
     bare, dark = (layer([square()], [0.6], stand, CAMERA, shadow=s) for s in (0.0, 0.7))
     photo = np.full((240, 320, 3), 200, np.uint8)
     outside = bare[..., 3] == 0

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.simulate import capture
-from ambiguous_wild.simulate.develop import Developed, Shot, develop
-from ambiguous_wild.simulate.effects.moment import Moment
-from ambiguous_wild.simulate.effects.settings import KINDS, Defocus, Effects
+from ambiguous_wild.simulate.image_effects.photo_random import PhotoRandom
+from ambiguous_wild.simulate.image_effects.settings import KINDS, Defocus, Effects
 from ambiguous_wild.simulate.presets import PRESETS, preset, resized
+from ambiguous_wild.simulate.render import PlannedPhoto, RenderedPhoto, render_photo
 from ambiguous_wild.simulate.spec import CaptureSpec
 from ambiguous_wild.simulate.world import World
 
@@ -32,13 +32,13 @@ def small(**effects: object) -> CaptureSpec:
 
 
 @cache
-def planned() -> tuple[World, list[Shot]]:
+def planned() -> tuple[World, list[PlannedPhoto]]:
     return capture.plan(small(), 3)
 
 
-def taken(spec: CaptureSpec, k: int, seed: int = 3) -> Developed:
+def taken(spec: CaptureSpec, k: int, seed: int = 3) -> RenderedPhoto:
     world, shots = planned()
-    return develop(spec, world, shots[k], Moment(seed, k, k / 3))
+    return render_photo(spec, world, shots[k], PhotoRandom(seed, k, k / 3))
 
 
 @pytest.fixture
@@ -47,7 +47,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
     counted = dict.fromkeys(KINDS, 0)
 
     def count(name: str) -> None:
-        module = importlib.import_module(f"ambiguous_wild.simulate.effects.{name}")
+        module = importlib.import_module(f"ambiguous_wild.simulate.image_effects.{name}")
         original = getattr(module, name)
 
         def counting(*words: object, **more: object) -> object:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core.camera import Camera
-from ambiguous_wild.simulate.effects import (
+from ambiguous_wild.simulate.image_effects import (
     defocus,
     exposure_drift,
     iso_noise,
@@ -23,27 +23,27 @@ from ambiguous_wild.simulate.effects import (
     warp,
     white_balance,
 )
-from ambiguous_wild.simulate.effects.hand import hand_velocity
-from ambiguous_wild.simulate.effects.moment import Moment
+from ambiguous_wild.simulate.image_effects.hand_motion import hand_velocity
+from ambiguous_wild.simulate.image_effects.photo_random import PhotoRandom
 from ambiguous_wild.simulate.kernels import BOX
 from ambiguous_wild.simulate.shapes import Shape
 from ambiguous_wild.simulate.tracer import Light
 
 GREY = np.full((40, 60, 3), 0.2, np.float32)
-MOMENT = Moment(7, 3, 0.25)
+MOMENT = PhotoRandom(7, 3, 0.25)
 CAMERA = Camera(64, 36, 60.0, 60.0, 32.0, 18.0, np.eye(4))
 
 
 def test_a_stop_doubles_the_light() -> None:
     assert exposure_drift.exposure_drift(GREY, 1.0) == pytest.approx(0.4)
-    drawn = [exposure_drift.draw(settings.ExposureDrift(0.7), Moment(1, k, k / 29)) for k in range(30)]
+    drawn = [exposure_drift.draw(settings.ExposureDrift(0.7), PhotoRandom(1, k, k / 29)) for k in range(30)]
     assert max(np.abs(drawn)) <= 0.7 and np.ptp(drawn) > 0.7
     assert np.abs(np.diff(drawn)).max() < 0.5  # it wanders, it does not jump
 
 
 def test_white_balance_keeps_the_luminance_of_white() -> None:
     for k in range(20):
-        gains = white_balance.draw(settings.WhiteBalance(), Moment(1, k, k / 19))
+        gains = white_balance.draw(settings.WhiteBalance(), PhotoRandom(1, k, k / 19))
         white = white_balance.white_balance(np.ones((1, 1, 3), np.float32), gains)[0, 0]
         assert white @ [0.2126, 0.7152, 0.0722] == pytest.approx(1.0, abs=1e-6)
         assert abs(np.log2(gains[0] / gains[2])) <= 0.5 + 1e-9
@@ -111,7 +111,7 @@ def test_defocus_spreads_a_point_over_a_disc_and_loses_no_light() -> None:
     assert spread.sum() == pytest.approx(1.0, abs=1e-5) and spread[15, 15] == pytest.approx(
         1 / (9 * np.pi), rel=0.1
     )
-    shares = [defocus.draw(settings.Defocus(share=0.4), Moment(0, k, 0)) > 0 for k in range(200)]
+    shares = [defocus.draw(settings.Defocus(share=0.4), PhotoRandom(0, k, 0)) > 0 for k in range(200)]
     assert 0.3 < np.mean(shares) < 0.5
 
 
@@ -150,9 +150,13 @@ def test_polish_is_for_the_named_textures_alone() -> None:
 
 
 def test_streams_of_effects_are_independent_and_repeat() -> None:
-    def numbers(moment: Moment) -> list[float]:
+    def numbers(moment: PhotoRandom) -> list[float]:
         return [float(moment.rng(name).random()) for name in ("jpeg", "iso_noise", "hand")]
 
-    assert numbers(Moment(1, 2, 0.0)) == numbers(Moment(1, 2, 0.9))
-    drawn = [*numbers(Moment(1, 2, 0.0)), *numbers(Moment(1, 3, 0.0)), *numbers(Moment(2, 2, 0.0))]
+    assert numbers(PhotoRandom(1, 2, 0.0)) == numbers(PhotoRandom(1, 2, 0.9))
+    drawn = [
+        *numbers(PhotoRandom(1, 2, 0.0)),
+        *numbers(PhotoRandom(1, 3, 0.0)),
+        *numbers(PhotoRandom(2, 2, 0.0)),
+    ]
     assert len(set(drawn)) == 9

@@ -11,25 +11,26 @@ from scipy import ndimage
 
 from ambiguous_wild.core.camera import Camera
 from ambiguous_wild.simulate import capture
+from ambiguous_wild.simulate.camera_path import look_at
 from ambiguous_wild.simulate.distractors import Placement, movers
 from ambiguous_wild.simulate.presets import PRESETS, resized
 from ambiguous_wild.simulate.spec import CaptureSpec, Distractor
 from ambiguous_wild.simulate.tracer import trace
-from ambiguous_wild.simulate.walk import look_at
 from ambiguous_wild.simulate.world import World
 
 # preset: what it says of itself, the mean share of a train photo's pixels that distractors cover
 STATED = {
+    "courtyard": (0.14, 0.22),
     "courtyard-plain": (0.16, 0.24),
     "courtyard-thin": (0.04, 0.09),
     "courtyard-sparse": (0.035, 0.065),
-    "courtyard-crowd": (0.40, 0.50),
+    "courtyard-crowd": (0.41, 0.49),
 }
 THIN = ("pole", "barrier", "banner")
 
 
 def small(name: str, views: int = 8, width: int = 128) -> CaptureSpec:
-    return replace(resized(PRESETS[name], views=views, width=width), detail_px_per_m=12.0, samples=1)
+    return replace(resized(PRESETS[name], views=views, width=width), detail_px_per_m=5.0, samples=1)
 
 
 def masks(spec: CaptureSpec, seed: int) -> np.ndarray:

@@ -10,7 +10,8 @@ import types
 
 import torch
 
-from ambiguous_wild.splat import device, gsplat_seam
+from ambiguous_wild.splat import device
+from ambiguous_wild.splat.gpu import gsplat_seam
 from ambiguous_wild.splat.reference import harmonics, rotations
 
 _BOX = 3.33  # deviations a radius has at most

@@ -5,6 +5,7 @@ import torch
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.rendered import Cotangents
 
 
 def camera(width=37, height=29, *, angle=0.3, fx=30.0, fy=33.0, cx=None, cy=None) -> Camera:
@@ -44,3 +45,9 @@ def cotangents(height, width, seed=0) -> dict[str, torch.Tensor]:
     shapes = {"d_image": (height, width, 3), "d_image_extra": (height, width, 3)}
     shapes |= {"d_alpha": (height, width), "d_depth": (height, width)}
     return {k: torch.from_numpy(rng.normal(size=s).astype(np.float32)) for k, s in shapes.items()}
+
+
+def given(d: dict[str, torch.Tensor]) -> Cotangents:
+    """`cotangents` as a render takes them."""
+    names = ("d_image", "d_image_extra", "d_alpha", "d_depth")
+    return Cotangents(*(d.get(name) for name in names))

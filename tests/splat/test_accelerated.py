@@ -8,13 +8,15 @@ import pytest
 import torch
 
 from ambiguous_wild.io.scene_folder import load_scene
-from ambiguous_wild.splat import clock, fused_loss
+from ambiguous_wild.splat import clock
+from ambiguous_wild.splat.gpu import fused_loss
+from ambiguous_wild.splat.gpu.sentinel import Sentinel
 from ambiguous_wild.splat.losses import photometric, ssim_map
 from ambiguous_wild.splat.parts import MaskPolicy, Parts
 from ambiguous_wild.splat.reference import photometric_reference, ssim_map_reference
-from ambiguous_wild.splat.sentinel import Sentinel
+from ambiguous_wild.splat.rendered import Cotangents
 from ambiguous_wild.splat.watchdog import NonFinite
-from tests.host_reads import READ, moved
+from tests.host_reads import READ, moved, no_transfers
 from tests.tiny_scene import with_points, write_tiny_scene
 
 from . import fake_gsplat
@@ -78,14 +80,75 @@ class OnMeta(MaskPolicy):
         return keep[..., None] * (step.rendered.image - 0.5) / step.photo.numel()
 
 
-@pytest.mark.parametrize("mask", [MaskPolicy, OnMeta])
+class Fickle(MaskPolicy):
+    """Gives another keep map and another loss of its own at every call; what it predicts is neither."""
+
+    def __init__(self, bad=None, where="keep"):
+        self.bad, self.where, self.calls = bad, where, 0
+
+    def keep(self, step):
+        self.calls += 1
+        keep = torch.full_like(step.photo[..., 0], 1.0 / self.calls)
+        if step.iteration == self.bad and self.where == "keep":
+            keep[20, 30] = math.nan
+        return keep
+
+    def predict(self, step):
+        return None
+
+    def cotangent(self, step, keep):
+        self.calls += 1
+        alpha = torch.full_like(keep, 1e-4 / self.calls)
+        if step.iteration == self.bad and self.where == "alpha":
+            alpha[20, 30] = math.nan
+        return Cotangents(alpha=alpha, extra=1e-4 * keep[..., None] * step.photo)
+
+
+@pytest.mark.parametrize("where", ["keep", "alpha"])
+def test_the_step_that_broke_is_made_again_with_its_own_keep_map(scene, tmp_path, fake, where):
+    """Whatever the policy would say now: it has learnt since."""
+    mask = Fickle(7, where)
+    trainer = trainer_for(scene, tmp_path / "run", parts=Parts(mask=mask), iterations=60, probes=0)
+    trainer.watchdog.every = 12
+    said = "loss is" if where == "keep" else "gradient of .*means.*"
+    with pytest.raises(NonFinite, match=rf"{said} .* iteration 7, view") as info:
+        for _ in range(12):
+            trainer.step()
+    assert mask.calls == 24  # nobody asks the policy again
+    keep = info.value.seen["keep"]
+    expected = torch.full_like(keep, 1.0 / 13)  # of its call in step 7
+    if where == "keep":
+        expected[20, 30] = math.nan
+    assert torch.equal(keep.nan_to_num(-1.0), expected.nan_to_num(-1.0))
+
+
+def test_what_weighed_the_broken_step_is_kept_whatever_the_sizes_after_it():
+    sentinel, loss = Sentinel(torch.device("cpu"), 3), torch.tensor(0.5)
+    sound, broken = [torch.ones(2)], [torch.tensor([1.0, math.inf])]
+    sentinel.watch(1, 0, loss, sound, torch.full((4, 5), 0.1))
+    weights = torch.rand(2, 3), Cotangents(image=torch.rand(2, 3, 3), depth=torch.rand(2, 3))
+    sentinel.watch(2, 1, loss, broken, *weights)
+    sentinel.watch(3, 2, loss, broken, torch.full((4, 5), 0.3), torch.full((4, 5, 3), 0.4))
+    found = sentinel.first_broken()
+    assert found.iteration == 2 and torch.equal(found.keep, weights[0])
+    assert torch.equal(found.extra.image, weights[1].image) and found.extra.extra is None
+    assert torch.equal(found.extra.depth, weights[1].depth) and found.extra.alpha is None
+    sentinel.reset()
+    sentinel.watch(4, 0, loss, broken, None)
+    assert sentinel.first_broken().keep is None
+
+
+@pytest.mark.parametrize("mask", [MaskPolicy, OnMeta, Fickle])
 def test_no_host_read_in_the_loop_but_where_it_looks(scene, tmp_path, monkeypatch, mask):
     """On torch's `meta` device reading a value raises, and so does mixing with the host's tensors."""
     with fake_gsplat.installed(monkeypatch):
         trainer = moved(trainer_for(scene, tmp_path, parts=Parts(mask=mask()), iterations=1000, probes=0))
-        for _ in range(2):
+        for _ in range(12):  # two epochs: what is copied once, the cameras, is
             trainer.timeline.loss(trainer.step())
-        assert trainer.iteration == 2
+        assert trainer.iteration == 12
+        with no_transfers():
+            for _ in range(3):
+                trainer.timeline.loss(trainer.step())
         with pytest.raises((RuntimeError, NotImplementedError), match=READ):
             trainer.check_parameters()  # looking does read
 
@@ -204,6 +267,34 @@ def test_the_fused_loss_reads_nothing_and_is_one_graph_for_a_compiler():
             assert torch.equal(x, y)
 
 
+def test_the_loss_is_compiled_once_for_all_sizes(monkeypatch):
+    """Photos of several sizes, smaller ones, and strides of any kind: a run meets them in the middle."""
+    compiled = []
+    monkeypatch.setattr(fused_loss, "_compiles", lambda device: True)
+
+    def counting(graph, inputs):
+        compiled.append(graph)
+        return graph.forward
+
+    loss = fused_loss._Compiled(fused_loss._loss, backend=counting)
+    for height, width, masked in (
+        (16, 16, True),  # a square one first: its sides must not be taken for one number
+        (17, 23, True),
+        (40, 21, True),
+        (17, 23, False),
+        (9, 30, False),
+    ):
+        a, b, keep = pictures(height, width)
+        keep = keep if masked else None
+        planes = b.permute(2, 0, 1).contiguous().permute(1, 2, 0)  # the same values, other strides
+        for photo in (b, planes):
+            found = loss(a, photo, keep, 0.2, False)
+            for x, y in zip(found, fused_loss._loss(a, b, keep, 0.2, False), strict=True):
+                torch.testing.assert_close(x, y, rtol=1e-6, atol=1e-9)
+        assert len(compiled) == (1 if masked else 2), (height, width)
+    assert not loss.broken
+
+
 def test_without_a_compiler_the_loss_runs_as_it_stands_and_says_so():
     class Cuda(torch.Tensor):
         device = torch.device("cuda")
@@ -231,12 +322,12 @@ def test_the_sentinel_stays_up_and_counts_what_was_sound():
     assert not sentinel.watch(5, 0, loss, sound, None)
     assert sentinel.watch(6, 0, loss, broken, None)
     assert sentinel.watch(7, 0, loss, sound, None)  # it stays up
-    assert sentinel.first_broken() == 6
+    assert sentinel.first_broken().iteration == 6
     assert sentinel.empty_views() == {2}
     sentinel.reset()
     assert sentinel.first_broken() is None
     assert sentinel.watch(8, 0, torch.tensor(math.nan), sound, None)
-    assert sentinel.first_broken() == 8
+    assert sentinel.first_broken().iteration == 8
     assert torch.equal(sound[0], torch.ones(4, 3))
 
 

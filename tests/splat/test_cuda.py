@@ -5,15 +5,16 @@ import pytest
 import torch
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.splat import gsplat_seam
 from ambiguous_wild.splat.cpu.render import render_cpu
-from ambiguous_wild.splat.cuda import on_device, render_cuda
+from ambiguous_wild.splat.gpu import gsplat_seam
+from ambiguous_wild.splat.gpu.render import on_device, render_cuda
 from ambiguous_wild.splat.reference import render_reference
 from ambiguous_wild.splat.render import render
-from ambiguous_wild.stress.agreement import agree
+from ambiguous_wild.splat.rendered import Cotangents
+from ambiguous_wild.stress.float64_check import agree
 
 from . import fake_gsplat
-from .scenes import camera, cotangents, doubles, gaussians
+from .scenes import camera, cotangents, doubles, gaussians, given
 
 BACKGROUND = (0.1, 0.5, 0.9)
 # plain float32 sums in no favourable order, and a determinant that is a difference: two digits of seven
@@ -60,7 +61,8 @@ def test_pictures_and_gradients_are_those_of_the_reference(fake, antialias, aske
     assert (rendered.depth - truth.depth).abs().max() < TOLERANCE * (truth.depth.max() + 1)
     assert not (truth.visible & ~rendered.visible).any()
     assert torch.equal(rendered.radii > 0, rendered.visible)
-    grads = rendered.backward(**d)
+    grads = rendered.backward(given(d))
+    assert torch.equal(grads.visible, rendered.visible)
     assert (grads.screen_extra is None) == ("d_image_extra" not in d)
     for name, value in expected.items():
         error = (getattr(grads, name) - value).abs().max()
@@ -70,8 +72,9 @@ def test_pictures_and_gradients_are_those_of_the_reference(fake, antialias, aske
 def test_absolute_sums_are_those_of_the_cpu_kernels(fake):
     g, cam = gaussians(4), camera()
     d_image = cotangents(cam.height, cam.width)["d_image"]
-    expected = render_cpu(g, cam).backward(d_image, absolute=True)
-    found = render(g, cam).backward(d_image, absolute=True)
+    needs = frozenset({"absolute"})
+    expected = render_cpu(g, cam).backward(d_image, needs)
+    found = render(g, cam).backward(d_image, needs)
     # what the loops drop beyond 1/255 of a row is the same; a pixel on the verge of the cut may differ
     scale = expected.screen_abs.abs().max()
     assert (found.screen_abs - expected.screen_abs).abs().max() < 1e-4 * scale
@@ -92,7 +95,7 @@ def test_the_clamp_is_the_installed_versions_own(monkeypatch):
     assert (other - truth).abs().max() > 1e-3  # the clamp tells, or this test shows nothing
 
 
-def test_without_a_graph_there_is_no_way_back_and_the_same_picture(fake):
+def test_without_a_graph_there_is_no_backward_pass_and_the_same_picture(fake):
     g, cam = gaussians(6), camera()
     with torch.no_grad():
         rendered = render(g, cam)
@@ -125,7 +128,7 @@ def test_a_second_cotangent_comes_back_once_more_through_the_pixels_alone(fake, 
     g, cam = gaussians(8), camera()
     d = cotangents(cam.height, cam.width)
     rendered = render(g, cam)
-    rendered.backward(d["d_image"], d_image_extra=d["d_image_extra"])
+    rendered.backward(Cotangents(d["d_image"], d["d_image_extra"]))
     assert calls == {"project": 1, "blend": 1}  # no depth, no second drawing unless asked for
     assert rendered.depth.shape == (cam.height, cam.width)
     assert calls == {"project": 1, "blend": 2}
@@ -142,8 +145,8 @@ def test_nothing_to_draw(fake):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_adapter_passes_the_bound_that_follows_from_the_problem(fake, seed):
-    from ambiguous_wild.stress.agreement import camera as front_camera
-    from ambiguous_wild.stress.agreement import cloud
+    from ambiguous_wild.stress.float64_check import camera as front_camera
+    from ambiguous_wild.stress.float64_check import cloud
 
     measured = agree(cloud(30, seed), front_camera(), "cpu", "", sh_degree=1)
     assert measured.error <= measured.tolerance
@@ -154,7 +157,7 @@ def test_no_host_read_in_a_whole_step(fake):
     g, cam = gaussians(9).to("meta"), camera()
     rendered = render_cuda(g, cam, sh_degree=3, background=BACKGROUND, antialias=True)
     d = {k: v.to("meta") for k, v in cotangents(cam.height, cam.width).items()}
-    grads = rendered.backward(**d)
+    grads = rendered.backward(given(d))
     for name in NAMES:
         assert getattr(grads, name).shape == getattr(g, name).shape
     with pytest.raises(RuntimeError):

@@ -9,8 +9,8 @@ from types import SimpleNamespace
 import pytest
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.splat import cuda_ready, gsplat_build
-from ambiguous_wild.splat.cuda_ready import Found, choose, why_not
+from ambiguous_wild.splat.gpu import gsplat_build, readiness
+from ambiguous_wild.splat.gpu.readiness import Found, choose, why_not
 
 ARCHS = ["sm_75", "sm_80", "sm_86", "sm_90", "sm_100", "sm_120"]
 TORCH = {
@@ -214,8 +214,8 @@ def test_kernels_of_a_wheel_that_was_compiled_beforehand_are_found(machine, monk
     assert not gsplat_build.is_prebuilt(machine.package)
     (machine.package / "csrc.cpython-312-x86_64-linux-gnu.so").touch()
     assert gsplat_build.is_prebuilt(machine.package)
-    monkeypatch.setattr(cuda_ready, "compile_kernels", lambda *_: pytest.fail("compiles"))
-    cuda_ready.make_ready(found(prebuilt=True, compiled=False), machine.said.append)
+    monkeypatch.setattr(readiness, "compile_kernels", lambda *_: pytest.fail("compiles"))
+    readiness.make_ready(found(prebuilt=True, compiled=False), machine.said.append)
 
 
 def test_what_another_process_compiled_meanwhile_is_not_compiled_again(machine):
@@ -237,7 +237,7 @@ def test_auto_goes_on_with_the_cpu_where_the_compiler_fails(monkeypatch):
     def fails(found, say):
         raise AwError("gsplat did not compile: error")
 
-    monkeypatch.setattr(cuda_ready, "make_ready", fails)
+    monkeypatch.setattr(readiness, "make_ready", fails)
     said = []
     assert choose("auto", said.append, looking=lambda: found(compiled=False)) == "cpu"
     assert said == ["warning: the GPU is not used, the CPU is: gsplat did not compile: error"]
@@ -310,17 +310,17 @@ def test_what_is_looked_at_is_what_torch_and_gsplat_will_take(tmp_path, monkeypa
     (tmp_path / "gsplat/__init__.py").touch()
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setenv("TORCH_EXTENSIONS_DIR", str(tmp_path / "kept"))
-    seen = cuda_ready.look(TORCH)
+    seen = readiness.look(TORCH)
     assert (seen.driver, seen.nvcc, seen.hidden) == ("Fine GPU, 600.0", "13.0", None)
     assert seen.compiler == str(tmp_path / "bin/my-c++") and seen.gsplat == str(tmp_path / "gsplat")
     assert not seen.compiled and seen.folder == tmp_path / "kept/gsplat_cuda"
     (tmp_path / "kept/gsplat_cuda").mkdir(parents=True)
     (tmp_path / "kept/gsplat_cuda/gsplat_cuda.so").touch()
-    assert cuda_ready.look(TORCH).compiled
+    assert readiness.look(TORCH).compiled
     monkeypatch.setenv("CUDA_HOME", str(tmp_path / "absent"))
-    assert cuda_ready.look(TORCH).nvcc == "11.8"  # gsplat takes the one on $PATH then
+    assert readiness.look(TORCH).nvcc == "11.8"  # gsplat takes the one on $PATH then
 
 
 def test_torch_is_asked_for_plain_values():
-    facts = cuda_ready.torch_facts()
+    facts = readiness.torch_facts()
     assert facts.keys() == TORCH.keys()

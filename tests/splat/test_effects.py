@@ -16,13 +16,12 @@ from ambiguous_wild.splat.effects.chain import Chain
 from ambiguous_wild.splat.effects.exposure import AffineExposure
 from ambiguous_wild.splat.effects.poses import PoseRefinement, moved
 from ambiguous_wild.splat.effects.smoothing import SmoothingFilter, filter_sizes
-from ambiguous_wild.splat.effects.tracks import photo_gains
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.reference import render_reference
-from ambiguous_wild.splat.rendered import Gradients
-from ambiguous_wild.splat.step import TrainData
+from ambiguous_wild.splat.rendered import Cotangents, Frame, Gradients
+from ambiguous_wild.splat.step import Shot, TrainData
 from ambiguous_wild.splat.trainer import Trainer
 from tests.splat.scenes import camera as make_camera
 from tests.splat.scenes import gaussians as random_gaussians
@@ -79,7 +78,20 @@ def test_an_effect_that_does_nothing_leaves_the_bits_alone(scene, tmp_path):
 def test_only_overridden_hooks_are_called(scene, tmp_path):
     trainer = trainer_for(scene, tmp_path, ("exposure",))
     chain = trainer.effects
-    assert [len(h) for h in (chain._camera, chain._model, chain._pose, chain._image)] == [0, 0, 0, 1]
+    assert [len(chain._with(hook)) for hook in ("camera", "model", "shade", "pose", "image")] == [
+        0,
+        0,
+        0,
+        0,
+        1,
+    ]
+    assert chain._with("image", without=("exposure",)) == ()
+
+
+def test_an_effect_that_the_method_brings_is_applied_once():
+    parts = Parts(effects=(AffineExposure(),))
+    assert with_effects(parts, ("exposure",)).effects == parts.effects
+    assert [e.name for e in with_effects(parts, ("exposure", "poses")).effects] == ["exposure", "poses"]
 
 
 def test_names():
@@ -164,19 +176,31 @@ def test_exposure_gradients_and_closure():
     effect._close()
     assert effect.adam.values[:3].sum(dim=0).abs().max() < 1e-12
     image, weight = (torch.from_numpy(rng.normal(size=(3, 4, 3))) for _ in range(2))
-    assert effect.image(image, None) is image
-    d_image = effect.image_backward(image, weight, 1, learn=True)
-    torch.testing.assert_close(d_image, numeric(lambda x: (effect.image(x, 1) * weight).sum(), image))
+    frame = Frame(image, torch.ones(3, 4), lambda: torch.ones(3, 4))
+    assert effect.image(frame, shot_of(None))[0] is frame
+
+    def toned(x):
+        return effect.image(replace(frame, image=x), shot_of(1))[0].image
+
+    _, pull = effect.image(frame, shot_of(1))
+    effect.image(replace(frame, image=2 * image), shot_of(0))  # another picture in between changes nothing
+    found = pull(Cotangents(weight, extra=2 * weight))
+    torch.testing.assert_close(found.image, numeric(lambda x: (toned(x) * weight).sum(), image))
+    torch.testing.assert_close(found.extra, 2 * found.image)  # and effects learn from the image's alone
     row = effect.adam.values[1].clone()
 
     def of_row(values):
         effect.adam.values[1] = values
-        return (effect.image(image, 1) * weight).sum()
+        return (toned(image) * weight).sum()
 
-    torch.testing.assert_close(effect._gradient, numeric(of_row, row))
+    torch.testing.assert_close(found.own["exposure"]["affine"], numeric(of_row, row))
     effect.adam.values[1] = row
-    effect.step(1, 0.0)
+    effect.step(found.own["exposure"], shot_of(1))
     assert effect.adam.values[:3].sum(dim=0).abs().max() < 1e-12
+
+
+def shot_of(view, camera=None) -> Shot:
+    return Shot(iteration=0, nominal=0.0, view=view, camera=make_camera() if camera is None else camera)
 
 
 def as_gradients(g, weights) -> Gradients:
@@ -200,36 +224,37 @@ def test_gradients_of_the_model_effects(kind):
     effect.setup(tiny_data(cameras))
     rng = np.random.default_rng(1)
     if kind == "appearance":
-        effect.rows = RowAdam(torch.from_numpy(rng.normal(size=(3, 4))))
+        effect.rows_of_photos = RowAdam(torch.from_numpy(rng.normal(size=(3, 4))))
         effect.net = {name: w.double() for name, w in effect.net.items()}
         effect.centre, effect.spread = effect.centre.double(), effect.spread.double()
     weights = {name: torch.from_numpy(rng.normal(size=tuple(t.shape))) for name, t in g.items()}
-    effect.model(g, 1, 0)
-    found = effect.model_backward(as_gradients(g, weights), 1)
+    _, pull = effect.model(g, shot_of(1))
+    effect.model(g, shot_of(0))  # another picture in between changes nothing
+    found = pull(as_gradients(g, weights))
     for name in ("log_scales", "opacity_logits") if kind == "antialias" else ("sh0",):
 
         def of(values, name=name):
-            return linear(effect.model(replace(g, **{name: values}), 1, 0), weights)
+            return linear(effect.model(replace(g, **{name: values}), shot_of(1))[0], weights)
 
         torch.testing.assert_close(getattr(found, name), numeric(of, getattr(g, name)), rtol=1e-5, atol=1e-7)
     if kind == "appearance":
-        row = effect.rows.values[1].clone()
+        row = effect.rows_of_photos.values[1].clone()
 
         def of_row(values):
-            effect.rows.values[1] = values
-            return linear(effect.model(g, 1, 0), weights)
+            effect.rows_of_photos.values[1] = values
+            return linear(effect.model(g, shot_of(1))[0], weights)
 
-        torch.testing.assert_close(effect._pending["row"], numeric(of_row, row))
-        effect.rows.values[1] = row
+        torch.testing.assert_close(found.own["appearance"]["row"], numeric(of_row, row))
+        effect.rows_of_photos.values[1] = row
         last = effect.net["last"]
 
         def of_net(column):
             changed = last.clone()
             changed[:, 0] = column
             effect.net["last"] = changed
-            return linear(effect.model(g, 1, 0), weights)
+            return linear(effect.model(g, shot_of(1))[0], weights)
 
-        torch.testing.assert_close(effect._pending["last"][:, 0], numeric(of_net, last[:, 0].clone()))
+        torch.testing.assert_close(found.own["appearance"]["last"][:, 0], numeric(of_net, last[:, 0].clone()))
 
 
 def test_the_filter_is_mip_splattings():
@@ -244,7 +269,7 @@ def test_the_filter_is_mip_splattings():
     effect.setup(tiny_data(cameras))
     g = random_gaussians(0, n=1)
     g.means[0] = torch.tensor([0.0, 0.0, 3.0])
-    drawn = effect.model(g, 0, 0)
+    drawn, _ = effect.model(g, shot_of(0))
     s2, f2 = (2 * g.log_scales[0]).exp(), float(size[0]) ** 2
     torch.testing.assert_close((2 * drawn.log_scales[0]).exp(), s2 + f2)
     expected = torch.sigmoid(g.opacity_logits[0]) * (s2 / (s2 + f2)).prod().sqrt()
@@ -265,13 +290,13 @@ def test_the_cameras_gradient_against_finite_differences_of_the_reference(degree
     if started:
         effect.adam.values[0] = torch.tensor([0.05, -0.04, 0.03, 0.01, -0.02, 0.015])
     parameters = {name: tensor.clone().requires_grad_(True) for name, tensor in g.items()}
-    r = render_reference(parameters, effect.camera(0, cam), sh_degree=degree)
+    r = render_reference(parameters, effect.camera(shot_of(0, cam)), sh_degree=degree)
     (r.image * weight).sum().backward()
     gradients = Gradients(
         **{n: torch.zeros_like(p) if p.grad is None else p.grad for n, p in parameters.items()},
         screen=torch.zeros(6, 2),
     )
-    effect.pose_backward(g, effect.camera(0, cam), gradients, 0)
+    own = effect.pose(g, gradients, shot_of(0, effect.camera(shot_of(0, cam))))
 
     def loss(delta):
         pose = moved(cam.cam_from_world, delta[:3].numpy(), effect.depth * delta[3:].numpy())
@@ -282,99 +307,4 @@ def test_the_cameras_gradient_against_finite_differences_of_the_reference(degree
 
     expected = numeric(loss, effect.adam.values[0].clone(), step=1e-6)
     assert expected.abs().min() > 1e-2
-    torch.testing.assert_close(effect._gradient, expected, rtol=1e-4, atol=1e-4)
-
-
-# -- what they are for ----------------------------------------------------------------------------
-
-
-def brightened(data, gains):
-    return replace(data, photos=[(p * g).clamp(0, 1) for p, g in zip(data.photos, gains)])
-
-
-def psnr_of(trainer, photos, view=False):
-    errors = [
-        float((trainer.make_step(trainer.iteration, i).rendered.image - p).square().mean())
-        for i, p in enumerate(photos)
-    ]
-    return -10 * np.log10(np.mean(errors))
-
-
-GAINS = [0.8, 1.05, 0.9, 1.1, 0.75, 1.0]
-
-
-@pytest.mark.parametrize("name", ["exposure", "appearance"])
-def test_colour_effects_explain_drifting_exposure(scene, tmp_path, name):
-    drift = lambda data: brightened(data, GAINS)  # noqa: E731
-    runs = {
-        n: trainer_for(scene, tmp_path / (n or "none"), [n] if n else [], drift, iterations=300)
-        for n in ("", name)
-    }
-    for run in runs.values():
-        run.train()
-    photos = runs[""].data.photos
-    assert psnr_of(runs[name], photos) > psnr_of(runs[""], photos) + 3
-    # a photo of unseen exposure, fitted on its left half, is explained on the right one
-    camera, photo = scene.test[0].camera, None
-    from ambiguous_wild.io.images import load_image_float
-
-    photo = torch.from_numpy(load_image_float(scene.test[0].image_path)) * 0.7
-    keep = torch.zeros(photo.shape[:2])
-    keep[:, : photo.shape[1] // 2] = 1
-    before = bits(runs[name])
-    fitted = runs[name].render_fitted(camera, photo, keep)
-    assert bits(runs[name]) == before
-    right = slice(photo.shape[1] // 2, None)
-    neutral = runs[name].render(camera).image
-    errors = [float((image - photo)[:, right].square().mean()) for image in (fitted, neutral)]
-    assert errors[0] < 0.25 * errors[1]
-    # what lies in the other half is not read
-    torn = photo.clone()
-    torn[:, right] = 0.5
-    assert torch.equal(runs[name].render_fitted(camera, torn, keep), fitted)
-
-
-def test_poses_return_when_they_were_disturbed(scene, tmp_path):
-    rng = np.random.default_rng(0)
-    truth = [v.camera for v in scene.train]
-
-    def disturb(data):
-        noise = rng.normal(size=(len(truth), 3)) * 0.012
-        cameras = [
-            replace(c, cam_from_world=moved(c.cam_from_world, n, np.zeros(3))) for c, n in zip(truth, noise)
-        ]
-        return replace(data, cameras=cameras)
-
-    trainer = trainer_for(scene, tmp_path, ("poses",), disturb, iterations=400)
-
-    def error(cameras):
-        """Px by which a point of the wall moves from photo to photo, but for a turn that all share."""
-        turns = [c.cam_from_world[:3, :3] @ t.cam_from_world[:3, :3].T for c, t in zip(cameras, truth)]
-        return float(np.std([t[0, 2] for t in turns]) + np.std([t[1, 2] for t in turns])) * truth[0].fx
-
-    before = error(trainer.data.cameras)
-    trainer.train()
-    after = error([trainer.effects.camera(i, c) for i, c in enumerate(trainer.data.cameras)])
-    assert after < 0.6 * before
-
-
-def test_gains_from_tracks_are_those_put_in():
-    rng = np.random.default_rng(0)
-    views, points = 5, 200
-    gains = np.exp(rng.normal(size=(views, 3)) * 0.15)
-    gains /= np.exp(np.log(gains).mean(axis=0))
-    cam = make_camera(64, 48)
-    base = np.repeat(np.repeat(rng.uniform(0.2, 0.6, (8, 8, 3)), 6, 0), 8, 1)
-    photos = [base * g for g in gains]
-    photos[2][:20, :20] = 0.9  # something stands before a tenth of the picture
-    xy = rng.uniform([4, 4], [60, 44], (points, 2))
-    tracks = Points(
-        rng.normal(size=(points, 3)), np.zeros((points, 3), np.uint8), np.zeros(points),
-        np.arange(points + 1) * views, np.tile(np.arange(views), points).astype(np.int32),
-        np.repeat(xy, views, axis=0).astype(np.float32),
-    )  # fmt: skip
-    scene = Scene(None, "s", tuple(View(f"{i}", None, cam, "train") for i in range(views)), tracks)
-    np.testing.assert_allclose(photo_gains(scene, photos), gains, rtol=0.01)
-    # a probe's photos are smaller than those the tracks are in px of
-    halves = [photo[::2, ::2] for photo in photos]
-    np.testing.assert_allclose(photo_gains(scene, halves), gains, rtol=0.02)
+    torch.testing.assert_close(own["motion"], expected, rtol=1e-4, atol=1e-4)

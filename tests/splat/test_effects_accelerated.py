@@ -18,8 +18,8 @@ from ambiguous_wild.splat.effects.posed import PosedCamera, left_jacobian, turne
 from ambiguous_wild.splat.effects.poses import PoseRefinement, right_jacobian_transposed
 from ambiguous_wild.splat.effects.smoothing import filter_sizes
 from ambiguous_wild.splat.parts import Parts
-from ambiguous_wild.splat.rendered import Gradients
-from ambiguous_wild.splat.step import TrainData
+from ambiguous_wild.splat.rendered import NOTHING, Cotangents, Gradients, as_cotangents
+from ambiguous_wild.splat.step import Shot, TrainData
 from tests.host_reads import READ, moved, no_transfers
 from tests.splat.scenes import camera as make_camera
 from tests.splat.scenes import gaussians as random_gaussians
@@ -69,19 +69,29 @@ class Painted:
         self.alpha = self.depth = self.image[..., 0]
         self.visible, self.radii = gaussians.means[:, 0] > -9.0, gaussians.means[:, 0]
 
-    def backward(self, d_image, *, d_image_extra=None, d_alpha=None, d_depth=None, absolute=False):
-        found = torch.autograd.grad(self.drawn, list(self.leaves.values()), d_image)
-        return Gradients(**dict(zip(self.leaves, found)), screen=found[0][:, :2])
+    def backward(self, cotangents, needs=NOTHING):
+        given = as_cotangents(cotangents)
+        found = torch.autograd.grad(self.drawn, list(self.leaves.values()), given.image)
+        return Gradients(**dict(zip(self.leaves, found)), screen=found[0][:, :2], own=given.own)
+
+
+def paint(gaussians, shot, shade):
+    return Painted(gaussians, shot.camera)
+
+
+def shot_of(camera, view=None, iteration=0, progress=0.5):
+    return Shot(iteration=iteration, nominal=30_000 * progress, progress=progress, view=view, camera=camera)
 
 
 def visit(chain, data, gaussians, iteration, divisor=1, called_off=None, targets=None):
     """One step of training, but for the Gaussians."""
     view = iteration % len(data.photos)
-    camera = chain.camera(view, shrink_camera(data.cameras[view], divisor))
-    rendered = chain.render(gaussians, camera, view, iteration, Painted)
+    shot = shot_of(shrink_camera(data.cameras[view], divisor), view, iteration, 0.1 + 0.01 * iteration)
+    shot = replace(shot, camera=chain.camera(shot))
+    rendered = chain.render(gaussians, shot, paint)
     target = 0.2 if targets is None else targets[view]
     gradients = rendered.backward((rendered.image - target) / rendered.image.numel())
-    chain.step(view, 0.1 + 0.01 * iteration, called_off)
+    chain.step(gradients, shot, called_off)
     if iteration % 3 == 0:
         chain.rows_changed()
     return rendered.image, gradients
@@ -145,10 +155,10 @@ def test_a_learnt_pose_is_composed_as_on_the_cpu(monkeypatch):
     for view in range(3):
         for divisor in (1, 2):
             camera = shrink_camera(data.cameras[view], divisor)
-            expected = cpu.camera(view, camera)
+            expected = cpu.camera(shot_of(camera, view))
             with monkeypatch.context() as patch:
                 on_accelerator(patch)
-                found = there.camera(view, camera)
+                found = there.camera(shot_of(camera, view))
             assert isinstance(found, PosedCamera) and (found.width, found.height) == SIZE_OF[divisor]
             for one in (found, found.resized(12, 6)):
                 like = expected if one is found else expected.resized(12, 6)
@@ -160,7 +170,7 @@ def test_a_learnt_pose_is_composed_as_on_the_cpu(monkeypatch):
                 np.testing.assert_allclose(one.intrinsics, like.intrinsics, rtol=1e-14)
     there.adam.steps = [0, 0, 0]
     on_accelerator(monkeypatch)
-    assert there.camera(0, data.cameras[0]) is data.cameras[0]  # never moved
+    assert there.camera(shot_of(data.cameras[0], 0)) is data.cameras[0]  # never moved
 
 
 SIZE_OF = {1: SIZE, 2: (SIZE[0] // 2, SIZE[1] // 2)}
@@ -276,7 +286,8 @@ def test_a_step_leaves_the_host_alone(monkeypatch, names):
     chain, data, g, off, known = moved([chain, data, g, off, {}])
     assert data.device.type == "meta"
 
-    def draw(gaussians, camera):
+    def draw(gaussians, shot, shade):
+        camera = shot.camera
         if not isinstance(camera, PosedCamera):  # a plain camera is copied where the renderer first meets it
             if id(camera) not in known:
                 pose, centre = (torch.zeros(s, dtype=torch.float64).to("meta") for s in ((4, 4), 3))
@@ -287,14 +298,16 @@ def test_a_step_leaves_the_host_alone(monkeypatch, names):
 
     def step(iteration, divisor, called_off):
         view = iteration % len(data.photos)
-        camera = chain.camera(view, cameras[view, divisor])
+        shot = shot_of(cameras[view, divisor], view, iteration)
+        camera = chain.camera(shot)
         assert isinstance(camera, PosedCamera) == ("poses" in names)
         if "poses" in names:
             camera = shrink_camera(camera, 2)  # as a policy's coarse render does
-        rendered = chain.render(g, camera, view, iteration, draw)
+        shot = replace(shot, camera=camera)
+        rendered = chain.render(g, shot, draw)
         extra = torch.zeros_like(rendered.image)
-        gradients = rendered.backward(rendered.image - 0.5, d_image_extra=extra)
-        chain.step(view, 0.5, called_off)
+        gradients = rendered.backward(Cotangents(rendered.image - 0.5, extra))
+        chain.step(gradients, shot, called_off)
         chain.rows_changed()
         assert gradients.means.device.type == "meta"
 

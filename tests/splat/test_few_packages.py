@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.io import images, pillow
+from ambiguous_wild.io import images, pillow_fallback
 from ambiguous_wild.splat import device as devices
 from ambiguous_wild.splat.neighbours import nearest_three, nearest_three_torch
 from tests.tiny_scene import write_tiny_scene
@@ -224,7 +224,7 @@ def test_what_pillow_cannot_keep_is_refused(tmp_path, monkeypatch):
         images.write_png(tmp_path / "new.png", deep)
     monkeypatch.setitem(sys.modules, "PIL", None)
     with pytest.raises(AwError, match=r"neither OpenCV nor Pillow .* pip install"):
-        pillow.encode_png(np.zeros((2, 2), np.uint8))
+        pillow_fallback.encode_png(np.zeros((2, 2), np.uint8))
 
 
 # -- neighbours -----------------------------------------------------------------------------------

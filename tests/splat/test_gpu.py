@@ -9,16 +9,16 @@ import torch
 
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import get_method
-from ambiguous_wild.splat import fused_loss, gsplat_seam
 from ambiguous_wild.splat.cpu.render import render_cpu
 from ambiguous_wild.splat.data import load_train_data
+from ambiguous_wild.splat.gpu import fused_loss, gsplat_seam
 from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.render import render
 from ambiguous_wild.splat.trainer import Trainer
 from tests.tiny_scene import write_tiny_scene
 
-from .scenes import camera, cotangents, gaussians
+from .scenes import camera, cotangents, gaussians, given
 from .test_losses import pictures
 
 pytestmark = pytest.mark.gpu
@@ -47,7 +47,7 @@ def test_twenty_thousand_gaussians_as_on_the_cpu(antialias):
     cpu = render_cpu(g, cam, antialias=antialias)
     there = render(g.to(GPU), cam, antialias=antialias)
     on_gpu = {name: value.to(GPU) for name, value in d.items()}
-    found, expected = there.backward(**on_gpu), cpu.backward(**d)
+    found, expected = there.backward(given(on_gpu)), cpu.backward(given(d))
     # one splat at the cut of 1/255 more or less in a pixel
     assert (there.image.cpu() - cpu.image).abs().max() < 2 / 255
     assert (there.image.cpu() - cpu.image).abs().mean() < 1e-5
@@ -69,8 +69,9 @@ def test_twenty_thousand_gaussians_as_on_the_cpu(antialias):
 def test_absolute_sums_are_those_of_the_cpu():
     g, cam = gaussians(1, 500), camera()
     d = cotangents(cam.height, cam.width)["d_image"]
-    expected = render_cpu(g, cam).backward(d, absolute=True).screen_abs
-    found = render(g.to(GPU), cam).backward(d.to(GPU), absolute=True).screen_abs.cpu()
+    needs = frozenset({"absolute"})
+    expected = render_cpu(g, cam).backward(d, needs).screen_abs
+    found = render(g.to(GPU), cam).backward(d.to(GPU), needs).screen_abs.cpu()
     assert (found - expected).abs().max() < 1e-3 * expected.abs().max()
 
 
@@ -82,6 +83,15 @@ def test_the_compiled_loss_is_that_of_the_cpu(weighting):
     assert float(found.value) == pytest.approx(expected.value, rel=1e-5)
     assert (found.d_image.cpu() - expected.d_image).abs().max() < 1e-5 * expected.d_image.abs().max()
     assert not fused_loss._compiled_loss.broken
+
+
+def test_the_loss_is_compiled_once_for_all_sizes():
+    call = fused_loss._Compiled(fused_loss._loss)
+    torch._dynamo.utils.counters.clear()
+    for size in ((64, 64), (378, 504), (252, 189), (126, 94)):
+        a, b, keep = (t.to(GPU) for t in pictures(*size))
+        call(a, b, keep, 0.2, False)
+    assert torch._dynamo.utils.counters["stats"]["unique_graphs"] == 1 and not call.broken
 
 
 @pytest.mark.parametrize("method", ["3dgs", "robustsplat", "dronesplat", "refinesplat"])

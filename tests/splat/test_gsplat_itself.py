@@ -10,13 +10,14 @@ from types import ModuleType, SimpleNamespace
 import pytest
 import torch
 
-from ambiguous_wild.splat import device, gsplat_seam
+from ambiguous_wild.splat import device
+from ambiguous_wild.splat.gpu import gsplat_seam
 from ambiguous_wild.splat.render import render
-from ambiguous_wild.stress.agreement import agree, cloud
-from ambiguous_wild.stress.agreement import camera as front_camera
+from ambiguous_wild.stress.float64_check import agree, cloud
+from ambiguous_wild.stress.float64_check import camera as front_camera
 
 from . import fake_gsplat
-from .scenes import camera, cotangents, gaussians
+from .scenes import camera, cotangents, gaussians, given
 
 gsplat = pytest.importorskip("gsplat")
 
@@ -150,7 +151,7 @@ def test_what_is_culled_leaves_no_number_that_is_none(kernels):
     rendered = render(g, cam, sh_degree=3)
     assert not rendered.visible.all()
     d = cotangents(cam.height, cam.width)
-    grads = rendered.backward(**d, absolute=True)
+    grads = rendered.backward(given(d), frozenset({"absolute"}))
     for name in (*dict(g.items()), "screen", "screen_extra", "screen_abs"):
         assert torch.isfinite(getattr(grads, name)).all(), name
         assert not getattr(grads, name)[~rendered.visible].any(), name

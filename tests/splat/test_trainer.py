@@ -162,7 +162,7 @@ class FakeTime:
 @pytest.fixture
 def fake_time(monkeypatch):
     clock = FakeTime()
-    for module in ("trainer", "clock"):
+    for module in ("run", "clock"):
         monkeypatch.setattr(f"ambiguous_wild.splat.{module}.time", clock)
     return clock
 

@@ -9,9 +9,9 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import get_method
-from ambiguous_wild.splat import fused_loss
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.effects import with_effects
+from ambiguous_wild.splat.gpu import fused_loss
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
 from tests.host_reads import READ, moved, no_transfers

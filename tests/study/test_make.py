@@ -15,8 +15,8 @@ from click.testing import CliRunner
 
 from ambiguous_wild.cli.study import command
 from ambiguous_wild.core import AwError
-from ambiguous_wild.study.make import page_of
-from ambiguous_wild.study.questions import Pair, draw, pairs_of_runs
+from ambiguous_wild.study.make import page_html
+from ambiguous_wild.study.questions import PairQuestion, render_pairs, sample_questions
 from tests.study.studies import METHODS, write_runs
 from tests.tiny_scene import TEST, TRAIN
 
@@ -107,12 +107,12 @@ def test_the_same_seed_makes_the_same_files_and_another_another(
 
 def test_drawing_is_even_over_pairs(tmp_path: Path) -> None:
     pairs = [
-        Pair(s, str(v), m, (Path("a"), Path("b")), None)
+        PairQuestion(s, str(v), m, (Path("a"), Path("b")), None)
         for s in ("s", "t")
         for v in range(20)
         for m in (("a", "b"), ("a", "c"), ("b", "c"))
     ]
-    chosen = draw(pairs, 12, np.random.default_rng(0))
+    chosen = sample_questions(pairs, 12, np.random.default_rng(0))
     assert len(set(map(id, chosen))) == 12
     counts = [sum(q.group == g for q in chosen) for g in {p.group for p in pairs}]
     assert counts == [2] * 6
@@ -132,7 +132,7 @@ def test_photos_in_which_nothing_moves_are_not_asked_about(made: tuple[Path, Pat
     assert make("--scene", scene, "-o", tmp_path / "s.html")["photos"] == len(TRAIN) - 1
     for name in TRAIN:
         cv2.imwrite(str(masks / name), np.zeros((48, 64), np.uint8))
-    assert "nothing moves" in error("--scene", scene, "-o", tmp_path / "t.html")
+    assert "no training photo of" in error("--scene", scene, "-o", tmp_path / "t.html")
 
 
 def test_what_cannot_be_is_said(made: tuple[Path, Path], tmp_path: Path) -> None:
@@ -167,7 +167,7 @@ def test_an_old_page_is_not_replaced_unasked(made: tuple[Path, Path], tmp_path: 
 
 
 def test_data_cannot_leave_its_script_element() -> None:
-    page = page_of(
+    page = page_html(
         {"title": "</script><script>alert(1)</script>", "study": "x", "questions": [], "images": {}}
     )
     assert page.count("</script>") == 2 and "alert(1)</script>" not in page
@@ -175,7 +175,7 @@ def test_data_cannot_leave_its_script_element() -> None:
 
 def test_a_method_of_any_name_stays_in_the_key(tmp_path: Path) -> None:
     _, runs = write_runs(tmp_path, ("<b>a</b>", "=b"))
-    assert {m for p in pairs_of_runs(runs) for m in p.methods} == {"<b>a</b>", "=b"}
+    assert {m for p in render_pairs(runs) for m in p.methods} == {"<b>a</b>", "=b"}
     make("--runs", runs, "-o", tmp_path / "s.html")
     assert "<b>a" not in (tmp_path / "s.html").read_text()
 

@@ -166,26 +166,26 @@ def test_csv_and_json_answers_score_alike(study: tuple[Path, Path, Any], tmp_pat
 BAD: dict[str, tuple[Any, str]] = {
     "empty": ("", "is empty"),
     "blank": (" \n", "is empty"),
-    "cut": ('{"format": "aw-study-answers", "vers', "cut short"),
+    "cut": ('{"format": "aw-study-answers", "vers', "truncated"),
     "other": ({"format": "something"}, "no answer file"),
     "array": ([1, 2], "no answer file"),
     "version": ({"version": 9}, "version 9"),
     "study": ({"study": "fff"}, "answers study 'fff'"),
-    "rater": ({"rater": ""}, "no fit rater"),
+    "rater": ({"rater": ""}, "no valid rater"),
     "half a character": ({"name": "\ud800"}, "half a character"),
     "half a rater": ({"rater": "\udfff"}, "half a character"),
-    "rater type": ({"rater": ["a"]}, "no fit rater"),
-    "none": ({"answers": []}, "holds no answer"),
-    "unasked": ({"answers": [{"question": "zz", "answer": "x", "ms": 1}]}, "never asked: 'zz'"),
-    "no question": ({"answers": [{"question": ["p0"], "answer": "x", "ms": 1}]}, "never asked"),
+    "rater type": ({"rater": ["a"]}, "no valid rater"),
+    "none": ({"answers": []}, "contains no answer"),
+    "unasked": ({"answers": [{"question": "zz", "answer": "x", "ms": 1}]}, "not in the study: 'zz'"),
+    "no question": ({"answers": [{"question": ["p0"], "answer": "x", "ms": 1}]}, "not in the study"),
     "no dict": ({"answers": ["x"]}, "is no answer"),
-    "choice": ({"answers": [{"question": "p0", "answer": "z", "left": "x", "ms": 1}]}, "there is: x, y, tie"),
-    "left": ({"answers": [{"question": "p0", "answer": "x", "left": "q", "ms": 1}]}, "stood on the left"),
-    "time": ({"answers": [{"question": "k0", "answer": "3", "ms": "nan"}]}, "no fit time"),
-    "time is no number": ({"answers": [{"question": "k0", "answer": "3", "ms": True}]}, "no fit time"),
+    "choice": ({"answers": [{"question": "p0", "answer": "z", "left": "x", "ms": 1}]}, "allowed: x, y, tie"),
+    "left": ({"answers": [{"question": "p0", "answer": "x", "left": "q", "ms": 1}]}, "as the left image"),
+    "time": ({"answers": [{"question": "k0", "answer": "3", "ms": "nan"}]}, "no valid time"),
+    "time is no number": ({"answers": [{"question": "k0", "answer": "3", "ms": True}]}, "no valid time"),
     "twice": ({"answers": [{"question": "k0", "answer": "3", "ms": 1}] * 2}, "twice"),
     "deep": ("[" * 100_000, "malformed"),
-    "bytes": (b"\xff\xfe\x00", "no text in UTF-8"),
+    "bytes": (b"\xff\xfe\x00", "not UTF-8 text"),
     "csv": ("a,b\n1,2\n", "first line must be"),
     "csv row": ("study,rater,name,question,answer,left,ms\nabc123,r,n,k0,3\n", "too few or too many"),
     "csv raters": (
@@ -273,4 +273,4 @@ def test_what_a_folder_of_answers_holds_besides_is_named(
     words = ["score", str(answers), "--key", str(key), "-o", str(tmp_path / "out")]
     done = CliRunner().invoke(command, words, catch_exceptions=False)
     assert f"{len(files)} raters" in done.stdout
-    assert "left out answers-anna.json.txt, bob" in done.stderr
+    assert "ignored answers-anna.json.txt, bob" in done.stderr

@@ -8,12 +8,12 @@ from ambiguous_wild.vision.dino import DinoConfig, DinoFeatures
 from ambiguous_wild.vision.grounded import GroundedInstances
 from ambiguous_wild.vision.label_maps import LabelMaps, SceneLabelMaps
 from ambiguous_wild.vision.labhog import LabHog
+from ambiguous_wild.vision.precompute import instance_labels, photo_features
 from ambiguous_wild.vision.progress import terminal_bar
 from ambiguous_wild.vision.protocols import NamedInstances, SceneInstances
 from ambiguous_wild.vision.sam import SamInstances
 from ambiguous_wild.vision.sam_video import SamVideoInstances
 from ambiguous_wild.vision.segments import GraphSegments, SegmentConfig
-from ambiguous_wild.vision.stage import instance_labels, photo_features
 
 
 def test_specs_are_taken_apart():
@@ -24,9 +24,9 @@ def test_specs_are_taken_apart():
     assert (spec.argument, spec.options) == ("a person, red car. dog", {"least_score": "0.3"})
     assert parse("labels:/some/where, else").argument == "/some/where, else"
     assert parse(r"labels:C:\maps").argument == r"C:\maps"
-    with pytest.raises(AwError, match="is no size"):
+    with pytest.raises(AwError, match="is not a size"):
         parse("sam2@big")
-    with pytest.raises(AwError, match="comes twice"):
+    with pytest.raises(AwError, match="is given twice"):
         parse("sam2,grid=3,grid=4")
 
 
@@ -108,7 +108,7 @@ def test_without_weights_a_name_answers_with_the_command(offline):
         (make_instances, "sam2-video"),
         (make_instances, "grounded:car"),
     ):
-        with pytest.raises(AwError, match=r"bring it with: .*hf download"):
+        with pytest.raises(AwError, match=r"download them with: .*hf download"):
             make(spec)
 
 

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.vision.dino import DinoConfig, DinoFeatures
-from ambiguous_wild.vision.labhog import _degrade
+from ambiguous_wild.vision.labhog import blurred_noisy_copy
 
 KINDS = {"dinov2": (14, 1), "registers": (14, 5), "dinov1": (8, 1)}  # patch, tokens that are no patch
 
@@ -106,7 +106,7 @@ def test_the_unit_is_the_distance_that_blur_and_noise_make(checkpoint, photo):
     features.fit(photos)
     means = []
     for index in (0, 4):  # the first and the last of five
-        one, two = features(photos[index]), features(_degrade(photos[index], index))
+        one, two = features(photos[index]), features(blurred_noisy_copy(photos[index], index))
         means.append(1.0 - F.cosine_similarity(one.reshape(-1, 32), two.reshape(-1, 32)).mean())
     assert features.unit == pytest.approx(float(sum(means) / 2), rel=1e-3)
     other = DinoFeatures("dinov2", features.config, checkpoint("dinov2"))

@@ -35,11 +35,11 @@ def test_the_unit_is_the_distance_that_blur_and_noise_make():
     features = LabHog()
     photos = [photo(k) for k in range(4)]
     features.fit(photos)
-    from ambiguous_wild.vision.labhog import _degrade
+    from ambiguous_wild.vision.labhog import blurred_noisy_copy
 
     distances = []
     for index, one in enumerate(photos):
-        a, b = features(one), features(_degrade(one, index))
+        a, b = features(one), features(blurred_noisy_copy(one, index))
         cosine = (a * b).sum(2) / (a.norm(dim=2) * b.norm(dim=2))
         distances.append((1 - cosine).mean())
     assert float(torch.stack(distances).mean()) == pytest.approx(features.unit, rel=0.05)

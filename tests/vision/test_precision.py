@@ -7,8 +7,8 @@ import torch.nn.functional as F
 from ambiguous_wild.vision import dino
 from ambiguous_wild.vision.dino import DinoConfig, DinoFeatures
 from ambiguous_wild.vision.labhog import LabHog
+from ambiguous_wild.vision.precompute import PreciseFeatures, photo_features
 from ambiguous_wild.vision.sceneconv import SceneConv
-from ambiguous_wild.vision.stage import PreciseFeatures, photo_features
 from tests.host_reads import moved, no_transfers
 
 KINDS = ("dinov2", "registers", "dinov1")
@@ -50,7 +50,7 @@ def test_features_in_mixed_precision_are_those_in_float32_nearly(checkpoint, pho
     assert float(F.cosine_similarity(gradient_there.ravel(), gradient.ravel(), dim=0)) > 0.99
     assert torch.equal(found, there(image))  # the same picture, the same features: no distance to itself
     monkeypatch.undo()
-    there._place = torch.device("meta")  # as if it had been elsewhere: the weights are read again
+    there._device = torch.device("meta")  # as if it had been elsewhere: the weights are read again
     assert torch.equal(there(image), exact)
 
 

@@ -10,7 +10,7 @@ import torch
 from ambiguous_wild.core import AwError
 from ambiguous_wild.vision import cache
 from ambiguous_wild.vision import sceneconv as module
-from ambiguous_wild.vision.labhog import _degrade
+from ambiguous_wild.vision.labhog import blurred_noisy_copy
 from ambiguous_wild.vision.sceneconv import SceneConv
 from ambiguous_wild.vision.sceneconv_train import (
     Pairs,
@@ -76,7 +76,7 @@ def test_training_finds_another_object_of_the_same_colours(scene, trained):
         for k, photo in enumerate(photos):
             other = photo.clone()
             other[20:44, 30:60] = torch.from_numpy(texture(100 + k, 24, 30))
-            render = _degrade(photo, 50 + k)
+            render = blurred_noisy_copy(photo, 50 + k)
             distance = (1 - (features(other) * features(render)).sum(2)).numpy()
             inside = np.zeros(distance.shape, dtype=bool)
             inside[6:10, 8:14] = True
@@ -92,7 +92,8 @@ def test_training_finds_another_object_of_the_same_colours(scene, trained):
 def test_the_unit_is_the_distance_that_blur_and_noise_make(scene, trained):
     photos, _ = scene
     distances = [
-        1 - torch.nn.functional.cosine_similarity(trained(photo), trained(_degrade(photo, k)), dim=2)
+        1
+        - torch.nn.functional.cosine_similarity(trained(photo), trained(blurred_noisy_copy(photo, k)), dim=2)
         for k, photo in enumerate(photos)
     ]
     assert float(torch.stack(distances).mean()) == pytest.approx(trained.unit, rel=1e-3)

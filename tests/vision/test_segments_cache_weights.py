@@ -104,7 +104,7 @@ def test_weights_are_found_where_they_lie(tmp_path, monkeypatch):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     assert not any(line.present for line in weights.status())
-    assert all(line.bring for line in weights.status())
+    assert all(line.command for line in weights.status())
 
     own = tmp_path / "own"
     monkeypatch.setenv("AW_WEIGHTS", str(own))
@@ -147,15 +147,20 @@ def test_old_leftovers_of_killed_writes_are_removed_from_the_cache(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == [young.name, "k.npz", other.name]
 
 
-def test_what_brings_a_weight_can_be_pasted_with_and_without_a_folder(monkeypatch, tmp_path):
+def test_the_download_command_can_be_pasted_with_and_without_a_folder(monkeypatch, tmp_path):
+    fake_curl = tmp_path / "bin" / "curl"  # writes what it was asked to download
+    fake_curl.parent.mkdir()
+    fake_curl.write_text('#!/bin/sh\n[ "$1 $2" = "-fL -o" ] && printf %s "$4" > "$3"\n')
+    fake_curl.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{fake_curl.parent}{os.pathsep}{os.environ['PATH']}")
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.delenv("AW_WEIGHTS", raising=False)
     for line in weights.status():
-        assert line.bring.startswith("export AW_WEIGHTS=~/.cache/ambiguous_wild/weights && ")
+        assert line.command.startswith("export AW_WEIGHTS=~/.cache/ambiguous_wild/weights && ")
     file = next(w for w in weights.KNOWN if w.kind == "file")
-    (tmp_path / file.files[0]).write_bytes(b"x")
-    bring = next(s.bring for s in weights.status() if s.name == file.name)
-    assert subprocess.run(["bash", "-c", bring], cwd=tmp_path).returncode == 0
+    command = next(s.command for s in weights.status() if s.name == file.name)
+    assert subprocess.run(["bash", "-c", command], cwd=tmp_path).returncode == 0
     monkeypatch.setenv("AW_WEIGHTS", str(tmp_path / ".cache/ambiguous_wild/weights"))
-    assert weights.find(file)[0] is not None
-    assert not any("export" in s.bring for s in weights.status())
+    folder, _ = weights.find(file)
+    assert folder is not None and (folder / file.files[0]).read_text() == file.url
+    assert not any("export" in s.command for s in weights.status())

@@ -35,7 +35,7 @@ class Measured:
 
 @dataclass(frozen=True)
 class Look:
-    """The features of a measurement, for maps: what was taken off, and every distractor's feature."""
+    """Features of a measurement, for maps: the mean that was subtracted, and each distractor's feature."""
 
     spec: str  # of the features
     features: Any
@@ -149,7 +149,7 @@ def fitted(scene: Scene, spec: str, cache: Path | None) -> Any:
         photos = [torch.from_numpy(seen_by(spec, load_photo(v))) for v in views]
         backend.fit_scene(photos, train_tracks(scene), cache)
         return backend
-    # fitted to what it will see
+    # fitted to the photos it will be applied to
     chosen = sorted({round(i) for i in np.linspace(0, len(views) - 1, min(FIT_PHOTOS, len(views)))})
     backend.fit([torch.from_numpy(seen_by(spec, load_photo(views[i]))) for i in chosen])
     return backend

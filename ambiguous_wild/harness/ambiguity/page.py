@@ -15,8 +15,8 @@ from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.harness.ambiguity import figure
 from ambiguous_wild.harness.ambiguity.measure import Look, Measured, load_photo
 from ambiguous_wild.harness.ambiguity.sources import Background, Masks
-from ambiguous_wild.harness.ambiguity.summary import NOBODY, cosine_column, describe, row
-from ambiguous_wild.harness.render_tables import csv_text
+from ambiguous_wild.harness.ambiguity.summary import NO_DISTRACTORS, cosine_column, describe, row
+from ambiguous_wild.harness.tables.render import csv_text
 from ambiguous_wild.io.atomic import atomic_dir, refuse_file, write_json, write_text
 from ambiguous_wild.metrics import ambiguity as am
 
@@ -26,7 +26,7 @@ WIDTH = 420  # px of a picture on the page
 
 
 def check_folder(folder: Path) -> None:
-    """Raise AwError where the folder is a file or holds something else than a report: it would be lost."""
+    """Raise AwError where the path is a file, or a folder with files that are no report."""
     refuse_file(folder)
     if not folder.is_dir() or not any(folder.iterdir()):
         return
@@ -106,7 +106,7 @@ _CLASSES = {
     "colour": "ambiguous in colour",
     "semantic": "semantically ambiguous",
     "neither": "neither ambiguous in colour nor semantically",
-    NOBODY: "nobody there",
+    NO_DISTRACTORS: "no distractors",
 }
 _HEADS = {
     "photo": "photo",

@@ -1,14 +1,17 @@
-"""The background as a trained run renders it, where that can be believed."""
+"""The background as a trained run renders it, where other photos confirm it."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ambiguous_wild.core import AwError, Camera, Scene, View
-from ambiguous_wild.harness.ambiguity.sources import Masks
 from ambiguous_wild.io import plain_yaml
+
+if TYPE_CHECKING:
+    from ambiguous_wild.harness.ambiguity.sources import Masks
 
 OPAQUE = 0.9  # accumulated alpha from which something stands there
 SEEN_BY = 2  # other photos that must see the surface unmasked
@@ -76,7 +79,7 @@ def check_run(scene: Scene, run: Path) -> None:
     Raises:
         AwError: what is wrong, and what to do.
     """
-    from ambiguous_wild.harness.run import scene_identity
+    from ambiguous_wild.harness.running.identity import scene_identity
 
     path = run / "config.yaml"
     if not path.is_file() or not (run / "point_cloud.ply").is_file():
@@ -132,4 +135,5 @@ def _load(run: Path):
     from ambiguous_wild.splat.gaussians import Gaussians
 
     arrays = read_splat_ply(run / "point_cloud.ply")
-    return Gaussians(**{k: torch.from_numpy(np.ascontiguousarray(v)) for k, v in arrays.items()})
+    found: dict[str, Any] = {k: torch.from_numpy(np.ascontiguousarray(v)) for k, v in arrays.items()}
+    return Gaussians(**found)

@@ -63,15 +63,15 @@ def find_masks(scene: Scene, choice: str | None, run: Path | None, keep: bool = 
                 "masks"
             )
     if choice == "truth":
-        return Masks("truth", _all(scene, truth, "add them (all black where nobody stands)"), False)
+        return Masks("truth", _all(scene, truth, "add them (all black where there is no distractor)"), False)
     if choice == "scene":
         folder = scene.root / "masks" / "train"
-        return Masks("scene", _all(scene, folder, "add them (all white where nobody stands)"), True)
+        return Masks("scene", _all(scene, folder, "add them (all white where there is no distractor)"), True)
     if choice == "run":
         if run is None:
             raise AwError("--masks run needs --run RUN, a folder of 'aw bench'")
         return Masks("run", _all(scene, run / "masks", "this method draws no masks; take another run"), True)
-    wanted = "add them (all black where nobody stands)"
+    wanted = "add them (all black where there is no distractor)"
     return Masks("folder", _all(scene, Path(choice), wanted), keep)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from typing import Any
+from typing import Any, TypedDict
 
 from ambiguous_wild.core import Scene
 from ambiguous_wild.harness.ambiguity.measure import Look, Measured, feature_family, weight_free
@@ -18,8 +18,50 @@ LOOKS = (
     "compare with, --features dinov2-small sees kinds of things"
 )
 NAMED = "weight-free features see looks, not meaning; compared with the objects named"
-NOBODY = "nobody there"  # the class of a scene whose masks are empty
+NO_DISTRACTORS = "no distractors"  # the class of a scene whose masks are empty
 REAL = "raw cosine, as the paper's"
+
+
+class Scored(TypedDict):
+    """A score with its 95 % interval over photos; None = undefined."""
+
+    value: float | None
+    low: float | None
+    high: float | None
+
+
+class OcclusionScore(Scored):
+    """Share of a train photo that distractors cover."""
+
+    min: float
+    max: float
+
+
+class ColourScore(Scored):
+    """Share of the distractor pixels whose colour is close to their background."""
+
+    threshold: float
+    ambiguous_above: float
+    ambiguous: bool | None  # None = no verdict
+    mean_residual: float | None
+    distractor_px: int
+    unknown_px: int  # with an unknown background
+
+
+class SemanticScore(Scored):
+    """Similarity of distractors to the static scene."""
+
+    ambiguous_above: float
+    ambiguous: bool | None  # None = no verdict
+    compared_with: str
+    cosine_most_similar: float | None
+    cosine_mean: float | None
+    usual_match: float | None
+    same_surface: float | None
+    unrelated: float | None
+    calibrated: float | None
+    photos: int
+    note: str
 
 
 def semantic_metric(features: str) -> str:
@@ -59,7 +101,7 @@ def summarise(
         "background": background,
         "features": features,
         "seed": seed,
-        "class": classify(colour["ambiguous"], semantic["ambiguous"]) if covered.mean else NOBODY,
+        "class": classify(colour["ambiguous"], semantic["ambiguous"]) if covered.mean else NO_DISTRACTORS,
         "occlusion": {**_interval(covered), "min": min(shares), "max": max(shares)},
         am.COLOUR_METRIC: colour,
         semantic_metric(features): semantic,
@@ -76,7 +118,7 @@ def classify(colour: bool | None, semantic: bool | None) -> str:
     ]
 
 
-def _colour(measured: list[Measured], seed: int) -> dict[str, Any]:
+def _colour(measured: list[Measured], seed: int) -> ColourScore:
     counts = [m.counts for m in measured]
     total = am.pooled(counts)
     share = am.ratio_interval([c.close for c in counts], [c.known for c in counts], seed=seed)
@@ -91,7 +133,7 @@ def _colour(measured: list[Measured], seed: int) -> dict[str, Any]:
     }
 
 
-def _semantic(measured: list[Measured], look: Look, features: str, seed: int) -> dict[str, Any]:
+def _semantic(measured: list[Measured], look: Look, features: str, seed: int) -> SemanticScore:
     photos = [m.matches for m in measured if m.matches]
     # A mean is a ratio to the number of photos; without any it is missing, and not an error.
     best = am.ratio_interval([sem.photo_cosine(p) for p in photos], [1.0] * len(photos), seed=seed)
@@ -133,13 +175,14 @@ def row(m: Measured, metric: str) -> dict[str, Any]:
 
 def describe(summary: dict[str, Any]) -> list[str]:
     """The scores as sentences, for the terminal and the page."""
-    colour, covered = summary[am.COLOUR_METRIC], summary["occlusion"]
-    if summary["class"] == NOBODY:
+    colour: ColourScore = summary[am.COLOUR_METRIC]
+    covered: OcclusionScore = summary["occlusion"]
+    if summary["class"] == NO_DISTRACTORS:
         return [
             f"the masks of all {summary['photos']} photos are empty: no distractor, so nothing that could be "
             "ambiguous"
         ]
-    look = summary[semantic_metric(summary["features"])]
+    look: SemanticScore = summary[semantic_metric(summary["features"])]
     lines = [
         f"occlusion: {_percent(covered)} of a train photo, from {100 * covered['min']:.1f} to "
         f"{100 * covered['max']:.1f} %",
@@ -159,7 +202,7 @@ def describe(summary: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _colour_line(colour: dict[str, Any]) -> str:
+def _colour_line(colour: ColourScore) -> str:
     if colour["value"] is None:
         return "colour: no verdict, for no distractor's background is known"
     return (
@@ -168,7 +211,7 @@ def _colour_line(colour: dict[str, Any]) -> str:
     )
 
 
-def _semantic_line(look: dict[str, Any], lookalike: bool) -> str:
+def _semantic_line(look: SemanticScore, lookalike: bool) -> str:
     if look["value"] is None:
         return f"semantic: no verdict, for no distractor could be compared with the {look['compared_with']}"
     if lookalike:
@@ -183,27 +226,36 @@ def _semantic_line(look: dict[str, Any], lookalike: bool) -> str:
     )
 
 
-def _percent(score: dict[str, Any]) -> str:
+def _percent(score: Scored) -> str:
     if score["value"] is None:
         return "missing"
     text = f"{100 * score['value']:.1f} %"
-    return text if score["low"] is None else f"{text} [{100 * score['low']:.1f}, {100 * score['high']:.1f}]"
+    return (
+        text
+        if score["low"] is None or score["high"] is None
+        else f"{text} [{100 * score['low']:.1f}, {100 * score['high']:.1f}]"
+    )
 
 
-def _value(score: dict[str, Any]) -> str:
+def _value(score: Scored) -> str:
     if score["value"] is None:
         return "missing"
     text = f"{score['value']:.3f}"
-    return text if score["low"] is None else f"{text} [{score['low']:.3f}, {score['high']:.3f}]"
+    return (
+        text
+        if score["low"] is None or score["high"] is None
+        else f"{text} [{score['low']:.3f}, {score['high']:.3f}]"
+    )
 
 
-def _word(score: dict[str, Any]) -> str:
+def _word(score: ColourScore | SemanticScore) -> str:
     word = {None: "no verdict", True: "AMBIGUOUS", False: "not ambiguous"}[score["ambiguous"]]
-    close = score["low"] is not None and score["low"] <= score["ambiguous_above"] <= score["high"]
+    low, high = score["low"], score["high"]
+    close = low is not None and high is not None and low <= score["ambiguous_above"] <= high
     return f"{word}, but the interval crosses the limit" if close else word
 
 
-def _interval(interval: Interval) -> dict[str, float | None]:
+def _interval(interval: Interval) -> Scored:
     return {"value": _number(interval.mean), "low": _number(interval.low), "high": _number(interval.high)}
 
 

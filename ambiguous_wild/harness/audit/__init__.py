@@ -1,1 +1,1 @@
-"""What cannot be right in a table of results, found without knowing the right answer."""
+"""Find entries of a table of results that cannot be right, without knowing the right values."""

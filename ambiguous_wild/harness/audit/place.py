@@ -1,4 +1,4 @@
-"""SSIM and LPIPS out of place: impossible, exchanged, or unlike everything around them."""
+"""SSIM and LPIPS that are impossible, exchanged, or unlike the other entries of the table."""
 
 from __future__ import annotations
 

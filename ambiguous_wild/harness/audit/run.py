@@ -8,7 +8,7 @@ import io
 from ambiguous_wild.harness.audit import place, repeats, values
 from ambiguous_wild.harness.audit.finding import KINDS, Finding
 from ambiguous_wild.harness.audit.table import Number
-from ambiguous_wild.harness.render_tables import csv_text, markdown_text, plain
+from ambiguous_wild.harness.tables.render import csv_text, markdown_text, plain
 
 CHECKS = (
     repeats.repeated, values.contradictions, place.exchanged, values.means,

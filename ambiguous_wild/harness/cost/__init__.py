@@ -1,1 +1,1 @@
-"""What accuracy costs: time to reach it, dB per minute, which method to pay for."""
+"""Accuracy against cost: time to reach a PSNR, dB per minute, Pareto-optimal methods."""

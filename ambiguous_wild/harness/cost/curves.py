@@ -1,7 +1,7 @@
 """Curves: the runs of one method with the same settings, over its scenes and seeds, and their means.
 
-A mean is over seeds, then over scenes. A cell that failed, or a scene that a curve has no run on, makes the
-mean missing: nobody gains by failing where it is hard.
+A mean is over seeds, then over scenes. A cell that failed, or a scene that a curve has no run on, makes
+the mean missing, so that no method gains from a failure.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from ambiguous_wild.metrics import stats
 class Curve:
     """One line of a plot: a method, its settings, one length of training."""
 
-    name: str  # the method, with whatever tells it from the other curves but the length
+    name: str  # the method, and settings that differ between curves except the length
     method: str
     length: Length
     runs: tuple[CostRun, ...]
@@ -114,7 +114,7 @@ def timeline(curve: Curve, scenes: Sequence[str], count: int = 120) -> tuple[np.
 
 
 def _names(runs: Sequence[CostRun]) -> list[str]:
-    """What to call each run's curve: the method, and whatever settings vary among its runs."""
+    """The name of each run's curve: its method, and the settings that vary among its runs."""
     asked: dict[str, set[str]] = {}
     values: dict[str, dict[str, set[Any]]] = {}
     for run in runs:

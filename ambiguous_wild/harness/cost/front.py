@@ -1,4 +1,4 @@
-"""What each curve reaches, what it costs, and which of them nothing beats at its price."""
+"""PSNR and cost of each curve, and which curves are Pareto-optimal."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ class Point:
     length: str
     runs: int
     psnr: Summary  # dB
-    minutes: Summary  # of training, with what comes before the first step where that is asked for
+    minutes: Summary  # of training; with the set-up before it where `setup` is set
     setup_s: Summary
     numbers: dict[str, Summary]  # ms an iteration, Gaussians, MB, frames a second
-    front: bool = False  # no other reaches as much in less time
+    front: bool = False  # Pareto-optimal: no other curve reaches this PSNR in less time
 
 
 def points(curves: Sequence[Curve], scenes: Sequence[str] = (), *, setup: bool = False) -> list[Point]:
-    """One point a curve, the front of training time against PSNR marked; who knows the truth is not on it.
+    """One point a curve, with those on the Pareto front of training time and PSNR marked; oracles never are.
 
     Args:
         curves: from `curves_of`.
@@ -41,7 +41,7 @@ def points(curves: Sequence[Curve], scenes: Sequence[str] = (), *, setup: bool =
 
 
 def pareto(among: Sequence[Point]) -> list[Point]:
-    """Those that no other beats in PSNR without taking longer, by time; a missing number is never on it."""
+    """Pareto-optimal points in order of time; a point with a missing number is never one."""
     known = [p for p in among if not math.isnan(p.psnr.mean) and not math.isnan(p.minutes.mean)]
     front: list[Point] = []
     for point in sorted(known, key=lambda p: (p.minutes.mean, -p.psnr.mean)):

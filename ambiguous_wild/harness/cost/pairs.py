@@ -1,4 +1,4 @@
-"""What one effect, or one option, brings and costs: pairs of runs that differ in nothing else.
+"""Gain and cost of one effect or option, from pairs of runs that differ in nothing else.
 
 Both runs of a pair have the same method, scene, seed, length, device and code. Where the length is a
 budget, both trained equally long: what the effect costs is in its dB already, and dB a minute has no meaning.
@@ -26,7 +26,7 @@ Kind = Literal["effect", "interval", "option"]
 
 @dataclass(frozen=True)
 class Change:
-    """What a change brings, over all pairs of runs that differ in it alone."""
+    """Gain and cost of a change, over all pairs of runs that differ in it alone."""
 
     kind: Kind  # "interval": an option called *_every, how often something is refreshed
     name: str

@@ -21,9 +21,9 @@ from ambiguous_wild.harness.cost.plot_style import (
     text,
     ticks_of_time,
 )
-from ambiguous_wild.harness.cost.report import PLOTS, Report
+from ambiguous_wild.harness.cost.report import PLOTS, CostReport
 from ambiguous_wild.harness.cost.text import Unit, per_minute, time_unit
-from ambiguous_wild.harness.render_tables import plain
+from ambiguous_wild.harness.tables.render import plain
 from ambiguous_wild.io.palette import CATEGORIES, plot_colour
 from ambiguous_wild.methods.registry import knows_truth
 
@@ -35,8 +35,8 @@ AXES = (
 KINDS = {"effect": 0, "interval": 1, "option": 2}
 
 
-def draw_all(report: Report, folder: Path) -> list[Path]:
-    """Every plot that the runs give something to draw for, as SVG and PNG; returns what was written."""
+def draw_all(report: CostReport, folder: Path) -> list[Path]:
+    """Draw every plot that the runs have data for, as SVG and PNG; returns the paths."""
     written = []
     for name, draw in zip(PLOTS, (draw_timelines, draw_budgets, draw_front, draw_changes)):
         figure = draw(report)
@@ -44,13 +44,13 @@ def draw_all(report: Report, folder: Path) -> list[Path]:
     return written
 
 
-def _panels(report: Report) -> list[tuple[str, tuple[str, ...]]]:
+def _panels(report: CostReport) -> list[tuple[str, tuple[str, ...]]]:
     """(title, scenes) of each panel: the mean first where there are several."""
     panels: list[tuple[str, tuple[str, ...]]] = [(scene, (scene,)) for scene in report.scenes]
     return [(f"mean over {len(panels)} scenes", report.scenes), *panels] if len(panels) > 1 else panels
 
 
-def draw_timelines(report: Report) -> Any | None:
+def draw_timelines(report: CostReport) -> Any | None:
     """Test PSNR over training time: seeds thin, their mean thick, their spread at the end."""
     curves = [c for c in longest(report.curves) if any(len(run.points) > 1 for run in c.runs)]
     if not curves:
@@ -97,7 +97,7 @@ def _dot(axes: Any, x: Summary, y: Summary, colour: Any) -> None:
                   capsize=2.5, zorder=3)  # fmt: skip
 
 
-def draw_budgets(report: Report) -> Any | None:
+def draw_budgets(report: CostReport) -> Any | None:
     """PSNR at the end of runs of several lengths: each dot was trained for that long from the start."""
     lengths = {name: [c for c in report.curves if c.name == name] for name in {c.name for c in report.curves}}
     if all(len(curves) < 2 for curves in lengths.values()):
@@ -142,8 +142,8 @@ def _few(times: Sequence[float]) -> list[float]:
     return kept
 
 
-def draw_front(report: Report) -> Any | None:
-    """PSNR against time, megabytes and frames a second; the grey line is what nothing beats at its price."""
+def draw_front(report: CostReport) -> Any | None:
+    """PSNR against time, megabytes and frames a second; the grey line is the Pareto front."""
     look, unit = looks([p.curve for p in report.points]), time_unit(report)
     panels = [
         axis for axis in AXES if any(finite(_x(p, axis[0], unit).mean, p.psnr.mean) for p in report.points)
@@ -189,7 +189,7 @@ def _front_line(axes: Any, at: Sequence[tuple[float, float]], less_is_better: bo
               solid_capstyle="round", marker="o", markersize=13, zorder=1)  # fmt: skip
 
 
-def draw_changes(report: Report) -> Any | None:
+def draw_changes(report: CostReport) -> Any | None:
     """A row a change: dB gained with its interval, and beside it what it costs."""
     rows = [c for c in report.changes if finite(c.db.mean)]
     if not rows:

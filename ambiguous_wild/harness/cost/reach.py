@@ -106,7 +106,7 @@ def first_time(run: CostRun, psnr: float) -> tuple[float, bool]:
 def _level(target: Target, curves: Sequence[Curve], scene: str) -> float:
     if not target.relative:
         return target.db
-    # what is shown the truth sets no target for those who are not
+    # an oracle sets no target for the other methods
     rivals = [curve for curve in curves if not all(knows_truth(run.method) for run in curve.runs)]
     ends = [summary(curve, (scene,), lambda run: run.psnr).mean for curve in rivals or curves]
     return max((end for end in ends if math.isfinite(end)), default=math.nan) - target.db
@@ -123,7 +123,7 @@ def _reach(curve: Curve, target: Target, scene: str | None, level: dict[str, flo
     if not missing:
         mean = summary(curve, tuple(level), minutes)
         if any(run.blind for run in runs):
-            mean = Summary(mean.mean)  # of bounds: how far they lie apart says nothing
+            mean = Summary(mean.mean)  # the spread of upper bounds means nothing
     return Reach(
         scene,
         curve.name,

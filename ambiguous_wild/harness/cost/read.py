@@ -1,4 +1,4 @@
-"""Runs as the cost report reads them: what was asked for, what it reached, and how it got there.
+"""Runs as the cost report reads them: settings, result, and PSNR over time.
 
 Unlike a comparison, this takes many runs of one method on one scene with one seed: they differ in length,
 effects or options, and their differences are what is measured.
@@ -9,15 +9,16 @@ from __future__ import annotations
 import csv
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash, flatten
-from ambiguous_wild.harness.result_file import FAILED, RESULT, read_result
-from ambiguous_wild.harness.store import read_config, run_folders
+from ambiguous_wild.harness.running.records import Cost, RunResult
+from ambiguous_wild.harness.running.result_file import FAILED, RESULT, read_result
+from ambiguous_wild.harness.running.store import read_config, run_folders
 from ambiguous_wild.metrics import stats
 
 # of the training: they change how a run is kept and watched, not its result
@@ -62,7 +63,7 @@ class CostRun:
     numbers: dict[str, float]  # see NUMBERS; NaN where not measured
     points: tuple[tuple[float, float], ...]  # (seconds of training, PSNR in dB), in order of time
     error: str = ""
-    blind: str = ""  # why of the way there only the end is known; empty: it was probed, or failed
+    blind: str = ""  # why PSNR over time is unknown; empty: it was probed, or the run failed
 
     @property
     def base(self) -> str:
@@ -129,7 +130,7 @@ def _each_once(folders: Sequence[Path]) -> list[Path]:
     return list(found.values())
 
 
-def _run(folder: Path, result: dict[str, Any]) -> CostRun:
+def _run(folder: Path, result: RunResult) -> CostRun:
     config = read_config(folder)
     train, scene = _mapping(config.get("train")), _mapping(config.get("scene"))
     cost = result["cost"]
@@ -168,7 +169,7 @@ def _run(folder: Path, result: dict[str, Any]) -> CostRun:
     )
 
 
-def _length(train: dict[str, Any], cost: dict[str, Any]) -> Length:
+def _length(train: Mapping[str, Any], cost: Cost) -> Length:
     budget = _number(train.get("budget_s"))
     if budget > 0.0:
         return Length(budget, 0)
@@ -177,7 +178,7 @@ def _length(train: dict[str, Any], cost: dict[str, Any]) -> Length:
 
 
 def _asked(folder: Path) -> str:
-    """What --effects said, where it said a word: its effects may differ from scene to scene."""
+    """The word given to --effects (auto, all), or empty: with a word, effects differ between scenes."""
     try:
         said = json.loads((folder / "effects.json").read_text(encoding="utf-8")).get("asked", "")
     except (OSError, ValueError, AttributeError, RecursionError):

@@ -16,7 +16,7 @@ from ambiguous_wild.harness.cost.front import Point, points
 from ambiguous_wild.harness.cost.pairs import Change, changes
 from ambiguous_wild.harness.cost.reach import Reach, times_to_reach
 from ambiguous_wild.harness.cost.read import CostRun, Found
-from ambiguous_wild.harness.render_tables import csv_text
+from ambiguous_wild.harness.tables.render import csv_text
 from ambiguous_wild.io.atomic import write_json, write_text
 
 PLOTS = ("timelines", "budgets", "front", "changes")
@@ -25,7 +25,7 @@ FILES = ("cost.csv", "time-to-psnr.csv", "changes.csv", "timelines.csv", "cost.j
 
 
 @dataclass(frozen=True)
-class Report:
+class CostReport:
     """Everything `aw cost` prints, writes and draws."""
 
     curves: tuple[Curve, ...]
@@ -40,8 +40,8 @@ class Report:
 
 def cost_report(
     found: Found, *, targets: Sequence[float] = (), setup: bool = False, made_by: str = ""
-) -> Report:
-    """Everything there is to say of the runs.
+) -> CostReport:
+    """The cost report of the runs.
 
     Args:
         found: from `read_cost_runs`.
@@ -50,7 +50,7 @@ def cost_report(
         made_by: the command that makes it again.
     """
     curves, scenes = curves_of(found.runs), tuple(sorted({run.scene for run in found.runs}))
-    return Report(
+    return CostReport(
         tuple(curves),
         scenes,
         tuple(points(curves, setup=setup)),
@@ -92,7 +92,7 @@ def _blind(runs: Sequence[CostRun]) -> list[str]:
     return lines
 
 
-def write_report(report: Report, folder: Path) -> list[Path]:
+def write_report(report: CostReport, folder: Path) -> list[Path]:
     """cost.json, cost.csv, time-to-psnr.csv, changes.csv and timelines.csv; returns what was written."""
     _remove_earlier(folder)
     tables = {
@@ -111,7 +111,7 @@ def write_report(report: Report, folder: Path) -> list[Path]:
 
 
 def _remove_earlier(folder: Path) -> None:
-    """Take away what an earlier report left, and nothing else: its plots must not stand beside our tables."""
+    """Remove the files of an earlier report, and nothing else: old plots must not stay beside new tables."""
     try:
         ours = "time_to_psnr" in json.loads((folder / "cost.json").read_text(encoding="utf-8"))
     except (OSError, ValueError, TypeError, RecursionError):
@@ -121,7 +121,7 @@ def _remove_earlier(folder: Path) -> None:
             (folder / name).unlink(missing_ok=True)
 
 
-def plain_data(report: Report) -> dict[str, Any]:
+def plain_data(report: CostReport) -> dict[str, Any]:
     """The report for JSON; null = missing."""
     data = {
         "schema": 1,

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from ambiguous_wild.harness.cost.curves import Summary
 from ambiguous_wild.harness.cost.pairs import Change
 from ambiguous_wild.harness.cost.reach import Reach
-from ambiguous_wild.harness.cost.report import Report
-from ambiguous_wild.harness.render_tables import plain
+from ambiguous_wild.harness.cost.report import CostReport
+from ambiguous_wild.harness.tables.render import plain
 
 MISSING = "—"
 SHORT_MIN = 3.0  # trainings below this are told in seconds
@@ -25,7 +25,7 @@ class Listing:
     rows: tuple[tuple[str, ...], ...]
 
 
-def to_text(report: Report) -> str:
+def to_text(report: CostReport) -> str:
     """Every table of the report, aligned, and what is missing below."""
     parts = []
     for listing in listings(report):
@@ -48,7 +48,7 @@ class Unit:
         return Summary(minutes.mean * self.per_minute, minutes.spread * self.per_minute)
 
 
-def time_unit(report: Report) -> Unit:
+def time_unit(report: CostReport) -> Unit:
     """Seconds where every training is short, else minutes."""
     minutes = [
         run.train_s / 60.0 for curve in report.curves for run in curve.runs if not math.isnan(run.train_s)
@@ -56,7 +56,7 @@ def time_unit(report: Report) -> Unit:
     return Unit("s", 60.0, 1) if max(minutes, default=0.0) < SHORT_MIN else Unit("min", 1.0, 2)
 
 
-def listings(report: Report) -> list[Listing]:
+def listings(report: CostReport) -> list[Listing]:
     """The tables: what each curve reaches, how soon, and what each change brings."""
     tables = [_points(report)]
     scenes: dict[str | None, list[Reach]] = {}
@@ -73,7 +73,7 @@ def listings(report: Report) -> list[Listing]:
     return tables
 
 
-def _points(report: Report) -> Listing:
+def _points(report: CostReport) -> Listing:
     over = f"mean over {len(report.scenes)} scenes" if len(report.scenes) > 1 else report.scenes[0]
     unit = time_unit(report)
     rows = []
@@ -91,7 +91,7 @@ def _points(report: Report) -> Listing:
     return Listing(f"what each method reaches, and what it costs ({over})", head, tuple(rows))
 
 
-def _reached(scene: str | None, rows: Sequence[Reach], report: Report) -> Listing:
+def _reached(scene: str | None, rows: Sequence[Reach], report: CostReport) -> Listing:
     unit = time_unit(report)
     targets = list(dict.fromkeys(row.target for row in rows))
     by_key = {(row.curve, row.target): row for row in rows}
@@ -153,7 +153,7 @@ def number(value: Summary, digits: int, *, sign: bool = False, spread: bool = Tr
     return text if math.isnan(value.spread) or not spread else f"{text} ± {value.spread:.{digits}f}"
 
 
-def _has_spread(report: Report) -> bool:
+def _has_spread(report: CostReport) -> bool:
     return any(not math.isnan(p.psnr.spread) for p in report.points)
 
 

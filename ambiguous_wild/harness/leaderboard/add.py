@@ -1,4 +1,4 @@
-"""Take runs in: each is checked, and the board changes only by those that pass."""
+"""Add runs to the board: each is checked, and only those that pass are added."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ambiguous_wild.harness.leaderboard.board import dataset_file, measured, rea
 from ambiguous_wild.harness.leaderboard.entry import CHECKED, Entry, Key
 from ambiguous_wild.harness.leaderboard.scenes import Scenes
 from ambiguous_wild.harness.leaderboard.verify import Unfinished, Verified, verify
-from ambiguous_wild.harness.store import run_folders
+from ambiguous_wild.harness.running.store import run_folders
 from ambiguous_wild.io.atomic import sweep
 from ambiguous_wild.io.lock import folder_lock
 
@@ -23,7 +23,7 @@ Tick = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
-class Report:
+class AddReport:
     """What became of one run."""
 
     run: Path
@@ -42,7 +42,7 @@ def add(
     quick: bool = False,
     dry: bool = False,
     tick: Tick = lambda done, total: None,
-) -> list[Report]:
+) -> list[AddReport]:
     """Check runs and add those that pass.
 
     Args:
@@ -69,16 +69,16 @@ def add(
         there = read_board(board)
         pictures.read_index(board)  # a damaged one is found before anything is written
         finder = Scenes(scenes, dataset, there)
-        reports: dict[Path, Report] = {}
+        reports: dict[Path, AddReport] = {}
         passed: list[Verified] = []
         for done, run in enumerate(sorted(runs)):
             tick(done, len(runs))
             try:
                 passed.append(verify(run, finder, quick=quick))
             except Unfinished as error:
-                reports[run] = Report(run, "refused" if run in paths else "unfinished", str(error))
+                reports[run] = AddReport(run, "refused" if run in paths else "unfinished", str(error))
             except AwError as error:
-                reports[run] = Report(run, "refused", str(error))
+                reports[run] = AddReport(run, "refused", str(error))
         tick(len(runs), len(runs))
         merged = _merge(board, there, passed, replace_other, reports)
         if not dry:
@@ -102,29 +102,33 @@ def _find(paths: Sequence[Path]) -> set[Path]:
 
 
 def _merge(
-    board: Path, there: list[Entry], passed: list[Verified], replace_other: bool, reports: dict[Path, Report]
+    board: Path,
+    there: list[Entry],
+    passed: list[Verified],
+    replace_other: bool,
+    reports: dict[Path, AddReport],
 ) -> list[Entry]:
     """The runs of the board afterwards; fills in the reports."""
     entries = {e.key: e for e in there}
     for reason, bad in _conflicts(board, there, passed):
-        reports[bad.run] = Report(bad.run, "refused", reason)
+        reports[bad.run] = AddReport(bad.run, "refused", reason)
     for v in passed:
         if v.run in reports:
             continue
         old = entries.get(v.entry.key)
         if old is None:
-            reports[v.run] = Report(v.run, "added")
+            reports[v.run] = AddReport(v.run, "added")
             entries[v.entry.key] = v.entry
         elif old.result_hash == v.entry.result_hash and old.config_hash == v.entry.config_hash:
-            reports[v.run] = Report(v.run, "there already")
-            # Whatever was checked once against the photos stays so.
+            reports[v.run] = AddReport(v.run, "there already")
+            # A run that was once checked against the photos stays checked.
             better = max(old.checked, v.entry.checked, key=CHECKED.index)
             entries[v.entry.key] = replace(old, checked=better)
         elif replace_other:
-            reports[v.run] = Report(v.run, "replaced")
+            reports[v.run] = AddReport(v.run, "replaced")
             entries[v.entry.key] = v.entry
         else:
-            reports[v.run] = Report(v.run, "refused", _other_numbers(v, old))
+            reports[v.run] = AddReport(v.run, "refused", _other_numbers(v, old))
     return [entries[k] for k in sorted(entries)]
 
 

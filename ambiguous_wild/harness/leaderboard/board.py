@@ -83,7 +83,7 @@ def examine(board: Path) -> tuple[list[Entry], list[str]]:
             raise AwError(f"{e.name} is twice in {dataset_file(board, e.dataset)}: restore the file")
         seen.add(e.key)
     entries.sort(key=lambda e: e.key)
-    # Where a row was changed, all.csv differs by that: it is not to blame.
+    # Where a row was changed, all.csv must differ: that is not a second problem.
     return entries, wrong or _check_all(board, entries)
 
 

@@ -1,4 +1,4 @@
-"""What is wrong with a board: its files first, then what an audit of its numbers asks."""
+"""Check a board: first its files, then an audit of its numbers."""
 
 from __future__ import annotations
 

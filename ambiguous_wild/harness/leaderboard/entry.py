@@ -9,7 +9,7 @@ from typing import Literal
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash
-from ambiguous_wild.harness.leaderboard.sheet import Cell, number, to_count, to_number, unguard
+from ambiguous_wild.harness.leaderboard.sheet import CsvValue, number, to_count, to_number, unguard
 from ambiguous_wild.harness.measures import MEASURES
 
 FIRST = ("dataset", "scene", "method", "setting", "options", "seed", "images")
@@ -77,14 +77,14 @@ def in_order(names: Iterable[str]) -> list[str]:
     return sorted(names, key=lambda n: (known.index(n) if n in known else len(known), n))
 
 
-def wide(entries: Sequence[Entry]) -> tuple[list[str], list[list[Cell]]]:
+def wide(entries: Sequence[Entry]) -> tuple[list[str], list[list[CsvValue]]]:
     """Head and rows, one row a run."""
     quality = in_order({k for e in entries for k in e.quality})
     cost = in_order({k for e in entries for k in e.cost})
     head = [*FIRST, *quality, *(COST + k for k in cost), *LAST]
-    rows: list[list[Cell]] = []
+    rows: list[list[CsvValue]] = []
     for e in sorted(entries, key=lambda e: e.key):
-        row: list[Cell] = [*e.key, e.images]
+        row: list[CsvValue] = [*e.key, e.images]
         row += [e.quality.get(k) for k in quality]
         row += [e.cost.get(k) for k in cost]
         row += [" ".join(e.missing), e.device, e.hardware, e.version, e.source, e.code_hash]
@@ -122,7 +122,7 @@ def from_wide(head: Sequence[str], row: Mapping[str, str], where: str) -> Entry:
     )
 
 
-def tidy(entries: Iterable[Entry]) -> Iterator[list[Cell]]:
+def tidy(entries: Iterable[Entry]) -> Iterator[list[CsvValue]]:
     """Rows under `TIDY`, one a run and metric; what is missing has a row without a value."""
     for e in sorted(entries, key=lambda e: e.key):
         last = [e.device, e.version, e.source, e.config_hash, e.scene_hash, e.checked]

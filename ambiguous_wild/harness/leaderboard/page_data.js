@@ -77,8 +77,8 @@ function summary(group, key, scenes) {
   return { value, spread: spread(bySeed), seeds: bySeed };
 }
 
-/** Whether a method is shown exact masks or clean photos: it bounds the others and is not ranked among them. */
-const isBound = (group) => DATA.bounds.includes(group.method);
+/** Whether a method is shown exact masks or clean photos: such an oracle is not ranked. */
+const isOracle = (group) => DATA.oracles.includes(group.method);
 
 /** Rank 1, 2, 3 of each value, or null; equal in print is equal in rank. */
 function ranks(values, key) {

@@ -64,7 +64,7 @@ function drawPlot() {
   }
   root.append(svg("text", { class: "axis", x: (left + right) / 2, y: height - 10, "text-anchor": "middle" }, `${measure(kx).label}${log ? " (logarithmic)" : ""}`),
     svg("text", { class: "axis", transform: `translate(14 ${(top + bottom) / 2}) rotate(-90)`, "text-anchor": "middle" }, measure(ky).label));
-  const front = pareto(points.filter((p) => !isBound(p.group)), kx, ky);
+  const front = pareto(points.filter((p) => !isOracle(p.group)), kx, ky);
   if (front.length > 1) {
     const path = front.map((p, i) => (i ? `H${px(p.x.value)}V${py(p.y.value)}` : `M${px(p.x.value)} ${py(p.y.value)}`)).join("");
     root.append(svg("path", { class: "front", d: path }));
@@ -74,7 +74,7 @@ function drawPlot() {
   points.forEach((p, i) => root.append(label(p, px(p.x.value), py(p.y.value), taken, [left, right, top, bottom])));
   $("plot").replaceChildren(root);
   const many = points.some((p) => p.y.seeds.length > 1);
-  $("plot-said").textContent = `${measure(ky).label} against ${measure(kx).label}. Not beaten in both: ${front.map((p) => p.group.method).join(", ")}${front.length > 1 ? " (dashed)" : ""}.`
+  $("plot-said").textContent = `${measure(ky).label} against ${measure(kx).label}. Pareto-optimal: ${front.map((p) => p.group.method).join(", ")}${front.length > 1 ? " (dashed)" : ""}.`
     + (many ? " Bars: sample deviation over seeds; faint dots: the seeds." : "");
 }
 

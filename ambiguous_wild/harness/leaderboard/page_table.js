@@ -81,7 +81,7 @@ function drawMeasured() {
   ];
   const first = columns[1];
   const fallback = { key: first.key, down: Boolean(first.down) };
-  const ranked = measuredOnes.map((c, i) => ranks(rows.map((row) => (isBound(row.group) ? NaN : row.cells[i].value)), c.metric));
+  const ranked = measuredOnes.map((c, i) => ranks(rows.map((row) => (isOracle(row.group) ? NaN : row.cells[i].value)), c.metric));
   const ends = measuredOnes.map((_, i) => rows.flatMap((row) => row.cells[i].seeds).filter(Number.isFinite));
   const limits = ends.map((v) => [Math.min(...v), Math.max(...v)]);
   const body = h("tbody");
@@ -110,8 +110,8 @@ function nameCell(group, width) {
     if (isOpen) line.nextElementSibling.remove();
     else line.after(h("tr", { class: "more" }, h("td", { colspan: width }, h("div", { class: "runs" }, ...group.runs.map(oneRun)))));
   });
-  const bound = isBound(group) ? h("span", { class: "badge", title: "shown exact masks or clean photos: what is possible, not ranked" }, "bound") : null;
-  return h("th", { scope: "row", class: "name" }, open, bound, h("small", {}, group.about));
+  const oracle = isOracle(group) ? h("span", { class: "badge", title: "shown exact masks or clean photos" }, "oracle (not ranked)") : null;
+  return h("th", { scope: "row", class: "name" }, open, oracle, h("small", {}, group.about));
 }
 
 function oneRun(run) {

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ambiguous_wild.core import AwError, Scene, View
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.harness.measures import PARTIAL
-from ambiguous_wild.harness.regions import find_regions
+from ambiguous_wild.harness.running.records import ImageRow, metrics_of
+from ambiguous_wild.harness.running.regions import find_regions
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.metrics import image as image_metrics
@@ -28,7 +28,7 @@ FULL_IMAGE = image_metrics.METRICS | {"flip": flip}
 def check_photos(
     run: Path,
     scene: Scene,
-    rows: list[dict[str, Any]],
+    rows: list[ImageRow],
     renders: Mapping[str, Path],
     *,
     half: bool = False,
@@ -39,7 +39,7 @@ def check_photos(
     Args:
         run: the run folder, for messages.
         scene: with the test photos.
-        rows: per image, name and metrics.
+        rows: metrics of each image.
         renders: PNG by image name.
         half: the right half was measured.
         quick: PSNR of the whole picture alone.
@@ -71,9 +71,10 @@ def check_photos(
         if half:
             right = slice(photo.shape[1] // 2, None)
             render, photo = (np.ascontiguousarray(picture[:, right]) for picture in (render, photo))
+        values = metrics_of(row)
         for metric in known:
-            if metric in row:
-                _compare(run, name, metric, row[metric], FULL_IMAGE[metric](render, photo))
+            if metric in values:
+                _compare(run, name, metric, values[metric], FULL_IMAGE[metric](render, photo))
         if regions is not None:
             # A run of before a metric was kept has it of no image; one that has it, has it of all.
             computed = regions.psnr(name, render, photo)
@@ -87,23 +88,23 @@ def check_photos(
         )
 
 
-def _compare_regions(run: Path, row: dict[str, Any], computed: dict[str, float]) -> None:
+def _compare_regions(run: Path, row: ImageRow, computed: dict[str, float]) -> None:
     """PSNR on parts of a picture: there where the scene has such pixels, and nowhere else."""
-    name = row["name"]
+    name, values = row["name"], metrics_of(row)
     for metric in PARTIAL:
-        if metric in row and metric not in computed:
+        if metric in values and metric not in computed:
             raise AwError(
                 f"{run} was changed: {metric} of {name} is in metrics.json, and its scene has no such pixel "
                 "in that picture; restore the files, or run it again with 'aw bench --overwrite always'"
             )
-        if metric in computed and metric not in row:
+        if metric in computed and metric not in values:
             raise AwError(
                 f"{run} is partial: no {metric} of {name}, though its scene has such pixels there; restore "
                 "metrics.json, or run it again with 'aw bench --overwrite always'"
             )
-        if metric in row:
+        if metric in values:
             tolerance = REGION_TOLERANCE.get(metric, TOLERANCE)
-            _compare(run, name, metric, row[metric], computed[metric], tolerance)
+            _compare(run, name, metric, values[metric], computed[metric], tolerance)
 
 
 def _compare(

@@ -15,7 +15,7 @@ from ambiguous_wild.core.config import config_hash
 from ambiguous_wild.harness.leaderboard.board import measured
 from ambiguous_wild.harness.leaderboard.entry import Entry
 from ambiguous_wild.harness.leaderboard.sheet import (
-    Cell,
+    CsvValue,
     number,
     read_csv,
     slug,
@@ -107,7 +107,7 @@ def keep(board: Path, runs: Iterable[Verified], count: int) -> int:
 
 
 def drop(board: Path, runs: Iterable[Entry]) -> None:
-    """Remove the pictures of runs that are not among these, and photos beside which no render is left."""
+    """Remove the pictures of runs that are not among these, and photos without any render left."""
     cells = {(*e.key[:-1], str(e.seed)) for e in runs}
     index = read_index(board)
     keys = ("dataset", "scene", "method", "setting", "options", "seed")
@@ -128,7 +128,7 @@ def drop(board: Path, runs: Iterable[Entry]) -> None:
 
 
 def _write_index(board: Path, index: Iterable[Row]) -> None:
-    rows: list[list[Cell]] = []
+    rows: list[list[CsvValue]] = []
     for row in sorted(index, key=lambda r: r["file"]):
         seed = int(row["seed"]) if row["seed"] else None
         psnr = to_number(row["psnr"], "psnr")

@@ -23,9 +23,10 @@ from ambiguous_wild.harness.leaderboard.reported import SOURCE, Printed, read_re
 from ambiguous_wild.harness.leaderboard.sheet import to_number
 from ambiguous_wild.harness.measures import measure
 from ambiguous_wild.io.atomic import atomic_dir, check_output, sweep_siblings, write_json
+from ambiguous_wild.io.foreign_files import list_names
+from ambiguous_wild.io.foreign_files import refuse_foreign_files as refuse_strangers
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.lock import folder_lock
-from ambiguous_wild.io.strangers import list_names, refuse_strangers
 from ambiguous_wild.methods.registry import knows_truth
 
 GENERATOR = '<meta name="generator" content="aw leaderboard publish">'
@@ -178,7 +179,7 @@ def _facts(
     )  # fmt: skip
     return {
         "order": order,
-        "bounds": sorted({e.method for e in entries if knows_truth(e.method)}),
+        "oracles": sorted({e.method for e in entries if knows_truth(e.method)}),
         "measures": measures,
         "runs": [
             {k: getattr(e, k) for k in columns}

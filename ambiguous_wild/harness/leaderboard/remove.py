@@ -1,4 +1,4 @@
-"""Take runs down: the board is afterwards as if they had never been there."""
+"""Remove runs from the board, with their pictures."""
 
 from __future__ import annotations
 

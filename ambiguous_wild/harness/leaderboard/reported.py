@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ambiguous_wild.harness.audit.table import read_tables
-from ambiguous_wild.harness.leaderboard.sheet import Cell, to_csv
+from ambiguous_wild.harness.leaderboard.sheet import CsvValue, to_csv
 
 SOURCE = "reported"
 COLUMNS = (
@@ -63,7 +63,7 @@ def read_reported(folder: Path) -> list[Printed]:
 
 def reported_csv(numbers: Sequence[Printed]) -> str:
     """One number a row, each marked as reported; beside the value how it is printed."""
-    rows: Iterator[list[Cell]] = (
+    rows: Iterator[list[CsvValue]] = (
         [SOURCE, n.method, n.setting, n.dataset, n.scene, n.metric, n.variant, n.value, n.printed, n.table]
         for n in numbers
     )

@@ -1,4 +1,4 @@
-"""What sets a run apart, in words, and the command that makes it again."""
+"""The settings of a run in words, and the command that makes it again."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from typing import Any
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash, to_plain
 from ambiguous_wild.harness.leaderboard.sheet import HIDDEN
+from ambiguous_wild.harness.running.records import RunResult
 
 
 def setting(config: Mapping[str, Any]) -> str:
@@ -126,7 +127,7 @@ def _word(value: Any) -> str:
     return "none" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
 
 
-def hardware(path: Path, result: Mapping[str, Any]) -> str:
+def hardware(path: Path, result: RunResult) -> str:
     """What the times depend on: "Intel Xeon, 2 threads", or the GPU.
 
     Raises:

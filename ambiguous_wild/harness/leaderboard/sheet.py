@@ -16,8 +16,8 @@ from ambiguous_wild.core import AwError
 FORMULA = ("=", "+", "-", "@")
 LARGEST = 200_000_000  # bytes
 LONGEST = 200  # characters of a name
-HIDDEN = ("Cc", "Cf", "Cs", "Zl", "Zp")  # Unicode categories of characters that nobody sees
-Cell = str | int | float | None
+HIDDEN = ("Cc", "Cf", "Cs", "Zl", "Zp")  # Unicode categories of invisible characters
+CsvValue = str | int | float | None
 
 
 def guard(text: str) -> str:
@@ -43,7 +43,7 @@ def number(value: float | None) -> str:
     return repr(float(value))
 
 
-def to_csv(head: Sequence[str], rows: Iterable[Sequence[Cell]]) -> str:
+def to_csv(head: Sequence[str], rows: Iterable[Sequence[CsvValue]]) -> str:
     """Text is guarded, numbers stay numbers, None is an empty cell."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")

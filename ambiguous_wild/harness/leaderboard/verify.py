@@ -1,4 +1,4 @@
-"""Whether a run folder is what it says: each check refuses with one line."""
+"""Verify a run folder before it is added to a board; each failed check is one line."""
 
 from __future__ import annotations
 
@@ -7,11 +7,10 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, cast
 
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.errors import shortlist
-from ambiguous_wild.harness.identity import config_identity
 from ambiguous_wild.harness.leaderboard.entry import COST, FIRST, LAST, Entry
 from ambiguous_wild.harness.leaderboard.photos import check_photos
 from ambiguous_wild.harness.leaderboard.scenes import Scenes
@@ -19,8 +18,10 @@ from ambiguous_wild.harness.leaderboard.settings import command, hardware, optio
 from ambiguous_wild.harness.leaderboard.sheet import check_text
 from ambiguous_wild.harness.leaderboard.values import check_values
 from ambiguous_wild.harness.measures import PARTIAL
-from ambiguous_wild.harness.result_file import FAILED, RESULT, read_result
-from ambiguous_wild.harness.store import MASK_SCORES, read_config
+from ambiguous_wild.harness.running.identity import config_identity
+from ambiguous_wild.harness.running.records import RunConfig, RunResult, metrics_of
+from ambiguous_wild.harness.running.result_file import FAILED, RESULT, read_result
+from ambiguous_wild.harness.running.store import MASK_SCORES, read_config
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.metrics import stats
@@ -91,11 +92,11 @@ def verify(run: Path, scenes: Scenes, *, quick: bool = False) -> Verified:
         checked="files" if scene is None else "psnr" if quick else "photos",
         reproduce=again,
     )
-    psnr = {row["name"]: row.get("psnr", math.nan) for row in result["per_image"]}
+    psnr = {row["name"]: _known(row.get("psnr")) for row in result["per_image"]}
     return Verified(entry, run, tuple(sorted(renders)), psnr, scene)
 
 
-def _result(run: Path) -> dict[str, Any]:
+def _result(run: Path) -> RunResult:
     if not (run / RESULT).is_file():
         if (run / FAILED).is_file():
             failed = read_result(run / FAILED)
@@ -112,19 +113,19 @@ def _result(run: Path) -> dict[str, Any]:
     return result
 
 
-def _config(run: Path) -> dict[str, Any]:
+def _config(run: Path) -> RunConfig:
     config = read_config(run)
     wrong = [k for k in ("train", "scene", "options") if not isinstance(config.get(k), dict)]
     wrong += [k for k in ("method", "source", "config_hash", "version") if not isinstance(config.get(k), str)]
     if wrong:
         raise AwError(
             f"{run / 'config.yaml'} is absent, damaged or not of 'aw bench' ({shortlist(wrong)}); without it "
-            "nobody can say what was run: restore it, or run again"
+            "its settings are unknown: restore it, or run again"
         )
-    return config
+    return cast(RunConfig, config)
 
 
-def _words(run: Path, config: dict[str, Any]) -> tuple[str, str]:
+def _words(run: Path, config: RunConfig) -> tuple[str, str]:
     """(setting, command) of a configuration that a stranger wrote."""
     try:
         return check_text(f"setting of {run}", setting(config)), command(config)
@@ -134,7 +135,7 @@ def _words(run: Path, config: dict[str, Any]) -> tuple[str, str]:
         raise AwError(f"{run / 'config.yaml'} is none that 'aw bench' writes ({error}); {ANEW}") from None
 
 
-def _check_identity(run: Path, result: dict[str, Any], config: dict[str, Any]) -> None:
+def _check_identity(run: Path, result: RunResult, config: RunConfig) -> None:
     """Configuration and result are of each other, and of code that can be named."""
     try:
         computed = config_identity(config)
@@ -164,7 +165,7 @@ def _check_identity(run: Path, result: dict[str, Any], config: dict[str, Any]) -
     _check_source(run, config)
 
 
-def _check_source(run: Path, config: dict[str, Any]) -> None:
+def _check_source(run: Path, config: RunConfig) -> None:
     from ambiguous_wild.methods.registry import BUILTIN
 
     source, method = config["source"], config["method"]
@@ -174,11 +175,11 @@ def _check_source(run: Path, config: dict[str, Any]) -> None:
     if not source and method.split("@")[0] not in {entry.name for entry in BUILTIN}:
         raise AwError(
             f"{run}: method {method[:60]!a} is none of this package and config.yaml has no hash of its code, "
-            "so nobody can say what ran; run it as a file, see docs/add-a-method.md"
+            "so its code is unknown; run it as a file, see docs/add-a-method.md"
         )
 
 
-def _check_files(run: Path, result: dict[str, Any], *, ours: bool) -> dict[str, Path]:
+def _check_files(run: Path, result: RunResult, *, ours: bool) -> dict[str, Path]:
     """Image name -> render; everything a result rests on is there."""
     # A program of others may have no splats; then its result says no size either.
     size = result["cost"].get("model_mb")
@@ -211,9 +212,10 @@ def _inside(run: Path, name: str) -> str:
     return str(pure.with_suffix(".png"))
 
 
-def _qualities(run: Path, result: dict[str, Any]) -> tuple[dict[str, float], tuple[str, ...]]:
+def _qualities(run: Path, result: RunResult) -> tuple[dict[str, float], tuple[str, ...]]:
     """(mean over the images by metric, metrics that lack a value somewhere)."""
-    names = {k for row in result["per_image"] for k in row if k != "name"} | set(result["missing"])
+    rows = [metrics_of(row) for row in result["per_image"]]
+    names = {metric for row in rows for metric in row} | set(result["missing"])
     for name in sorted(names):
         if (
             not re.fullmatch(r"[a-z][a-z0-9_.]{0,60}", name)
@@ -221,16 +223,19 @@ def _qualities(run: Path, result: dict[str, Any]) -> tuple[dict[str, float], tup
             or name.startswith(COST)
         ):
             raise AwError(f"{run}: {name[:60]!a} cannot name a metric: lower case, digits, '_' and '.'")
-    rows = result["per_image"]
     means = {
-        name: stats.mean([row.get(name) for row in rows if name in row or name not in PARTIAL])
+        name: stats.mean([_known(row.get(name)) for row in rows if name in row or name not in PARTIAL])
         for name in names
     }
-    masks = result["masks"] or {}
+    masks: Mapping[str, Any] = result["masks"] or {}
     means |= {f"mask_{k}": float(masks[k]) for k in MASK_SCORES if masks.get(k) is not None}
     missing = tuple(sorted(k for k, v in means.items() if math.isnan(v)))
     return {k: v for k, v in means.items() if not math.isnan(v)}, missing
 
 
-def _half(config: dict[str, Any]) -> bool:
+def _known(value: float | None) -> float:
+    return math.nan if value is None else value
+
+
+def _half(config: RunConfig) -> bool:
     return config.get("protocol", "full") == "half"

@@ -1,4 +1,4 @@
-"""Thresholds, and what follows from them: a plan says effect, evidence, threshold, decision, why and cost."""
+"""Decide which effects a scene needs: evidence against thresholds."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ class Decision:
 
 @dataclass(frozen=True)
 class Plan:
-    """What a scene calls for."""
+    """The effects that a scene needs, with the evidence for each."""
 
     scene: str
     decisions: tuple[Decision, ...]
     probed: bool = False
 
     def effects(self, among: Iterable[str] | None = None) -> tuple[str, ...]:
-        """Names for `--effects`: what was decided on, of those allowed.
+        """Names for `--effects`: effects that were decided on, among those allowed.
 
         A lower SH degree is never among them: it saves no time worth mentioning, and on matt scenes too cost
         a third to half a decibel (docs/effects.md).

@@ -1,7 +1,7 @@
-"""Evidence that needs a render: a short run of plain 3DGS on small photos, and what it leaves unexplained.
+"""Evidence that needs a render: the residual of a short run of plain 3DGS on small photos.
 
 A render of few iterations lacks detail everywhere, but detail is signed: averaged over a window it vanishes.
-Something that stands before the scene in one photo is a patch of one sign, and stays.
+A distractor in front of the scene in one photo is a patch of one sign, and stays.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from ambiguous_wild.splat.trainer import Trainer
 
 LONGEST = 160  # px of the probe's photos
 ITERATIONS = 300
-SETTLED = 1200  # iterations after which fields are learnt as well, and a passer-by still is not
+SETTLED = 1200  # iterations after which fine texture is learnt and a distractor in one photo still is not
 WINDOW = 1 / 20  # of the longest side: side of the window
 STANDS_OUT = 0.12  # code values of a window's mean residual, in the worst channel
 LARGE = 0.05  # of a photo: a patch above it is more than an instance
@@ -139,7 +139,7 @@ def occlusion(
     iterations: int = ITERATIONS,
     tick: Callable[[], object] | None = None,
 ) -> Occlusion:
-    """Train the probe and look at what it leaves.
+    """Train the probe and measure its residual.
 
     Args:
         scene: the scene.

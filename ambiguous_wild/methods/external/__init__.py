@@ -1,1 +1,1 @@
-"""Other people's programs as methods: they train and render, our harness measures what they wrote."""
+"""External programs as methods: they train and render, our harness measures their pictures."""

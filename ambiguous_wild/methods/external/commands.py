@@ -1,4 +1,4 @@
-"""The plain adapter: a train command, a render command, and where the pictures land."""
+"""The plain adapter: a train command, a render command, and the paths of the pictures."""
 
 from __future__ import annotations
 
@@ -20,7 +20,9 @@ from ambiguous_wild.methods.external.process import end_left_over, run_logged
 from ambiguous_wild.methods.external.program import DONE, Produced, Task
 from ambiguous_wild.methods.external.staging import split_lists, stage
 
-BEGUN = "begun.json"  # in the folder of the program: what was begun, to tell whether it may go on
+BEGUN = (
+    "begun.json"  # in the program's folder: the command that was started, to know whether it may be resumed
+)
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,7 @@ class CommandProgram:
         """Train unless that is done, render unless that is done, collect.
 
         Raises:
-            AwError: a command fails or does not leave what it should.
+            AwError: a command fails or writes no complete output.
         """
         self._check_length(task)
         end_left_over(task.logs)
@@ -73,7 +75,7 @@ class CommandProgram:
             shutil.rmtree(staged, ignore_errors=True)
 
     def _goes_on(self, task: Task, output: Path) -> bool:
-        """Whether something lies there that `resume` may take over: left by the same command."""
+        """Whether there is output of the same command that `resume` may continue."""
         try:
             begun = json.loads((task.work / BEGUN).read_text(encoding="utf-8"))
         except (OSError, ValueError, RecursionError):
@@ -146,7 +148,7 @@ class CommandProgram:
         )
 
     def _facts(self) -> dict[str, Any]:
-        """What ran, and what of the run's settings it was not told."""
+        """The program's revision, and the settings of the run that it was not given."""
         revision = _revision(self.cwd)
         deaf = sorted({"seed", "iterations"} - self._used())
         return {"revision": revision, "not_told": deaf}
@@ -178,7 +180,7 @@ def _read(state: Path) -> dict[str, float]:
 
 
 def _revision(folder: Path) -> str | None:
-    """The commit of the repository the program lies in; None where it lies in none."""
+    """The commit of the program's repository; None if it is in none."""
     try:
         done = subprocess.run(
             ["git", "-C", str(folder), "rev-parse", "HEAD"], capture_output=True, text=True, timeout=10

@@ -14,10 +14,10 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash, from_plain, to_plain
 from ambiguous_wild.core.names import check_name
 from ambiguous_wild.io import plain_yaml
+from ambiguous_wild.methods.entry import MethodEntry, NoOptions
 from ambiguous_wild.methods.external import templates
 from ambiguous_wild.methods.external.commands import CommandProgram
 from ambiguous_wild.methods.external.program import no_parts
-from ambiguous_wild.methods.registry import MethodEntry, NoOptions
 
 RUN = ("scene", "source", "images", "output", "seed", "iterations", "budget_s", "factor", "device")
 VIEW = ("stem", "name", "index")
@@ -34,15 +34,15 @@ class Description:
     paper: str = ""
     needs: str = ""
     train: str | tuple[str, ...] = ()
-    render: str | tuple[str, ...] = ()  # left out where training renders
-    resume: str | tuple[str, ...] = ()  # instead of train, where a stopped run left something in {output}
-    renders: str = ""  # where the render of a test photo lies; may hold wildcards
-    masks: str = ""  # where the keep map of a train photo lies, white = kept
+    render: str | tuple[str, ...] = ()  # left out if training renders
+    resume: str | tuple[str, ...] = ()  # instead of train, if a stopped run left files in {output}
+    renders: str = ""  # path of a test photo's render; may contain wildcards
+    masks: str = ""  # path of a train photo's keep map, white = kept
     ply: str = ""  # splats, for counting and size
     cwd: str = ""  # relative to the file; empty = the file's folder
     prefix: str | tuple[str, ...] = ()  # before every command, e.g. conda run --no-capture-output -n theirs
     environment: dict[str, Any] = field(default_factory=dict)
-    options: dict[str, Any] = field(default_factory=dict)  # placeholders of one's own; --set NAME.KEY=VALUE
+    options: dict[str, Any] = field(default_factory=dict)  # placeholders of your own; --set NAME.KEY=VALUE
     scene_files: dict[str, Any] = field(default_factory=dict)  # text files that the program wants in {scene}
     timeout_h: float = 0.0  # of each command; 0 = none
 
@@ -51,7 +51,7 @@ def load_description(path: Path) -> MethodEntry:
     """The method that a description makes.
 
     Raises:
-        AwError: no such file, no YAML or TOML, an unknown key or placeholder, or a key that must be there.
+        AwError: no such file, no YAML or TOML, an unknown key or placeholder, or a missing key.
     """
     try:
         content = path.read_bytes()
@@ -81,7 +81,7 @@ def load_description(path: Path) -> MethodEntry:
         config=options,
         paper=description.paper,
         needs=description.needs or "its own environment",
-        # What says nothing about the result may be mended without training again.
+        # keys without influence on the result may change without a new training
         source_hash=config_hash({k: v for k, v in to_plain(description).items() if k not in _NO_MATTER}),
         program=program,
     )

@@ -1,8 +1,8 @@
 """`nerfbaselines:METHOD`: a method of NerfBaselines, through its command line in its own environment.
 
-It needs numpy below 2, so it never shares ours. Its training runs without its own evaluation, which would
-count as training time; its renders are read from the predictions archive and measured as all others are.
-Source: nerfbaselines 1.2.12, `cli/_train.py`, `cli/_render.py`, `evaluation.py`.
+It needs numpy below 2, so it cannot share our environment. Its training runs without its own evaluation,
+which would count as training time; its renders are read from the predictions archive and measured like all
+others. Source: nerfbaselines 1.2.12, `cli/_train.py`, `cli/_render.py`, `evaluation.py`.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.core.names import check_name
 from ambiguous_wild.io.archive import Limits, unpack
 from ambiguous_wild.io.atomic import atomic_dir, write_json
+from ambiguous_wild.methods.entry import MethodEntry
 from ambiguous_wild.methods.external.process import end_left_over, run_logged
 from ambiguous_wild.methods.external.program import DONE, Produced, Task, no_parts
-from ambiguous_wild.methods.registry import MethodEntry
 
-PROGRAM = "AW_NERFBASELINES"  # environment variable: where its command lies
+PROGRAM = "AW_NERFBASELINES"  # environment variable: path of its command
 TESTED = "1.2.12"
 LIMITS = Limits(bytes=50_000_000_000)  # of an unpacked predictions archive
 
 
 @dataclass(frozen=True)
 class Options:
-    """What its command line takes; `--set nerfbaselines-METHOD.KEY=VALUE`."""
+    """Options of its command line; `--set nerfbaselines-METHOD.KEY=VALUE`."""
 
     backend: str = ""  # conda, docker, apptainer or python; empty = its own choice
-    presets: tuple[str, ...] = ()  # names with commas; none = those it applies by itself
+    presets: tuple[str, ...] = ()  # names with commas; none = its own defaults
     overrides: tuple[str, ...] = ()  # KEY=VALUE,KEY=VALUE of the method
     iterations_key: str = ""  # the method's key for its length: gets --iterations; empty = its own length
     seed_key: str = ""  # the method's key for its seed; empty = it has none and is not told
@@ -46,7 +46,7 @@ def nerfbaselines_entry(method: str) -> MethodEntry:
     """The entry of a method of NerfBaselines.
 
     Raises:
-        AwError: NerfBaselines is not there (says how to install it), or the method's name is unfit.
+        AwError: NerfBaselines is not installed (the message says how), or the name is not allowed.
     """
     program = find_program()
     name = check_name("method of NerfBaselines", method)
@@ -65,7 +65,7 @@ def find_program() -> str:
     """The command `nerfbaselines`, by $AW_NERFBASELINES or on PATH.
 
     Raises:
-        AwError: it is not there; says the commands that install it.
+        AwError: it is not installed; the message gives the commands.
     """
     wanted = os.environ.get(PROGRAM, "")
     found = shutil.which(wanted or "nerfbaselines")
@@ -90,7 +90,7 @@ class NerfBaselines:
         """Train, render the test split to an archive, read it.
 
         Raises:
-            AwError: a command fails, the scene is none that it loads as it is, or a render is missing.
+            AwError: a command fails, the scene cannot be loaded as it is, or a render is missing.
         """
         self._check(task)
         end_left_over(task.logs)
@@ -157,7 +157,7 @@ class NerfBaselines:
         return [*command, *_backend(task.options)]
 
     def _own_metrics(self, task: Task, archive: Path, steps: _Steps) -> dict[str, Any] | None:
-        """What NerfBaselines itself says of the same renders; beside our numbers, never instead of them."""
+        """NerfBaselines' own metrics of the same renders; beside our numbers, never instead of them."""
         if not task.options.evaluate:
             return None
         path = task.work / "results.json"
@@ -170,7 +170,7 @@ class NerfBaselines:
 
 
 class _Steps:
-    """The commands of one run, and how long those took that are done."""
+    """The commands of one run, and the seconds of those that are done."""
 
     def __init__(self, method: NerfBaselines, task: Task) -> None:
         self.method, self.task = method, task
@@ -220,7 +220,7 @@ def _factor_it_loads(scene: Scene) -> int:
 
 
 def _checkpoint(output: Path) -> Path | None:
-    """checkpoint-N of the last step that is whole: its nb-info.json is written last."""
+    """checkpoint-N of the last complete step: its nb-info.json is written last."""
     found = [
         (int(path.name.removeprefix("checkpoint-")), path)
         for path in output.glob("checkpoint-*")
@@ -234,7 +234,7 @@ def _info(checkpoint: Path) -> dict[str, Any]:
 
 
 def _cost(info: dict[str, Any], seconds: dict[str, float]) -> dict[str, float]:
-    """Training time is what NerfBaselines counted; the wall time of its commands stands beside it."""
+    """Training time as NerfBaselines counts it, and the wall time of its commands."""
     cost = {f"{step}_wall_s": seconds[f"{step}_s"] for step in ("train", "render") if f"{step}_s" in seconds}
     train_s = info.get("total_train_time", seconds.get("train_s"))
     used = info.get("resources_utilization")

@@ -1,4 +1,4 @@
-"""One command of somebody else's: without a shell, with a log, a time limit and no process left behind."""
+"""Runs one external command: without a shell, with a log and a time limit; ends all its processes."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from pathlib import Path
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.atomic import write_json
 
-GRACE_S = 10.0  # between asking a program to end and ending it
-_RECORD = ".running.json"  # of a command that runs, beside its log
+GRACE_S = 10.0  # between SIGTERM and SIGKILL
+_RECORD = ".running.json"  # of a running command, beside its log
 _TAIL_BYTES, _TAIL_LINES = 8192, 4
 _ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]|[\x00-\x08\x0b-\x1f\x7f]")
 
@@ -35,7 +35,7 @@ def run_logged(
 
     Args:
         what: for errors, e.g. ``"train of gsplat-mcmc"``.
-        command: program and arguments, as they are: no shell reads them.
+        command: program and arguments, unchanged: no shell reads them.
         log: of stdout and stderr.
         cwd: where it runs.
         environment: variables on top of ours.
@@ -89,7 +89,7 @@ def _tail(log: Path) -> str:
 
 
 def _end_group(group: int, process: subprocess.Popen[bytes] | None = None) -> None:
-    """End every process of the group: first asked, then not."""
+    """End every process of the group: SIGTERM first, then SIGKILL."""
     for sign, patience in ((signal.SIGTERM, GRACE_S), (signal.SIGKILL, GRACE_S)):
         try:
             os.killpg(group, sign)
@@ -111,13 +111,13 @@ def _alive(group: int) -> bool:
         os.killpg(group, 0)
     except (ProcessLookupError, PermissionError):
         return False
-    # A leader that has ended and waits to be asked about it, by a parent that may be gone, counts no longer.
+    # A leader that has ended but was not waited for (a zombie) does not count.
     stat = _stat(group)
     return stat is None or stat[0] != "Z"
 
 
 def end_left_over(logs: Path) -> None:
-    """End what a killed run of ours left working for these logs: two would spoil each other's files."""
+    """End processes that a killed run left behind for these logs: two would overwrite each other's files."""
     for record in sorted(logs.glob(f"*{_RECORD}")):
         _end_recorded(record)
 
@@ -128,20 +128,20 @@ def _end_recorded(record: Path) -> None:
         group, host, start = int(left["group"]), left["host"], left["start"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return
-    # Numbers of processes are used again: the time it began tells whether it is still the same.
+    # Process ids are reused: the start time tells whether it is still the same process.
     if host == platform.node() and start is not None and start == _start(group):
         _end_group(group)
     record.unlink(missing_ok=True)
 
 
 def _start(pid: int) -> str | None:
-    """When the process began, in the kernel's own units; None where that is not known."""
+    """Start time of the process in the kernel's units; None if unknown."""
     stat = _stat(pid)
     return None if stat is None else stat[19]
 
 
 def _stat(pid: int) -> list[str] | None:
-    """What Linux says of the process, from its state on; None where there is none, or no such system."""
+    """Fields of /proc/PID/stat from the state on; None without such a process or system."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except OSError:

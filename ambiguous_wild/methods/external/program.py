@@ -1,4 +1,4 @@
-"""What an external method is to the harness: something that is started and leaves pictures."""
+"""The interface of an external method: the harness starts it and reads the pictures that it writes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, NoReturn, Protocol
 
 from ambiguous_wild.core import AwError, Scene
 
-WORK, LOGS = "external", "logs"  # folders of a run: what the program writes, and what it says
+WORK, LOGS = "external", "logs"  # folders of a run: the program's output, and its logs
 DONE = "done.json"  # in WORK: the commands that ended, and the seconds they took
 
 
@@ -21,7 +21,7 @@ class Task:
     options: Any  # the method's frozen dataclass
     seed: int
     iterations: int
-    budget_s: float | None  # training time, where the run has one instead of a length
+    budget_s: float | None  # training time, if the run has one instead of a length
     device: str  # "cpu" or "cuda"
     folder: Path  # the run folder
     work: Path  # folder for what the program writes; kept when a run is resumed
@@ -30,27 +30,27 @@ class Task:
 
 @dataclass(frozen=True)
 class Produced:
-    """What a program left behind, and what is known of its cost."""
+    """The output of a program, and its known cost."""
 
     renders: Mapping[str, Path]  # test view -> 8-bit PNG at the size of its photo
     masks: Mapping[str, Path] = field(default_factory=dict)  # train view -> PNG, white = kept
     ply: Path | None = None  # splats, as 3DGS writes them
-    cost: Mapping[str, float] = field(default_factory=dict)  # train_s, render_s and what else is known
+    cost: Mapping[str, float] = field(default_factory=dict)  # train_s, render_s and other known costs
     facts: Mapping[str, Any] = field(default_factory=dict)
 
 
 class Program(Protocol):
-    """Trains, renders the test views, and says where things are."""
+    """Trains, renders the test views, and returns the paths of its output."""
 
     def run(self, task: Task) -> Produced:
-        """Go on where a stopped run ended.
+        """Run, or resume a stopped run.
 
         Raises:
-            AwError: it fails, takes too long, or does not leave what it should.
+            AwError: it fails, takes too long, or writes no complete output.
         """
         ...
 
 
 def no_parts(options: Any) -> NoReturn:
-    """The recipe of a method that has none."""
+    """The recipe of an external method, which has no parts."""
     raise AwError("an external method is a program of its own: it has no parts that fit into another method")

@@ -1,7 +1,7 @@
-"""The scene as an external program sees it: a folder of links, so that nothing it writes changes the scene.
+"""The scene as an external program sees it: a folder of links, so that its writes do not change the scene.
 
 Programs of the 3DGS family write into the scene (``sparse/0/points3D.ply``) and want their split in files of
-their own. Photos are linked, folders are real; ``truth/`` is left out: no method may see it.
+their own. Photos are linked, folders are real; ``truth/`` is left out: no method may read it.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The paper's ablations of RefineSplat, and ours, as data. Settings are on top of the defaults.
 
-Where the paper varies a loss that is off by default (config.py says why), the rows switch it on.
+If the paper varies a loss that is off by default (see config.py), the rows switch it on.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ ABLATIONS = (
     ),
     Group(
         "thresholds",
-        "What cuts the instances in two",
+        "Threshold between static and transient instances",
         (
             Variant("t-hard", ("mask.threshold=hard",), "T_hard: a fixed value"),
             Variant("t-statistics", ("mask.threshold=statistics",), "T_statistics: mean and deviation"),
@@ -79,41 +79,41 @@ ABLATIONS = (
                 "(c) merging alone",
             ),
             Variant("both", _NO_SUPPORT, "(d)"),
-            Variant("support", ("density.decides=total",), "and what masks hide in every photo goes"),
-            # without entropy terms their gradient is 0 and `decides` decides nothing: these rows have them
+            Variant("support", ("density.decides=total",), "and Gaussians masked in every photo are removed"),
+            # without entropy terms their gradient is 0 and `decides` has no effect, so these rows have them
             Variant(
                 "losses-total", (*_PRINTED_LOSSES, "density.decides=total"), "with L_id, L_cr: L decides"
             ),
             Variant("losses-photometric", (*_PRINTED_LOSSES, "density.decides=photometric"), "L_GS decides"),
-            Variant("losses-entropy", (*_PRINTED_LOSSES, "density.decides=entropy"), "they decide"),
+            Variant(
+                "losses-entropy", (*_PRINTED_LOSSES, "density.decides=entropy"), "the entropy terms decide"
+            ),
         ),
         "Tab. analysis of the entropy-aware density control",
     ),
     Group(
         "evidence",
-        "What is judged, and whether other views and visits have a say",
+        "What is judged, and the use of other views and visits",
         (
             Variant("structure", ("mask.statistic=structure",), "colour and structure of pixels"),
             Variant(
                 "no-other-views",
                 ("mask.multiview.strength=0", "mask.multiview.seen_by=0"),
-                "each view believes itself",
+                "each view by itself",
             ),
             *(
                 Variant(f"strength-{value}", (f"mask.multiview.strength={value}",))
                 for value in ("0.5", "1", "3")
             ),
             *(Variant(f"views-{value}", (f"mask.multiview.views={value}",)) for value in ("4", "16")),
-            Variant("any-photo", ("mask.multiview.agree=0",), "views count whatever their photos show"),
-            Variant("no-ceiling", ("mask.ceiling=0",), "thresholds as high as the scene's residuals"),
-            Variant("low-ceiling", ("mask.ceiling_least=0",), "and as low as what is not learnt yet"),
-            Variant(
-                "no-sparse-points", ("mask.multiview.sparse=false",), "what is not learnt has no surface"
-            ),
+            Variant("any-photo", ("mask.multiview.agree=0",), "views of any colour are used"),
+            Variant("no-ceiling", ("mask.ceiling=0",), "no upper limit of thresholds"),
+            Variant("low-ceiling", ("mask.ceiling_least=0",), "no lower limit of the ceiling"),
+            Variant("no-sparse-points", ("mask.multiview.sparse=false",), "unlearnt surfaces have no depth"),
             Variant("rims", ("mask.multiview.seen_by=0",), "masks where no other photo looks"),
-            Variant("no-first-look", ("first_look.on=false",), "the first renders alone decide"),
-            Variant("first-look-first", ("first_look.weight=1",), "no word of it in later masks"),
-            Variant("no-memory", ("mask.memory=0",), "the present render alone"),
+            Variant("no-first-look", ("first_look.on=false",), "no masks before the first renders"),
+            Variant("first-look-first", ("first_look.weight=1",), "not used in later masks"),
+            Variant("no-memory", ("mask.memory=0",), "the current render only"),
             Variant("no-hold", ("mask.hold=1",), "regions do not grow below the threshold"),
             Variant("identities", ("mask.entropy_weight=0.5",), "scaled by the contrast of identities"),
             Variant("on-features", _ON_FEATURES, "identities and features on their grid"),
@@ -147,7 +147,7 @@ ABLATIONS = (
     ),
     Group(
         "features",
-        "What photo and render are compared by",
+        "Features that compare photo and render",
         tuple(
             Variant(name, (*_ON_FEATURES, f"features={name}"), features=name, text=text)
             for name, text in (
@@ -169,7 +169,7 @@ ABLATIONS = (
         "printed",
         "Each printed form in the place of ours",
         (
-            Variant("on-features", _ON_FEATURES, "what the rows on features are compared with"),
+            Variant("on-features", _ON_FEATURES, "reference of the rows on features"),
             Variant("sigmoid", (*_ON_FEATURES, "mask.variant=sigmoid"), "psi one-against-rest"),
             Variant(
                 "statistic-entropy", ("mask.statistic=entropy", *_ON_FEATURES[1:]), "entropy of the render"
@@ -178,18 +178,18 @@ ABLATIONS = (
             Variant("scope-photo", ("mask.scope=photo",), "each photo cut by itself"),
             Variant("t-ent-literal", ("mask.threshold=literal",), "additive objective"),
             Variant("no-gate", _NO_GATE, "always cuts in two"),
-            Variant("no-agreement", (*_ON_FEATURES, *_NO_AGREEMENT), "an unsure identity is enough"),
+            Variant("no-agreement", (*_ON_FEATURES, *_NO_AGREEMENT), "an uncertain identity is enough"),
             Variant(
                 "no-tracks",
                 _NO_TRACKS,
-                "SfM vouches for nothing",
+                "SfM tracks keep no instance",
             ),
-            Variant("no-alpha", ("mask.least_alpha=0",), "what is not learnt yet is judged"),
+            Variant("no-alpha", ("mask.least_alpha=0",), "unlearnt pixels are judged too"),
             Variant("cosine-plain", (*_ON_FEATURES, "mask.cosine=plain")),
             Variant("spread-var", (*_ON_FEATURES, "mask.spread=var"), "mean + variance"),
             Variant("no-global-gate", (*_ON_FEATURES, *_NO_GLOBAL_GATE)),
             Variant("overlap-literal", ("density.merge.form=literal",), "a density, not a share"),
-            Variant("no-support", _NO_SUPPORT, "what masks hide in every photo stays"),
+            Variant("no-support", _NO_SUPPORT, "Gaussians masked in every photo stay"),
             Variant("whole-components", ("density.merge.most=0",), "clusters of any size merge"),
             Variant("losses", _PRINTED_LOSSES, "L_id + 0.2 L_cr"),
             Variant("all", _ALL_PRINTED, "all of them together"),

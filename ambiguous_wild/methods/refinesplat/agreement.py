@@ -1,4 +1,4 @@
-"""Whether photos show the same, and what several views say together. Nothing here has a state."""
+"""Whether two photos show the same colours, and the combined evidence of several views. Pure functions."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ FAR_MORE = 1.5  # times as many pixels
 
 
 def agree(difference: np.ndarray, same: np.ndarray, most: float, offset: np.ndarray) -> np.ndarray:
-    """Where two pictures show the same colour, bool [h, w].
+    """Pixels where two pictures show the same colour, bool [h, w].
 
     Args:
         difference: [h, w, 3] of their colours (`colour_difference`).
         same: [h, w] bool, where they show the same surface.
         most: difference in [0, 1] up to which two colours are the same.
-        offset: [3], what they differ by everywhere (`common_offset`).
+        offset: [3], their common colour offset (`common_offset`).
     """
     return same & (np.abs(difference - offset).mean(axis=2) < most)
 
@@ -25,10 +25,10 @@ def colour_difference(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
 
 
 def common_offset(difference: np.ndarray, same: np.ndarray, most: float = 0.06) -> np.ndarray:
-    """What two pictures of the same surfaces differ by everywhere, [3] float32; zeros where that is chance.
+    """The colour offset between two pictures of the same surfaces, [3] float32; zeros if there is none.
 
-    The median difference is exposure or weather and no other content, but only if far more agree without it:
-    before a crowd it is chance.
+    The median difference is an offset (exposure, weather) only if far more pixels agree once it is
+    subtracted; behind a crowd it is chance.
 
     Args:
         difference: [h, w, 3] of their colours in [0, 1].
@@ -44,24 +44,22 @@ def common_offset(difference: np.ndarray, same: np.ndarray, most: float = 0.06) 
     return np.zeros(3, np.float32)
 
 
-def word_weight(
-    seen: np.ndarray, agreeing: np.ndarray, enough: float, heard_anyway: np.ndarray
-) -> np.ndarray:
-    """How much the word of n views counts, [h, w] float32 in [0, 1].
+def agreement_weight(seen: np.ndarray, agreeing: np.ndarray, enough: float, always: np.ndarray) -> np.ndarray:
+    """Weight of the evidence of n views, [h, w] float32 in [0, 1].
 
     Args:
-        seen: [n, h, w] bool, who sees the surface.
-        agreeing: [n, h, w] bool, who sees it in the same colour.
-        enough: above 0, share of those who see it that must agree for their word to count whole.
-        heard_anyway: [h, w] bool, where it counts whole whatever they show.
+        seen: [n, h, w] bool, the views that see the surface.
+        agreeing: [n, h, w] bool, those that see it in the same colour.
+        enough: above 0, share of the seeing views that must agree for a weight of 1.
+        always: [h, w] bool, pixels whose weight is 1 in any case.
     """
     share = agreeing.sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
     weight = np.minimum(share / enough, 1.0)
-    return np.where(heard_anyway, 1.0, weight).astype(np.float32)
+    return np.where(always, 1.0, weight).astype(np.float32)
 
 
 def quantile_of(stack: np.ndarray, quantile: float) -> np.ndarray:
-    """Quantile over the first axis of [n, h, w] of what is not NaN, linear between ranks; NaN where all is.
+    """Quantile over the first axis of [n, h, w] ignoring NaN, linear between ranks; NaN if all are NaN.
 
     One sort: numpy's nanquantile takes fifty times as long on such a stack.
     """

@@ -1,6 +1,6 @@
-"""One label space for the scene: which instances of different photos are the same thing.
+"""One label space for the scene: instances of different photos that are the same object.
 
-The paper takes ids from a video tracker. Photos in no order have none, so instances are associated by the
+The paper takes ids from a video tracker. Unordered photos have none, so instances are associated by the
 SfM tracks that run through them, then by their mean features. Two instances of one photo never merge.
 """
 
@@ -44,7 +44,7 @@ def associate(
         min_shared: tracks that must run through both instances.
         min_share: and their share of the tracks of the instance that has fewer.
         min_similarity: cosine of mean features for those that tracks do not join.
-        most: identities at most; those in the most photos, then the largest, are kept.
+        most: identities at most; those in the most photos are kept, then the largest.
     """
     counts = [max(int(label.max(initial=0)), 0) for label in labels]
     offsets = np.r_[0, np.cumsum(counts)]
@@ -108,7 +108,7 @@ def _track_pairs(
 
 
 def _join_by_features(groups: _Groups, features: np.ndarray, min_similarity: float) -> None:
-    """Give instances that no track joined to the most similar group that their photo is not in."""
+    """Join instances without shared tracks to the most similar group that has no instance of their photo."""
     alone = [i for i in range(len(features)) if groups.size(i) == 1]
     norms = np.linalg.norm(features, axis=1, keepdims=True)
     unit = features / np.maximum(norms, 1e-12)

@@ -25,9 +25,9 @@ _ANY = math.inf
 class MaskConfig:
     """From photo and render to M_final. docs/refinesplat.md holds the figures behind every default.
 
-    `structure` judges pixels by colour and structure (structure.py), and needs no features; all other
-    statistics live on the feature grid and are the paper's or nearer to it. Fields marked F are read with
-    those alone.
+    `structure` judges pixels by colour and structure (structure.py) and needs no features; all other
+    statistics are on the feature grid and are the paper's, or nearer to it. Fields marked F are used with
+    those only.
     """
 
     statistic: Statistic = "structure"  # what is judged; `entropy` is printed
@@ -40,23 +40,25 @@ class MaskConfig:
     memory: float = 0.5  # of a photo's earlier residuals in the present one; `structure` only
     multiview: MultiViewConfig = field(
         default_factory=MultiViewConfig
-    )  # what other views say; `structure` only
+    )  # evidence of other views; `structure` only
     entropy_weight: float = 0.0  # how much the contrast of identities scales `structure`, 0 to 1
     variant: Variant = "softmax"  # of psi and its entropy; `sigmoid` is printed
-    scope: Literal["scene", "photo"] = "scene"  # whose instances the threshold cuts; `photo` is printed
+    scope: Literal["scene", "photo"] = "scene"  # instances that the threshold divides; `photo` is printed
     gate: float = 3.0  # robust deviations an instance must stand above the median; 0 = printed
     least: float | None = (
         None  # and the statistic at least, in its unit: 10 of `structure`, else 4; 0 = printed
     )
     disagree: float = 3.0  # F: `gate` for the feature distance between photo and render; 0 = printed
     disagree_units: float = 3.0  # F: and at least this many units of what blur and noise make; 0 = printed
-    # no threshold above this share of what unrelated content gives (`unrelated_residual`); 0 = printed
+    # no threshold above this share of the residual of unrelated pictures (`unrelated_residual`); 0 = printed
     ceiling: float = 0.25  # `structure` only
-    ceiling_least: float = 6.0  # `structure` only: but that is no lower than so many units
+    ceiling_least: float = 6.0  # `structure` only: the ceiling is at least so many units
     use_local: bool = True  # M_local; off is an ablation row
     use_global: bool = True  # M_global; off is an ablation row
     static_tracks: float = 0.0  # of the photo's mean SfM track density keeps an instance; 0 = printed
-    least_alpha: float = 0.5  # below this opacity a render is no evidence: not learnt yet; 0 = printed
+    least_alpha: float = (
+        0.5  # below this opacity the model is not learnt yet and gives no evidence; 0 = printed
+    )
     cosine: Literal["calibrated", "plain"] = "calibrated"  # F: in U; `plain` is printed
     normal_units: float = 10.0  # F: distance in units at which the calibrated cosine is 0
     box: int = 3  # F: cells, box filter over U / H
@@ -100,21 +102,21 @@ class RefineSplatConfig:
     """Times in nominal iterations (of 30 000); the `min_` fields are real iterations of the run."""
 
     mask: MaskConfig = field(default_factory=MaskConfig)
-    first_look: FirstLookConfig = field(default_factory=FirstLookConfig)  # what counts until masks begin
+    first_look: FirstLookConfig = field(default_factory=FirstLookConfig)  # keep maps until masks begin
     features: str = "labhog"  # back end of phi, see docs/foundation-models.md; `dinov2-small` is the paper's
     instances: str = "graph"  # back end of the instance masks; `grounded-video:...` is the paper's
     segments: SegmentConfig = field(default_factory=SegmentConfig)  # of `graph`
     psi: PsiConfig = field(default_factory=PsiConfig)  # the frozen identity classifier
     density: EntropyDensityConfig = field(default_factory=EntropyDensityConfig)  # growth and merging
-    mask_start: float = 500.0  # warm-up: before it every pixel counts that the first look lets through
-    min_mask_start: int = 250  # a render of fewer iterations means nothing
+    mask_start: float = 500.0  # warm-up: until then the first look alone decides which pixels are kept
+    min_mask_start: int = 250  # earlier renders show too little
     reset_pause: float = 300.0  # masks are not refreshed for so long after an opacity reset
     min_reset_pause: int = 200
     mask_every: int = 4  # each view's mask is refreshed at every k-th of its visits
     entropy_every: int = 4  # iterations between entropy terms, each weighing that many times as much
-    # Both losses are off with weight-free features, whose gradient to the image is that of colours and
-    # edges: 900 iterations on a simulated courtyard gave 28.2 dB without them, 26.4 with 0.001 and 0.0002,
-    # 25.3 with 0.02 and 0.004, 18.0 with the paper's 1 and 0.2.
+    # Both losses are off: with weight-free features their gradient to the image is that of colours and edges.
+    # 900 iterations on a simulated courtyard gave 28.2 dB without them, 26.4 with 0.001 and 0.0002, 25.3 with
+    # 0.02 and 0.004, 18.0 with the paper's 1 and 0.2.
     lambda_id: float = 0.0  # of L_id; 1 = printed
     lambda_cr: float = 0.0  # alpha_1, of L_cr; 0.2 = printed, 0.1 to 0.3 tried in the paper
     lambda_dssim: float = 0.2  # of D-SSIM in L_GS
@@ -139,6 +141,6 @@ class RefineSplatConfig:
         check_instances(self.instances)
         if self.density.decides == "entropy" and not (self.lambda_id or self.lambda_cr):
             raise AwError(
-                "refinesplat.density.decides=entropy: both entropy losses are off, so nothing would ever "
+                "refinesplat.density.decides=entropy: both entropy losses are off, so nothing would "
                 "grow; add --set refinesplat.lambda_cr=0.2, or decide by total"
             )

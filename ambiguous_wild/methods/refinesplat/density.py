@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -56,6 +57,9 @@ class EntropyAwareDensity(DensityControl):
     """Grows by the gradient of the whole loss, entropy terms included, and merges what overlaps."""
 
     config: EntropyDensityConfig
+    # [N, 3] sum of -dL/dmean over views, world
+    sums: ClassVar[Mapping[str, tuple[int, ...]]] = {**DensityControl.sums, "downhill": (3,)}
+    downhill: Tensor
 
     def __init__(self, config: DensityConfig, extent: float, seed: int) -> None:
         if not isinstance(config, EntropyDensityConfig):
@@ -63,7 +67,6 @@ class EntropyAwareDensity(DensityControl):
         if config.decides not in ("total", "photometric", "entropy"):
             raise unknown("gradient", config.decides, ("total", "photometric", "entropy"))
         super().__init__(config, extent, seed)
-        self.downhill = torch.zeros(0, 3)  # [N, 3] sum of -dL/dmean over views, world
         self.last_merge = 0.0  # nominal
         self.merged = 0  # Gaussians that merging removed so far
         self.support = Support(config.support)
@@ -77,9 +80,6 @@ class EntropyAwareDensity(DensityControl):
             return gradients.screen + extra
         return gradients.screen if self.config.decides == "photometric" else extra
 
-    def wants_extra(self) -> bool:
-        return self.config.decides != "photometric"
-
     @torch.no_grad()
     def observe(self, step: Step, gradients: Gradients, keep: Tensor | None = None) -> None:
         super().observe(step, gradients, keep)
@@ -91,7 +91,7 @@ class EntropyAwareDensity(DensityControl):
 
     @torch.no_grad()
     def refine(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> tuple[Gaussians, list[str]]:
-        """As 3DGS, and every `min_every` iterations to the end, what no kept pixel vouches for goes."""
+        """As 3DGS, and every `min_every` iterations to the end, what no kept pixel supports is removed."""
         gaussians, events = super().refine(step, gaussians, optimiser)
         due = step.iteration - self.last_judged >= self.config.min_every
         if events or not due or self.config.support.least_share <= 0:
@@ -148,22 +148,14 @@ class EntropyAwareDensity(DensityControl):
 
     def _select(self, stay: Tensor) -> None:
         super()._select(stay)
-        self.downhill = self.downhill[stay]
         self.support.select(stay)
 
     def _match(self, gaussians: Gaussians) -> None:
         super()._match(gaussians)
-        pad = torch.zeros(max(len(gaussians) - len(self.downhill), 0), 3, device=gaussians.device)
-        self.downhill = torch.cat([self.downhill.to(gaussians.device), pad])
         self.support.match(len(gaussians), gaussians.device)
-
-    def _clear(self, gaussians: Gaussians) -> None:
-        super()._clear(gaussians)
-        self.downhill = torch.zeros(len(gaussians), 3, device=gaussians.device)
 
     def state_dict(self) -> dict[str, Any]:
         return super().state_dict() | {
-            "downhill": self.downhill,
             "last_merge": self.last_merge,
             "merged": self.merged,
             "support": self.support.state_dict(),
@@ -172,7 +164,6 @@ class EntropyAwareDensity(DensityControl):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         super().load_state_dict(state)
-        self.downhill = state["downhill"]
         self.last_merge, self.merged = state["last_merge"], state["merged"]
         self.support.load_state_dict(state["support"])
         self.last_judged = state["last_judged"]

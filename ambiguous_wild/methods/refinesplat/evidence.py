@@ -1,4 +1,4 @@
-"""One photo against one render: the maps, and from them the masks. Nothing here has a state."""
+"""One photo compared with one render: the maps, and the masks made from them. Pure functions."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from ambiguous_wild.methods.refinesplat.threshold import Cut, robust_floor, t_en
 
 @dataclass(frozen=True)
 class Maps:
-    """Float arrays of one photo against one render: on the feature grid [h, w], or on pixels [H, W]."""
+    """Float arrays of one photo compared with one render: on the feature grid [h, w], or on pixels [H, W]."""
 
     statistic: np.ndarray  # what is judged, in its unit
-    distance: np.ndarray  # how far photo and render are apart, in units of what is normal
+    distance: np.ndarray  # distance of photo and render, in units of the normal one
     entropy: np.ndarray | None = None  # H of the render, in [0, 1]
     cosine: np.ndarray | None = None  # cos(phi(I), phi(render))
 
 
 @dataclass(frozen=True)
 class Judged:
-    """The instances of one photo as numbers; of other photos they are what is normal in the scene."""
+    """Statistics of the instances of one photo; those of other photos say what is normal in the scene."""
 
     values: np.ndarray  # [K] float64, mean statistic (Hbar)
     distances: np.ndarray  # [K] float64, mean distance in units
@@ -54,10 +54,10 @@ class Masks:
 def compare(phi_photo: Tensor, phi_render: Tensor, psi: Psi | None, unit: float, config: MaskConfig) -> Maps:
     """Entropy, statistic and distance maps of features [h, w, C] of photo and render.
 
-    Without psi (no instance has an identity) entropy is 0 and the distance alone speaks.
+    Without psi (no instance has an identity) the entropy is 0 and the distance alone is judged.
     """
     norms = torch.linalg.vector_norm(phi_photo, dim=2) * torch.linalg.vector_norm(phi_render, dim=2)
-    # a feature of length 0 (black in both) says nothing, which counts as agreement
+    # a feature of length 0 (black in both) counts as agreement
     cosine = torch.where(norms > 0, (phi_photo * phi_render).sum(2) / norms.clamp(min=1e-12), 1.0)
     distance = (1.0 - cosine).clamp(min=0.0) / unit
     if psi is None:
@@ -79,9 +79,9 @@ def compare(phi_photo: Tensor, phi_render: Tensor, psi: Psi | None, unit: float,
 
 
 def silence(maps: Maps, unseen: np.ndarray) -> Maps:
-    """The maps without evidence where the model has nothing to show yet (bool [h, w]).
+    """The maps without evidence where the model is not learnt yet (bool [h, w]).
 
-    A sky without points differs from every photo until it is learnt; masked, it would never be learnt.
+    A sky without points differs from every photo until it is learnt; if masked, it would never be learnt.
     """
     return Maps(
         np.where(unseen, 0.0, maps.statistic),
@@ -92,15 +92,15 @@ def silence(maps: Maps, unseen: np.ndarray) -> Maps:
 
 
 def scaled_by(structure: np.ndarray, evidence: np.ndarray, weight: float) -> np.ndarray:
-    """Pixel evidence [H, W] raised where identities disagree and lowered where they agree.
+    """Pixel evidence [H, W], raised where identities disagree and lowered where they agree.
 
     The factor 1 + weight (2 g - 1), g = evidence / (evidence + 4), lies in [1 - weight, 1 + weight]: the unit
     of the scene stays what it is.
 
     Args:
         structure: from `PixelEvidence`.
-        evidence: [h, w] on the feature grid, in units; 4 is where instances begin to be suspect.
-        weight: 0 = identities say nothing.
+        evidence: [h, w] on the feature grid, in units; instances are suspect from 4 on.
+        weight: 0 = identities are ignored.
     """
     share = np.maximum(evidence, 0.0)
     factor = 1.0 + weight * (2.0 * share / (share + 4.0) - 1.0)
@@ -127,8 +127,8 @@ def make_masks(
         others: instances of the scene's other photos when they were last judged (`scope` = scene).
         w2: weight of T_ent's lower subset.
         config: thresholds.
-        ceiling: the threshold is no higher than this, whatever stands apart from what.
-        unseen: [H, W] bool, what is not to be judged: no part of any instance, and never masked.
+        ceiling: upper limit of the threshold.
+        unseen: [H, W] bool, pixels that are not judged: part of no instance, and never masked.
     """
     if unseen is not None:
         labels = np.where(unseen, 0, labels)
@@ -156,7 +156,7 @@ def make_masks(
     final = local | global_
     if config.combine == "fused" and config.use_local and config.use_global:
         of_pixel = np.r_[0.0, np.nan_to_num(means)][np.clip(labels, 0, count)]
-        # a pixel of no instance stands for itself
+        # a pixel without an instance is judged alone
         both = np.where(labels > 0, np.sqrt(pixels * of_pixel), pixels)
         final = masking.hysteresis(both, config.hold * cut.threshold, cut.threshold)
         final &= ~masking.local_mask(labels, static)
@@ -192,7 +192,7 @@ def pooled(parts: Sequence[Judged]) -> Judged:
 def differs(judged: Judged, pool: Judged, config: MaskConfig) -> np.ndarray:
     """[K] bool: instances in which photo and render disagree more than is normal.
 
-    An identity that psi is unsure of is no distractor as long as the render shows what the photo shows.
+    An instance whose identity psi is unsure of is no distractor if the render agrees with the photo.
     """
     if config.disagree <= 0:
         return np.ones(len(judged.distances), dtype=bool)

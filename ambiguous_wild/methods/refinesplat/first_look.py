@@ -1,14 +1,14 @@
-"""A first look before any training: what no other photo shows at the same surface was only passing by.
+"""Masks before any training: a pixel that no other photo shows at the same surface is a distractor.
 
-Masks need a render, and the first renders show whatever stands before most cameras: 45 % of every photo
-behind a crowd is learnt before the first mask is made, and some of it stays. The sparse points know better:
-they lie on what several photos saw in one place. So the surface behind every pixel is taken from them
-(`vision/sparse_surface.py`) and looked up in the other photos, and a pixel counts in the first iterations
-only if enough of them show its colour there. Depth is off by a pixel or two, so a colour may lie anywhere
-between the least and the greatest around the place. What no sparse points surround counts.
+Masks need a render, and the first renders also show distractors: with a crowd that covers 45 % of every
+photo, the crowd is learnt before the first mask is made, and some of it stays. The sparse points lie on
+surfaces that several photos saw in one place. So the surface behind every pixel is taken from them
+(`vision/sparse_surface.py`) and looked up in the other photos; a pixel is kept in the first iterations only
+if enough of them show its colour there. Depth is off by a pixel or two, so a colour may lie anywhere between
+the least and the greatest around the place. Pixels without sparse points around them are kept.
 
-Later masks are made from renders, but the first look keeps a word in them (`FirstLookConfig.weight`): it is
-the one witness that no training can talk round.
+Later masks are made from renders, but the first look still scales their evidence (`FirstLookConfig.weight`):
+it does not depend on what the model has learnt.
 """
 
 from __future__ import annotations
@@ -31,16 +31,18 @@ _WINDOW = np.ones((3, 3), np.uint8)  # px of the map around the place where a co
 
 @dataclass(frozen=True)
 class FirstLookConfig:
-    """Whom to ask, and what difference of colour is too much."""
+    """Which views are compared, and the largest difference of colour."""
 
     on: bool = True
-    views: int = 16  # nearest train views asked
-    quantile: float = 0.3  # of their differences: this share must show the colour
-    threshold: float = 0.02  # difference of colour in [0, 1] above which a pixel waits
+    views: int = 16  # nearest train views used
+    quantile: float = 0.3  # of their differences: this share of views must show the colour
+    threshold: float = 0.02  # difference of colour in [0, 1] above which a pixel is masked at first
     normal: float = 3.0  # and above this many times what is normal in the photo
-    known_by: int = 3  # seen by fewer others, a surface is not judged
-    least: float = 0.1  # of a photo: where less would wait, nothing does; a start can bear that much
-    weight: float = 1.5  # `structure`: later evidence is so many times more, or less, as it says; 1 = no word
+    known_by: int = 3  # with fewer views that see it, a surface is not judged
+    least: float = (
+        0.1  # of a photo: if less would be masked, nothing is; so few distractors do no harm at the start
+    )
+    weight: float = 1.5  # `structure`: later evidence is multiplied or divided by up to this; 1 = unchanged
 
     def __post_init__(self) -> None:
         check_limits(
@@ -52,20 +54,20 @@ class FirstLookConfig:
 
 @dataclass(frozen=True)
 class FirstLook:
-    """What the other photos say of one photo, on a map [h, w] of its frame."""
+    """What the other photos show at the surfaces of one photo, on a map [h, w] of its frame."""
 
-    passing: np.ndarray  # float32: 1 = only passing by, 0 = they show it too, 0.5 = nobody could tell
+    passing: np.ndarray  # float32: 1 = distractor, 0 = the others show it too, 0.5 = unknown
     least: float
 
     def keep(self, shape: tuple[int, int]) -> np.ndarray | None:
-        """What to learn from at first, [H, W] bool; None where everything counts."""
+        """Pixels that are kept at first, [H, W] bool; None if all are."""
         passing = self.passing > 0.5
         if passing.mean() < self.least:
             return None
         return _resized(passing.astype(np.float32), shape) < 0.5
 
     def factor(self, weight: float, shape: tuple[int, int]) -> np.ndarray:
-        """Of the evidence of later masks, [H, W] float32 in [1 / weight, weight]."""
+        """Factor of the evidence of later masks, [H, W] float32 in [1 / weight, weight]."""
         return np.power(np.float32(weight), 2.0 * _resized(self.passing, shape) - 1.0)
 
 
@@ -75,7 +77,7 @@ def first_look(
     surfaces: Sequence[np.ndarray | None],
     config: FirstLookConfig,
 ) -> list[FirstLook | None]:
-    """What the photos say of each other; None where nothing is known of a photo.
+    """The first look at every photo; None for a photo without sparse points or comparable views.
 
     Args:
         cameras: of the photos.
@@ -95,12 +97,12 @@ def first_look(
             looks.append(None)
             continue
         world = world_points(cameras[view], inverse)
-        told = [
+        differences = [
             _difference(ours, world, cameras[j], surface, limits)
             for j in others
             if (surface := surfaces[j]) is not None and (limits := ranges[j]) is not None
         ]
-        looks.append(_judge(told, config))
+        looks.append(_judge(differences, config))
     return looks
 
 
@@ -116,7 +118,7 @@ def _difference(
     surface: np.ndarray,  # inverse depth of the other view
     limits: tuple[np.ndarray, np.ndarray],  # least and greatest colours around each of its pixels
 ) -> np.ndarray:
-    """How far our colours lie outside of what the other view shows there, [h, w]; NaN where it cannot see."""
+    """Distance of our colours to the other view's range there, [h, w]; NaN where it sees nothing."""
     local = world @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
     x, y = in_map(camera, local, surface.shape)
     z = local[..., 2]
@@ -130,16 +132,16 @@ def _difference(
     return np.where(sees, outside.mean(axis=2), np.float32(np.nan))
 
 
-def _judge(told: list[np.ndarray], config: FirstLookConfig) -> FirstLook | None:
-    """From what the others told of a photo; None where they could tell nothing."""
-    if not told:
+def _judge(differences: list[np.ndarray], config: FirstLookConfig) -> FirstLook | None:
+    """A first look from the differences of a photo to the others; None if nothing is known."""
+    if not differences:
         return None
-    stack = np.stack(told)
+    stack = np.stack(differences)
     evidence = quantile_of(stack, config.quantile)
     known = np.isfinite(stack).sum(axis=0) >= config.known_by
     if not known.any():
         return None
-    # What is normal: less than half of a photo is behind distractors, or nobody could tell.
+    # normal difference: distractors cover less than half of a photo, else nothing could be decided
     normal = float(np.quantile(evidence[known], 0.4))
     passing = evidence > max(config.threshold, config.normal * normal)
     return FirstLook(np.where(known, passing, 0.5).astype(np.float32), config.least)

@@ -16,13 +16,13 @@ from ambiguous_wild.methods.refinesplat.identity import Psi, psi_arrays, psi_fro
 from ambiguous_wild.methods.refinesplat.masking import grid_labels, instance_means
 from ambiguous_wild.splat.step import TrainData
 from ambiguous_wild.vision.cache import cache_key, cached
+from ambiguous_wild.vision.precompute import instance_labels, photo_features
 from ambiguous_wild.vision.protocols import Features, Instances, SceneFeatures
-from ambiguous_wild.vision.stage import instance_labels, photo_features
 
 
 @dataclass(frozen=True)
 class Semantics:
-    """What psi needs and gives, by train view."""
+    """Inputs and outputs of psi, by train view."""
 
     phi: list[Tensor]  # [h, w, C] of each photo
     identities: list[Tensor]  # [h, w] int64, 0 = none: L_id's target
@@ -32,7 +32,7 @@ class Semantics:
 
 
 class FrozenInputs:
-    """What the mask policy looks up by train view; features and identities are made when first asked for."""
+    """Frozen inputs of the mask policy by train view; features and identities are computed at first use."""
 
     def __init__(
         self, data: TrainData, features: Features, instances: Instances, config: RefineSplatConfig
@@ -47,14 +47,14 @@ class FrozenInputs:
         self.labels = [label for label, _ in compact] if compact else own  # [H, W] int32, 0 = none
         self._ids = [ids for _, ids in compact]
         self.counts = [max(int(label.max(initial=0)), 0) for label in self.labels]  # K of each photo
-        # [K] bool of each photo: instances that structure from motion vouches for
+        # [K] bool of each photo: instances that are static by structure from motion
         self.static = static_instances(
             self.labels, self.counts, train_tracks(data.scene), config.mask.static_tracks
         )
 
     @property
     def has_semantics(self) -> bool:
-        """Whether features and identities were asked for yet."""
+        """Whether features and identities were computed yet."""
         return "semantics" in self.__dict__
 
     @functools.cached_property
@@ -72,7 +72,7 @@ class FrozenInputs:
             grid.append(torch.from_numpy(cells.astype(np.int64)).to(data.device))
             ids = found.of_instance[index][cells].astype(np.int64)
             identities.append(torch.from_numpy(ids).to(data.device))
-        with torch.enable_grad():  # whoever asks first may stand where nothing is to be learnt
+        with torch.enable_grad():  # the first use may be inside of no_grad
             psi = _psi(data, phi, identities, found.count, config)
         return Semantics(phi, identities, grid, psi, found)
 
@@ -113,7 +113,7 @@ def train_tracks(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """SfM observations in train views: (point [L], train index [L], xy px [L, 2])."""
     points = scene.points
     index_of = {view.name: i for i, view in enumerate(scene.train)}
-    # the last entry answers view -1: observations in views outside the split
+    # the last entry is for view -1: observations in views outside the split
     table = np.array([index_of.get(v.name, -1) for v in scene.views] + [-1], dtype=np.int64)
     point = np.repeat(np.arange(len(points)), np.diff(points.track_offsets))
     photo = table[points.track_views]
@@ -139,9 +139,9 @@ def static_instances(
         labels: [H, W] int32 of each photo.
         counts: K of each photo.
         tracks: from `train_tracks`.
-        share: of the photo's mean density that vouches for an instance; 0 = none is vouched for.
+        share: of the photo's mean density from which an instance is static; 0 = none is.
         shortest: views a track has at least.
-        fewest: observations below which a photo's density says nothing.
+        fewest: observations that a photo needs to be judged.
     """
     point, photo, xy = tracks
     long = np.bincount(point)[point] >= shortest if len(point) else np.zeros(0, bool)

@@ -19,8 +19,8 @@ def identity_loss(
 ) -> Tensor:
     """L_id = CE(psi(phi(render)), identities), a mean over cells weighted by keep.
 
-    Unweighted it would ask the render to show the distractor. sigmoid: binary cross-entropy, one against
-    rest, summed over identities; cells without identity do not count.
+    Without weights it would make the render show the distractor. sigmoid: binary cross-entropy, one against
+    rest, summed over identities; cells without identity are ignored.
     """
     counts = weights * (identities > 0)
     index = (identities - 1).clamp(min=0)[:, None]
@@ -43,13 +43,13 @@ def consistency_loss(logits: Tensor, one_hot: Tensor, variant: Variant = "sigmoi
     Args:
         logits: [n, P].
         one_hot: [K, n] float, membership of each cell in each instance (weights are allowed: keep).
-            Instances without cells do not count.
+            Instances without cells are ignored.
         variant: sigmoid sums both sides of each channel; softmax has one distribution.
     """
     sizes = one_hot.sum(1)
     used = sizes > 0
     if devices.accelerated(logits.device):
-        # instances without cells stay, with weights of 0: to leave them out the host would have to ask which
+        # instances without cells stay, with weights of 0: the host does not read which they are
         weights = one_hot / torch.where(used, sizes, 1.0)[:, None]
         count = used.sum().clamp(min=1)
     else:
@@ -69,10 +69,10 @@ def consistency_loss(logits: Tensor, one_hot: Tensor, variant: Variant = "sigmoi
     else:
         raise unknown("entropy variant", variant, ("sigmoid", "softmax"))
     total = logits.new_zeros(len(weights))
-    of = one_hot.argmax(0)  # the instance of each cell; those of none weigh nothing
+    of = one_hot.argmax(0)  # the instance of each cell; cells without one have weight 0
     for s, log_s in sides:
-        # mean[s l] - mean[s] mean[l] = mean[(s - mean s) (l - mean l)]: where the cells agree, the first form
-        # is a difference of numbers equal to seven digits
+        # mean[s l] - mean[s] mean[l] = mean[(s - mean s) (l - mean l)]: if the cells agree, the first form is
+        # a difference of numbers that are equal to seven digits
         apart = (s - (weights @ s)[of]) * (log_s - (weights @ log_s)[of])
         total = total + (weights @ apart).sum(1)
     return total.mean() if count is None else total.sum() / count

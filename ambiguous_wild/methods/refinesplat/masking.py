@@ -63,14 +63,14 @@ def uncertainty(cosine: np.ndarray) -> np.ndarray:
 def calibrated_cosine(distance: np.ndarray, normal: float) -> np.ndarray:
     """A cosine that uses its whole range: 1 at distance 0, 0 at `normal` units, -1 at twice that and beyond.
 
-    Hand-made features are all alike (their cosine stays above 0.99, where U is 1 everywhere); what counts is
-    the distance in units of what blur and noise alone make.
+    Cosines of hand-made features stay above 0.99, where U is 1 everywhere; so the distance is taken in units
+    of what blur and noise alone make.
     """
     return 1.0 - np.clip(np.asarray(distance, dtype=np.float64) / normal, 0.0, 2.0)
 
 
 def ratio(u: np.ndarray, h: np.ndarray, eps_share: float = 0.1) -> np.ndarray:
-    """R = U / max(H, eps) with eps = `eps_share` of H's own mean, so that no pixel of H = 0 rules var(R)."""
+    """R = U / max(H, eps) with eps = `eps_share` of H's own mean, so that no H = 0 dominates var(R)."""
     h = np.asarray(h, dtype=np.float64)
     eps = max(eps_share * float(h.mean()), 1e-6)
     return np.asarray(u, dtype=np.float64) / np.maximum(h, eps)
@@ -129,12 +129,12 @@ def fill_holes(mask: np.ndarray, share: float) -> np.ndarray:
 
 
 def keep_map(transient: np.ndarray, most: float, evidence: np.ndarray | None = None) -> np.ndarray:
-    """keep = 1 - M_final [H, W] float32; where more than `most` of the photo would go, the surest go first.
+    """keep = 1 - M_final [H, W] float32; of a too large mask only the surest pixels are masked.
 
     Args:
         transient: [H, W] bool.
-        most: largest share that may be masked.
-        evidence: [H, W], larger = surer; without it an oversized mask is dropped whole.
+        most: largest share of the photo that may be masked.
+        evidence: [H, W], larger = surer; without it a too large mask is dropped.
     """
     if transient.mean() > most:
         if evidence is None:

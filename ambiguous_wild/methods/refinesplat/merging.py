@@ -1,7 +1,7 @@
 """Merging of overlapping Gaussians (RefineSplat, Eqs. 11-12 and Algorithm 1), in float64.
 
-Two readings are ours. The printed overlap is a probability density: its unit is 1/volume, so that 0.3 means
-another thing in a scene of another scale; the default is normalised to [0, 1]. And the printed outer product
+Two readings are ours. The printed overlap is a probability density in 1/volume, so a threshold of 0.3 depends
+on the scale of the scene; the default is normalised to [0, 1]. And the printed outer product
 (mu_i - mu*)(mu* - mu_i)^T is negative: it makes the merged covariance indefinite; the sign here is a
 mixture's second moment.
 """
@@ -32,7 +32,7 @@ _EIGEN_FLOOR = 1e-14  # of the largest eigenvalue: condition numbers up to needl
 
 @dataclass(frozen=True)
 class MergeConfig:
-    """When two Gaussians are one. Colour and overlap are the paper's."""
+    """When two Gaussians merge. Colour and overlap are the paper's."""
 
     neighbours: int = 8  # k of Algorithm 1; not stated
     colour: float = 0.15  # largest L2 distance of the constant colours in [0, 1] RGB; 0.10 to 0.20 tried
@@ -102,7 +102,7 @@ def merge_pairs(gaussians: Gaussians, candidates: np.ndarray, config: MergeConfi
         return np.zeros((0, 2), dtype=np.int64)
     chosen = gaussians.select(torch.from_numpy(rows).to(gaussians.device))
     means = chosen.means.detach().cpu().double().numpy()
-    # coincident centres are legion after cloning: the tree needs leaves that split on ties
+    # many centres coincide after cloning: the tree needs leaves that split on ties
     _, near = cKDTree(means, balanced_tree=False).query(means, k=min(config.neighbours + 1, len(rows)))
     i = np.repeat(np.arange(len(rows)), near.shape[1])
     j = near.ravel()
@@ -125,7 +125,7 @@ def clusters(count: int, pairs: np.ndarray, most: int = 0) -> np.ndarray:
     """Cluster of every row [count]: rows joined by pairs share a number.
 
     Without a limit a chain of pairs becomes one cluster, and a plain wall, whose neighbours all overlap,
-    one Gaussian; with `most` a pair is passed over where its cluster would exceed it.
+    one Gaussian; with `most`, a pair whose cluster would exceed it is skipped.
 
     Args:
         count: rows.
@@ -187,7 +187,14 @@ def merge_members(members: Gaussians, cluster: np.ndarray) -> Gaussians:
         opacity_logits=_tensor(logits),
         sh0=_tensor(mix @ members.sh0.detach().cpu().double().numpy()),
         sh_rest=_tensor((mix @ sh_rest).reshape(count, members.sh_rest.shape[1], 3)),
+        extra={name: _mixed(mix, values, count) for name, values in members.extra.items()},
     ).to(members.device)
+
+
+def _mixed(mix: sparse.csr_matrix, values: Tensor, count: int) -> Tensor:
+    """Weighted means [count, ...] of what every member carries."""
+    flat = values.detach().cpu().double().numpy().reshape(len(values), -1)
+    return _tensor((mix @ flat).reshape(count, *values.shape[1:]))
 
 
 def scale_rotation(cov: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,18 +1,17 @@
-"""Multi-view evidence: what is static is seen from elsewhere too.
+"""Multi-view evidence: a static surface looks the same from other views.
 
-A surface that the model has not learnt yet differs from its photo in every view that shows it; something that
-stood there once differs in one. So the evidence of a view is discounted by what the other views say of the
-same surface, found through the render's depth. Without it masks feed on themselves: what is masked early is
-never learnt and stays masked. Simulated courtyard, seeds 21 (distractors) and 37 (none), 3000 iterations:
-30.2 dB and 33.3 dB without, 32.4 and 36.5 with it; plain 3DGS 27.2 and 36.4, exact masks 32.6 and 36.4.
+A surface that the model has not learnt yet differs from the photo in every view; a distractor differs in one.
+So the evidence of a view is discounted by the other views' evidence about the same surface, which is found
+through the render's depth. Without the discount, masked pixels are never learnt and stay masked. Simulated
+courtyard, seeds 21 (distractors) and 37 (none), 3000 iterations: 30.2 dB and 33.3 dB without, 32.4 and 36.5
+with it; plain 3DGS 27.2 and 36.4, exact masks 32.6 and 36.4.
 
-Their word counts only where their photos show the same colour as this one: before a crowd every view has
-evidence everywhere, and without that condition views would excuse each other's distractors.
+Their evidence is used only where their photos show the same colour as this one: with a crowd in front of the
+scene every view has evidence everywhere, and would discount distractors of the others.
 
-What is not learnt yet has no depth either, and whoever is asked there sees another surface. So where fewer
-than `known_by` views see what the render shows, the sparse points say where the surface is. And where fewer
-than `seen_by` others look at all, at the rim of a capture, nothing is masked: nobody else could teach what is
-there.
+A surface that is not learnt yet has a wrong depth. So where fewer than `known_by` views see the render's
+surface, the sparse points' surface is used. Where fewer than `seen_by` other views look at all, at the rim of
+a capture, nothing is masked: no other photo could teach the surface.
 """
 
 from __future__ import annotations
@@ -28,36 +27,34 @@ from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.methods.refinesplat.agreement import (
     agree,
+    agreement_weight,
     colour_difference,
     common_offset,
     quantile_of,
-    word_weight,
 )
 
 SPREAD = 9  # px, box over a view's evidence before others read it: depth is off by a few pixels
 _BLUR = 5  # px, box over photos before their colours are compared, for the same reason
 _SHRINK = 2  # maps are kept at half the photo's size
-_ROW = 64  # px, pixels that are asked about one by one are put in rows of so many
+_ROW = 64  # px, single pixels that are looked up are put in rows of this length
 
 
 @dataclass(frozen=True)
 class MultiViewConfig:
-    """Whom to ask, and how much their word counts."""
+    """Which views are compared, and the weight of their evidence."""
 
-    strength: float = 1.5  # of the discount; 0 = nobody is asked
-    views: int = 8  # nearest train views asked
-    quantile: float = 0.5  # of what they say: low = a few that can explain the surface are enough
+    strength: float = 1.5  # of the discount; 0 = no other view is used
+    views: int = 8  # nearest train views used
+    quantile: float = 0.5  # of their evidence: low = a few views that explain the surface are enough
     depth: float = 0.15  # relative difference of depth up to which two views see the same surface
-    free: float = 2.0  # units of evidence elsewhere that are normal and discount nothing
-    agree: float = (
-        0.06  # difference of colour in [0, 1] up to which two photos show the same; 0 = never asked
-    )
-    agreeing: float = 0.35  # share of the views asked that must show the same for their word to count whole
-    # seen by fewer others, a render's surface is discounted whatever their photos show, or looked up again
+    free: float = 2.0  # units of evidence in other views that are normal and discount nothing
+    agree: float = 0.06  # difference of colour in [0, 1] up to which two photos show the same; 0 = not tested
+    agreeing: float = 0.35  # share of the views used that must show the same colour for full weight
+    # with fewer seeing views the colours are not tested, and the sparse points' surface is looked up too
     known_by: int = 3
-    sparse: bool = True  # where fewer see the render's surface, that of the sparse points is asked about
+    sparse: bool = True  # where fewer see the render's surface, look up that of the sparse points
     seen_by: int = (
-        2  # others whose frame holds a place (all there are, if fewer); else nothing is masked there
+        2  # other views (all, if fewer) that must have a place in their frame; else it is not masked
     )
 
     def __post_init__(self) -> None:
@@ -69,24 +66,24 @@ class MultiViewConfig:
 
 
 @dataclass(frozen=True)
-class Hearsay:
-    """What other views say of the surfaces of one view, maps [h, w] float32."""
+class MultiViewEvidence:
+    """Evidence of other views about the surfaces of one view, maps [h, w] float32."""
 
-    evidence: np.ndarray  # theirs, at the quantile of the config; NaN where no other view sees the surface
-    weight: np.ndarray  # in [0, 1]: how far their photos show what this one shows
+    evidence: np.ndarray  # at the quantile of the config; NaN where no other view sees the surface
+    weight: np.ndarray  # in [0, 1]: how far their photos agree with this one
 
 
 @dataclass(frozen=True)
-class _Word:
-    """Of one view on points [h, w] of another."""
+class _ViewEvidence:
+    """Evidence of one view at points [h, w] of another."""
 
     evidence: np.ndarray  # [h, w] float32, NaN where it sees another surface or none
     agree: np.ndarray  # [h, w] bool, where it sees the surface in the same colour
-    offset: np.ndarray  # [3] float32, what its colours differ by everywhere
+    offset: np.ndarray  # [3] float32, its colour offset
 
 
-class Elsewhere:
-    """What every view last said of the surfaces it shows: evidence and depth at half the photo's size."""
+class OtherViews:
+    """The last evidence of every view about its surfaces, and their depth, at half the photo's size."""
 
     def __init__(
         self,
@@ -98,13 +95,13 @@ class Elsewhere:
         self.cameras, self.config = list(cameras), config
         self.neighbours = nearest_views(cameras, config.views)
         self.colours = [small_colours(photo, half_size(c)) for photo, c in zip(photos, cameras, strict=True)]
-        # inverse depths of the sparse points' surface, [h, w] of any size, NaN where they say nothing
+        # inverse depths of the sparse points' surface, [h, w] of any size, NaN where there is none
         self.static = list(surfaces) if config.sparse and surfaces else [None] * len(self.cameras)
         self.evidence: dict[int, np.ndarray] = {}  # view: [h, w] float32
         self.depth: dict[int, np.ndarray] = {}  # view: [h, w] float32, along the camera's axis
 
     def remember(self, view: int, evidence: np.ndarray, depth: np.ndarray) -> None:
-        """Take what a view says.
+        """Store the evidence of a view.
 
         Args:
             view: which.
@@ -120,43 +117,43 @@ class Elsewhere:
         self.evidence[view] = cv2.resize(wide, size, interpolation=cv2.INTER_AREA)
         self.depth[view] = cv2.resize(depth.astype(np.float32), size, interpolation=cv2.INTER_NEAREST)
 
-    def ask(self, view: int) -> Hearsay | None:
-        """What the other views say of the surface that each pixel shows; None before any other was asked."""
-        asked = [j for j in self.neighbours[view] if j in self.depth]
-        if not asked or view not in self.depth:
+    def ask(self, view: int) -> MultiViewEvidence | None:
+        """The other views' evidence about the surface that each pixel shows; None if none is stored."""
+        used = [j for j in self.neighbours[view] if j in self.depth]
+        if not used or view not in self.depth:
             return None
         xyz = _surface(self.cameras[view], self.depth[view])
-        heard = [self._at(j, xyz, self.colours[view]) for j in asked]
-        evidence, agreeing = np.stack([h.evidence for h in heard]), np.stack([h.agree for h in heard])
+        views = [self._at(j, xyz, self.colours[view]) for j in used]
+        evidence, agreeing = np.stack([v.evidence for v in views]), np.stack([v.agree for v in views])
         few = np.isfinite(evidence).sum(axis=0) < self.config.known_by
-        again = self._ask_again(view, asked, few, [h.offset for h in heard], evidence, agreeing)
-        return Hearsay(
+        again = self._look_up_sparse(view, used, few, [v.offset for v in views], evidence, agreeing)
+        return MultiViewEvidence(
             quantile_of(evidence, self.config.quantile),
-            # few who see what the render shows are heard; who sees the sparse points' surface may look past
-            # a distractor at what is behind it
-            word_weight(np.isfinite(evidence), agreeing, self.config.agreeing, few & ~again),
+            # a few views that see the render's surface have full weight; views that see the sparse points'
+            # surface may look past a distractor at the background
+            agreement_weight(np.isfinite(evidence), agreeing, self.config.agreeing, few & ~again),
         )
 
-    def _ask_again(
+    def _look_up_sparse(
         self,
         view: int,
-        asked: list[int],
+        used: list[int],
         few: np.ndarray,
         offsets: list[np.ndarray],
         evidence: np.ndarray,
         agreeing: np.ndarray,
     ) -> np.ndarray:
-        """Put in what is said of the sparse points' surface, where few see the render's and more see that.
+        """Use evidence about the sparse points' surface where few views see the render's and more see it.
 
         Args:
-            view: who asks.
-            asked: the n views.
-            few: [h, w] bool, where to ask.
-            offsets: of colours, from the first time: these pixels alone would take a car for weather.
+            view: the querying view.
+            used: the n other views.
+            few: [h, w] bool, pixels to look up.
+            offsets: of colours, from the first lookup: these pixels alone could take a car for exposure.
             evidence, agreeing: [n, h, w], changed in place.
 
         Returns:
-            [h, w] bool, where something was put in.
+            [h, w] bool, pixels that were replaced.
         """
         again = np.zeros(few.shape, bool)
         inverse = self.static[view]
@@ -166,17 +163,17 @@ class Elsewhere:
         at = np.flatnonzero(few & np.isfinite(depth))
         if not len(at):
             return again
-        # as pictures, for OpenCV; the last row is filled up with the first pixel
+        # as pictures, for OpenCV; the last row is padded with the first pixel
         rows = np.pad(at, (0, -len(at) % _ROW), constant_values=at[0]).reshape(-1, _ROW)
         xyz = _surface(self.cameras[view], depth).reshape(-1, 3)[rows]
         colour = self.colours[view].reshape(-1, 3)[rows]
-        heard = [self._at(j, xyz, colour, sparse=True, offset=o) for j, o in zip(asked, offsets, strict=True)]
-        said = np.stack([h.evidence.ravel()[: len(at)] for h in heard])
-        same = np.stack([h.agree.ravel()[: len(at)] for h in heard])
-        first = evidence.reshape(len(asked), -1)
-        more = np.isfinite(said).sum(axis=0) > np.isfinite(first[:, at]).sum(axis=0)
-        first[:, at[more]] = said[:, more]
-        agreeing.reshape(len(asked), -1)[:, at[more]] = same[:, more]
+        views = [self._at(j, xyz, colour, sparse=True, offset=o) for j, o in zip(used, offsets, strict=True)]
+        found = np.stack([v.evidence.ravel()[: len(at)] for v in views])
+        same = np.stack([v.agree.ravel()[: len(at)] for v in views])
+        first = evidence.reshape(len(used), -1)
+        more = np.isfinite(found).sum(axis=0) > np.isfinite(first[:, at]).sum(axis=0)
+        first[:, at[more]] = found[:, more]
+        agreeing.reshape(len(used), -1)[:, at[more]] = same[:, more]
         again.ravel()[at[more]] = True
         return again
 
@@ -188,15 +185,15 @@ class Elsewhere:
         *,
         sparse: bool = False,
         offset: np.ndarray | None = None,
-    ) -> _Word:
-        """A view's word on world points [h, w, 3] that have the colours [h, w, 3] uint8 elsewhere.
+    ) -> _ViewEvidence:
+        """A view's evidence at world points [h, w, 3] of another view, whose colours are [h, w, 3] uint8.
 
         Args:
-            view: who is asked.
+            view: the view that is looked up.
             xyz: the points.
-            colour: theirs in the photo that asks.
+            colour: of the points in the querying view's photo.
             sparse: they lie on the sparse points' surface, so seeing that is enough.
-            offset: [3], what the two photos differ by everywhere; None: found from these points.
+            offset: [3], colour offset of the two photos; None: found from these points.
         """
         camera, depth = self.cameras[view], self.depth[view]
         pose = camera.cam_from_world.astype(np.float32)
@@ -213,35 +210,35 @@ class Elsewhere:
             there = cv2.remap(static, *_in_map(u, v, static.shape), cv2.INTER_NEAREST, borderValue=-1.0)
             same |= self._near(1.0 / np.where(there > 0, there, np.nan), z)
         evidence = cv2.remap(self.evidence[view], x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        heard = np.where(same, evidence, np.float32(np.nan))
+        own = np.where(same, evidence, np.float32(np.nan))
         if self.config.agree <= 0:
-            return _Word(heard, same, np.zeros(3, np.float32))
+            return _ViewEvidence(own, same, np.zeros(3, np.float32))
         theirs = cv2.remap(self.colours[view], x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         difference = colour_difference(colour, theirs)
         if offset is None:
             offset = common_offset(difference, same, self.config.agree)
-        return _Word(heard, agree(difference, same, self.config.agree, offset), offset)
+        return _ViewEvidence(own, agree(difference, same, self.config.agree, offset), offset)
 
     def _near(self, there: np.ndarray, z: np.ndarray) -> np.ndarray:
-        """Which points of depth z lie where a view sees a surface of depth `there`, NaN or below 0 = none."""
+        """Points of depth z that lie on the view's surface of depth `there`; NaN or below 0 = no surface."""
         return (z > 0) & (there > 0) & (np.abs(z - there) < self.config.depth * there)
 
 
 def discount(
-    evidence: np.ndarray, elsewhere: Hearsay | None, unit: float, config: MultiViewConfig
+    evidence: np.ndarray, others: MultiViewEvidence | None, unit: float, config: MultiViewConfig
 ) -> np.ndarray:
-    """Evidence [H, W] over sqrt(1 + strength * excess), excess = weight times what others say above `free`.
+    """Evidence [H, W] / sqrt(1 + strength * excess), excess = weight * (the others' evidence above `free`).
 
     Args:
         evidence: [H, W] >= 0.
-        elsewhere: from `Elsewhere.ask`, any size; where its evidence is NaN it says nothing.
+        others: from `OtherViews.ask`, any size; NaN evidence discounts nothing.
         unit: evidence that is normal in the scene.
-        config: strength and what is free of it.
+        config: strength and `free`.
     """
-    if elsewhere is None or config.strength <= 0 or unit <= 0:
+    if others is None or config.strength <= 0 or unit <= 0:
         return evidence
-    excess = np.nan_to_num(np.maximum(elsewhere.evidence / unit - config.free, 0.0), nan=0.0)
-    excess = (excess * elsewhere.weight).astype(np.float32)
+    excess = np.nan_to_num(np.maximum(others.evidence / unit - config.free, 0.0), nan=0.0)
+    excess = (excess * others.weight).astype(np.float32)
     at_pixels = cv2.resize(excess, evidence.shape[::-1], interpolation=cv2.INTER_LINEAR)
     return evidence / np.sqrt(1.0 + config.strength * at_pixels)
 
@@ -252,14 +249,14 @@ def half_size(camera: Camera) -> tuple[int, int]:
 
 
 def small_colours(photo: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """A photo [H, W, 3] in [0, 1] at (width, height), uint8, without what a pixel of depth error moves."""
+    """A photo [H, W, 3] in [0, 1] at (width, height), uint8, blurred against depth errors of a pixel."""
     blurred = cv2.blur(np.ascontiguousarray(photo), (_BLUR, _BLUR), borderType=cv2.BORDER_REPLICATE)
     small = cv2.resize(blurred, size, interpolation=cv2.INTER_AREA)
     return np.clip(np.rint(small * 255.0), 0, 255).astype(np.uint8)
 
 
 def _in_map(u: np.ndarray, v: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Columns and rows float32 in a map of the frame, for OpenCV, of places given as shares of the frame."""
+    """Columns and rows float32 in a map of the frame, for OpenCV, of positions in shares of the frame."""
     # pixel centres lie at .5 in our cameras and at whole numbers for OpenCV
     x = np.clip(u * shape[1] - 0.5, -9, shape[1] + 9)
     y = np.clip(v * shape[0] - 0.5, -9, shape[0] + 9)
@@ -267,7 +264,7 @@ def _in_map(u: np.ndarray, v: np.ndarray, shape: tuple[int, ...]) -> tuple[np.nd
 
 
 def nearest_views(cameras: Sequence[Camera], count: int) -> list[list[int]]:
-    """For each camera the `count` others that look most alike: near, and in the same direction."""
+    """For each camera the `count` most similar others: near, and with the same direction."""
     centres = np.stack([np.linalg.inv(c.cam_from_world)[:3, 3] for c in cameras])
     axes = np.stack([c.cam_from_world[2, :3] for c in cameras])
     result = []

@@ -1,4 +1,4 @@
-"""The masks of all views, made and kept on the host: numpy and OpenCV, for every statistic."""
+"""The masks of all views, computed and kept on the host: numpy and OpenCV, for every statistic."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ambiguous_wild.splat.step import Step
 
 
 class HostMasks:
-    """What a view's mask is made from, beside the render, and what is learnt on the way."""
+    """Masks of all views, with what they are computed from beside the render, and the learnt w2."""
 
     def __init__(
         self,
@@ -32,7 +32,7 @@ class HostMasks:
         labels: Sequence[np.ndarray],  # [H, W] int32 instances, 0 = none
         static: Sequence[np.ndarray],  # [K of the photo] bool, not to be masked
         device: torch.device | str,
-        compare: Callable[[Step], Maps],  # on the feature grid; asked only where the statistic needs it
+        compare: Callable[[Step], Maps],  # on the feature grid; called only if the statistic needs it
     ) -> None:
         self.config, self.looks, self.labels, self.static = config, looks, labels, static
         self.device, self.compare = device, compare
@@ -59,7 +59,7 @@ class HostMasks:
         return self.keeps.get(view)
 
     def renew(self, step: Step) -> None:
-        """Make the mask of the step's view; other views hear of it, and w2 is learnt."""
+        """Compute the mask of the step's view, store its evidence for other views, and learn w2."""
         _, masks = self.examine(step, remember=True)
         self.judged[step.view] = masks.judged
         if self.config.mask.w2 is None:
@@ -87,7 +87,7 @@ class HostMasks:
 
         Args:
             step: of any train view.
-            remember: whether other views hear what this one shows; else nothing is kept.
+            remember: whether the evidence is stored for other views; else nothing is kept.
         """
         view, mask = step.view, self.config.mask
         ceiling, unseen = math.inf, None
@@ -144,6 +144,6 @@ class HostMasks:
 
 
 def _four(row: list[str]) -> tuple[float, float, float, float]:
-    # stored as text: T_ent is inf where nothing stands apart, and JSON has no inf
+    # stored as text: T_ent is inf if no instance is an outlier, and JSON has no inf
     final, local, global_, threshold = (float(x) for x in row)
     return final, local, global_, threshold

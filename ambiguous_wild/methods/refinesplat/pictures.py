@@ -1,4 +1,4 @@
-"""What RefineSplat sees, for people: maps and masks of one step, and T_ent among the scene's instances."""
+"""Pictures of RefineSplat: maps and masks of one step, and T_ent among the scene's instances."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def panels(policy: RefineSplatMask, step: Step, *, begun: bool = True) -> dict[s
     """Entropy, instances by their statistic, and the local, global and final mask; [H, W, 3] uint8 each.
 
     Args:
-        policy: whose masks; it learns nothing here.
+        policy: it learns nothing here.
         step: of one train view at the photo's own size.
         begun: whether masks are in force at this step.
     """
@@ -49,7 +49,7 @@ def panels(policy: RefineSplatMask, step: Step, *, begun: bool = True) -> dict[s
 
 
 def _outlined(image: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """The image with a dark line where one instance ends and another begins."""
+    """The image with dark lines between instances."""
     edge = np.zeros(labels.shape, bool)
     edge[:, 1:] |= labels[:, 1:] != labels[:, :-1]
     edge[1:] |= labels[1:] != labels[:-1]

@@ -11,7 +11,12 @@ import numpy as np
 import torch
 
 from ambiguous_wild.core import Camera
-from ambiguous_wild.methods.refinesplat.multiview import Elsewhere, Hearsay, MultiViewConfig, discount
+from ambiguous_wild.methods.refinesplat.multiview import (
+    MultiViewConfig,
+    MultiViewEvidence,
+    OtherViews,
+    discount,
+)
 from ambiguous_wild.methods.refinesplat.structure import structure_residual, unrelated_residual
 from ambiguous_wild.vision.sparse_surface import seldom_seen
 
@@ -19,7 +24,7 @@ STATIC_QUANTILE = 0.25  # of a photo's pixels: static even where distractors cov
 
 
 class PixelEvidence:
-    """The structure residual of each view, discounted by what other views say of the same surface."""
+    """The structure residual of each view, discounted by other views' evidence about the same surface."""
 
     def __init__(
         self,
@@ -34,8 +39,8 @@ class PixelEvidence:
     ) -> None:
         self.photos = list(photos)
         self.config, self.base, self.least_alpha, self.memory = config, base, least_alpha, memory
-        self.elsewhere = Elsewhere(cameras, self.photos, config, surfaces)
-        # view: [h, w] uint8 of any size, 1 where too few others look for anything to be masked
+        self.other_views = OtherViews(cameras, self.photos, config, surfaces)
+        # view: [h, w] uint8 of any size, 1 where too few other views look, so that nothing is masked
         self.alone = {
             view: few.astype(np.uint8)
             for view, few in enumerate(seldom_seen(cameras, surfaces, config.seen_by))
@@ -48,7 +53,7 @@ class PixelEvidence:
 
     @property
     def unit(self) -> float:
-        """Residual that is normal in the scene: median over views; 0 before any was seen."""
+        """Normal residual of the scene: the median over views; 0 before any was seen."""
         return float(np.median([self.normal[v] for v in sorted(self.normal)])) if self.normal else 0.0
 
     def look(
@@ -59,9 +64,9 @@ class PixelEvidence:
         Args:
             view: which photo.
             image: [h, w, 3] render of its camera, any size.
-            alpha: [h, w] its opacity; below `least_alpha` nothing is learnt yet and nothing is evidence.
+            alpha: [h, w] its opacity; below `least_alpha` the model is not learnt yet: no evidence.
             depth: [h, w] sum of weight times z.
-            remember: whether other views hear of it.
+            remember: whether the evidence is stored for other views.
         """
         photo = self.photos[view]
         size = (photo.shape[1], photo.shape[0])
@@ -87,16 +92,16 @@ class PixelEvidence:
         return discount(evidence, others, unit, self.config) / unit
 
     def unseen(self, view: int) -> np.ndarray | None:
-        """Where too few others look for anything to be masked, [H, W] bool of the photo; None: nowhere."""
+        """Pixels that too few other views see, which are never masked, [H, W] bool; None: there are none."""
         if view not in self.alone:
             return None
         size = self.photos[view].shape[1::-1]
         return cv2.resize(self.alone[view], size, interpolation=cv2.INTER_NEAREST) > 0
 
     def ceiling(self, view: int, share: float, least: float = 0.0) -> float:
-        """That share of what unrelated content gives, in units, as `look` of the view divided by; 0 = inf.
+        """That share of the residual of unrelated pictures, in the unit that `look` divided by; 0 = inf.
 
-        Never below `least`: where hardly anything is learnt, that share is what every pixel has.
+        Never below `least`: while the model is hardly learnt, every pixel has such a residual.
         """
         if share <= 0 or self.unrelated <= 0:
             return math.inf
@@ -105,32 +110,34 @@ class PixelEvidence:
     def _unit(self, normal: float) -> float:
         return max(self.unit or normal, 1e-4)  # a perfect render of a synthetic scene has no noise at all
 
-    def _others(self, view: int, evidence: np.ndarray, depth: np.ndarray, remember: bool) -> Hearsay | None:
-        heard = self.elsewhere
-        before = heard.evidence.get(view), heard.depth.get(view)
-        heard.remember(view, evidence, depth)
-        others = heard.ask(view)
+    def _others(
+        self, view: int, evidence: np.ndarray, depth: np.ndarray, remember: bool
+    ) -> MultiViewEvidence | None:
+        others = self.other_views
+        before = others.evidence.get(view), others.depth.get(view)
+        others.remember(view, evidence, depth)
+        found = others.ask(view)
         if not remember:
-            for kept, old in zip((heard.evidence, heard.depth), before):
+            for kept, old in zip((others.evidence, others.depth), before):
                 if old is None:
                     del kept[view]
                 else:
                     kept[view] = old
-        return others
+        return found
 
     def state_dict(self) -> dict[str, Any]:
         return {
             "normal": {str(v): x for v, x in self.normal.items()},
             "before": {str(v): torch.from_numpy(x) for v, x in self.before.items()},
-            "evidence": {str(v): torch.from_numpy(x) for v, x in self.elsewhere.evidence.items()},
-            "depth": {str(v): torch.from_numpy(x) for v, x in self.elsewhere.depth.items()},
+            "evidence": {str(v): torch.from_numpy(x) for v, x in self.other_views.evidence.items()},
+            "depth": {str(v): torch.from_numpy(x) for v, x in self.other_views.depth.items()},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.normal = {int(v): float(x) for v, x in state["normal"].items()}
         self.before = {int(v): x.numpy() for v, x in state["before"].items()}
-        self.elsewhere.evidence = {int(v): x.numpy() for v, x in state["evidence"].items()}
-        self.elsewhere.depth = {int(v): x.numpy() for v, x in state["depth"].items()}
+        self.other_views.evidence = {int(v): x.numpy() for v, x in state["evidence"].items()}
+        self.other_views.depth = {int(v): x.numpy() for v, x in state["depth"].items()}
 
 
 def _resized(x: np.ndarray, size: tuple[int, int]) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""RefineSplat's mask policy: when masks are made and refreshed, what is learnt, what is saved."""
+"""RefineSplat's mask policy: when masks are made and refreshed, what is learnt and saved."""
 
 from __future__ import annotations
 
@@ -11,19 +11,20 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ambiguous_wild.methods.masking_common import PausingMask, upsampled
 from ambiguous_wild.methods.refinesplat import pictures
 from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.evidence import Judged, Maps, Masks, compare, silence
 from ambiguous_wild.methods.refinesplat.first_look import FirstLook, first_look
 from ambiguous_wild.methods.refinesplat.inputs import FrozenInputs
 from ambiguous_wild.methods.refinesplat.losses import consistency_loss, identity_loss, instance_matrix
-from ambiguous_wild.methods.refinesplat.on_device.maker import DeviceMasks, only_on_host
+from ambiguous_wild.methods.refinesplat.on_device.mask_builder import DeviceMasks, only_on_host
 from ambiguous_wild.methods.refinesplat.on_device.pixels import PixelEvidence as DevicePixelEvidence
 from ambiguous_wild.methods.refinesplat.on_host import HostMasks
 from ambiguous_wild.methods.refinesplat.pixels import PixelEvidence
 from ambiguous_wild.splat import device as devices
 from ambiguous_wild.splat.data import shrink_keep
-from ambiguous_wild.splat.parts import MaskPolicy, State
+from ambiguous_wild.splat.parts import State
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.backends import make_features, make_instances
 from ambiguous_wild.vision.protocols import Features, Instances
@@ -31,9 +32,10 @@ from ambiguous_wild.vision.segments import GraphSegments
 from ambiguous_wild.vision.sparse_surface import static_surfaces
 
 
-class RefineSplatMask(MaskPolicy):
+class RefineSplatMask(PausingMask):
     """Entropy-aware local and global masks, cached per view and refreshed as the render improves."""
 
+    config: RefineSplatConfig
     inputs: FrozenInputs
     masks: HostMasks | DeviceMasks  # makes and keeps them
 
@@ -47,29 +49,30 @@ class RefineSplatMask(MaskPolicy):
         self.features = features or make_features(config.features)
         self.instances = instances or _instances(config)
         self.visits: dict[int, int] = {}  # view: steps since masks began
-        self.last_reset = 0  # iteration, 0 = never
-        self.looks: dict[int, FirstLook] = {}  # view: what other photos say of it, where they can tell
+        self.looks: dict[int, FirstLook] = {}  # view: its comparison with other photos, if there is one
 
     def setup(self, data: TrainData) -> None:
         self.data = data
         self.inputs = FrozenInputs(data, self.features, self.instances, self.config)
         config = self.config
         if self._reads_identities:
-            _ = self.inputs.semantics  # part of what the method costs before its first step
+            _ = self.inputs.semantics  # computed now, as a cost of the method before its first step
         photos = [photo.cpu().numpy() for photo in data.photos]
         surfaces = static_surfaces(data.cameras, data.scene.points.xyz)
         if config.first_look.on:
             found = first_look(data.cameras, photos, surfaces, config.first_look)
             self.looks = {view: look for view, look in enumerate(found) if look is not None}
-        self.masks = self._maker(photos, surfaces)
-        # view: what counts before masks begin, [H, W] float32; none where everything does
+        self.masks = self._mask_builder(photos, surfaces)
+        # view: keep map before masks begin, [H, W] float32; absent if everything is kept
         self.first = {
             view: torch.from_numpy(keep.astype(np.float32)).to(data.device)
             for view, look in self.looks.items()
             if (keep := look.keep(photos[view].shape[:2])) is not None
         }
 
-    def _maker(self, photos: list[np.ndarray], surfaces: list[np.ndarray | None]) -> HostMasks | DeviceMasks:
+    def _mask_builder(
+        self, photos: list[np.ndarray], surfaces: list[np.ndarray | None]
+    ) -> HostMasks | DeviceMasks:
         data, inputs = self.data, self.inputs
         known = (
             self.config, photos, data.cameras, surfaces, self.looks, inputs.labels, inputs.static, data.device
@@ -78,16 +81,16 @@ class RefineSplatMask(MaskPolicy):
             setting = only_on_host(self.config)
             if setting is None:
                 return DeviceMasks(*known, tensors=data.photos)
-            warnings.warn(f"masks are made on the host, which the GPU waits for: {setting}", stacklevel=3)
+            warnings.warn(f"masks are made on the host, and the GPU waits for them: {setting}", stacklevel=3)
         return HostMasks(*known, compare=self.compare)
 
     def keep(self, step: Step) -> Tensor | None:
-        if not self._begun(step):
+        if not self.begun(step):
             first = self.first.get(step.view)
             return None if first is None else shrink_keep(first, step.divisor)
         visit = self.visits.get(step.view, 0)
         due = not self.masks.has(step.view) or visit % self.config.mask_every == 0
-        if due and not self._paused(step):
+        if due and not self.paused(step):
             self.masks.renew(step)
         self.visits[step.view] = visit + 1
         keep = self.masks.keep_of(step.view)
@@ -96,7 +99,7 @@ class RefineSplatMask(MaskPolicy):
     def cotangent(self, step: Step, keep: Tensor | None) -> Tensor | None:
         """d(lambda_id L_id + lambda_cr L_cr)/dimage through the frozen features and psi."""
         config = self.config
-        if not self.regularises() or not self._begun(step) or step.iteration % config.entropy_every:
+        if not self.regularises() or not self.begun(step) or step.iteration % config.entropy_every:
             return None
         if self.inputs.semantics.psi is None:
             return None
@@ -110,12 +113,9 @@ class RefineSplatMask(MaskPolicy):
         return self.config.lambda_id > 0 or self.config.lambda_cr > 0
 
     def predict(self, step: Step) -> Tensor | None:
-        if not self._begun(step):
+        if not self.begun(step):
             return None
         return shrink_keep(self.masks.predict(step), step.divisor)
-
-    def on_opacity_reset(self, step: Step) -> None:
-        self.last_reset = step.iteration
 
     def facts(self) -> dict[str, Any]:
         shares = self.shares
@@ -128,7 +128,7 @@ class RefineSplatMask(MaskPolicy):
             "masked_share_global": float(mean[2]),
             "t_ent_mean": float(finite.mean()) if len(finite) else None,
             "w2": self.w2,
-            # pictures look at identities that the training never read
+            # pictures may read identities that the training never used
             "identities": self.inputs.semantics.found.count if self._reads_identities else None,
         }
 
@@ -144,7 +144,7 @@ class RefineSplatMask(MaskPolicy):
 
     @property
     def pixels(self) -> PixelEvidence | DevicePixelEvidence:
-        """What photos and renders differ by, and what other views say of it."""
+        """Evidence at pixels, discounted by other views."""
         return self.masks.pixels
 
     @property
@@ -157,22 +157,12 @@ class RefineSplatMask(MaskPolicy):
         """View: its instances when its mask was last made."""
         return self.masks.judged
 
-    def _begun(self, step: Step) -> bool:
-        return step.nominal >= self.config.mask_start and step.iteration >= self.config.min_mask_start
-
-    def _paused(self, step: Step) -> bool:
-        if not self.last_reset:
-            return False
-        nominal_per_iteration = step.nominal / step.iteration
-        pause = max(self.config.reset_pause / nominal_per_iteration, self.config.min_reset_pause)
-        return step.iteration - self.last_reset < pause
-
     def examine(self, step: Step, *, remember: bool = False) -> tuple[Maps, Masks]:
         """The maps of the step's view and its masks at the photo's own size, as arrays.
 
         Args:
             step: of any train view.
-            remember: whether other views hear what this one shows; else nothing is kept.
+            remember: whether the evidence is stored for other views; else nothing is kept.
         """
         return self.masks.examine(step, remember=remember)
 
@@ -181,7 +171,7 @@ class RefineSplatMask(MaskPolicy):
         """Entropy and distances on the feature grid, from the step's render."""
         found, mask = self.inputs.semantics, self.config.mask
         features = self.inputs.features
-        image = _enlarge(step.rendered.image, self.data.photos[step.view])
+        image = upsampled(step.rendered.image, *self.data.photos[step.view].shape[:2])
         maps = compare(found.phi[step.view], features(image), found.psi, features.unit, mask)
         alpha = F.adaptive_avg_pool2d(step.rendered.alpha[None, None], maps.distance.shape)[0, 0]
         return silence(maps, (alpha < mask.least_alpha).cpu().numpy())
@@ -189,7 +179,7 @@ class RefineSplatMask(MaskPolicy):
     def _entropy_terms(self, image: Tensor, step: Step, keep: Tensor | None) -> Tensor:
         inputs, config = self.inputs.semantics, self.config
         assert inputs.psi is not None  # cotangent returned before
-        logits = inputs.psi(self.inputs.features(_enlarge(image, self.data.photos[step.view])))
+        logits = inputs.psi(self.inputs.features(upsampled(image, *self.data.photos[step.view].shape[:2])))
         h, w, channels = logits.shape
         flat = logits.reshape(-1, channels)
         weights = torch.ones(h * w, device=image.device)
@@ -208,7 +198,7 @@ class RefineSplatMask(MaskPolicy):
         return loss
 
     def panels(self, step: Step) -> dict[str, np.ndarray]:
-        return pictures.panels(self, step, begun=self._begun(step))
+        return pictures.panels(self, step, begun=self.begun(step))
 
     def draw(self, folder: Path) -> list[Path]:
         return pictures.draw_entropies(self, folder)
@@ -229,16 +219,6 @@ class RefineSplatMask(MaskPolicy):
         self.last_reset = int(state["last_reset"])
         if state["psi"] is not None and self.inputs.semantics.psi is not None:
             self.inputs.semantics.psi.load_state_dict(state["psi"])
-
-
-def _enlarge(image: Tensor, like: Tensor) -> Tensor:
-    """A render [h, w, 3] at the size of the photo `like` [H, W, 3], bilinear."""
-    if image.shape[:2] == like.shape[:2]:
-        return image
-    chw = image.permute(2, 0, 1)[None]
-    return F.interpolate(chw, size=tuple(like.shape[:2]), mode="bilinear", align_corners=False)[0].permute(
-        1, 2, 0
-    )
 
 
 def _instances(config: RefineSplatConfig) -> Instances:

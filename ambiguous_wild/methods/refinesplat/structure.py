@@ -1,7 +1,7 @@
-"""Where photo and render differ in colour and in structure: evidence of a distractor at every pixel.
+"""Evidence of a distractor at every pixel: photo and render differ in colour and in structure.
 
 A render that is not sharp yet differs from its photo in fine texture, but its structure still correlates
-with the photo's; where something else stands, it does not. On 30 simulated photos against renders of an
+with the photo's; at a distractor it does not. On 30 simulated photos against renders of an
 unmasked model (600, 3000 iterations), the best IoU of one threshold was 0.74 and 0.82 for the residual
 alone, 0.65 and 0.75 for the correlation alone, 0.78 and 0.83 for the product, 0.68 and 0.75 for the distance
 of Lab + HOG.
@@ -26,7 +26,7 @@ def structure_residual(photo: np.ndarray, render: np.ndarray, base: float = 0.3)
     Args:
         photo: [H, W, 3] float32 in [0, 1].
         render: of the same camera, same size.
-        base: what is left of the residual where the structure agrees perfectly.
+        base: factor of the residual where the structure agrees perfectly.
     """
     residual = _box(mean_difference(photo, render), RESIDUAL_BOX)
     return residual * (1.0 + base - correlation(photo @ GREY, render @ GREY))
@@ -39,11 +39,11 @@ def mean_difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def unrelated_residual(photos: Sequence[np.ndarray], base: float = 0.3) -> float:
-    """What `structure_residual` gives where two pictures have nothing to do with each other.
+    """The `structure_residual` of two unrelated pictures.
 
     Median over pixels, then over photos, of each photo against the mirror image of another one: same place,
-    same light, other content. An absolute scale that no render has a part in, so it holds where nothing is
-    learnt well: before a crowd even "normal" residuals are large.
+    same light, other content. The scale does not depend on any render, so it also holds where little is
+    learnt: behind a crowd even "normal" residuals are large.
 
     Args:
         photos: [H, W, 3] float32 in [0, 1] each, sizes may differ.
@@ -61,8 +61,8 @@ def unrelated_residual(photos: Sequence[np.ndarray], base: float = 0.3) -> float
 def correlation(a: np.ndarray, b: np.ndarray, box: int = STRUCTURE_BOX) -> np.ndarray:
     """Normalised cross-correlation of grey images [H, W] over boxes, in [-1, 1].
 
-    1 where both are plain, near 0 where one of them is: a plain coat before a textured wall has no structure
-    in common with it, though nothing in it contradicts the wall's.
+    1 where both are plain, near 0 where one of them is: a plain coat in front of a textured wall shares no
+    structure with it.
     """
     mean_a, mean_b = _box(a, box), _box(b, box)
     # differences of nearly equal float32 sums may come out below zero

@@ -1,9 +1,8 @@
-"""Which Gaussians the kept pixels vouch for.
+"""Gaussians that no kept pixel supports.
 
-A Gaussian that stands behind a mask in every photo that has it in its frame is never corrected: whatever
-it has become stays, and a view between those photos shows it as a dark blotch in mid-air. What nobody
-vouches for is removed; where it was right, the hole it leaves is no evidence for a mask (`least_alpha`) and
-is learnt anew.
+A Gaussian that is masked in every photo whose frame contains it is never corrected; a view between those
+photos shows it as a dark blotch in mid-air. Such Gaussians are removed. If one was right, the hole it leaves
+is no evidence for a mask (`least_alpha`) and is learnt again.
 """
 
 from __future__ import annotations
@@ -18,17 +17,17 @@ from torch import Tensor
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.splat import device as devices
-from ambiguous_wild.splat.cuda import on_device
 from ambiguous_wild.splat.density import rotation_matrices
 from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.gpu.render import on_device
 
 
 @dataclass(frozen=True)
 class SupportConfig:
-    """When a Gaussian counts as vouched for by nobody."""
+    """When a Gaussian counts as unsupported."""
 
-    least_share: float = 0.1  # of the looks it must reach a kept pixel; 0 = never removed (printed)
-    looks: int = 8  # with its centre in the frame before it is judged
+    least_share: float = 0.1  # of the looks must reach a kept pixel; 0 = never removed (printed)
+    looks: int = 8  # with its centre in the frame, before it is judged
     every: int = 4  # iterations between looks
 
     def __post_init__(self) -> None:
@@ -45,7 +44,7 @@ class Support:
         self.kept = torch.zeros(0)  # [N]
 
     def due(self, iteration: int) -> bool:
-        """Whether this iteration is looked at."""
+        """Whether this iteration counts."""
         return self.config.least_share > 0 and iteration % self.config.every == 0
 
     def look(self, gaussians: Gaussians, visible: Tensor, camera: Camera, keep: Tensor | None) -> None:
@@ -61,29 +60,29 @@ class Support:
             self._look_at_all(gaussians, visible, camera, keep)
             return
         rows = torch.nonzero(visible).squeeze(1)
-        inside, vouched = _on_kept(gaussians.means[rows], camera, keep)
+        inside, supported = _on_kept(gaussians.means[rows], camera, keep)
         self.looked[rows] += inside.to(self.looked.dtype)
-        hidden = rows[inside & ~vouched]
+        hidden = rows[inside & ~supported]
         if len(hidden):
-            # a large one is vouched for by its flanks too
+            # a large one is supported at its flanks too
             parts = gaussians.means[hidden], gaussians.quats[hidden], gaussians.log_scales[hidden]
-            vouched[inside & ~vouched] = _flank_on_kept(*parts, camera, keep)
-        self.kept[rows] += (inside & vouched).to(self.kept.dtype)
+            supported[inside & ~supported] = _flank_on_kept(*parts, camera, keep)
+        self.kept[rows] += (inside & supported).to(self.kept.dtype)
 
     def _look_at_all(
         self, gaussians: Gaussians, visible: Tensor, camera: Camera, keep: Tensor | None
     ) -> None:
-        """As `look` where the host must not ask which rows: all are computed, those not asked count 0."""
-        inside, vouched = _on_kept(gaussians.means, camera, keep)
+        """As `look` without reading rows on the host: all are computed, invisible ones count 0."""
+        inside, supported = _on_kept(gaussians.means, camera, keep)
         if keep is not None:
             parts = gaussians.means, gaussians.quats, gaussians.log_scales
-            vouched |= _flank_on_kept(*parts, camera, keep)
+            supported |= _flank_on_kept(*parts, camera, keep)
         inside &= visible
         self.looked += inside.to(self.looked.dtype)
-        self.kept += (inside & vouched).to(self.kept.dtype)
+        self.kept += (inside & supported).to(self.kept.dtype)
 
     def judge(self) -> Tensor:
-        """Who is to go, [N] bool; the evidence on those who were judged and stay counts half from now on."""
+        """Gaussians to remove, [N] bool; counts of judged ones that stay are halved."""
         judged = self.looked >= self.config.looks
         drop = judged & (self.kept < self.config.least_share * self.looked)
         half = torch.where(judged, 0.5, 1.0)
@@ -114,7 +113,7 @@ def _flank_on_kept(
     camera: Camera,
     keep: Tensor | None,
 ) -> Tensor:
-    """Whose flanks reach a kept pixel, one standard deviation along every axis, [N] bool."""
+    """Gaussians whose flanks, one standard deviation along every axis, reach a kept pixel, [N] bool."""
     axes = rotation_matrices(quats) * log_scales.exp()[:, None, :]
     ends = means[:, None, :] + torch.cat([axes, -axes], dim=2).transpose(1, 2)
     _, flanks = _on_kept(ends.reshape(-1, 3), camera, keep)
@@ -122,7 +121,7 @@ def _flank_on_kept(
 
 
 def _on_kept(points: Tensor, camera: Camera, keep: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Of points [N, 3] in the world: which the frame holds, and which lie on a kept pixel, [N] bool each."""
+    """Of world points [N, 3]: inside the frame, and on a kept pixel, [N] bool each."""
     if devices.accelerated(points.device):
         pose = on_device(camera, points.device).viewmat[0]
     else:

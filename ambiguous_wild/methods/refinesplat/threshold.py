@@ -3,7 +3,7 @@
 Printed: argmax_t (1 - w2) Ent(Hbar >= t) + w2 Ent(Hbar < t), Ent(X) = -sum x log x on raw values. That sum is
 additive over the two subsets, so for w2 < 1/2 the smallest value wins (everything is transient) and for
 w2 > 1/2 the largest (nothing is). The default normalises within each subset (Kapur's maximum entropy):
-q_i = x_i / sum x, Ent = -sum q_i log q_i. Both always cut the set in two, so values must also stand apart.
+q_i = x_i / sum x, Ent = -sum q_i log q_i. Both always divide the set in two, so a gate requires outliers.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ TEMPERATURE = 0.1  # nats, of the threshold that w2 is learnt through
 
 @dataclass(frozen=True)
 class Cut:
-    """Where the values of one photo are cut in two."""
+    """The threshold between static and transient values of one photo."""
 
-    threshold: float  # above: transient; inf = nothing stands apart
+    threshold: float  # above: transient; inf = no value is an outlier
     flagged: np.ndarray  # [K] bool
     floor: float  # the gate's own bound: the larger of median + gate * robust spread and `least`
 
@@ -43,7 +43,7 @@ def t_ent(
     """The threshold T_ent, or one of the two it is compared with, and the instances above it.
 
     Args:
-        values: Hbar of each instance; NaN is refused by the caller.
+        values: Hbar of each instance; without NaN.
         w2: weight of the lower subset, in (0, 1).
         form: `kapur` or `literal` (the printed objective) for T_ent; `hard` for T_hard, a fixed value;
             `statistics` for T_statistics, mean + standard deviation (DroneSplat's).
@@ -143,8 +143,8 @@ class LearntWeight:
     """w2 = sigmoid(theta), learnt through the soft threshold.
 
     The paper does not say how: an argmax has no gradient. Here soft memberships
-    m_j = sigmoid((Hbar_j - T) / spread) weigh each instance's residual, kept instances pay it and masked ones
-    pay `price` per pixel, so that masking everything is no solution.
+    m_j = sigmoid((Hbar_j - T) / spread) weight each instance: kept ones pay their residual, masked ones
+    a price of 1 per pixel, so that masking everything is no solution.
     """
 
     theta: float = 0.0
@@ -166,7 +166,7 @@ class LearntWeight:
         index = np.argsort(values, kind="stable")
         order = values[index]
         starts = np.flatnonzero((order > floor) & np.r_[False, np.diff(order) > 0])
-        if len(starts) < 2:  # w2 decides nothing
+        if len(starts) < 2:  # w2 has no influence
             return
         theta = torch.tensor(self.theta, dtype=torch.float64, requires_grad=True)
         x = torch.from_numpy(order)
@@ -178,5 +178,5 @@ class LearntWeight:
         loss = (share * ((1 - member) * cost + member)).sum()
         (gradient,) = torch.autograd.grad(loss, theta)
         step = float(gradient.clamp(-1.0, 1.0)) if torch.isfinite(gradient) else 0.0
-        # normalised by nothing: the sign and size both mean something, the clip bounds them
+        # not normalised: sign and size both matter, the clip bounds them
         self.theta = float(np.clip(self.theta - self.rate * 50 * step, -THETA_LIMIT, THETA_LIMIT))

@@ -1,4 +1,4 @@
-"""Every hyper-parameter of RobustSplat in one place; values without a word beside them are the authors'."""
+"""Every hyper-parameter of RobustSplat in one place; values without a comment are the authors'."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ class RobustSplatConfig:
     lr_opacity: float = 0.025
     lambda_dssim: float = 0.2
     mask_start: float = 500.0
-    min_mask_start: int = 300  # a render of fewer iterations means nothing
+    min_mask_start: int = 300  # earlier renders show too little
     bootstrap: float = 20_000.0  # coarse supervision before, fine after
     coarse_divisor: int = 4  # of the render's side for the coarse residual
     coarse_render: Literal["render", "shrink"] = "render"  # a render of its own, or the full one shrunk
-    lower: float = 0.6  # share of residuals that is surely static
-    upper: float = 0.8  # and of those that may be
+    lower: float = 0.6  # share of residuals that are surely static
+    upper: float = 0.8  # share that may be static
     decay: float = 0.95  # of the running histogram
     bins: int = 10_000
     beta: float = 2000.0  # decay of the pull towards "all static"
@@ -57,7 +57,7 @@ class RobustSplatConfig:
     lambda_residual: float = 0.5
     threshold: float = 0.25  # kept above
     erosion: int = 7  # px, side of the min-pool
-    reset_pause: float = 300.0  # the net rests so long after an opacity reset
+    reset_pause: float = 300.0  # the net does not learn for so long after an opacity reset
     min_reset_pause: int = 200
 
     def __post_init__(self) -> None:
@@ -98,5 +98,5 @@ class RobustSplatConfig:
 
     @property
     def hand_made(self) -> bool:
-        """Whether the features are not a net's."""
+        """Whether the features come from no net."""
         return self.features.startswith("labhog")

@@ -21,7 +21,7 @@ class MaskNet(nn.Module):
     def __init__(self, mean: Tensor, std: Tensor, hidden: int, seed: int) -> None:
         """
         Args:
-            mean, std: [C], subtracted and divided by; zeros and ones leave the features as they are.
+            mean, std: [C], subtracted and divided by; zeros and ones change nothing.
             hidden: width.
             seed: of the weights, drawn as `nn.Linear` draws them.
         """
@@ -52,8 +52,8 @@ class MaskNet(nn.Module):
 def enlarged(z: Tensor, height: int, width: int) -> Tensor:
     """[h, w, C] to [height, width, C], bilinear with pixel centres kept in place (not align_corners).
 
-    Two products with small matrices: with many channels on the CPU a third of what `F.interpolate` and its
-    way back cost, and the same numbers to rounding.
+    Two products with small matrices: with many channels on the CPU a third of the cost of `F.interpolate`
+    and its backward pass, equal up to rounding.
     """
     h, w, channels = z.shape
     rows = _weights(h, height, z.dtype, z.device)
@@ -63,7 +63,7 @@ def enlarged(z: Tensor, height: int, width: int) -> Tensor:
 
 @cache
 def _weights(size: int, to: int, dtype: torch.dtype, place: torch.device) -> Tensor:
-    """[to, size]: how much of each value is in each enlarged one; rows sum to one. Copied there once."""
+    """[to, size]: weight of each value in each enlarged one; rows sum to one. Copied to the device once."""
     at = ((torch.arange(to, dtype=torch.float64) + 0.5) * (size / to) - 0.5).clamp(min=0.0)
     low = at.floor().long().clamp(max=size - 1)
     high = (low + 1).clamp(max=size - 1)
@@ -75,7 +75,7 @@ def _weights(size: int, to: int, dtype: torch.dtype, place: torch.device) -> Ten
 
 
 def adam_of(net: nn.Module, lr: float, place: torch.device) -> torch.optim.Adam:
-    """Adam on the net's parameters; on an accelerator one kernel, with the count of steps kept there."""
+    """Adam on the net's parameters; on an accelerator one kernel, which keeps the step count there."""
     return torch.optim.Adam(net.parameters(), lr=lr, fused=device.accelerated(place) or None)
 
 
@@ -86,11 +86,11 @@ def adam_state(optimiser: torch.optim.Adam) -> list[dict[str, Any]]:
 
 
 def load_adam_state(optimiser: torch.optim.Adam, rows: list[dict[str, Any]]) -> None:
-    """Put back what `adam_state` returned."""
+    """Restore what `adam_state` returned."""
     parameters = [p for group in optimiser.param_groups for p in group["params"]]
     fused = bool(optimiser.defaults["fused"])
     for parameter, row in zip(parameters, rows):
-        # Adam keeps the count of steps on the CPU, the fused one where the parameter is
+        # Adam keeps the count of steps on the CPU, the fused one on the parameter's device
         optimiser.state[parameter] = {
             k: v.clone() if k == "step" and not fused else v.clone().to(parameter) for k, v in row.items()
         }

@@ -1,4 +1,4 @@
-"""RobustSplat's mask policy: a net on frozen features, taught coarse to fine by agreement with renders."""
+"""RobustSplat's mask policy: a net on frozen features, taught coarse to fine from agreement with renders."""
 
 from __future__ import annotations
 
@@ -11,34 +11,30 @@ from torch import Tensor
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.io.palette import MASKED, faded, ramp, tint
-from ambiguous_wild.methods.later import later
+from ambiguous_wild.methods.deferred import deferred
+from ambiguous_wild.methods.masking_common import MaskedShares, PausingMask, upsampled
 from ambiguous_wild.methods.robustsplat import supervision
 from ambiguous_wild.methods.robustsplat.config import RobustSplatConfig
 from ambiguous_wild.methods.robustsplat.net import MaskNet, adam_of, adam_state, load_adam_state
 from ambiguous_wild.splat.data import shrink, shrink_camera
-from ambiguous_wild.splat.parts import MaskPolicy, State
-from ambiguous_wild.splat.render import render
+from ambiguous_wild.splat.parts import State
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.backends import make_features, parse
+from ambiguous_wild.vision.precompute import photo_features
 from ambiguous_wild.vision.protocols import Features
-from ambiguous_wild.vision.stage import photo_features
 
 
-class RobustSplatMask(MaskPolicy):
-    """The net learns every iteration from mask_start on; its map, cut and eroded, is the keep map."""
+class RobustSplatMask(PausingMask):
+    """The net learns every iteration from mask_start on; its map, thresholded and eroded, is the keep map."""
 
-    def __init__(self, config: RobustSplatConfig, sh_every: float = 1000.0, sh_degree: int = 3) -> None:
-        """
-        Args:
-            config: the method's options.
-            sh_every, sh_degree: of the host's schedule, for the coarse render.
-        """
-        self.config, self.sh_every, self.sh_degree = config, sh_every, sh_degree
+    config: RobustSplatConfig
+
+    def __init__(self, config: RobustSplatConfig) -> None:
+        self.config = config
         self.fine: Features = make_features(config.features)
         self.coarse: Features = make_features(config.coarse_features or coarse_spec(config))
         self.histogram = torch.zeros(config.bins, dtype=torch.float64)
-        self.last_reset = 0  # iteration, 0 = never
-        self.shares: dict[int, float | Tensor] = {}  # view: share masked when it was last seen
+        self.shares = MaskedShares()
         self.loss_sum: float | Tensor = 0.0  # of the mask loss
         self.loss_count = 0.0
         self._coarse_cameras: dict[int, tuple[Camera, Camera]] = {}  # view: a step's, and its coarse one
@@ -56,9 +52,9 @@ class RobustSplatMask(MaskPolicy):
         self.optimiser = adam_of(self.net, self.config.net_lr, data.device)
 
     def keep(self, step: Step) -> Tensor | None:
-        if not self._begun(step):
+        if not self.begun(step):
             return None
-        if self._paused(step):
+        if self.paused(step):
             keep = self._cut(self._map(step))
         else:
             with torch.enable_grad():
@@ -68,20 +64,16 @@ class RobustSplatMask(MaskPolicy):
                 loss.backward()
             keep = self._cut(mask.detach())  # of the net before this step, as the authors have it
             self.optimiser.step()
-            self.loss_sum, self.loss_count = self.loss_sum + later(loss), self.loss_count + 1
-        self.shares[step.view] = later(1.0 - keep.mean())
+            self.loss_sum, self.loss_count = self.loss_sum + deferred(loss), self.loss_count + 1
+        self.shares.take(step.view, keep)
         return keep
 
     def predict(self, step: Step) -> Tensor | None:
-        return self._cut(self._map(step)) if self._begun(step) else None
-
-    def on_opacity_reset(self, step: Step) -> None:
-        self.last_reset = step.iteration
+        return self._cut(self._map(step)) if self.begun(step) else None
 
     def facts(self) -> dict[str, Any]:
-        shares = [float(self.shares[view]) for view in sorted(self.shares)]
         return {
-            "masked_share": sum(shares) / len(shares) if shares else 0.0,
+            "masked_share": self.shares.mean(),
             "mask_loss_mean": float(self.loss_sum) / self.loss_count if self.loss_count else None,
             "features": self.fine.name,
         }
@@ -92,7 +84,7 @@ class RobustSplatMask(MaskPolicy):
         masked = self._cut(mask).cpu().numpy() < 0.5
         stage = "coarse" if step.nominal < self.config.bootstrap else "fine"
         photo = faded((step.photo.cpu().numpy() * 255 + 0.5).astype(np.uint8))
-        used = "" if self._begun(step) else ", not used yet"
+        used = "" if self.begun(step) else ", not used yet"
         return {
             f"disagreement, {stage}": ramp(1.0 - self._target(step).cpu().numpy(), 0.0, 1.0),
             "the net": ramp(1.0 - mask.cpu().numpy(), 0.0, 1.0),
@@ -134,8 +126,8 @@ class RobustSplatMask(MaskPolicy):
         """T_cos [H, W] of the render, coarse before the switch and fine after."""
         early = step.nominal < self.config.bootstrap
         features, phi = (self.coarse, self.phi_coarse) if early else (self.fine, self.phi)
-        full = self.data.cameras[step.view]  # not the photo: it need not lie on the device
-        image = _enlarge(step.rendered.image.detach(), full.height, full.width)
+        full = self.data.cameras[step.view]  # not the photo, which may not be on the device
+        image = upsampled(step.rendered.image.detach(), full.height, full.width)
         seen = features(self._coarse_picture(image) if early else image)
         cosine = F.cosine_similarity(phi[step.view], seen, dim=2)
         if self._calibrate:
@@ -143,7 +135,7 @@ class RobustSplatMask(MaskPolicy):
         return supervision.resized(supervision.cosine_target(cosine), *step.photo.shape[:2])
 
     def _bounds(self, step: Step) -> tuple[Tensor, Tensor]:
-        """Lower and upper bound [H, W]; the running histogram takes this step's residuals in first."""
+        """Lower and upper bound [H, W]; this step's residuals enter the running histogram first."""
         config = self.config
         if step.nominal < config.bootstrap:
             e = supervision.residual(shrink(step.photo, config.coarse_divisor), self._coarse_render(step))
@@ -167,11 +159,10 @@ class RobustSplatMask(MaskPolicy):
         if known is None or known[0] is not step.camera:  # a renderer copies a camera it has not met
             known = (step.camera, shrink_camera(step.camera, config.coarse_divisor))
             self._coarse_cameras[step.view] = known
-        degree = min(int(step.nominal // self.sh_every), self.sh_degree, step.gaussians.sh_degree)
-        return render(step.gaussians, known[1], sh_degree=degree).image.detach()
+        return step.draw(camera=known[1]).image.detach()
 
     def _coarse_picture(self, image: Tensor) -> Tensor:
-        """What coarse features see: hand-made ones a smaller picture, nets resize by themselves."""
+        """The input of coarse features: a smaller picture for hand-made ones; nets resize by themselves."""
         if not self.config.hand_made:
             return image
         share = self.config.coarse_share
@@ -185,7 +176,7 @@ class RobustSplatMask(MaskPolicy):
         return self.config.cosine == "calibrated" or (self.config.cosine == "auto" and self.config.hand_made)
 
     def _inputs(self, phi: Tensor) -> Tensor:
-        """What the net sees of a photo, [h, w, C']: its features, and hand-made ones averaged more widely."""
+        """The net's input of a photo, [h, w, C']: features; hand-made ones also averaged more widely."""
         if not self.config.net_context:
             return phi
         maps = phi.permute(2, 0, 1)[None]
@@ -207,14 +198,9 @@ class RobustSplatMask(MaskPolicy):
 
     # -- when -------------------------------------------------------------------------------------
 
-    def _begun(self, step: Step) -> bool:
-        return step.nominal >= self.config.mask_start and step.iteration >= self.config.min_mask_start
-
-    def _paused(self, step: Step) -> bool:
-        if not self.last_reset:
-            return False
-        pause = max(self.config.reset_pause * step.iteration / step.nominal, self.config.min_reset_pause)
-        return step.iteration - self.last_reset < pause
+    def pause_iterations(self, step: Step) -> float:
+        # multiplied first: the last bit decides whether some runs of over 20 000 iterations rest one more
+        return self.config.reset_pause * step.iteration / step.nominal
 
     # -- state ------------------------------------------------------------------------------------
 
@@ -224,7 +210,7 @@ class RobustSplatMask(MaskPolicy):
             "adam": adam_state(self.optimiser),
             "histogram": self.histogram,
             "last_reset": self.last_reset,
-            "shares": {str(view): float(share) for view, share in self.shares.items()},
+            "shares": self.shares.state_dict(),
             "losses": [float(self.loss_sum), self.loss_count],
         }
 
@@ -234,7 +220,7 @@ class RobustSplatMask(MaskPolicy):
         load_adam_state(self.optimiser, state["adam"])
         self.histogram = state["histogram"].to(self.data.device)
         self.last_reset = int(state["last_reset"])
-        self.shares = {int(view): float(share) for view, share in state["shares"].items()}
+        self.shares = MaskedShares.from_state(state["shares"])
         self.loss_sum, self.loss_count = state["losses"]
 
 
@@ -245,11 +231,3 @@ def coarse_spec(config: RobustSplatConfig) -> str:
     found = parse(config.features)
     head = f"{found.name}@{round((found.size or 504) * config.coarse_share)}"
     return head + "".join(f",{key}={value}" for key, value in found.options.items())
-
-
-def _enlarge(image: Tensor, height: int, width: int) -> Tensor:
-    """A render [h, w, 3] at [height, width, 3], the size of its photo, bilinear."""
-    if image.shape[:2] == (height, width):
-        return image
-    chw = image.permute(2, 0, 1)[None]
-    return F.interpolate(chw, size=(height, width), mode="bilinear", align_corners=False)[0].permute(1, 2, 0)

@@ -1,11 +1,12 @@
 """RobustSplat as a recipe of parts.
 
 Source: "RobustSplat: Decoupling Densification and Dynamics for Transient-Free 3DGS", ICCV 2025
-(arXiv 2506.02751) and its released code. Growth and opacity resets wait until the static scene and a mask
-stand; a per-pixel net on frozen features is taught by agreement with renders, first at a low scale.
+(arXiv 2506.02751) and its released code. Densification and opacity resets wait until the static
+scene and the masks are stable; a per-pixel net on frozen features learns from the agreement of photos with
+renders, first at a low scale.
 
 With weights the published form is `features=dinov2-small-registers@504,normalise=raw`. Without, the features
-are hand-made (Lab and HOG); what that changes is marked "auto" in `config.py`.
+are hand-made (Lab and HOG); settings that change with that are "auto" in `config.py`.
 """
 
 from __future__ import annotations
@@ -19,13 +20,10 @@ Config = RobustSplatConfig
 
 def build(options: RobustSplatConfig) -> Parts:
     """Mask net, delayed growth, both pictures masked before SSIM; the rest of the loop is 3DGS."""
-    schedule = Schedule(lr_opacity=options.lr_opacity)
-    degree = 3
     return Parts(
-        mask=RobustSplatMask(options, schedule.sh_every, degree),
+        mask=RobustSplatMask(options),
         density_config=options.density,
-        schedule=schedule,
+        schedule=Schedule(lr_opacity=options.lr_opacity),
         lambda_dssim=options.lambda_dssim,
         weighting="images",
-        sh_degree=degree,
     )

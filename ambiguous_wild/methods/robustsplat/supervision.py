@@ -1,4 +1,4 @@
-"""What RobustSplat's mask net learns from: the cosine target, residual bounds, and its loss. Pure functions.
+"""The targets and the loss of RobustSplat's mask net: cosine target, residual bounds. Pure functions.
 
 Maps are [H, W] float32, 1 = static.
 """
@@ -20,10 +20,10 @@ def cosine_target(cosine: Tensor) -> Tensor:
 
 
 def calibrated(cosine: Tensor, unit: float, normal: float) -> Tensor:
-    """The cosine over its whole range: 0 at a distance of `normal` units of nuisance, -1 from twice that.
+    """The cosine stretched to its whole range: 0 at a distance of `normal` units, -1 from twice that.
 
-    Hand-made features are all alike: their cosine stays above 0.99, where the published target is 1
-    everywhere. `unit` is the cosine distance that blur and noise alone make (`Features.unit`).
+    Cosines of hand-made features stay above 0.99, where the published target is 1 everywhere. The unit is
+    the cosine distance that blur and noise alone make (`Features.unit`).
     """
     return 1.0 - ((1.0 - cosine) / (unit * normal)).clamp(0.0, 2.0)
 
@@ -37,23 +37,23 @@ def update_histogram(histogram: Tensor, values: Tensor, decay: float) -> Tensor:
     """h <- decay h + hist(values); `histogram` [bins] float64 over [0, 1], values in [0, 1]."""
     bins = len(histogram)
     index = (values.reshape(-1).double() * bins).long().clamp(0, bins - 1)
-    if device.accelerated(histogram.device):  # bincount has the host read the largest index
+    if device.accelerated(histogram.device):  # bincount reads the largest index on the host
         ones = torch.ones_like(index, dtype=histogram.dtype)
         return decay * histogram + torch.zeros_like(histogram).scatter_add_(0, index, ones)
     return decay * histogram + torch.bincount(index, minlength=bins).double()
 
 
 def percentile(histogram: Tensor, share: float) -> float | Tensor:
-    """The smallest bin edge below which at least `share` of everything lies; 1 for an empty histogram.
+    """The smallest bin edge with at least `share` of all counts below it; 1 for an empty histogram.
 
-    A 0-d tensor on an accelerator, so that the host need not know it.
+    A 0-d tensor on an accelerator, so that the host does not wait for it.
     """
     if device.accelerated(histogram.device):
         return _percentile_there(histogram, share)
     total = float(histogram.sum())
     if total <= 0:
         return 1.0
-    # a share of rounding below the target, so that 0.6 of 10 equal counts is six of them
+    # a little below the target for rounding, so that 0.6 of 10 equal counts is six of them
     reached = torch.cumsum(histogram, 0) >= share * total * (1.0 - 1e-12)
     return (int(torch.nonzero(reached)[0]) + 1) / len(histogram)
 
@@ -66,7 +66,7 @@ def _percentile_there(histogram: Tensor, share: float) -> Tensor:
 
 
 def bound(e: Tensor, threshold: float | Tensor) -> Tensor:
-    """1 where e < threshold, or where more than half of the 3x3 neighbourhood is; zeros beyond the border."""
+    """1 where e < threshold for the pixel or for over half of its 3x3 neighbourhood; outside counts as 0."""
     inlier = (e < threshold).float()
     near = F.avg_pool2d(inlier[None, None], 3, stride=1, padding=1)[0, 0]
     return ((inlier > 0) | (near > 0.5)).float()
@@ -93,7 +93,7 @@ def mask_loss(
 ) -> Tensor:
     """0.5 mean|M - T_cos| + 0.5 mean(relu(M - u) + relu(l - M)) + 2 exp(-it / beta) mean(1 - M).
 
-    The authors' last term, 0.5 max|W1| max|W2|, is made from detached weights: a constant, left out.
+    The authors' last term, 0.5 max|W1| max|W2|, is made from detached weights, hence constant and left out.
     """
     pull = lambda_pull * math.exp(-nominal / beta)
     bounds = (F.relu(mask - upper) + F.relu(lower - mask)).mean()

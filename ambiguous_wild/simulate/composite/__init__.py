@@ -1,1 +1,1 @@
-"""Distractors with exact masks on a scene of real photographs."""
+"""Distractors with exact masks, added to a scene of real photos."""

@@ -1,4 +1,4 @@
-"""Cut-outs: pictures whose alpha is the mask, or shapes filled with a piece of the scene itself."""
+"""Cut-outs: images whose alpha is the mask, or shapes filled with a window of a photo."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.simulate.atlas import srgb_to_linear
 
-SMALLEST_PX = 8  # a shorter side holds no shape
-LARGEST_PX = 1200  # more than any photo shows of one; larger files are read and reduced
+SMALLEST_PX = 8  # shorter side
+LARGEST_PX = 1200  # longer side; larger files are reduced
 _BLOB_PX = 200
 _BLOBS = 3
 
 
 @dataclass(frozen=True)
 class Cutout:
-    """One thing that moves from photo to photo."""
+    """One distractor image."""
 
     name: str
     light: (
         np.ndarray
     )  # [h, w, 4] float32: linear RGB times alpha, and alpha in [0, 1]; transparent rim of 1 px
-    source: str = ""  # sha256 of the file it is from, "" where it is drawn
+    source: str = ""  # sha256 of its file, "" where it was drawn
 
     @property
     def aspect(self) -> float:
@@ -37,7 +37,7 @@ class Cutout:
 
     @property
     def filled(self) -> float:
-        """Share of its rectangle that alpha covers."""
+        """Share of the rectangle that alpha covers."""
         return float(self.light[..., 3].mean())
 
     def reduced(self, height: int) -> Cutout:
@@ -53,7 +53,7 @@ def read_cutouts(folder: Path | str) -> list[Cutout]:
     """All PNG files of the folder, ordered by name.
 
     Raises:
-        AwError: no folder, no PNG in it, or files whose alpha says nothing.
+        AwError: no folder, no PNG in it, or files whose alpha holds no shape.
     """
     root = Path(folder)
     if not root.is_dir():
@@ -66,13 +66,13 @@ def read_cutouts(folder: Path | str) -> list[Cutout]:
     if flat:
         raise AwError(
             f"{len(flat)} of {len(paths)} cut-outs in {root} have no shape in alpha: {shortlist(flat)}; "
-            "cut the thing out (alpha 0 around it) or take the file away"
+            "make the background transparent (alpha 0) or remove the file"
         )
     return [Cutout(p.stem, premultiplied(i), sha256_file(p)) for p, i in images.items() if i is not None]
 
 
 def premultiplied(rgba: np.ndarray) -> np.ndarray:
-    """sRGB with alpha to linear light times alpha, with a transparent rim so that edges stay soft.
+    """sRGB with alpha to linear light times alpha, with a transparent rim for soft edges.
 
     Args:
         rgba: [H, W, 4] float32 in [0, 1], not premultiplied.
@@ -83,7 +83,7 @@ def premultiplied(rgba: np.ndarray) -> np.ndarray:
 
 
 def _read_rgba(path: Path) -> np.ndarray | None:
-    """[H, W, 4] float32 in [0, 1], cropped to what is visible; None where alpha holds no shape."""
+    """[H, W, 4] float32 in [0, 1], cropped to the visible part; None where alpha holds no shape."""
     read_png_rgb(path)  # its errors name the file and what to do
     pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
     if (
@@ -119,7 +119,7 @@ def _read_rgba(path: Path) -> np.ndarray | None:
 
 
 def blobs(rng: np.random.Generator) -> list[Cutout]:
-    """Rounded shapes without colour, to be filled with texture."""
+    """Rounded shapes to be filled with texture."""
     made = []
     grid = (np.arange(_BLOB_PX) + 0.5) / _BLOB_PX * 2 - 1
     angle, radius = np.arctan2(grid[:, None], grid[None]), np.hypot(grid[:, None], grid[None])
@@ -138,10 +138,10 @@ def filled(
     corner: Sequence[int],  # row and column of the window in the photo
     size: tuple[int, int],  # height and width of the window, px
 ) -> Cutout:
-    """The shape cut out of a window of a photo: it has the scene's own colours and texture."""
+    """The shape filled with a window of a photo."""
     (top, left), (height, width) = corner, size
     window = photo[top : top + height, left : left + width].astype(np.float32) / 255
-    # Reduced shapes keep their alpha's mean; enlarged ones stay smooth.
+    # Area averaging keeps the mean of alpha; linear interpolation keeps edges smooth.
     how = cv2.INTER_AREA if height < shape.light.shape[0] else cv2.INTER_LINEAR
     alpha = cv2.resize(np.ascontiguousarray(shape.light[..., 3]), (width, height), interpolation=how)
     name = f"patch {shape.name}"

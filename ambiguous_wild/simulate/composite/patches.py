@@ -1,4 +1,4 @@
-"""Shapes filled with texture from another place of the scene: its own colours, by construction."""
+"""Shapes filled with texture of the scene, so that they have its colours."""
 
 from __future__ import annotations
 
@@ -10,33 +10,33 @@ import numpy as np
 
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.simulate.composite.cutouts import SMALLEST_PX, Cutout, filled
-from ambiguous_wild.simulate.composite.placing import CompositeConfig, Site
+from ambiguous_wild.simulate.composite.placement import CompositeConfig, VisiblePoints
 
-_LARGEST = 0.6  # of the photo's sides: no window is larger
+_LARGEST = 0.6  # of the photo's sides: largest window
 
 
 def cut_patches(
     shapes: Sequence[Cutout],
-    places: Sequence[Site],
+    sites: Sequence[VisiblePoints],
     pictures: Mapping[str, Path],
     config: CompositeConfig,
     rng: np.random.Generator,
 ) -> tuple[list[Cutout], dict[int, np.ndarray], dict[int, np.ndarray]]:
-    """Fill every shape from a window of a train photo, about as large as the shape will be seen.
+    """Fill every shape from a window of a train photo, about as large as the shape will appear.
 
     Args:
-        shapes: cut-outs of which the alpha counts.
-        places: from `sites`; windows are cut from their photos.
-        pictures: by the view's name, its largest picture.
-        config: coverage and presence, from which the size follows.
-        rng: where the seed enters.
+        shapes: cut-outs; only their alpha is used.
+        sites: from `visible_points`; windows are cut from their photos.
+        pictures: view name -> its largest image file.
+        config: coverage and presence, which give the size.
+        rng: source of randomness.
 
     Returns:
-        The patches; per index the mean CIELAB colour [3]; per index the world position it is from [3].
+        The patches; by index the mean CIELAB colour [3]; by index the world position of the window [3].
     """
     patches, colours, origins = [], {}, {}
     for k, shape in enumerate(shapes):
-        site = places[int(rng.integers(len(places)))]
+        site = sites[int(rng.integers(len(sites)))]
         photo = read_png_rgb(pictures[site.view.name])
         height, width = _window(shape, photo.shape, config, len(shapes))
         top = int(rng.integers(0, photo.shape[0] - height + 1))
@@ -52,7 +52,7 @@ def cut_patches(
 
 
 def _window(shape: Cutout, photo: tuple[int, ...], config: CompositeConfig, count: int) -> tuple[int, int]:
-    """Height and width of the window, px: the area that one of `count` things will cover."""
+    """Height and width of the window, px: the area that one of `count` patches will cover."""
     area = config.coverage * photo[0] * photo[1] / (count * config.presence)
     height = np.sqrt(area / (shape.aspect * shape.filled))
     shrink = min(1.0, _LARGEST * photo[0] / height, _LARGEST * photo[1] / (height * shape.aspect))

@@ -51,7 +51,7 @@ _ONE = np.float32(1.0)
 
 # Columns of a row of sums: h = e dL/dalpha where nothing is clamped, u and dy as in project.py.
 SUM_H, SUM_U, SUM_UU, SUM_Y, SUM_UY, SUM_YY, SUM_RED, SUM_GREEN, SUM_BLUE, SUM_DEPTH = range(10)
-EXTRA_U, EXTRA_Y, ABS_U, ABS_V = range(10, 14)
+EXTRA_U, EXTRA_Y, ABS_U, ABS_V, SUM_SQUARED, SUM_COUNT = range(10, 16)
 ROW = 16
 
 
@@ -179,11 +179,11 @@ def forward(
 @kernel
 def _backward_tile(
     records, slots, instances, begin, end, top, left, rows, planes, extra, with_extra, with_depth,
-    absolute, sums,
+    absolute, tally, sums,
 ):  # fmt: skip
     """Walk a tile's list back to front; planes = (T, last, behind, cotangents of red, green, blue,
     alpha, depth). `extra` = (behind, red, green, blue) of the second cotangent. What is None of `with_extra`,
-    `with_depth` and `absolute` is compiled away.
+    `with_depth`, `absolute` and `tally` is compiled away.
     """
     transmittance, last, behind, d_red, d_green, d_blue, d_alpha, depths = planes
     lanes = lane_centres()
@@ -221,6 +221,8 @@ def _backward_tile(
         x_y = zero
         a_u = zero
         a_v = zero
+        squares = zero
+        pixels = zero
         for y in range(low, high):
             if k - begin > furthest[y]:
                 continue
@@ -256,6 +258,13 @@ def _backward_tile(
                 a_u = a_u + magnitude(hu_main)
                 # dsigma/dv apart from constants that the reduction multiplies in.
                 a_v = a_v + magnitude(fma(hu_main, curve_x * slant, h * (-curve_y * dy)))
+            if tally is not None:
+                hu_one = h * u
+                # as above, and dsigma/du with the same constants left out
+                along_u = hu_one * curve_x
+                along_v = fma(hu_one, curve_x * slant, h * (-curve_y * dy))
+                squares = squares + fma(along_u, along_u, along_v * along_v)
+                pixels = pixels + select(drawn, _ONE, _ZERO)
             if with_extra is not None:
                 red2 = load(extra[1], at)
                 green2 = load(extra[2], at)
@@ -281,15 +290,18 @@ def _backward_tile(
             s_green = fma(weight, green, s_green)
             s_blue = fma(weight, blue, s_blue)
         row = sum_lanes(
-            (s_h, s_u, s_uu, s_y, s_uy, s_yy, s_red, s_green, s_blue, s_depth, x_u, x_y, a_u, a_v)
-        )
+            (
+                s_h, s_u, s_uu, s_y, s_uy, s_yy, s_red, s_green, s_blue, s_depth, x_u, x_y, a_u, a_v,
+                squares, pixels,
+            )
+        )  # fmt: skip
         store(sums, instances[k] * ROW, row)
 
 
 @kernel
 def _backward_worker(
     worker, records, tile_slots, tile_instances, starts, tile_order, workers, width, height, background, kept,
-    d_image, d_alpha, d_depth, d_extra, absolute, sums,
+    d_image, d_alpha, d_depth, d_extra, absolute, tally, sums,
 ):  # fmt: skip
     columns = (width + TILE - 1) // TILE
     planes = (
@@ -349,25 +361,25 @@ def _backward_worker(
                     extra[0][at] = planes[0][at] * shade
         _backward_tile(
             records, tile_slots, tile_instances, starts[tile], starts[tile + 1], top, left, rows,
-            planes, extra, d_extra, d_depth, absolute, sums,
+            planes, extra, d_extra, d_depth, absolute, tally, sums,
         )  # fmt: skip
 
 
 @parallel_kernel
 def backward(
     records, tile_slots, tile_instances, starts, tile_order, workers, width, height, background, kept,
-    d_image, d_alpha, d_depth, d_extra, absolute, sums,
+    d_image, d_alpha, d_depth, d_extra, absolute, tally, sums,
 ):  # fmt: skip
     """Row of sums of every (tile, Gaussian).
 
     Args:
         d_image: [H, W, 3]; d_alpha, d_depth: [H, W] or None; d_extra: [H, W, 3] or None.
-        absolute: True or None.
+        absolute, tally: True or None; a tally is squared sums and pixel counts.
         sums: [I * 16] float32 out, row `tile_instances[k]` for list entry k.
         others: as in `forward`.
     """
     for worker in numba.prange(workers):
         _backward_worker(
             worker, records, tile_slots, tile_instances, starts, tile_order, workers, width, height,
-            background, kept, d_image, d_alpha, d_depth, d_extra, absolute, sums,
+            background, kept, d_image, d_alpha, d_depth, d_extra, absolute, tally, sums,
         )  # fmt: skip

@@ -16,7 +16,7 @@ from typing import Any
 import numba
 from numba.extending import intrinsic as _intrinsic
 
-from ambiguous_wild.io.compiled import forgiving
+from ambiguous_wild.io.numba_cache import rebuild_damaged_cache as forgiving
 from ambiguous_wild.splat.cpu.cache import kernel_cache
 
 LAYERS = ["omp", "tbb", "workqueue"]  # the first that is there

@@ -80,7 +80,7 @@ def direction_gradient(x, y, z, degree, d):
 
 
 @fused_kernel
-def _colours_chunk(first, stop, means, sh0, sh_rest, degree, centre, records, ids, radii):
+def _colours_chunk(first, stop, means, sh0, sh_rest, degree, centre, records, ids, radii, base):
     terms = (degree + 1) * (degree + 1) - 1
     values = np.zeros(15, np.float32)
     for slot in range(first, stop):
@@ -102,17 +102,24 @@ def _colours_chunk(first, stop, means, sh0, sh_rest, degree, centre, records, id
             ids[slot] = -1
             radii[i] = np.float32(0.0)
             continue
+        if base is not None:
+            base[slot, 0] = red
+            base[slot, 1] = green
+            base[slot, 2] = blue
         records[slot, RED] = max(red, np.float32(0.0))
         records[slot, GREEN] = max(green, np.float32(0.0))
         records[slot, BLUE] = max(blue, np.float32(0.0))
 
 
 @parallel_kernel
-def colours(means, sh0, sh_rest, degree, centre, records, ids, counts, radii):
+def colours(means, sh0, sh_rest, degree, centre, records, ids, counts, radii, base):
     """Fill red, green, blue of the records: max(SH(direction) + 0.5, 0).
 
-    A colour that is not finite takes its Gaussian out of the picture: id -1 and radius 0.
+    A colour that is not finite takes its Gaussian out of the picture: id -1 and radius 0. `base` [slots, 3]
+    or None takes the colours before they are clamped, for a shading function.
     """
     for chunk in numba.prange(counts.shape[0]):
         first = chunk * CHUNK
-        _colours_chunk(first, first + counts[chunk], means, sh0, sh_rest, degree, centre, records, ids, radii)
+        _colours_chunk(
+            first, first + counts[chunk], means, sh0, sh_rest, degree, centre, records, ids, radii, base
+        )

@@ -19,7 +19,7 @@ import numpy as np
 
 from ambiguous_wild.splat.cpu.compile import fused_kernel, parallel_kernel
 
-BLUR = 0.3  # px^2 added to both variances
+BLUR = 0.3  # px^2 added to both variances unless a method says otherwise
 NEAR = 0.01  # smallest depth that is drawn
 MIN_ALPHA = 1.0 / 255.0
 CHUNK = 1024  # Gaussians a work item; records of a chunk are contiguous
@@ -80,6 +80,7 @@ def footprint(mean, quat, scale, cam, x, y, z):
 @fused_kernel
 def _project_chunk(first, means, quats, log_scales, opacity_logits, cam, antialias, records, ids, radii):
     slot = first
+    blur = cam[22]
     for i in range(first, min(first + CHUNK, means.shape[0])):
         radii[i] = np.float32(0.0)
         m0 = np.float64(means[i, 0])
@@ -118,9 +119,9 @@ def _project_chunk(first, means, quats, log_scales, opacity_logits, cam, antiali
         n1 = p2 * q0 - p0 * q2
         n2 = p0 * q1 - p1 * q0
         det0 = n0 * n0 + n1 * n1 + n2 * n2
-        det = det0 + BLUR * (sxx + syy) + BLUR * BLUR
-        sxx += BLUR
-        syy += BLUR
+        det = det0 + blur * (sxx + syy) + cam[23]
+        sxx += blur
+        syy += blur
         if not (sxx < _HUGE and syy < _HUGE and det < _HUGE):
             continue
         opacity = sigmoid(logit)
@@ -167,8 +168,8 @@ def project(means, quats, log_scales, opacity_logits, cam, antialias, records, i
 
     Args:
         means, quats, log_scales, opacity_logits: raw parameters, float32.
-        cam: [22] float64: rows of W with t as columns 3 (0-11), fx, fy, cx, cy (12-15), width, height
-            (16, 17), limits of x/z and y/z (18-21).
+        cam: [24] float64: rows of W with t as columns 3 (0-11), fx, fy, cx, cy (12-15), width, height
+            (16, 17), limits of x/z and y/z (18-21), the blur in px^2 and its square (22, 23).
         antialias: 1 scales the opacity by sqrt(det S0 / det S).
         records: [N, 16] float32 out; chunk i starts at row i * CHUNK.
         ids: [N] int32 out: the Gaussian of each record.

@@ -14,14 +14,25 @@ from ambiguous_wild.splat.cpu import bins, blend, harmonics, project, reverse
 from ambiguous_wild.splat.cpu.buffers import Pool
 from ambiguous_wild.splat.cpu.compile import threads
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.rendered import Gradients
+from ambiguous_wild.splat.rendered import (
+    NOTHING,
+    Cotangents,
+    Gradients,
+    Shade,
+    ShadeGradients,
+    ShadePull,
+    as_cotangents,
+    check_needs,
+    spread,
+    sum_own,
+)
 
 _pool = Pool()
 
 
-def camera_vector(camera: Camera) -> np.ndarray:
-    """[22] float64: pose, intrinsics, size, limits of x/z and y/z in the Jacobian (card gsplat.md, 3)."""
-    out = np.empty(22)
+def camera_vector(camera: Camera, blur: float = project.BLUR) -> np.ndarray:
+    """[24] float64: pose, intrinsics, size, limits of x/z and y/z in the Jacobian, blur and its square."""
+    out = np.empty(24)
     out[:12] = camera.cam_from_world[:3].ravel()
     out[12:18] = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
     for k, (size, f, c) in enumerate(
@@ -30,6 +41,7 @@ def camera_vector(camera: Camera) -> np.ndarray:
         margin = 0.3 * 0.5 * size / f
         out[18 + 2 * k] = -c / f - margin
         out[19 + 2 * k] = (size - c) / f + margin
+    out[22:] = blur, blur * blur
     return out
 
 
@@ -52,10 +64,20 @@ class _Lists:
     tile_slots: np.ndarray
     tile_instances: np.ndarray
     kept: np.ndarray
+    shaded: _Shaded | None
+
+
+@dataclass
+class _Shaded:
+    """Of a render whose colours a function gave."""
+
+    rows: Tensor  # [M] int64, Gaussians that were shaded
+    slots: np.ndarray  # [M] their records
+    pull: ShadePull
 
 
 class RenderedCpu:
-    """Pictures of one camera and the way back to the parameters; see `render.Rendered`."""
+    """Pictures of one camera and the backward pass to the parameters; see `rendered.Rendered`."""
 
     def __init__(
         self, gaussians: Gaussians, camera: Camera, arrays: tuple[np.ndarray, ...], lists: _Lists
@@ -65,64 +87,84 @@ class RenderedCpu:
         self._camera = camera
         self._lists = lists
 
-    def backward(
-        self,
-        d_image: Tensor,  # [H, W, 3]
-        *,
-        d_image_extra: Tensor | None = None,  # [H, W, 3]
-        d_alpha: Tensor | None = None,  # [H, W]
-        d_depth: Tensor | None = None,  # [H, W]
-        absolute: bool = False,
-    ) -> Gradients:
-        """Gradients of sum(d_image * image) + ... for every raw parameter; may be called more than once.
+    def backward(self, cotangents: Cotangents | Tensor, needs: frozenset[str] = NOTHING) -> Gradients:
+        """Gradients of sum(cotangent * picture) for every raw parameter; may be called more than once.
 
         The Gaussians must hold the values they were rendered with.
 
         Raises:
-            AwError: a cotangent of another shape than its picture.
+            AwError: a cotangent of another shape than its picture, or an unknown statistic.
         """
-        height, width = self._camera.height, self._camera.width
-        shape = (height, width, 3)
+        check_needs(needs)
+        given = as_cotangents(cotangents)
+        shape = (self._camera.height, self._camera.width, 3)
+        image = torch.zeros(shape) if given.image is None else given.image
         sums = self._sums(
-            _cotangent("d_image", d_image, shape),
-            _optional("d_alpha", d_alpha, shape[:2]),
-            _optional("d_depth", d_depth, shape[:2]),
-            _optional("d_image_extra", d_image_extra, shape),
-            True if absolute else None,
+            _cotangent("d_image", image, shape),
+            _optional("d_alpha", given.alpha, shape[:2]),
+            _optional("d_depth", given.depth, shape[:2]),
+            _optional("d_image_extra", given.extra, shape),
+            True if "absolute" in needs else None,
+            True if needs & {"squared", "count"} else None,
         )
-        return self._chain(sums, d_image_extra is not None, absolute)
+        gradients = self._chain(sums, given.extra is not None, needs)
+        gradients.own = sum_own(given.own, gradients.own)
+        return gradients
 
-    def _sums(self, d_image: Any, d_alpha: Any, d_depth: Any, d_extra: Any, absolute: Any) -> np.ndarray:
+    def _sums(
+        self, d_image: Any, d_alpha: Any, d_depth: Any, d_extra: Any, absolute: Any, tally: Any
+    ) -> np.ndarray:
         s = self._lists
         sums = _pool.take("sums", (int(s.starts[-1]) * blend.ROW,), slack=0.25)
         blend.backward(
             s.records, s.tile_slots, s.tile_instances, s.starts, s.tile_order, threads(),
             self._camera.width, self._camera.height, s.background, s.kept,
-            d_image, d_alpha, d_depth, d_extra, absolute, sums,
+            d_image, d_alpha, d_depth, d_extra, absolute, tally, sums,
         )  # fmt: skip
         return sums
 
-    def _chain(self, sums: np.ndarray, extra: bool, absolute: bool) -> Gradients:
+    def _chain(self, sums: np.ndarray, extra: bool, needs: frozenset[str]) -> Gradients:
         s, g = self._lists, self._gaussians
         n = len(g)
         out = {name: _pool.take(f"d_{name}", tuple(t.shape)) for name, t in g.items() if name != "sh_rest"}
         rest, dirty = _pool.take_rows("d_sh_rest", tuple(g.sh_rest.shape))
         screen = _pool.take("screen", (n, 2))
         screen_extra = np.empty((n, 2), np.float32) if extra else None
-        screen_abs = np.empty((n, 2), np.float32) if absolute else None
+        screen_abs = np.empty((n, 2), np.float32) if "absolute" in needs else None
+        tally = np.empty((n, 2), np.float32) if needs & {"squared", "count"} else None
+        through = None if s.shaded is None else self._through_shading(sums, s.shaded)
         reverse.reverse(
             *(_array(t) for t in (g.means, g.quats, g.log_scales, g.opacity_logits, g.sh_rest)),
             s.degree, s.cam, s.centre, s.antialias, s.records, s.ids, s.counts, s.offsets, s.instances, sums,
             out["means"], out["quats"], out["log_scales"], out["opacity_logits"], out["sh0"], rest,
-            dirty, screen, screen_extra, screen_abs,
+            dirty, screen, screen_extra, screen_abs, tally, None if through is None else through[0],
         )  # fmt: skip
-        return Gradients(
-            **{name: torch.from_numpy(a) for name, a in out.items()},
+        found: dict[str, Any] = {name: torch.from_numpy(a) for name, a in out.items()}
+        gradients = Gradients(
+            **found,
             sh_rest=torch.from_numpy(rest),
             screen=torch.from_numpy(screen),
             screen_extra=None if screen_extra is None else torch.from_numpy(screen_extra),
             screen_abs=None if screen_abs is None else torch.from_numpy(screen_abs),
+            squared=torch.from_numpy(tally[:, 0]) if tally is not None and "squared" in needs else None,
+            count=torch.from_numpy(tally[:, 1]) if tally is not None and "count" in needs else None,
+            visible=self.visible,
         )
+        return gradients if through is None else spread(gradients, through[1], self._shaded_rows, g)
+
+    @property
+    def _shaded_rows(self) -> Tensor:
+        assert self._lists.shaded is not None
+        return self._lists.shaded.rows
+
+    def _through_shading(self, sums: np.ndarray, shaded: _Shaded) -> tuple[np.ndarray, ShadeGradients]:
+        """dL/d(SH colour) [slots, 3] of every record, and what the shading function itself learns."""
+        s = self._lists
+        colours = np.zeros((len(s.ids), 3), np.float32)
+        reverse.colour_sums(s.records, s.ids, s.counts, s.offsets, s.instances, sums, colours)
+        found = shaded.pull(torch.from_numpy(colours[shaded.slots]))
+        colours[shaded.slots] = _array(found.base)
+        return colours, found
 
 
 def _array(tensor: Tensor) -> np.ndarray:
@@ -148,6 +190,8 @@ def render_cpu(
     sh_degree: int = 3,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     antialias: bool = False,
+    blur: float = project.BLUR,
+    shade: Shade | None = None,
 ) -> RenderedCpu:
     """Render on the CPU; arguments and conventions as in `splat.render.render`.
 
@@ -163,7 +207,7 @@ def render_cpu(
         )
     n = len(gaussians)
     width, height = camera.width, camera.height
-    cam = camera_vector(camera)
+    cam = camera_vector(camera, blur)
     centre = camera.center
     means, quats, log_scales, logits, sh0, sh_rest = (_array(t) for _, t in gaussians.items())
     chunks = -(-n // project.CHUNK)
@@ -175,8 +219,10 @@ def render_cpu(
     slots = bins.visible_slots(ids, counts)
     if gaussians.before_colours is not None:
         gaussians.before_colours(ids[slots])
-    harmonics.colours(means, sh0, sh_rest, sh_degree, centre, records, ids, counts, radii)
+    base = None if shade is None else np.empty((n, 3), np.float32)
+    harmonics.colours(means, sh0, sh_rest, sh_degree, centre, records, ids, counts, radii, base)
     slots = bins.visible_slots(ids, counts)
+    shaded = None if shade is None or base is None else _shade(shade, base, ids, slots, records)
     order = bins.depth_order(slots, records)
 
     columns, rows = -(-width // bins.TILE), -(-height // bins.TILE)
@@ -201,6 +247,18 @@ def render_cpu(
     )
     lists = _Lists(
         cam, centre, sh_degree, antialias, behind, records, ids, counts, offsets, instances, starts,
-        tile_order, tile_slots, tile_instances, kept,
+        tile_order, tile_slots, tile_instances, kept, shaded,
     )  # fmt: skip
     return RenderedCpu(gaussians, camera, (image, alpha, depth, radii > 0, radii), lists)
+
+
+def _shade(
+    shade: Shade, base: np.ndarray, ids: np.ndarray, slots: np.ndarray, records: np.ndarray
+) -> _Shaded:
+    """Put the function's colours into the records of the visible Gaussians."""
+    rows = torch.from_numpy(ids[slots].astype(np.int64))
+    colours, pull = shade(torch.from_numpy(base[slots]), rows)
+    if tuple(colours.shape) != (len(rows), 3):
+        raise AwError(f"a shading function must give colours [{len(rows)}, 3], got {list(colours.shape)}")
+    records[slots, project.RED : project.BLUE + 1] = _array(colours).clip(min=0.0)
+    return _Shaded(rows, slots, pull)

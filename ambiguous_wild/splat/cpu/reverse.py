@@ -14,10 +14,12 @@ from ambiguous_wild.splat.cpu.blend import (
     EXTRA_Y,
     ROW,
     SUM_BLUE,
+    SUM_COUNT,
     SUM_DEPTH,
     SUM_GREEN,
     SUM_H,
     SUM_RED,
+    SUM_SQUARED,
     SUM_U,
     SUM_UU,
     SUM_UY,
@@ -26,8 +28,10 @@ from ambiguous_wild.splat.cpu.blend import (
 )
 from ambiguous_wild.splat.cpu.compile import fused_kernel, parallel_kernel
 from ambiguous_wild.splat.cpu.harmonics import C0, basis, direction_gradient
-from ambiguous_wild.splat.cpu.project import BLUE, BLUR, CHUNK, GREEN, RED, footprint, sigmoid
+from ambiguous_wild.splat.cpu.project import BLUE, CHUNK, GREEN, RED, footprint, sigmoid
 from ambiguous_wild.splat.cpu.simd import load, splat, store
+
+_PER_LOG2 = 1.3862943611198906  # 2 / log2(e): curvatures of the records are of 2 to the power
 
 
 @fused_kernel
@@ -36,14 +40,14 @@ def _cross(a, b):
 
 
 @fused_kernel
-def _covariance_gradient(sums, f1, f2, antialias):
+def _covariance_gradient(sums, f1, f2, antialias, blur, squared_blur):
     """dL/d(u, v) and dL/d(rows f1, f2 of J W R diag(s)) from the sums over pixels."""
-    sxx = f1[0] * f1[0] + f1[1] * f1[1] + f1[2] * f1[2] + BLUR
-    syy = f2[0] * f2[0] + f2[1] * f2[1] + f2[2] * f2[2] + BLUR
+    sxx = f1[0] * f1[0] + f1[1] * f1[1] + f1[2] * f1[2] + blur
+    syy = f2[0] * f2[0] + f2[1] * f2[1] + f2[2] * f2[2] + blur
     sxy = f1[0] * f2[0] + f1[1] * f2[1] + f1[2] * f2[2]
     n = _cross(f1, f2)
     det0 = n[0] * n[0] + n[1] * n[1] + n[2] * n[2]
-    det = det0 + BLUR * (sxx + syy) - BLUR * BLUR
+    det = det0 + blur * (sxx + syy) - squared_blur
     a = syy / det
     q = 1.0 / syy
     k = sxy * q
@@ -60,7 +64,7 @@ def _covariance_gradient(sums, f1, f2, antialias):
         e1 = _cross(f2, n)
         e2 = _cross(n, f1)
         near = sums[SUM_H] * (1.0 / det0 - 1.0 / det)
-        far = sums[SUM_H] * BLUR / det
+        far = sums[SUM_H] * blur / det
         d1 = (
             d1[0] + near * e1[0] - far * f1[0],
             d1[1] + near * e1[1] - far * f1[1],
@@ -90,7 +94,7 @@ def _quaternion_gradient(quat, norm, g):
 def _reverse_chunk(
     first, stop, means, quats, log_scales, opacity_logits, sh_rest, degree, cam, centre, antialias,
     records, ids, offsets, instances, sums, d_means, d_quats, d_log_scales, d_opacity_logits, d_sh0,
-    d_sh_rest, dirty, screen, screen_extra, screen_abs,
+    d_sh_rest, dirty, screen, screen_extra, screen_abs, tally, d_base,
 ):  # fmt: skip
     n = means.shape[0]
     terms = (degree + 1) * (degree + 1) - 1
@@ -109,6 +113,9 @@ def _reverse_chunk(
         if screen_abs is not None:
             screen_abs[i, 0] = 0.0
             screen_abs[i, 1] = 0.0
+        if tally is not None:
+            tally[i, 0] = 0.0
+            tally[i, 1] = 0.0
         seen = slot < stop and ids[slot] == i
         if dirty[i] and not seen:
             d_sh_rest[i] = 0.0
@@ -145,7 +152,7 @@ def _reverse_chunk(
         p, q, a, b, rot, _, _ = footprint((m0, m1, m2), quat, (s0, s1, s2), cam, x, y, z)
         f1 = (p[0] * s0, p[1] * s1, p[2] * s2)
         f2 = (q[0] * s0, q[1] * s1, q[2] * s2)
-        du, dv, g1, g2, inv_v, inv_y, slant = _covariance_gradient(total, f1, f2, antialias)
+        du, dv, g1, g2, inv_v, inv_y, slant = _covariance_gradient(total, f1, f2, antialias, cam[22], cam[23])
 
         d_opacity_logits[i] = total[SUM_H] * (1.0 - sigmoid(np.float64(opacity_logits[i])))
         d_log_scales[i, 0] = g1[0] * f1[0] + g2[0] * f2[0]
@@ -185,9 +192,14 @@ def _reverse_chunk(
             cy += slope / z
             cz -= slope * y / (z * z)
 
-        red = total[SUM_RED] if record[RED] > 0.0 else 0.0
-        green = total[SUM_GREEN] if record[GREEN] > 0.0 else 0.0
-        blue = total[SUM_BLUE] if record[BLUE] > 0.0 else 0.0
+        if d_base is None:
+            red = total[SUM_RED] if record[RED] > 0.0 else 0.0
+            green = total[SUM_GREEN] if record[GREEN] > 0.0 else 0.0
+            blue = total[SUM_BLUE] if record[BLUE] > 0.0 else 0.0
+        else:  # through the shading function, clamp included
+            red = np.float64(d_base[slot - 1, 0])
+            green = np.float64(d_base[slot - 1, 1])
+            blue = np.float64(d_base[slot - 1, 2])
         d_sh0[i, 0] = C0 * red
         d_sh0[i, 1] = C0 * green
         d_sh0[i, 2] = C0 * blue
@@ -230,7 +242,10 @@ def _reverse_chunk(
         screen[i, 1] = dv
         if screen_abs is not None:
             screen_abs[i, 0] = inv_v * total[ABS_U]
-            screen_abs[i, 1] = 1.3862943611198906 * total[ABS_V]  # 2 / log2(e)
+            screen_abs[i, 1] = _PER_LOG2 * total[ABS_V]
+        if tally is not None:
+            tally[i, 0] = _PER_LOG2 * _PER_LOG2 * total[SUM_SQUARED]
+            tally[i, 1] = total[SUM_COUNT]
 
 
 @parallel_kernel
@@ -238,7 +253,7 @@ def reverse(
     means, quats, log_scales, opacity_logits, sh_rest, degree, cam, centre, antialias,
     records, ids, counts, offsets, instances, sums,
     d_means, d_quats, d_log_scales, d_opacity_logits, d_sh0, d_sh_rest, dirty,
-    screen, screen_extra, screen_abs,
+    screen, screen_extra, screen_abs, tally, d_base,
 ):  # fmt: skip
     """Add each Gaussian's rows and chain them to its raw parameters; Gaussians not seen get zeros.
 
@@ -247,11 +262,36 @@ def reverse(
         sums: [I * 16] float32.
         dirty: [N] bool, rows of `d_sh_rest` that are not zero before; updated.
         screen_extra, screen_abs: [N, 2] or None.
+        tally: [N, 2] squared sums and pixel counts, or None.
+        d_base: [slots, 3] dL/d(SH colour) of each record where colours are shaded, or None.
         others: as in `project` and `colours`; d_* are written in full.
     """
     for chunk in numba.prange(counts.shape[0]):
         _reverse_chunk(
             chunk * CHUNK, chunk * CHUNK + counts[chunk], means, quats, log_scales, opacity_logits, sh_rest,
             degree, cam, centre, antialias, records, ids, offsets, instances, sums, d_means, d_quats,
-            d_log_scales, d_opacity_logits, d_sh0, d_sh_rest, dirty, screen, screen_extra, screen_abs,
+            d_log_scales, d_opacity_logits, d_sh0, d_sh_rest, dirty, screen, screen_extra, screen_abs, tally,
+            d_base,
         )  # fmt: skip
+
+
+@parallel_kernel
+def colour_sums(records, ids, counts, offsets, instances, sums, d_colours):
+    """dL/dcolour [slots, 3] of every record, 0 where the colour was clamped; for shading functions.
+
+    Args:
+        ids: [N] int32, -1 where a record is not drawn; its row is not written.
+        others: as in `reverse`.
+    """
+    for chunk in numba.prange(counts.shape[0]):
+        for slot in range(chunk * CHUNK, chunk * CHUNK + counts[chunk]):
+            if ids[slot] < 0:
+                continue
+            red, green, blue = 0.0, 0.0, 0.0
+            for at in range(offsets[slot], offsets[slot] + instances[slot]):
+                red += sums[at * ROW + SUM_RED]
+                green += sums[at * ROW + SUM_GREEN]
+                blue += sums[at * ROW + SUM_BLUE]
+            d_colours[slot, 0] = red if records[slot, RED] > 0.0 else 0.0
+            d_colours[slot, 1] = green if records[slot, GREEN] > 0.0 else 0.0
+            d_colours[slot, 2] = blue if records[slot, BLUE] > 0.0 else 0.0

@@ -10,6 +10,7 @@ import torch
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.rendered import Cotangents
 
 COLD_S = 35  # measured, one core at 2.6 GHz
 
@@ -53,8 +54,8 @@ def warm_up(announce: Callable[[str], None] = lambda text: None) -> float:
     photometric(rendered.image, photo, keep, weighting="images")
     ssim_map(rendered.image, photo)
     gradients = rendered.backward(loss.d_image)
-    rendered.backward(loss.d_image, d_image_extra=loss.d_image)
-    rendered.backward(loss.d_image, absolute=True)
+    rendered.backward(Cotangents(loss.d_image, extra=loss.d_image))
+    rendered.backward(loss.d_image, frozenset({"absolute"}))
     # as many tensors as the watchdog gives: of gradients, of parameters
     all_finite([tensor for name, tensor in gaussians.items() if name != "sh_rest"])
     all_finite([tensor for _, tensor in gaussians.items()])

@@ -52,7 +52,10 @@ def with_effects(parts: Parts, names: Sequence[str]) -> Parts:
     if not names:
         return parts
     built: list[Effect] = []
+    brought = {effect.name for effect in parts.effects}  # by the method itself: once is enough
     for name in check_effects(names):
+        if name in brought:
+            continue
         if name in DEGREES:
             parts = dataclasses.replace(parts, sh_degree=min(parts.sh_degree, DEGREES[name]))
             continue

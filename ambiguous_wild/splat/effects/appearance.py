@@ -8,6 +8,7 @@ state per Gaussian and so nothing of density control.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -15,10 +16,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ambiguous_wild.splat.effects.base import Effect, RowAdam, State, decayed
+from ambiguous_wild.splat.effects.base import Effect, RowAdam, State, decayed, same
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
-from ambiguous_wild.splat.rendered import Gradients
-from ambiguous_wild.splat.step import TrainData
+from ambiguous_wild.splat.rendered import Gradients, Pull
+from ambiguous_wild.splat.step import Shot, TrainData
 
 SIZE, HIDDEN, OCTAVES = 4, 32, 4  # of the embedding, of the net, of the Fourier features
 RATE_ROWS, RATE_NET, FINAL = 0.02, 2e-3, 0.1  # both decay to this share
@@ -42,12 +43,10 @@ class AppearanceEmbedding(Effect):
             values = rng.normal(size=shape) / np.sqrt(shape[0])
             return torch.tensor(values, dtype=torch.float32, device=data.device)
 
-        self.rows = RowAdam(torch.zeros(self.views + 1, SIZE, device=data.device))
+        self.rows_of_photos = RowAdam(torch.zeros(self.views + 1, SIZE, device=data.device))
         inputs = 6 * OCTAVES + 1
         self.net = {"first": weights(inputs, HIDDEN), "last": 0.3 * weights(HIDDEN + 1, SIZE * 6)}
         self.moments = {name: RowAdam(values[None]) for name, values in self.net.items()}
-        self._pending: dict[str, Tensor] | None = None
-        self._graph: tuple[dict[str, Tensor], Tensor] | None = None
 
     def features(self, means: Tensor) -> Tensor:
         """[N, 25]: Fourier features of positions, as WildGaussians starts its embeddings from, and 1."""
@@ -62,53 +61,49 @@ class AppearanceEmbedding(Effect):
         # the embedding first: one [33, 6] matrix a view instead of SIZE of them a Gaussian
         return hidden @ torch.einsum("hse,s->he", net["last"].reshape(-1, SIZE, 6), embedding)
 
-    def model(self, gaussians: Gaussians, view: int | None, iteration: int) -> Gaussians:
-        if view is None:
-            return replace(gaussians)
-        leaves = self.net | {"row": self.rows.values[view], "sh0": gaussians.sh0}
+    def model(self, gaussians: Gaussians, shot: Shot) -> tuple[Gaussians, Pull]:
+        row = shot.row(self.views)
+        if row is None:
+            return gaussians, same
+        leaves = self.net | {"row": self.rows_of_photos.values[row], "sh0": gaussians.sh0}
         leaves = {name: tensor.detach().clone().requires_grad_(True) for name, tensor in leaves.items()}
         with torch.enable_grad():
             change = self.change(self.features(gaussians.means), leaves["row"], leaves)
             colour = (SH_C0 * leaves["sh0"] + 0.5) * (1 + change[:, :3]) + change[:, 3:]
             sh0 = (colour - 0.5) / SH_C0
-        self._graph = (leaves, sh0)
-        return replace(gaussians, sh0=sh0.detach())
 
-    def model_backward(self, gradients: Gradients, view: int | None) -> Gradients:
-        if view is None or self._graph is None:
-            return gradients
-        leaves, sh0 = self._graph
-        self._graph = None
-        found = torch.autograd.grad(sh0, list(leaves.values()), gradients.sh0.to(sh0))
-        self._pending = dict(zip(leaves, found))
-        return replace(gradients, sh0=self._pending.pop("sh0").contiguous())
+        def pull(gradients: Gradients) -> Gradients:
+            found = torch.autograd.grad(sh0, list(leaves.values()), gradients.sh0.to(sh0), retain_graph=True)
+            own = dict(zip(leaves, found))
+            before = own.pop("sh0").contiguous()
+            return replace(gradients, sh0=before).with_own(self.name, own)
 
-    def step(self, view: int, progress: float, called_off: Tensor | None = None) -> None:
-        if self._pending is None:
-            return
-        share = decayed(1.0, FINAL, progress)
-        self.rows.step(view, self._pending["row"], RATE_ROWS * share, called_off)
+        return replace(gaussians, sh0=sh0.detach()), pull
+
+    def step(self, own: Mapping[str, Tensor], shot: Shot, called_off: Tensor | None = None) -> None:
+        assert shot.view is not None
+        share = decayed(1.0, FINAL, shot.progress)
+        self.rows_of_photos.step(shot.view, own["row"], RATE_ROWS * share, called_off)
         for name, adam in self.moments.items():
-            adam.step(0, self._pending[name], RATE_NET * share, called_off)
-        self._pending = None
-        rows = self.rows.values[: self.views]
+            adam.step(0, own[name], RATE_NET * share, called_off)
+        rows = self.rows_of_photos.values[: self.views]
         rows -= rows.mean(dim=0)
 
     def begin_fit(self) -> None:
-        self.rows.reset(self.views)
+        self.rows_of_photos.reset(self.views)
 
-    def fit(self) -> None:
-        if self._pending is not None:
-            self.rows.step(self.views, self._pending["row"], FIT_RATE)
-            self._pending = None
+    def fit(self, own: Mapping[str, Tensor]) -> None:
+        self.rows_of_photos.step(self.views, own["row"], FIT_RATE)
 
     def facts(self) -> dict[str, Any]:
-        return {"embedding_std": float(self.rows.values[: self.views].std(unbiased=False))}
+        return {"embedding_std": float(self.rows_of_photos.values[: self.views].std(unbiased=False))}
 
     def state_dict(self) -> State:
-        return {"rows": self.rows.state_dict()} | {name: m.state_dict() for name, m in self.moments.items()}
+        return {"rows": self.rows_of_photos.state_dict()} | {
+            name: m.state_dict() for name, m in self.moments.items()
+        }
 
     def load_state_dict(self, state: State) -> None:
-        self.rows.load_state_dict(state["rows"])
+        self.rows_of_photos.load_state_dict(state["rows"])
         for name, adam in self.moments.items():
             adam.load_state_dict(state[name])

@@ -7,15 +7,25 @@ Forward in that order, backward in reverse. The mask policy and the loss see the
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from ambiguous_wild.core import Camera
+from ambiguous_wild.splat.field import Row
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.rendered import Gradients
-from ambiguous_wild.splat.step import TrainData
+from ambiguous_wild.splat.rendered import (
+    Cotangents,
+    Frame,
+    FramePull,
+    Gradients,
+    Pull,
+    ShadeGradients,
+    ShadePull,
+)
+from ambiguous_wild.splat.step import Shot, Step, TrainData
 
 if TYPE_CHECKING:
     from ambiguous_wild.splat.parts import Parts
@@ -26,11 +36,15 @@ State = dict[str, Any]
 class Effect:
     """Does nothing. Override the hooks of the places it acts in; the others are never called.
 
-    `view` is the index of a train photo, `None` for any other camera (neutral), or the number of train
-    photos while a test photo's half is fitted.
+    What goes through a hook comes back through the pull that it returned: no hook keeps anything of one
+    picture in the object. Gradients of the effect's own parameters travel in `own`, under its name.
     """
 
     name = ""
+
+    def acts(self, hook: str) -> bool:
+        """Whether that hook is to be called at all."""
+        return getattr(type(self), hook) is not getattr(Effect, hook)
 
     def change_parts(self, parts: Parts) -> Parts:
         """The method's parts with what the effect needs of the renderer."""
@@ -39,40 +53,47 @@ class Effect:
     def setup(self, data: TrainData) -> None:
         """Called once before the first step, and again when a run resumes."""
 
-    def camera(self, view: int, camera: Camera) -> Camera:
+    def rows(self, gaussians: Gaussians) -> Mapping[str, Row]:
+        """What every Gaussian carries for this effect from the start, by name: `Gaussians.extra`."""
+        return {}
+
+    def camera(self, shot: Shot) -> Camera:
         """The camera of a train photo, at the resolution of the step."""
-        return camera
+        return shot.camera
 
-    def model(self, gaussians: Gaussians, view: int | None, iteration: int) -> Gaussians:
-        """The Gaussians as they are drawn."""
-        return gaussians
+    def model(self, gaussians: Gaussians, shot: Shot) -> tuple[Gaussians, Pull]:
+        """The Gaussians as they are drawn, all rows; the pull must not change tensors in place."""
+        return gaussians, same
 
-    def model_backward(self, gradients: Gradients, view: int | None) -> Gradients:
-        """Gradients of what `model` returned to those of what it was given; keeps those of its own.
+    def shade(
+        self, gaussians: Gaussians, rows: Tensor | slice, base: Tensor, shot: Shot
+    ) -> tuple[Tensor, ShadePull]:
+        """Colours [M, 3] of the visible rows from those of the harmonics, see `rendered.Shade`."""
+        return base, ShadeGradients
 
-        Not in place: the tensors are the renderer's.
+    def image(self, frame: Frame, shot: Shot) -> tuple[Frame, FramePull]:
+        """The pictures as they are compared; not in place.
+
+        The effect learns from `Cotangents.image` alone: a method's own loss on the render (`extra`) is no
+        statement about a photo's exposure.
         """
-        return gradients
+        return frame, unchanged
 
-    def pose_backward(self, gaussians: Gaussians, camera: Camera, gradients: Gradients, view: int) -> None:
-        """Keep the gradient of the camera; `gaussians` and `gradients` are those of the render call."""
+    def pose(self, gaussians: Gaussians, gradients: Gradients, shot: Shot) -> Mapping[str, Tensor]:
+        """Own gradients of a train photo's camera; `gaussians` and `gradients` are the render call's."""
+        return {}
 
-    def image(self, image: Tensor, view: int | None) -> Tensor:
-        """[H, W, 3] to [H, W, 3]; not in place."""
-        return image
-
-    def image_backward(self, image: Tensor, d_image: Tensor, view: int | None, *, learn: bool) -> Tensor:
-        """dL/d(what `image` was given) from dL/d(what it returned); keeps its own gradient if `learn`."""
-        return d_image
-
-    def step(self, view: int, progress: float, called_off: Tensor | None = None) -> None:
-        """Learn from the gradients kept since the last step.
+    def step(self, own: Mapping[str, Tensor], shot: Shot, called_off: Tensor | None = None) -> None:
+        """Learn from the gradients of one step.
 
         Args:
-            view: whose they are.
-            progress: of the run, in [0, 1].
+            own: of the effect's own parameters, as its pulls gave them.
+            shot: whose they are.
             called_off: on an accelerator, [1] float32 there; 1 = nothing is to change, whatever they are.
         """
+
+    def after_step(self, step: Step, gaussians: Gaussians) -> None:
+        """Called last in every step, with the Gaussians that the next one starts from."""
 
     def rows_changed(self) -> None:
         """Density control made, split, merged or dropped Gaussians."""
@@ -80,7 +101,7 @@ class Effect:
     def begin_fit(self) -> None:
         """A test photo is about to be fitted: its row starts neutral."""
 
-    def fit(self) -> None:
+    def fit(self, own: Mapping[str, Tensor]) -> None:
         """One step of that row alone; nothing shared changes."""
 
     def facts(self) -> dict[str, Any]:
@@ -92,6 +113,16 @@ class Effect:
 
     def load_state_dict(self, state: State) -> None:
         """Restore what `state_dict` returned; exact, so that a resumed run gives the same bits."""
+
+
+def same(gradients: Gradients) -> Gradients:
+    """The pull of a model that was not changed."""
+    return gradients
+
+
+def unchanged(cotangents: Cotangents) -> Cotangents:
+    """The pull of a picture that was not changed."""
+    return cotangents
 
 
 class RowAdam:

@@ -2,20 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError, Camera
 from ambiguous_wild.splat.effects.base import Effect, State
+from ambiguous_wild.splat.field import Row
+from ambiguous_wild.splat.fields import frames_of
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.losses import photometric
-from ambiguous_wild.splat.rendered import Gradients, Rendered
-from ambiguous_wild.splat.step import TrainData
+from ambiguous_wild.splat.rendered import (
+    NOTHING,
+    Cotangents,
+    FramePull,
+    Gradients,
+    Pull,
+    Rendered,
+    Shade,
+    ShadeGradients,
+    ShadePull,
+    as_cotangents,
+    frame_of,
+    sum_own,
+)
+from ambiguous_wild.splat.step import Shot, Step, TrainData
 
-Draw = Callable[[Gaussians, Camera], Rendered]
+Draw = Callable[[Gaussians, Shot, Shade | None], Rendered]
 FIT_STEPS = 128  # WildGaussians' number for an embedding on half a test photo
 
 
@@ -27,75 +44,118 @@ class Chain:
         self.views = len(data.photos)
         for effect in self.effects:
             effect.setup(data)
-        self._camera = self._with("camera")
-        self._model = self._with("model")
-        self._pose = self._with("pose_backward")
-        self._image = self._with("image")
-        self._rows = self._with("rows_changed")
-        self._step = self._with("step")
-        self._fit = self._with("fit")
 
-    def _with(self, hook: str) -> tuple[Effect, ...]:
-        return tuple(e for e in self.effects if getattr(type(e), hook) is not getattr(Effect, hook))
+    def _with(self, hook: str, without: Collection[str] = ()) -> tuple[Effect, ...]:
+        return tuple(e for e in self.effects if e.name not in without and e.acts(hook))
 
-    def camera(self, view: int, camera: Camera) -> Camera:
+    def rows(self, gaussians: Gaussians) -> dict[str, Row]:
+        """What every Gaussian carries for the effects.
+
+        Raises:
+            AwError: two effects carry something under the same name.
+        """
+        found: dict[str, Row] = {}
+        for effect in self._with("rows"):
+            for name, row in effect.rows(gaussians).items():
+                if name in found:
+                    raise AwError(
+                        f"effect {effect.name} carries {name!r} with every Gaussian, and another does too"
+                    )
+                found[name] = row
+        return found
+
+    def camera(self, shot: Shot) -> Camera:
         """The camera of a train photo as the effects have it."""
-        for effect in self._camera:
-            camera = effect.camera(view, camera)
-        return camera
+        for effect in self._with("camera"):
+            shot = replace(shot, camera=effect.camera(shot))
+        return shot.camera
 
-    def model(self, gaussians: Gaussians, view: int | None, iteration: int) -> Gaussians:
-        """The Gaussians as they are drawn for this view; for `None` what a viewer should be given."""
-        for effect in self._model:
-            changed = effect.model(gaussians, view, iteration)
-            if "before_colours" in gaussians.__dict__:  # the renderer asks for postponed rows
-                changed.__dict__["before_colours"] = gaussians.before_colours
+    def model(
+        self, gaussians: Gaussians, shot: Shot, without: Collection[str] = ()
+    ) -> tuple[Gaussians, list[Pull]]:
+        """The Gaussians as they are drawn, and the pulls in the order in which the effects acted."""
+        pulls = []
+        for effect in self._with("model", without):
+            changed, pull = effect.model(gaussians, shot)
+            if changed is not gaussians and "before_colours" in gaussians.__dict__:
+                changed.__dict__["before_colours"] = gaussians.before_colours  # for postponed rows
             gaussians = changed
-        return gaussians
+            pulls.append(pull)
+        return gaussians, pulls
 
-    def render(
-        self, gaussians: Gaussians, camera: Camera, view: int | None, iteration: int, draw: Draw
-    ) -> Rendered:
-        """Draw with all effects; the camera is already theirs."""
-        drawn = self.model(gaussians, view, iteration)
-        rendered = draw(drawn, camera)
-        images = [rendered.image]
-        for effect in self._image:
-            images.append(effect.image(images[-1], view))
-        return Drawn(self, rendered, images, drawn, camera, view)
+    def neutral_model(self, gaussians: Gaussians, iteration: int) -> Gaussians:
+        """The Gaussians as they are drawn for no photo in particular; colours of nets are not in them."""
+        camera = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, np.eye(4))  # no effect on all rows asks for it
+        shot = Shot(iteration=iteration, nominal=0.0, view=None, camera=camera)
+        return self.model(gaussians, shot)[0]
 
-    def step(self, view: int, progress: float, called_off: Tensor | None = None) -> None:
+    def render(self, gaussians: Gaussians, shot: Shot, draw: Draw, without: Collection[str] = ()) -> Rendered:
+        """Draw with all effects but those named; the camera is already theirs."""
+        drawn, model_pulls = self.model(gaussians, shot, without)
+        rendered = draw(drawn, shot, self._shade(drawn, shot, without))
+        frame, frame_pulls = frame_of(rendered), []
+        for effect in self._with("image", without):
+            frame, pull = effect.image(frame, shot)
+            frame_pulls.append(pull)
+        posing = () if shot.view is None else self._with("pose", without)
+        return Drawn(rendered, frame.image, frame.alpha, drawn, shot, model_pulls, frame_pulls, posing)
+
+    def _shade(self, drawn: Gaussians, shot: Shot, without: Collection[str]) -> Shade | None:
+        shading = self._with("shade", without)
+        if not shading:
+            return None
+
+        def shade(base: Tensor, rows: Tensor | slice) -> tuple[Tensor, ShadePull]:
+            pulls, colours = [], base
+            for effect in shading:
+                colours, pull = effect.shade(drawn, rows, colours, shot)
+                pulls.append(pull)
+            return colours, lambda d_colours: _pull_all(pulls, d_colours)
+
+        return shade
+
+    def step(self, gradients: Gradients, shot: Shot, called_off: Tensor | None = None) -> None:
         """Every effect learns from the backward pass just done; see `Effect.step`."""
-        for effect in self._step:
-            effect.step(view, progress, called_off)
+        for effect in self._with("step"):
+            own = gradients.own.get(effect.name)
+            if own is not None:
+                effect.step(own, shot, called_off)
+
+    def after_step(self, step: Step, gaussians: Gaussians) -> None:
+        """The end of a step; see `Effect.after_step`."""
+        for effect in self._with("after_step"):
+            effect.after_step(step, gaussians)
 
     def rows_changed(self) -> None:
         """Density control changed the set of Gaussians."""
-        for effect in self._rows:
+        for effect in self._with("rows_changed"):
             effect.rows_changed()
 
-    def fit_view(
-        self, gaussians: Gaussians, camera: Camera, photo: Tensor, keep: Tensor, draw: Draw
-    ) -> Tensor:
+    def fit_view(self, gaussians: Gaussians, shot: Shot, photo: Tensor, keep: Tensor, draw: Draw) -> Tensor:
         """Fit the colour effects, and nothing else, to a part of a photo; the picture under that fit.
 
         Args:
             gaussians: the trained model; it does not change.
-            camera: of the photo.
+            shot: of the photo, with `fitting`.
             photo: [H, W, 3] in [0, 1]; outside `keep` it is not read.
             keep: [H, W], 1 where the fit may look.
             draw: the render call.
         """
-        for effect in self._fit:
+        # black where it may not be looked at, for effects that read the photo too
+        photo = torch.where(keep[..., None] > 0, photo, torch.zeros_like(photo))
+        shot = replace(shot, photo=photo)
+        fitted = self._with("fit")
+        for effect in fitted:
             effect.begin_fit()
-        for _ in range(FIT_STEPS if self._fit else 0):
-            rendered = self.render(gaussians, camera, self.views, 0, draw)
+        for _ in range(FIT_STEPS if fitted else 0):
+            rendered = self.render(gaussians, shot, draw)
             # "images" blanks both pictures outside: no window of SSIM reaches into the other half
             loss = photometric(rendered.image, photo, keep, weighting="images")
-            rendered.backward(loss.d_image)
-            for effect in self._fit:
-                effect.fit()
-        return self.render(gaussians, camera, self.views, 0, draw).image
+            own = rendered.backward(loss.d_image).own
+            for effect in fitted:
+                if effect.name in own:
+                    effect.fit(own[effect.name])
+        return self.render(gaussians, shot, draw).image
 
     def facts(self) -> dict[str, Any]:
         """What every effect says of itself, by its name."""
@@ -115,22 +175,51 @@ class Chain:
             effect.load_state_dict(state[effect.name])
 
 
+def _pull_all(pulls: Sequence[ShadePull], d_colours: Tensor) -> ShadeGradients:
+    found = ShadeGradients(d_colours)
+    for pull in reversed(pulls):
+        one = pull(found.base)
+        means = [m for m in (one.means, found.means) if m is not None]
+        extra: Mapping[str, Tensor] = {
+            name: one.extra[name] + found.extra[name]
+            if name in one.extra and name in found.extra
+            else {**one.extra, **found.extra}[name]
+            for name in {**one.extra, **found.extra}
+        }
+        found = ShadeGradients(
+            one.base, extra, sum(means[1:], means[0]) if means else None, sum_own(found.own, one.own)
+        )
+    return found
+
+
 class Drawn:
     """A `Rendered` whose picture went through the image effects and whose gradients go back through all."""
 
     def __init__(
         self,
-        chain: Chain,
         rendered: Rendered,
-        images: list[Tensor],
+        image: Tensor,
+        alpha: Tensor,
         drawn: Gaussians,
-        camera: Camera,
-        view: int | None,
+        shot: Shot,
+        model_pulls: Sequence[Pull],
+        frame_pulls: Sequence[FramePull],
+        posing: Sequence[Effect],
     ) -> None:
-        self.image, self.alpha = images[-1], rendered.alpha
+        """
+        Args:
+            rendered: by the back end.
+            image, alpha: after the image effects.
+            drawn: the Gaussians that the back end drew.
+            shot: of the picture.
+            model_pulls, frame_pulls: in the order in which the effects acted.
+            posing: effects that learn from the camera's gradient.
+        """
+        self.image, self.alpha = image, alpha
         self.visible = rendered.visible
-        self._chain, self._inner, self._images = chain, rendered, images
-        self._drawn, self._camera, self._view = drawn, camera, view
+        self.frames = frames_of(rendered)
+        self._inner, self._drawn, self._shot = rendered, drawn, shot
+        self._model_pulls, self._frame_pulls, self._posing = model_pulls, frame_pulls, posing
 
     @property
     def depth(self) -> Tensor:
@@ -141,28 +230,14 @@ class Drawn:
         return self._inner.radii
 
     @torch.no_grad()
-    def backward(
-        self,
-        d_image: Tensor,
-        *,
-        d_image_extra: Tensor | None = None,
-        d_alpha: Tensor | None = None,
-        d_depth: Tensor | None = None,
-        absolute: bool = False,
-    ) -> Gradients:
-        """As `Rendered.backward`. Effects learn from `d_image` alone: a method's own loss on the render
-        is no statement about a photo's exposure."""
-        chain, view = self._chain, self._view
-        for effect, image in reversed(list(zip(chain._image, self._images))):
-            d_image = effect.image_backward(image, d_image, view, learn=True)
-            if d_image_extra is not None:
-                d_image_extra = effect.image_backward(image, d_image_extra, view, learn=False)
-        gradients = self._inner.backward(
-            d_image, d_image_extra=d_image_extra, d_alpha=d_alpha, d_depth=d_depth, absolute=absolute
-        )
-        if view is not None and view < chain.views:
-            for effect in chain._pose:
-                effect.pose_backward(self._drawn, self._camera, gradients, view)
-        for effect in reversed(chain._model):
-            gradients = effect.model_backward(gradients, view)
+    def backward(self, cotangents: Cotangents | Tensor, needs: frozenset[str] = NOTHING) -> Gradients:
+        """As `Rendered.backward`, with gradients of the effects' own parameters in `own`."""
+        given = as_cotangents(cotangents)
+        for frame_pull in reversed(self._frame_pulls):
+            given = frame_pull(given)
+        gradients = self._inner.backward(given, needs)
+        for effect in self._posing:
+            gradients = gradients.with_own(effect.name, effect.pose(self._drawn, gradients, self._shot))
+        for pull in reversed(self._model_pulls):
+            gradients = pull(gradients)
         return gradients

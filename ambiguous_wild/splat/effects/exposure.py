@@ -7,14 +7,17 @@ no photo, is drawn as the mean train photo sees it.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ambiguous_wild.splat.effects.base import Effect, RowAdam, State, decayed
+from ambiguous_wild.splat.effects.base import Effect, RowAdam, State, decayed, unchanged
 from ambiguous_wild.splat.effects.tracks import photo_gains
-from ambiguous_wild.splat.step import TrainData
+from ambiguous_wild.splat.rendered import Cotangents, Frame, FramePull, Own, sum_own
+from ambiguous_wild.splat.step import Shot, TrainData
 
 RATE, RATE_FINAL = 0.01, 0.001  # 3DGS's exposure_lr
 FIT_RATE = 0.02
@@ -31,7 +34,6 @@ class AffineExposure(Effect):
         gains = photo_gains(data.scene, [p.cpu().numpy() for p in data.photos])
         table[: self.views, range(3), range(3)] = torch.from_numpy(gains.astype("float32") - 1).to(table)
         self.adam = RowAdam(table)
-        self._gradient: Tensor | None = None
         self._close()
 
     def _close(self) -> None:
@@ -42,35 +44,36 @@ class AffineExposure(Effect):
         row = self.adam.values[view]
         return row[:, :3] + torch.eye(3, dtype=row.dtype, device=row.device), row[:, 3]
 
-    def image(self, image: Tensor, view: int | None) -> Tensor:
-        if view is None:
-            return image
-        matrix, offset = self._affine(view)
-        return (image @ matrix.T + offset).contiguous()
+    def image(self, frame: Frame, shot: Shot) -> tuple[Frame, FramePull]:
+        row = shot.row(self.views)
+        if row is None:
+            return frame, unchanged
+        matrix, offset = self._affine(row)
+        before = frame.image
 
-    def image_backward(self, image: Tensor, d_image: Tensor, view: int | None, *, learn: bool) -> Tensor:
-        if view is None:
-            return d_image
-        matrix, _ = self._affine(view)
-        if learn:
-            flat = d_image.reshape(-1, 3)
-            gradient = torch.cat([flat.T @ image.reshape(-1, 3), flat.sum(dim=0)[:, None]], dim=1)
-            self._gradient = gradient.to(self.adam.values)
-        return (d_image @ matrix).contiguous()
+        def pull(cotangents: Cotangents) -> Cotangents:
+            image, extra = (
+                None if d is None else (d @ matrix).contiguous() for d in (cotangents.image, cotangents.extra)
+            )
+            own: Own = {}
+            if cotangents.image is not None:
+                flat = cotangents.image.reshape(-1, 3)
+                gradient = torch.cat([flat.T @ before.reshape(-1, 3), flat.sum(dim=0)[:, None]], dim=1)
+                own = {self.name: {"affine": gradient.to(self.adam.values)}}
+            return replace(cotangents, image=image, extra=extra, own=sum_own(cotangents.own, own))
 
-    def step(self, view: int, progress: float, called_off: Tensor | None = None) -> None:
-        if self._gradient is not None:
-            self.adam.step(view, self._gradient, decayed(RATE, RATE_FINAL, progress), called_off)
-            self._gradient = None
-            self._close()
+        return replace(frame, image=(before @ matrix.T + offset).contiguous()), pull
+
+    def step(self, own: Mapping[str, Tensor], shot: Shot, called_off: Tensor | None = None) -> None:
+        assert shot.view is not None
+        self.adam.step(shot.view, own["affine"], decayed(RATE, RATE_FINAL, shot.progress), called_off)
+        self._close()
 
     def begin_fit(self) -> None:
         self.adam.reset(self.views)
 
-    def fit(self) -> None:
-        if self._gradient is not None:
-            self.adam.step(self.views, self._gradient, FIT_RATE)
-            self._gradient = None
+    def fit(self, own: Mapping[str, Tensor]) -> None:
+        self.adam.step(self.views, own["affine"], FIT_RATE)
 
     def facts(self) -> dict[str, Any]:
         gains = self.adam.values[: self.views, range(3), range(3)] + 1

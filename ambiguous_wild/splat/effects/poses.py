@@ -7,6 +7,7 @@ the camera's gradient is a sum over the Gaussians' own gradients, less the part 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -21,7 +22,7 @@ from ambiguous_wild.splat.effects.posed import PosedCamera, left_jacobian, scale
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
 from ambiguous_wild.splat.reference import harmonics
 from ambiguous_wild.splat.rendered import Gradients
-from ambiguous_wild.splat.step import TrainData
+from ambiguous_wild.splat.step import Shot, TrainData
 
 RATE_PX, FINAL = 0.2, 0.01  # px a step of what a turn moves in the picture; decays to this share
 BEGIN = 0.05  # of the run: before it the render is no evidence of where a camera stood
@@ -47,9 +48,10 @@ class PoseRefinement(Effect):
         self.intrinsics = torch.from_numpy(np.stack([c.intrinsics for c in data.cameras])).to(data.device)
         self.rate = RATE_PX / float(np.median([camera.fx for camera in data.cameras]))  # rad, and of depth
         self.degree = 3
-        self._gradient: Tensor | None = None
 
-    def camera(self, view: int, camera: Camera) -> Camera:
+    def camera(self, shot: Shot) -> Camera:
+        assert shot.view is not None
+        view, camera = shot.view, shot.camera
         if device.accelerated(self.adam.values.device):
             return self._camera_there(view, camera)
         delta = self.adam.values[view].numpy()
@@ -69,34 +71,34 @@ class PoseRefinement(Effect):
         smaller = camera.width / full.width, camera.height / full.height
         return PosedCamera(camera, pose, scaled(self.intrinsics[view], *smaller))
 
-    def _pose_backward_there(
-        self, gaussians: Gaussians, camera: Camera, gradients: Gradients, view: int
-    ) -> None:
+    def pose(self, gaussians: Gaussians, gradients: Gradients, shot: Shot) -> Mapping[str, Tensor]:
+        assert shot.view is not None
+        row = self.adam.values[shot.view]
+        if device.accelerated(row.device):
+            return {"motion": self._gradient_there(gaussians, gradients, shot.camera, shot.view)}
+        left = left_gradient(gaussians, shot.camera, gradients, self.degree)
+        # the motion is exp(w) then the shift: about the present pose, the shift part of w is subtracted
+        shift = torch.tensor(self.depth * row[3:].numpy())
+        turn = left[:3] - torch.linalg.cross(shift, left[3:])
+        turn = right_jacobian_transposed(row[:3]) @ turn
+        return {"motion": torch.cat([turn, self.depth * left[3:]])}
+
+    def _gradient_there(
+        self, gaussians: Gaussians, gradients: Gradients, camera: Camera, view: int
+    ) -> Tensor:
         pose = camera.pose if isinstance(camera, PosedCamera) else self.poses[view]
         centre = -pose[:3, 3] @ pose[:3, :3]
         left = _left_gradient(gaussians, pose, centre, gradients, slice(None), self.degree)
         row = self.adam.values[view]
         turn = left[:3] - torch.linalg.cross(self.depth * row[3:], left[3:])
-        self._gradient = torch.cat([left_jacobian(row[:3]).T @ turn, self.depth * left[3:]])
+        return torch.cat([left_jacobian(row[:3]).T @ turn, self.depth * left[3:]])
 
-    def pose_backward(self, gaussians: Gaussians, camera: Camera, gradients: Gradients, view: int) -> None:
-        if device.accelerated(self.adam.values.device):
-            return self._pose_backward_there(gaussians, camera, gradients, view)
-        left = left_gradient(gaussians, camera, gradients, self.degree)
-        # the motion is exp(w) then the shift: about the present pose, the shift part of w is subtracted
-        shift = torch.tensor(self.depth * self.adam.values[view, 3:].numpy())
-        turn = left[:3] - torch.linalg.cross(shift, left[3:])
-        turn = right_jacobian_transposed(self.adam.values[view, :3]) @ turn
-        self._gradient = torch.cat([turn, self.depth * left[3:]])
-        return None
-
-    def step(self, view: int, progress: float, called_off: Tensor | None = None) -> None:
-        gradient, self._gradient = self._gradient, None
-        if gradient is None or progress < BEGIN:
+    def step(self, own: Mapping[str, Tensor], shot: Shot, called_off: Tensor | None = None) -> None:
+        if shot.progress < BEGIN or shot.view is None:
             return
-        row = self.adam.values[view]
-        share = decayed(1.0, FINAL, progress)
-        self.adam.step(view, gradient, self.rate * share, called_off)
+        row = self.adam.values[shot.view]
+        share = decayed(1.0, FINAL, shot.progress)
+        self.adam.step(shot.view, own["motion"], self.rate * share, called_off)
         pull = PULL * share if called_off is None else PULL * share * share_of(called_off, row)
         row *= 1 - pull  # decoupled from Adam's scaling, as weight decay is in AdamW
 

@@ -15,8 +15,8 @@ from torch import Tensor
 from ambiguous_wild.core import Camera
 from ambiguous_wild.splat.effects.base import Effect, State
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.rendered import Gradients
-from ambiguous_wild.splat.step import TrainData
+from ambiguous_wild.splat.rendered import Gradients, Pull
+from ambiguous_wild.splat.step import Shot, TrainData
 
 if TYPE_CHECKING:
     from ambiguous_wild.splat.parts import Parts
@@ -41,14 +41,14 @@ class SmoothingFilter(Effect):
         self._poses: list[Tensor] = []  # of the cameras, where the Gaussians are
         self._stale = True  # rows changed since
         self._at = 0
-        self._kept: tuple[Tensor, Tensor, Tensor] | None = None
 
-    def model(self, gaussians: Gaussians, view: int | None, iteration: int) -> Gaussians:
+    def model(self, gaussians: Gaussians, shot: Shot) -> tuple[Gaussians, Pull]:
         size = self.size
-        if self._stale or (view is not None and iteration - self._at >= EVERY):
+        due = self._stale or (not shot.neutral and shot.iteration - self._at >= EVERY)
+        if due or shot.other_gaussians:
             size = filter_sizes(gaussians.means, self.cameras, self._poses_like(gaussians.means))
-            if view is not None:  # what is drawn for a probe changes no state
-                self.size, self._at, self._stale = size, iteration, False
+            if not shot.neutral and not shot.other_gaussians:  # a probe changes no state
+                self.size, self._at, self._stale = size, shot.iteration, False
         variance = (2 * gaussians.log_scales).exp()
         wide = variance + size.to(variance)[:, None] ** 2
         share = variance / wide  # [N, 3]
@@ -56,26 +56,23 @@ class SmoothingFilter(Effect):
         opacity = plain * share.prod(dim=1).sqrt()
         # an opaque Gaussian that is not widened has logit infinity otherwise
         opacity = opacity.clamp(1e-7, 1 - 1e-6)
-        self._kept = (share, plain, opacity)
-        return replace(gaussians, log_scales=0.5 * wide.log(), opacity_logits=torch.logit(opacity))
+
+        def pull(gradients: Gradients) -> Gradients:
+            # dL/d log o', with o' (1 - o') the slope of the sigmoid
+            d_log = gradients.opacity_logits / (1 - opacity)
+            return replace(
+                gradients,
+                log_scales=(gradients.log_scales * share + d_log[:, None] * (1 - share)).contiguous(),
+                opacity_logits=(d_log * (1 - plain)).contiguous(),
+            )
+
+        return replace(gaussians, log_scales=0.5 * wide.log(), opacity_logits=torch.logit(opacity)), pull
 
     def _poses_like(self, means: Tensor) -> list[Tensor]:
         """Copied there once: copies in between steps make the host of an accelerator wait."""
         if not self._poses or (self._poses[0].dtype, self._poses[0].device) != (means.dtype, means.device):
             self._poses = poses_like(means, self.cameras)
         return self._poses
-
-    def model_backward(self, gradients: Gradients, view: int | None) -> Gradients:
-        if self._kept is None:
-            raise RuntimeError("backward without a render")
-        share, plain, opacity = self._kept
-        # dL/d log o', with o' (1 - o') the slope of the sigmoid
-        d_log = gradients.opacity_logits / (1 - opacity)
-        return replace(
-            gradients,
-            log_scales=(gradients.log_scales * share + d_log[:, None] * (1 - share)).contiguous(),
-            opacity_logits=(d_log * (1 - plain)).contiguous(),
-        )
 
     def rows_changed(self) -> None:
         self._stale = True

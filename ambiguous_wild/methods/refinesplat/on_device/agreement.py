@@ -1,4 +1,4 @@
-"""Whether photos show the same, and what several views say together: agreement.py with torch.
+"""Agreement of colours between views, and their combined evidence: agreement.py with torch.
 
 Colours are as uint8 holds them, 0 to 255, in float32.
 """
@@ -39,19 +39,19 @@ def common_offset(difference: Tensor, same: Tensor, most: float) -> Tensor:
     some = torch.where(same[:, None], difference, torch.nan).flatten(2)  # [n, 3, pixels]
     common = median(some)
     apart = torch.stack([some, some - common[..., None]]).abs_().mean(2)  # [2, n, pixels]
-    # NaN is no agreement: neither a pixel that shows something else, nor a view that shows nothing
+    # comparisons with NaN are false: pixels of other surfaces, and views without any, do not agree
     as_they_are, shifted = (apart < most * _WHITE).sum(2)
     return common.masked_fill((shifted <= FAR_MORE * as_they_are)[:, None], 0.0)
 
 
-def word_weight(seen: Tensor, agreed: Tensor, enough: float, heard_anyway: Tensor) -> Tensor:
-    """As `agreement.word_weight`, from how many see a place and how many agree, [h, w] int64 each."""
+def agreement_weight(seen: Tensor, agreed: Tensor, enough: float, always: Tensor) -> Tensor:
+    """As `agreement.agreement_weight`, from counts of seeing and agreeing views, [h, w] int64."""
     share = agreed / seen.clamp(min=1)
-    return (share / enough).clamp_(max=1.0).masked_fill_(heard_anyway, 1.0)
+    return (share / enough).clamp_(max=1.0).masked_fill_(always, 1.0)
 
 
 class Ranks:
-    """Quantiles over n views of which any number may be missing: ranks by how many are there."""
+    """Quantiles over n views of which any number may be missing: ranks by the number present."""
 
     def __init__(self, views: int, quantile: float, device: torch.device | str) -> None:
         last = np.maximum(np.arange(views + 1) - 1, 0)

@@ -1,9 +1,9 @@
-"""Connected components in a fixed number of rounds: hysteresis and filled gaps without a loop that looks.
+"""Connected components in a fixed number of rounds: hysteresis and gaps, without value-dependent loops.
 
 Every pixel points to a pixel of its own component, at first to the largest among itself and its neighbours.
-A round takes the largest pointer among each pixel's neighbours, hangs the pixel's own target on it, and makes
-all pointers jump three times (FastSV: Zhang, Azad, Buluc 2020). Pointers only grow, so nothing is ever joined
-that is not connected; what too few rounds would leave is a component in two parts.
+A round takes the largest pointer among each pixel's neighbours, points the pixel's own target to it, and
+follows all pointers three times (FastSV: Zhang, Azad, Buluc 2020). Pointers only grow, so unconnected pixels
+are never joined; too few rounds would leave a component in two parts.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-_JUMPS = 3  # halve the rounds that one jump takes; more bring nothing
+_JUMPS = 3  # need half as many rounds as one; more do not help
 # Needed at 504 x 378 px, 4 or 8 neighbours, mirrored or not: 7 by 6 of 49 mazes and 6 by the others and by
 # Hilbert curves, 5 by spirals, serpentines, combs and stairs, 5 by random pixels of any density, 4 by blobs;
 # 7 by a maze of four times the pixels. A round leaves the local maxima of the parts that touch, so the number
@@ -32,7 +32,7 @@ def rounds_for(pixels: int) -> int:
 def components(masks: Tensor, connectivity: int) -> Tensor:
     """Components of masks [n, H, W] bool: [n * H * W] int64, a number from 1 on for each; 0 = in no mask."""
     pixels = masks.numel()
-    # pooling knows floating point alone
+    # pooling needs floating point
     dtype = torch.float32 if pixels < _FLOAT32_EXACT else torch.float64
     inside = masks.reshape(-1).long()
     own = torch.arange(1, pixels + 1, dtype=dtype, device=masks.device) * inside
@@ -42,7 +42,7 @@ def components(masks: Tensor, connectivity: int) -> Tensor:
         for _ in range(_JUMPS):
             labels = labels.take(labels)
         around = _largest_around(labels[1:].view(masks.shape), connectivity, dtype) * inside
-        # who brings nothing new writes to itself: thousands at the slot of one root would queue there
+        # pixels without a larger label write to themselves: thousands would wait for the slot of one root
         target = torch.where(around > labels[1:], labels[1:], slots)
         labels = labels.scatter_reduce(0, target, around, "amax")
     for _ in range(_JUMPS):
@@ -55,7 +55,7 @@ def hysteresis(values: Tensor, low: Tensor, high: Tensor) -> Tensor:
     labels = components(values > low, 8)
     strong = (values > high).view(-1).int()
     reached = strong.new_zeros(labels.numel() + 1).scatter_reduce_(0, labels, strong, "amax")
-    # a strong pixel is a weak one too: what is not in a component is not strong
+    # a strong pixel is also weak, so pixels outside of components are not strong
     return reached.take(labels).bool().view(values.shape)
 
 

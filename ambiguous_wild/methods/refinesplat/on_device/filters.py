@@ -27,14 +27,14 @@ def resized(x: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def nearest(x: Tensor, size: tuple[int, int]) -> Tensor:
-    """[h, w] at (height, width), the pixel that each upper left corner lies in (cv2.INTER_NEAREST)."""
+    """[h, w] at (height, width), the pixel that contains each upper left corner (cv2.INTER_NEAREST)."""
     return F.interpolate(x[None, None], size=size, mode="nearest")[0, 0]
 
 
 def blur_and_shrink(length: int, parts: int, size: int) -> np.ndarray:
     """One axis of a box filter, border replicated, and then of cv2.INTER_AREA: [parts, length] float32.
 
-    Both are linear: `rows @ x @ columns.T` is the whole of them in two products.
+    Both are linear: `rows @ x @ columns.T` applies them in two products.
     """
     edges = np.arange(parts + 1) * (length / parts)
     cells = np.arange(length)

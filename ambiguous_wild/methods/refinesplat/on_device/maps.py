@@ -1,4 +1,4 @@
-"""A stack of maps of all views, read at places of other views' frames."""
+"""A stack of maps of all views, sampled at positions in other views' frames."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ class Maps:
         """
         Args:
             maps: [channels, h, w] of each view.
-            device: where they are to lie.
-            pad: what lies beyond a smaller map: `zero`, or its own `edge`.
+            device: of the stack.
+            pad: padding of a smaller map: `zero`, or its own `edge`.
         """
         self.edge = pad == "edge"
         self.sizes = [m.shape[1:] for m in maps]
         h, w = (max(size[axis] for size in self.sizes) for axis in (0, 1))
         self.stack = torch.zeros((len(maps), maps[0].shape[0], h, w), device=device)
-        # of the stack's maps, how much each view's covers; None: all of it
+        # share of the stack's size that each view's map covers; None: all of it
         self.shares: Tensor | None = None
         if len(set(self.sizes)) > 1:
             shares = np.array([[size[1] / w, size[0] / h] for size in self.sizes])

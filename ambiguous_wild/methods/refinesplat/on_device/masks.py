@@ -1,6 +1,6 @@
 """Instances, thresholds and masks of one photo from its evidence: evidence.make_masks with torch.
 
-Of the statistic `structure` alone: the evidence is the statistic and the distance at once.
+For the statistic `structure` only: the evidence is both the statistic and the distance.
 """
 
 from __future__ import annotations
@@ -53,19 +53,19 @@ class Labels:
         ]
         self.of_pixel = [torch.from_numpy(label.astype(np.int32).ravel()).to(device) for label in clean]
         areas = np.full((len(clean), self.most), np.nan)
-        vouched = np.zeros((len(clean), self.most), bool)
+        flags = np.zeros((len(clean), self.most), bool)
         for view, (label, count) in enumerate(zip(clean, self.counts)):
             areas[view, :count] = np.bincount(label.ravel(), minlength=count + 1)[1 : count + 1]
-            vouched[view, :count] = static[view]
+            flags[view, :count] = static[view]
         areas[areas == 0] = np.nan
         self.known = np.isfinite(areas)  # [views, K]
         self.areas = torch.from_numpy(areas).to(device)  # [views, K] float64 px, NaN where there is none
-        self.vouched = torch.from_numpy(vouched).to(device)  # [views, K]
-        # [H, W] bool of the views where structure from motion vouches for anything
+        self.static_flags = torch.from_numpy(flags).to(device)  # [views, K]
+        # view: [H, W] bool, its static instances by structure from motion; only views that have some
         self.static = {
-            view: torch.from_numpy(np.r_[False, vouched[view]][label]).to(device)
+            view: torch.from_numpy(np.r_[False, flags[view]][label]).to(device)
             for view, label in enumerate(clean)
-            if vouched[view].any()
+            if flags[view].any()
         }
 
     def means(self, view: int, evidence: Tensor) -> Tensor:
@@ -89,7 +89,7 @@ def make_masks(
     ceiling: Tensor | None,
     seen: Tensor | None,
 ) -> PhotoMasks:
-    """As `evidence.make_masks`; what `others` says of this view is not read. `seen` [H, W]: None = all."""
+    """As `evidence.make_masks`; the row of this view in `others` is not read. `seen` [H, W]: None = all."""
     shape = evidence.shape
     means = labels.means(view, evidence)
     values = means
@@ -101,13 +101,13 @@ def make_masks(
     static = labels.static.get(view)
     flagged = means > cut.threshold
     if static is not None:
-        flagged = flagged & ~labels.vouched[view]
+        flagged = flagged & ~labels.static_flags[view]
     nothing = torch.zeros(shape, dtype=torch.bool, device=evidence.device)
     local = labels.on_pixels(view, flagged, shape) if config.use_local else nothing
     weak, strong = config.hold * cut.threshold, cut.threshold
     if config.combine == "fused" and config.use_local and config.use_global:
         of_instance = labels.on_pixels(view, means.nan_to_num(nan=0.0), shape)
-        # a pixel of no instance stands for itself
+        # a pixel without an instance is judged alone
         inside = labels.of_pixel[view].view(shape) > 0
         both = torch.where(inside, (evidence * of_instance).sqrt_(), evidence)
         final, global_ = hysteresis(torch.stack([both, evidence.double()]), weak, strong)
@@ -115,7 +115,7 @@ def make_masks(
         global_ = hysteresis(evidence[None], weak, strong)[0] if config.use_global else nothing
         final = local | global_
     if static is not None:
-        # the union holds none of them anyway
+        # the union contains none of them
         final, global_ = final & ~static, global_ & ~static
     final = dilate(fill_holes(final, config.fill), config.dilation)
     if seen is not None:

@@ -14,8 +14,8 @@ from torch import Tensor
 from ambiguous_wild.core import Camera
 from ambiguous_wild.methods.refinesplat.config import MaskConfig
 from ambiguous_wild.methods.refinesplat.on_device import filters
-from ambiguous_wild.methods.refinesplat.on_device.elsewhere import Elsewhere, discount
 from ambiguous_wild.methods.refinesplat.on_device.maps import sized
+from ambiguous_wild.methods.refinesplat.on_device.multiview import OtherViews, discount
 from ambiguous_wild.methods.refinesplat.on_device.ranks import low_quantile, median
 from ambiguous_wild.methods.refinesplat.pixels import STATIC_QUANTILE
 from ambiguous_wild.methods.refinesplat.structure import unrelated_residual
@@ -23,7 +23,7 @@ from ambiguous_wild.vision.sparse_surface import seldom_seen
 
 
 class PixelEvidence:
-    """The structure residual of each view, discounted by what other views say of the same surface."""
+    """The structure residual of each view, discounted by other views' evidence about the same surface."""
 
     def __init__(
         self,
@@ -32,13 +32,13 @@ class PixelEvidence:
         surfaces: Sequence[np.ndarray | None],  # inverse depths of the sparse points, or none at all
         config: MaskConfig,
         device: torch.device | str,
-        tensors: Sequence[Tensor] | None = None,  # the photos, where they lie on the device already
+        tensors: Sequence[Tensor] | None = None,  # the photos, if they are on the device already
     ) -> None:
         self.config = config
-        # as they come: photos that do not fit on the device are sent there one at a time
+        # unchanged: photos that do not fit on the device are sent there one at a time
         self.photos = tensors or [sized(photo, device) for photo in photos]
         self.grey = filters.grey_weights(device)
-        self.elsewhere = Elsewhere(cameras, photos, config.multiview, surfaces, device)
+        self.other_views = OtherViews(cameras, photos, config.multiview, surfaces, device)
         self.unseen_on_host = [
             None if few is None or not few.any() else _at_size(few, photo.shape)
             for few, photo in zip(
@@ -72,41 +72,41 @@ class PixelEvidence:
         if config.memory > 0 and view in self.before:
             evidence = torch.lerp(evidence, self.before[view].float(), config.memory)
         normal, count = low_quantile(evidence, left_out, STATIC_QUANTILE)
-        hearsay = None
+        others = None
         if config.multiview.strength > 0:
             mean_depth = depth / alpha.clamp(min=1e-3) * (alpha > 1e-3)
-            halved = self.elsewhere.halved(view, mean_depth)
-            hearsay = self.elsewhere.ask(view, halved)
+            halved = self.other_views.halved(view, mean_depth)
+            others = self.other_views.ask(view, halved)
             if remember:
-                self.elsewhere.remember(view, evidence, halved)
+                self.other_views.remember(view, evidence, halved)
         if remember:
             self.normal[view].copy_(torch.where(count > 0, normal, self.normal[view]))
             if config.memory > 0:
                 self.before[view] = evidence.half()
         unit = self._unit(normal)
-        return discount(evidence, hearsay, unit, config.multiview) / unit, unit
+        return discount(evidence, others, unit, config.multiview) / unit, unit
 
     def ceiling(self, unit: Tensor) -> Tensor | None:
-        """No threshold is above this, in the unit that `look` divided by, 0-d; None: any may be."""
+        """Upper limit of thresholds, in the unit that `look` divided by, 0-d; None: no limit."""
         share = self.config.ceiling
         if share <= 0 or self.unrelated <= 0:
             return None
         return (share * self.unrelated / unit).clamp_(min=self.config.ceiling_least)
 
     def _unit(self, normal: Tensor) -> Tensor:
-        """Residual that is normal in the scene: median over views, of this one alone before any was seen."""
+        """Normal residual of the scene: the median over views; of this view alone before any was seen."""
         found = median(self.normal)
         return torch.where(found > 0, found, normal).clamp_(min=1e-4)
 
     def state_dict(self) -> dict[str, Any]:
-        """As `pixels.PixelEvidence.state_dict`: a run may go on on the host."""
-        heard, normal = self.elsewhere, self.normal.tolist()
-        views = sorted(heard.heard_of)
+        """As `pixels.PixelEvidence.state_dict`: a run may be resumed on the host."""
+        others, normal = self.other_views, self.normal.tolist()
+        views = sorted(others.stored_views)
         return {
             "normal": {str(v): x for v, x in enumerate(normal) if not math.isnan(x)},
             "before": {str(v): x.cpu() for v, x in self.before.items()},
-            "evidence": {str(v): heard.said.of(v)[0].cpu().contiguous() for v in views},
-            "depth": {str(v): heard.depth.of(v)[0].cpu().contiguous() for v in views},
+            "evidence": {str(v): others.stored.of(v)[0].cpu().contiguous() for v in views},
+            "depth": {str(v): others.depth.of(v)[0].cpu().contiguous() for v in views},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -116,7 +116,7 @@ class PixelEvidence:
             normal[int(view)] = x
         self.normal = torch.from_numpy(normal).to(device)
         self.before = {int(v): x.to(device) for v, x in state["before"].items()}
-        self.elsewhere.restore(
+        self.other_views.restore(
             {int(v): x.to(device) for v, x in state["evidence"].items()},
             {int(v): x.to(device) for v, x in state["depth"].items()},
         )

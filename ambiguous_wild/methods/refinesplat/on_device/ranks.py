@@ -1,4 +1,4 @@
-"""Medians and quantiles of what is there, on the device: how many that is, the host never learns."""
+"""Medians and quantiles that ignore missing values, on the device; the host never reads their number."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from torch import Tensor
 
 
 def median(x: Tensor) -> Tensor:
-    """Median over the last axis of what is not NaN; NaN where all is.
+    """Median over the last axis, ignoring NaN; NaN if all are NaN.
 
-    As numpy's: of an even number the mean of the middle two. torch gives the lower of them.
+    As numpy's, the mean of the middle two of an even number; torch gives the lower one.
     """
     return 0.5 * (torch.nanmedian(x, -1).values - torch.nanmedian(-x, -1).values)
 
@@ -25,12 +25,12 @@ def low_quantile(x: Tensor, left_out: Tensor, quantile: float) -> tuple[Tensor, 
     rank = (count.double() - 1.0).clamp_(min=0.0) * quantile
     low = rank.floor()
     below, above = ordered.double().gather(0, torch.stack([low, rank.ceil()]).long())
-    # of none both are infinite, and their difference is no number
+    # with no pixel both are infinite and their difference is NaN
     return (below + (rank - low) * (above - below)).nan_to_num_(nan=0.0), count
 
 
 def spread_of(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Median and robust spread as in `threshold.robust_floor`, 0-d; NaN among values [n] is not there."""
+    """Median and robust spread as in `threshold.robust_floor`, 0-d; NaN among values [n] is ignored."""
     middle = median(values)
     deviation = 1.4826 * median((values - middle).abs_())
     return middle, torch.maximum(deviation, 0.05 * middle.abs()).clamp_(min=1e-12)

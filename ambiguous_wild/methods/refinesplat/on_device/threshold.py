@@ -1,6 +1,7 @@
-"""T_ent and its learnt weight w2: threshold.py with torch, in float64, without a look at how many there are.
+"""T_ent and its learnt weight w2: threshold.py with torch, in float64, without reading counts on the host.
 
-The host picks candidates and drops what is NaN; here all stay, and what is no candidate scores -inf.
+The host path selects candidates and drops NaN; here all values stay, and values that are no candidates score
+-inf.
 """
 
 from __future__ import annotations
@@ -16,37 +17,37 @@ from ambiguous_wild.methods.refinesplat.config import MaskConfig
 from ambiguous_wild.methods.refinesplat.on_device.ranks import spread_of
 from ambiguous_wild.methods.refinesplat.threshold import TEMPERATURE, THETA_LIMIT, LearntWeight
 
-FORMS = ("kapur", "hard")  # of the threshold that there are here
+FORMS = ("kapur", "hard")  # of the threshold that are implemented here
 
 
 @dataclass(frozen=True)
 class Pool:
-    """The instances a threshold cuts, and what both the cut and the learning of w2 need; all float64."""
+    """The instances that a threshold divides, with the sums that it and the learning of w2 need; float64."""
 
-    order: Tensor  # [n] ascending, NaN (not there) last
-    index: Tensor  # [n] int64, which instance that is
-    x: Tensor  # [n] the same in order, 0 where it is not there
+    order: Tensor  # [n] ascending, NaN (missing) last
+    index: Tensor  # [n] int64, its instance
+    x: Tensor  # [n] the same, 0 where it is missing
     total: Tensor  # 0-d sum of x
     middle: Tensor  # 0-d median
     spread: Tensor  # 0-d robust deviation
-    upper: Tensor  # [n] entropy of the upper set, if cut below each value
-    more_below: Tensor  # [n] by how much that of the lower set is greater
+    upper: Tensor  # [n] entropy of the upper set of a cut below each value
+    more_below: Tensor  # [n] how much greater that of the lower set is
     above_previous: Tensor  # [n] bool: larger than the one before, so a cut may lie between
 
     def floor(self, gate: float) -> Tensor:
-        """`threshold.robust_floor`, 0-d; NaN where nothing is there."""
+        """`threshold.robust_floor`, 0-d; NaN if all are missing."""
         return self.middle + gate * self.spread
 
 
 @dataclass(frozen=True)
 class Cut:
-    """Where the values are cut in two, as `threshold.Cut`."""
+    """The threshold between static and transient values, as `threshold.Cut`."""
 
-    threshold: Tensor  # 0-d float64, inf = nothing stands apart
+    threshold: Tensor  # 0-d float64, inf = no value is an outlier
     floor: Tensor  # 0-d float64
 
     def below(self, ceiling: Tensor | None) -> Cut:
-        """The cut with no threshold above the ceiling; then nor is the floor."""
+        """The cut with threshold and floor limited to the ceiling."""
         if ceiling is None:
             return self
         high = self.threshold > ceiling
@@ -55,7 +56,7 @@ class Cut:
 
 
 def pool_of(values: Tensor) -> Pool:
-    """Sort and measure values [n] >= 0 float64, NaN = not there; n >= 1."""
+    """Sort values [n] >= 0 float64 and compute their statistics; NaN = missing; n >= 1."""
     order, index = values.sort()
     x = order.nan_to_num(nan=0.0).clamp_(min=0.0)
     sums = torch.stack([x, torch.xlogy(x, x)])
@@ -82,14 +83,14 @@ def t_ent(pool: Pool, w2: Tensor, config: MaskConfig) -> Cut:
     start = scores.argmax().clamp(min=1)
     between = 0.5 * (pool.order.take(start) + pool.order.take(start - 1))
     apart = candidate.any()
-    if config.gate <= 0:  # or the gate's bound is above values that are all alike
+    if config.gate <= 0:  # with a gate, its bound is above values that are all equal
         last = pool.order.nan_to_num(nan=-math.inf).amax()
         apart = apart & (last - pool.order[0] > 1e-9 * last.abs().clamp(min=1e-300))
     return Cut(torch.where(apart, between, math.inf), floor)
 
 
 def _candidates(pool: Pool, w2: Tensor, floor: Tensor) -> tuple[Tensor, Tensor]:
-    """Below which values a cut may lie, [n] bool, and the objective there, -inf elsewhere."""
+    """The values below which a cut may lie, [n] bool, and the objective there, else -inf."""
     candidate = pool.above_previous & (pool.order > floor)
     return candidate, torch.addcmul(pool.upper, pool.more_below, w2).masked_fill_(~candidate, -math.inf)
 
@@ -102,7 +103,7 @@ def learnt(theta: Tensor, pool: Pool, areas: Tensor, floor: Tensor, config: Mask
     Args:
         theta: before.
         pool: the instances.
-        areas: [n] px, in the order they had before they were sorted; NaN = not there.
+        areas: [n] px, in the order before sorting; NaN = missing.
         floor: of the cut; candidates lie above it.
         config: `disagree` decides the price of a masked pixel.
     """
@@ -125,4 +126,4 @@ def learnt(theta: Tensor, pool: Pool, areas: Tensor, floor: Tensor, config: Mask
     gradient = dl_dt * dt_dw2 * (w2 * (1.0 - w2))
     step = gradient.nan_to_num_(nan=0.0, posinf=0.0, neginf=0.0).clamp_(-1.0, 1.0)
     moved = (theta - LearntWeight.rate * 50 * step).clamp_(-THETA_LIMIT, THETA_LIMIT)
-    return torch.where(candidate.sum() >= 2, moved, theta)  # else w2 decides nothing
+    return torch.where(candidate.sum() >= 2, moved, theta)  # with fewer, w2 has no influence

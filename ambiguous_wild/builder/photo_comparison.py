@@ -1,0 +1,219 @@
+"""Compare photos on the surfaces they share: exposure, colour, sharpness, overlap.
+
+A photo's mean brightness depends on what it shows. On surfaces that two photos share (SIFT matches of one
+epipolar geometry) the median difference is that of the camera settings. Least squares over all pairs gives
+one offset a photo.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+SIDE = 800  # px, longer side at which photos are compared
+FEATURES = 1000
+RATIO = 0.8  # Lowe's ratio test
+MIN_INLIERS = 16  # matches of one epipolar geometry for two photos to overlap
+# Candidates of each photo: the next photos, and those of the most similar coarse colours.
+NEXT_PHOTOS, SIMILAR_PHOTOS = 4, 8
+EXTRA_CANDIDATES = 60  # more of them for a photo that overlaps with none yet
+_PATCH = 4  # px, half a patch around a feature
+QUANTITIES = ("exposure", "red", "blue", "sharpness")  # log2 each; red and blue over green
+
+
+@dataclass(frozen=True)
+class PhotoFeatures:
+    """What the comparison needs of one photo: about 150 kB."""
+
+    xy: np.ndarray  # [F, 2] float32 px
+    descriptors: np.ndarray  # [F, 128] uint8
+    values: np.ndarray  # [F, 4] float32, `QUANTITIES` around each feature; NaN where clipped or too dark
+    coarse_colours: np.ndarray  # [96] float32, unit length: to find photos of the same place
+
+
+@dataclass(frozen=True)
+class PhotoComparison:
+    """Result of the comparison, over all pairs."""
+
+    offsets: np.ndarray  # [N, 4] float64, log2, median 0; NaN for photos without a partner
+    partners: np.ndarray  # [N] int, number of photos that overlap with it
+    group: np.ndarray  # [N] int, connected groups of overlapping photos; 0 is the largest
+    forward: float  # share of overlapping pairs that differ by motion along the line of sight; NaN: no pair
+
+
+def photo_features(
+    rgb: np.ndarray,  # [H, W, 3] uint8
+) -> PhotoFeatures:
+    """SIFT features of a photo, with brightness, colour and sharpness around each."""
+    scale = SIDE / max(rgb.shape[:2])
+    small = cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else rgb
+    gray = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
+    sift = getattr(cv2, "SIFT_create")  # noqa: B009 - absent from OpenCV's own stubs
+    points, descriptors = sift(FEATURES).detectAndCompute(gray, None)
+    if descriptors is None:
+        points, descriptors = [], np.zeros((0, 128))
+    xy = np.array([p.pt for p in points], np.float32).reshape(-1, 2)
+    return PhotoFeatures(xy, descriptors.astype(np.uint8), _values(small, gray, xy), _coarse_colours(small))
+
+
+def _values(small: np.ndarray, gray: np.ndarray, xy: np.ndarray) -> np.ndarray:
+    """`QUANTITIES` in a patch around each feature, [F, 4]."""
+    codes = small.astype(np.float32) / 255
+    linear = np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
+    size = (2 * _PATCH + 1, 2 * _PATCH + 1)
+    colour = cv2.blur(linear, size)
+    laplacian = cv2.Laplacian(gray, cv2.CV_32F)
+    # Divided by contrast below, so that exposure does not count as sharpness.
+    fine = np.sqrt(cv2.blur(laplacian * laplacian, size))
+    mean = cv2.blur(gray.astype(np.float32), size)
+    contrast = np.sqrt(np.maximum(cv2.blur(gray.astype(np.float32) ** 2, size) - mean * mean, 0.0))
+    col = np.clip(np.round(xy[:, 0]).astype(int), 0, gray.shape[1] - 1)
+    row = np.clip(np.round(xy[:, 1]).astype(int), 0, gray.shape[0] - 1)
+    c = colour[row, col]
+    clipped = cv2.dilate((small.max(axis=2) >= 250).astype(np.uint8), np.ones(size, np.uint8))[row, col] > 0
+    usable = ~clipped & (c.min(axis=1) > 0.004) & (contrast[row, col] > 2.0)
+    c = np.maximum(c, 1e-4)
+    luma = c @ np.array([0.2126, 0.7152, 0.0722], np.float32)
+    sharp = np.maximum(fine[row, col], 1e-3) / np.maximum(contrast[row, col], 1e-3)
+    values = np.log2(np.stack([luma, c[:, 0] / c[:, 1], c[:, 2] / c[:, 1], sharp], axis=1))
+    return np.where(usable[:, None], values, np.nan).astype(np.float32)
+
+
+def _coarse_colours(small: np.ndarray) -> np.ndarray:
+    """Mean colours of 8 x 4 cells, less their mean: similar for photos of the same thing."""
+    cells = cv2.resize(small, (8, 4), interpolation=cv2.INTER_AREA).astype(np.float32).reshape(-1, 3)
+    cells -= cells.mean(axis=0)
+    return (cells / max(float(np.linalg.norm(cells)), 1e-6)).ravel()
+
+
+def compare_photos(
+    features: Sequence[PhotoFeatures],  # in the order of capture, where known
+    step: Callable[[], None] = lambda: None,
+) -> PhotoComparison:
+    """Match each photo with the next and the most similar ones; solve for one offset a photo."""
+    count = len(features)
+    graph = np.zeros((count, count), bool)
+    rows: list[tuple[int, int, np.ndarray, float]] = []
+    forward: list[bool] = []
+
+    def try_pair(i: int, j: int) -> None:
+        found = _match(features[i], features[j])
+        if found is None:
+            return
+        graph[i, j] = graph[j, i] = True
+        forward.append(is_forward(features[i].xy[found[0]], features[j].xy[found[1]]))
+        difference = features[i].values[found[0]] - features[j].values[found[1]]
+        good = np.isfinite(difference).all(axis=1)
+        if good.sum() >= MIN_INLIERS // 2:
+            rows.append((i, j, np.median(difference[good], axis=0), float(np.sqrt(good.sum()))))
+
+    tried = set(candidate_pairs(features))
+    for i, j in sorted(tried):
+        try_pair(i, j)
+        step()
+    # A photo that overlaps with few is tried against more candidates before it counts as isolated.
+    groups = _groups(graph)
+    for i in np.flatnonzero((groups != 0) | (graph.sum(axis=1) < 2)).tolist():
+        for j in most_similar(features, i, EXTRA_CANDIDATES):
+            if (pair := (min(i, j), max(i, j))) not in tried:
+                tried.add(pair)
+                try_pair(*pair)
+    share = float(np.mean(forward)) if forward else math.nan
+    return PhotoComparison(_solve(count, rows), graph.sum(axis=1), _groups(graph), share)
+
+
+def is_forward(
+    a: np.ndarray,  # [M, 2] px, matches of one geometry
+    b: np.ndarray,  # [M, 2] px
+) -> bool:
+    """Whether the picture grows or shrinks about a point inside it: motion along the line of sight.
+
+    A similarity is fitted to the matches. It must scale by over 3 %, turn by less than it scales, and have
+    its fixed point among the matches: near that point there is no parallax.
+    """
+    cv2.setRNGSeed(0)
+    fit, _ = cv2.estimateAffinePartial2D(a, b, ransacReprojThreshold=0.02 * SIDE)
+    if fit is None:
+        return False
+    cos, sin = float(fit[0, 0]), float(fit[1, 0])
+    growth = abs(math.log(max(math.hypot(cos, sin), 1e-6)))
+    if growth < math.log(1.03) or abs(math.atan2(sin, cos)) > growth:
+        return False
+    fixed = np.linalg.solve(np.eye(2) - fit[:, :2], fit[:, 2])
+    low, high = np.percentile(a, [5, 95], axis=0)
+    return bool(((fixed > low) & (fixed < high)).all())
+
+
+def candidate_pairs(features: Sequence[PhotoFeatures]) -> list[tuple[int, int]]:
+    """Pairs to match: all of a small capture, else each photo with the next and the most similar ones."""
+    count = len(features)
+    if count <= NEXT_PHOTOS + SIMILAR_PHOTOS:
+        return [(i, j) for i in range(count) for j in range(i + 1, count)]
+    colours = np.stack([f.coarse_colours for f in features])
+    alike = colours @ colours.T
+    np.fill_diagonal(alike, -np.inf)
+    pairs = {(i, j) for i in range(count) for j in range(i + 1, min(i + 1 + NEXT_PHOTOS, count))}
+    for i in range(count):
+        pairs |= {
+            (min(i, int(j)), max(i, int(j))) for j in np.argsort(-alike[i], kind="stable")[:SIMILAR_PHOTOS]
+        }
+    return sorted(pairs)
+
+
+def most_similar(features: Sequence[PhotoFeatures], index: int, most: int) -> list[int]:
+    """The photos most similar to one, the most similar first."""
+    alike = np.array([f.coarse_colours @ features[index].coarse_colours for f in features])
+    return [int(j) for j in np.argsort(-alike, kind="stable") if j != index][:most]
+
+
+def _match(a: PhotoFeatures, b: PhotoFeatures) -> tuple[np.ndarray, np.ndarray] | None:
+    """Indices of matching features in both photos; None where the photos do not overlap."""
+    if min(len(a.xy), len(b.xy)) < MIN_INLIERS:
+        return None
+    nearest = cv2.BFMatcher(cv2.NORM_L2).knnMatch(
+        a.descriptors.astype(np.float32), b.descriptors.astype(np.float32), k=2
+    )
+    good = [m[0] for m in nearest if len(m) == 2 and m[0].distance < RATIO * m[1].distance]
+    if len(good) < MIN_INLIERS:
+        return None
+    one = np.array([m.queryIdx for m in good])
+    two = np.array([m.trainIdx for m in good])
+    cv2.setRNGSeed(0)
+    _, inlier = cv2.findFundamentalMat(a.xy[one], b.xy[two], cv2.FM_RANSAC, 2.0, 0.99, 500)
+    if inlier is None or int(inlier.sum()) < MIN_INLIERS:
+        return None
+    keep = inlier.ravel() > 0
+    return one[keep], two[keep]
+
+
+def _solve(count: int, rows: list[tuple[int, int, np.ndarray, float]]) -> np.ndarray:
+    """Offsets [N, 4] whose differences fit the pairs' medians; NaN for photos without a pair."""
+    offsets = np.full((count, len(QUANTITIES)), np.nan)
+    if not rows:
+        return offsets
+    from scipy.sparse import csr_matrix
+    from scipy.sparse.linalg import lsqr
+
+    weight = np.array([w for *_, w in rows])
+    index = np.arange(len(rows))
+    i, j = np.array([r[0] for r in rows]), np.array([r[1] for r in rows])
+    data = np.concatenate([weight, -weight])
+    matrix = csr_matrix((data, (np.r_[index, index], np.r_[i, j])), shape=(len(rows), count))
+    seen = np.unique(np.r_[i, j])
+    for q in range(len(QUANTITIES)):
+        solved = lsqr(matrix, weight * np.array([r[2][q] for r in rows]))[0]
+        offsets[seen, q] = solved[seen] - np.median(solved[seen])
+    return offsets
+
+
+def _groups(graph: np.ndarray) -> np.ndarray:
+    """Connected groups of photos, numbered by size, 0 the largest."""
+    from scipy.sparse.csgraph import connected_components
+
+    _, label = connected_components(graph, directed=False)
+    order = np.argsort(-np.bincount(label), kind="stable")
+    return np.argsort(order)[label]

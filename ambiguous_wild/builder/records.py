@@ -1,0 +1,261 @@
+"""Records that one build stage hands to the next.
+
+They are written as JSON with the keys below: a stage's result to stage.json, `SceneRecord` to scene.json.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal, NotRequired, TypedDict
+
+from ambiguous_wild.core.scene import FileEntry
+
+
+class ExifRecord(TypedDict, total=False):
+    """`io.exif.Exif` without the values that the file does not state."""
+
+    make: str
+    model: str
+    focal_mm: float
+    focal_35mm: float
+    exposure_s: float
+    f_number: float
+    iso: float
+    white_balance: int
+    orientation: int
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
+    taken_at: str
+
+
+class PhotoRecord(TypedDict):
+    """One photo of the capture that can be read."""
+
+    source: str  # path relative to the capture folder
+    stem: str  # its files in the scene are <stem>.png
+    side: Literal["train", "test"] | None
+    sha256: str
+    width: int  # px
+    height: int  # px
+    exif: ExifRecord
+    camera: str | None  # make and model
+    blur: float  # variance of the Laplacian: the lower, the softer
+    mean_luma: float  # of 255
+    notes: list[str]  # what reading converted
+
+
+class CheckedPhoto(PhotoRecord):
+    """A photo as the capture checks see it."""
+
+    noise: float  # of 255; NaN where it cannot be measured
+
+
+class ScreenedPhoto(PhotoRecord):
+    """A photo as structure from motion gets it."""
+
+    work_name: str  # file name that COLMAP sees
+    copies: list[str]  # files of the capture with the same bytes, left out
+
+
+class SkippedPhoto(TypedDict):
+    """A photo that is left out."""
+
+    source: str
+    skipped: str  # the reason
+
+
+class ScreenResult(TypedDict):
+    """Of the stage `screen`."""
+
+    photos: list[ScreenedPhoto]
+    skipped: list[SkippedPhoto]
+    warnings: list[str]
+
+
+class MaskResult(TypedDict):
+    """Of the stage `masks`."""
+
+    kept_share: dict[str, float]  # stem -> share of white pixels
+
+
+class FeatureResult(TypedDict):
+    """Of the stage `features`."""
+
+    camera: str  # "single" or "per-image"
+    features: dict[str, int]  # work name -> number
+
+
+class MatchResult(TypedDict):
+    """Of the stage `matches`."""
+
+    matcher: str  # "exhaustive" or "sequential"
+    pairs: int  # tried
+    verified: int
+
+
+class ModelSummary(TypedDict):
+    """One of COLMAP's models."""
+
+    model: int  # its number and folder
+    images: int
+    points: int
+    error_px: float  # mean reprojection error
+    track_length: float  # mean
+
+
+class MappingResult(TypedDict):
+    """Of the stage `mapping`."""
+
+    models: list[ModelSummary]
+
+
+class UndistortResult(TypedDict):
+    """Of the stage `undistort`."""
+
+    truth: dict[str, int] | None  # part of the truth -> photos that have it
+
+
+class DownsampleResult(TypedDict):
+    """Of the stage `downsample`."""
+
+    size: list[int]  # width and height of most photos, px
+
+
+class PackageResult(TypedDict):
+    """Of the stage `package`."""
+
+    files: int
+    bytes: int
+
+
+class LostPhoto(TypedDict):
+    """A readable photo that is not in the scene."""
+
+    source: str
+    reason: str
+
+
+class ChosenMethods(TypedDict):
+    """What the settings "auto" became, and the model that was taken."""
+
+    camera: str
+    matcher: str
+    mapper: str
+    model: int
+
+
+class SceneCounts(TypedDict):
+    """How many of what the build found."""
+
+    photos: int
+    readable: int
+    registered: int
+    train: int
+    test: int
+    cameras: int
+    points: int
+    points_seen_in_test_only: int
+    points_of_track_length_2: int
+    pairs: int
+    pairs_verified: int
+
+
+class ScenePhoto(TypedDict):
+    """One readable photo in scene.json."""
+
+    source: str
+    sha256: str
+    split: str | None  # None: not in the scene
+    width: int
+    height: int
+    blur: float
+    mean_luma: float
+    features: int
+    notes: list[str]
+    exif: ExifRecord  # without GPS
+
+
+class BuildInputs(TypedDict):
+    """Everything that the scene's files follow from."""
+
+    photos: list[list[str | None]]  # source, stem, side, sha256, and "copy" where it is one
+    masks: list[list[str]] | None  # path and sha256 of every file
+    truth: list[list[str]] | None
+    test_list: str | None  # sha256
+    settings: dict[str, Any]  # `BuildSettings` as plain data
+    versions: dict[str, str]
+
+
+class BuildRecord(TypedDict):
+    """What the build found; the part of scene.json that a person reads."""
+
+    name: str
+    license: str
+    factor: int
+    images: str
+    split: str  # "list", "folders" or "every-8"
+    seed: int
+    settings: dict[str, Any]  # `BuildSettings` as plain data
+    chosen: ChosenMethods
+    counts: SceneCounts
+    reprojection_error_px: float
+    mean_track_length: float
+    models: list[ModelSummary]
+    lost: list[LostPhoto]
+    skipped: list[SkippedPhoto]
+    warnings: list[str]
+    photos: dict[str, ScenePhoto]
+    masks: MaskResult | None
+    truth: dict[str, int] | None
+
+
+class KeyedRecord(BuildRecord):
+    """`BuildRecord` with what it was built from and how long that took."""
+
+    build_key: str
+    inputs: BuildInputs
+    seconds: dict[str, float]  # stage -> s
+
+
+class SceneRecord(KeyedRecord):
+    """scene.json of a built scene."""
+
+    schema: str
+    schema_version: int
+    files: dict[str, FileEntry]  # path -> sha256 and size
+
+
+class CapturedPhoto(TypedDict):
+    """One photo of a capture's capture.json."""
+
+    photo: str
+    source: NotRequired[str]  # of a copied photo
+    frame: NotRequired[int]  # of a video or a camera
+    time_s: NotRequired[float]
+    sharpness: float
+
+
+class LeftOut(TypedDict):
+    """A photo of the source folder that was not copied."""
+
+    source: str
+    why: str
+
+
+class FrameCounts(TypedDict, total=False):
+    """Frames of a video."""
+
+    frames_read: int
+    frames_announced: int | None  # by the header; None where it says nothing usable
+
+
+class CaptureRecord(TypedDict):
+    """capture.json of `aw capture`."""
+
+    version: str
+    kind: Literal["folder", "video", "camera"]
+    source: str
+    frames_read: NotRequired[int]
+    frames_announced: NotRequired[int | None]
+    photos: list[CapturedPhoto]
+    left_out: list[LeftOut]

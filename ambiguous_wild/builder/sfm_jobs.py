@@ -1,0 +1,50 @@
+"""Jobs of the COLMAP process: `sfm` writes them as JSON, `sfm_worker` reads them."""
+
+from __future__ import annotations
+
+from typing import Literal, NotRequired, TypedDict
+
+
+class FeatureJob(TypedDict):
+    """Extract features."""
+
+    task: Literal["features"]
+    database: str
+    photos: str  # folder
+    names: list[str]
+    camera: str
+    masks: str | None  # folder
+    max_features: int
+    max_side: int  # px
+    seed: int
+    jobs: int
+    parent: NotRequired[int]  # process id, added when the job is written
+
+
+class MatchJob(TypedDict):
+    """Match and verify pairs."""
+
+    task: Literal["matches"]
+    database: str
+    names: list[str]
+    test_names: list[str]
+    matcher: str
+    seed: int
+    jobs: int
+    parent: NotRequired[int]
+
+
+class MappingJob(TypedDict):
+    """Build models."""
+
+    task: Literal["mapping"]
+    database: str
+    photos: str  # folder
+    output: str  # folder
+    progress: str  # file that holds the number of placed photos
+    mapper: str
+    seed: int
+    parent: NotRequired[int]
+
+
+SfmJob = FeatureJob | MatchJob | MappingJob

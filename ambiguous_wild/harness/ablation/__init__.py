@@ -1,0 +1,1 @@
+"""Ablations: a study of variants, and its report."""

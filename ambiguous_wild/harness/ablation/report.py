@@ -1,0 +1,249 @@
+"""From an ablation study's runs to ablation.json, .csv, .md and .png.
+
+A mean is over images, then over all runs (scene, seed) of the variant; one missing value makes it missing.
+The spread is the sample deviation over those runs. Differences to the default are taken run by run, on the
+same scene with the same seed, so that the spread of a difference is not the spread between scenes.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from pathlib import Path
+from typing import Any, Literal
+
+from ambiguous_wild.harness.ablation.plan import DIFFERENCES, METRICS, Outcome, Planned, Study, read_outcomes
+from ambiguous_wild.harness.ablation.records import GroupFacts, StudyReport, Summary, VariantRow
+from ambiguous_wild.io.atomic import atomic_path, write_json, write_text
+from ambiguous_wild.metrics import stats
+
+
+def report(study: Study, output: Path, made_by: str = "") -> StudyReport:
+    """The study as plain data: one entry a row, with its values, differences and runs.
+
+    Args:
+        study: planned, run or in part run.
+        output: the folder of its runs.
+        made_by: the command that makes it again.
+    """
+    default = read_outcomes(study.default, output)
+    rows = [_row(row, read_outcomes(row.cells, output), default) for row in study.rows]
+    return {
+        "schema": 1,
+        "made_by": made_by,
+        **study.facts(),
+        "groups": [{"name": g.name, "title": g.title, "source": g.source} for g in study.groups],
+        "rows": rows,
+    }
+
+
+def _row(row: Planned, outcomes: list[Outcome], default: list[Outcome]) -> VariantRow:
+    failed = [o for o in outcomes if o.result is None]
+    status: Literal["ok", "failed", "missing"] = "missing" if row.missing else "failed" if failed else "ok"
+    reason = row.missing or "; ".join(dict.fromkeys(f"{o.scene}, seed {o.seed}: {o.error}" for o in failed))
+    values = {key: _summary([o.value(key) for o in outcomes]) for key, _, _ in METRICS}
+    differences = {}
+    for key, _, _ in DIFFERENCES:
+        pairs = [(o.value(key), d.value(key)) for o, d in zip(outcomes, default, strict=False)]
+        differences[key] = _summary([None if a is None or b is None else a - b for a, b in pairs])
+    return {
+        "group": row.group,
+        "variant": row.variant.name,
+        "settings": list(row.variant.settings),
+        "text": row.variant.text,
+        "status": status,
+        "reason": reason,
+        "same_as": row.same_as,
+        "values": values,
+        "differences": differences,
+        "runs": [
+            {"scene": o.scene, "seed": o.seed, "folder": str(o.folder), "error": o.error or None}
+            | {key: o.value(key) for key, _, _ in METRICS}
+            for o in outcomes
+        ],
+    }
+
+
+def _summary(values: list[float | None]) -> Summary:
+    numbers = [math.nan if v is None else float(v) for v in values]
+    mean, spread = stats.mean(numbers), stats.spread(numbers)
+    return {"mean": _number(mean), "spread": _number(spread)}
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def write_report(data: StudyReport, folder: Path) -> list[Path]:
+    """ablation.json, .csv, .md and, where there is something to draw, .png; returns what was written."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / f"ablation.{kind}" for kind in ("json", "csv", "md")]
+    write_json(paths[0], data)
+    write_text(paths[1], to_csv(data))
+    png = folder / "ablation.png"
+    if draw(data, png):
+        paths.append(png)
+    write_text(paths[2], to_markdown(data, picture=png.name if png in paths else ""))
+    return paths
+
+
+def to_csv(data: StudyReport) -> str:
+    """One line a row of the study; empty cells where a value is missing."""
+    lines = []
+    for row in data["rows"]:
+        line: dict[str, Any] = {
+            "group": row["group"],
+            "variant": row["variant"],
+            "status": row["status"],
+            "reason": row["reason"],
+            "same_as": row["same_as"],
+        }
+        line |= {"settings": " ".join(row["settings"]), "runs": len(row["runs"])}
+        for key, entry in row["values"].items():
+            line |= {key: entry["mean"], f"{key}_spread": entry["spread"]}
+        for key, entry in row["differences"].items():
+            line |= {f"difference_{key}": entry["mean"], f"difference_{key}_spread": entry["spread"]}
+        lines.append(line)
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(lines[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({k: "" if v is None else v for k, v in line.items()} for line in lines)
+    return text.getvalue()
+
+
+def to_markdown(data: StudyReport, picture: str = "") -> str:
+    """One table a group: quality and cost of each variant."""
+    shown = [m for m in METRICS if any(r["values"][m[0]]["mean"] is not None for r in data["rows"])]
+    lines = [f"# Ablations of {data['method']}", "", _subtitle(data), ""]
+    if picture:
+        lines += [f"![quality against cost]({picture})", ""]
+    for group in data["groups"]:
+        rows = [row for row in data["rows"] if row["group"] == group["name"]]
+        lines += [f"## {group['name']}: {group['title']}", ""]
+        if group["source"]:
+            lines += [f"Paper: {group['source']}.", ""]
+        head = ["variant", *(label for _, label, _ in DIFFERENCES), *(label for _, label, _ in shown), "what"]
+        lines += [_line(head), _line(["---"] + ["---:"] * (len(head) - 2) + ["---"])]
+        for row in rows:
+            if row["status"] == "ok":
+                cells = [_cell(row, "differences", key, digits, sign=True) for key, _, digits in DIFFERENCES]
+                cells += [_cell(row, "values", key, digits) for key, _, digits in shown]
+            else:  # the reason stands below the table
+                cells = [row["status"], *[""] * (len(head) - 3)]
+            lines.append(_line([row["variant"], *cells, _what(row)]))
+        lines.append("")
+        lines += [f"- {r['variant']} {r['status']}: {r['reason']}" for r in rows if r["status"] != "ok"]
+        lines += [""] if lines[-1] else []
+    if data["made_by"]:
+        lines += [f"made by: `{data['made_by']}`", ""]
+    return "\n".join(lines)
+
+
+def _subtitle(data: StudyReport) -> str:
+    train = data["train"]
+    budget = train["budget_s"]
+    length = f"{train['iterations']} iterations" if budget is None else f"{budget:g} s of training"
+    base = f"; in every row: {' '.join(data['settings'])}" if data["settings"] else ""
+    return (
+        f"{', '.join(data['scenes'])}; seeds {', '.join(map(str, data['seeds']))}; {length}{base}. "
+        "Differences are to the default, on the same scene with the same seed; +- is the sample deviation "
+        "over runs."
+    )
+
+
+def _what(row: VariantRow) -> str:
+    parts = [row["text"], f"`{' '.join(row['settings'])}`" if row["settings"] else ""]
+    parts.append(f"same runs as {row['same_as']}" if row["same_as"] else "")
+    return "; ".join(part for part in parts if part)
+
+
+def _line(cells: list[str]) -> str:
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+
+def _cell(
+    row: VariantRow, kind: Literal["values", "differences"], key: str, digits: int, sign: bool = False
+) -> str:
+    entry = row[kind][key]
+    if row["variant"] == "default" and kind == "differences":
+        return ""
+    if entry["mean"] is None:
+        return "missing"
+    text = f"{entry['mean']:{'+' if sign else ''},.{digits}f}"
+    return text if entry["spread"] is None else f"{text} +- {entry['spread']:,.{digits}f}"
+
+
+def draw(data: StudyReport, path: Path) -> bool:
+    """Draw PSNR against ms per iteration, a panel a group; False where no group has two points."""
+    groups = [(g, _points(data, g["name"])) for g in data["groups"]]
+    groups = [(g, points) for g, points in groups if len(points) > 1]  # one point compares nothing
+    if not groups:
+        return False
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    columns = min(3, len(groups))
+    rows = -(-len(groups) // columns)
+    figure = Figure(figsize=(5.2 * columns, 3.9 * rows), layout="constrained", dpi=110)
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(rows, columns, squeeze=False)
+    for panel, (group, points) in zip(axes.flat, groups, strict=False):
+        _panel(panel, group, points)
+    for panel in list(axes.flat)[len(groups) :]:
+        panel.set_axis_off()
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, metadata={"Software": None})
+    return True
+
+
+def _points(data: StudyReport, group: str) -> list[tuple[str, float, float, float]]:
+    """(variant, ms an iteration, PSNR, its spread), variants of the same runs under one name."""
+    merged: dict[tuple[float, float], tuple[list[str], float]] = {}
+    for row in data["rows"]:
+        ms, psnr = row["values"]["ms_per_iteration"]["mean"], row["values"]["psnr"]["mean"]
+        if row["group"] == group and ms is not None and psnr is not None:
+            names = merged.setdefault((ms, psnr), ([], row["values"]["psnr"]["spread"] or 0.0))[0]
+            names.append(row["variant"])
+    return [(" = ".join(names), ms, psnr, spread) for (ms, psnr), (names, spread) in merged.items()]
+
+
+def _panel(axes: Any, group: GroupFacts, points: list[tuple[str, float, float, float]]) -> None:
+    for index, (name, ms, psnr, spread) in enumerate(points):
+        is_default = name.split(" = ")[0] == "default"
+        colour = "k" if is_default else f"C{index % 10}"
+        axes.errorbar(ms, psnr, yerr=spread or None, fmt="*" if is_default else "o", color=colour,
+                      ms=13 if is_default else 7, elinewidth=1, capsize=2)  # fmt: skip
+    _labels(axes, points)
+    axes.set_title(f"{group['name']}: {group['title']}", fontsize=8)
+    axes.set_xlabel("ms per iteration", fontsize=8)
+    axes.set_ylabel("PSNR (dB)", fontsize=8)
+    axes.tick_params(labelsize=7)
+    axes.grid(alpha=0.25)
+
+
+def _labels(axes: Any, points: list[tuple[str, float, float, float]]) -> None:
+    """Name every point, each at least a line from the next and all of them inside the frame."""
+    axes.margins(0.12)
+    low, high = axes.get_ylim()
+    middle, line = sum(axes.get_xlim()) / 2, 0.05 * (high - low)
+    width = axes.get_xlim()[1] - axes.get_xlim()[0]
+    order = sorted(range(len(points)), key=lambda index: points[index][2])
+    heights, last = {}, -math.inf
+    for index in order:
+        last = heights[index] = max(points[index][2], last + line)
+    above = high + 0.4 * line
+    for index in reversed(order):  # labels that left the frame move down again
+        above = heights[index] = min(heights[index], above - line)
+    for index, (name, ms, psnr, _) in enumerate(points):
+        left = ms <= middle
+        axes.annotate(
+            name,
+            (ms, psnr),
+            xytext=(ms + (0.03 if left else -0.03) * width, heights[index]),
+            fontsize=7,
+            color="k" if name.split(" = ")[0] == "default" else f"C{index % 10}",
+            ha="left" if left else "right",
+            va="center",
+            arrowprops={"arrowstyle": "-", "lw": 0.4, "color": "0.6"},
+        )

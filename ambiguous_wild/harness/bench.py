@@ -1,0 +1,321 @@
+"""Train methods on scenes and measure them: what `aw bench` does, as a call with a report.
+
+    from ambiguous_wild import bench
+
+    report = bench(["3dgs", "refinesplat"], ["scene"], output="runs", iterations=3000)
+    for run in report.runs:
+        print(run.method, run.scene, run.outcome, run.mean("psnr"))
+
+Imports nothing heavy until names and options are checked.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, TypedDict
+
+from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.harness.running.callbacks import Callbacks as Callbacks
+from ambiguous_wild.harness.running.callbacks import Lines as Lines
+from ambiguous_wild.harness.running.engines.session import Engine as Engine
+from ambiguous_wild.harness.running.engines.session import Grid, Session
+
+if TYPE_CHECKING:
+    from ambiguous_wild.harness.planning.decide import Plan
+    from ambiguous_wild.harness.running.cell import Cell, CellReport, Outcome, Overwrite, Protocol
+    from ambiguous_wild.harness.running.records import RunResult
+    from ambiguous_wild.harness.running.store import Runs
+
+Place = Literal["mask", "density", "regulariser"]
+Words = str | Path
+
+
+class TrainSettings(TypedDict, total=False):
+    """Settings of training beside its length: fields of `TrainConfig`, with its defaults."""
+
+    resolution: Literal["auto", "full", "coarse-to-fine"]
+    max_gaussians: int | None  # None = the method's own ceiling
+    probes: int  # times the test PSNR is measured on the way
+    checkpoint_every_s: float
+    on_nonfinite: Literal["stop", "rollback"]
+
+
+@dataclass(frozen=True)
+class RunReport:
+    """What became of one run."""
+
+    method: str
+    scene: str
+    seed: int
+    group: str  # folder below the output, e.g. "budget-60s"; empty where there is one group
+    effects: tuple[str, ...]
+    folder: Path
+    outcome: Outcome
+    error: str  # empty unless the outcome is "failed"
+    result: RunResult | None  # as in metrics.json; None = no result that can be read
+
+    def mean(self, metric: str) -> float | None:
+        """Mean of an image metric over the test views; None where any value is missing."""
+        from ambiguous_wild.harness.running.records import metrics_of
+
+        rows = [] if self.result is None else self.result["per_image"]
+        values = [metrics_of(row).get(metric) for row in rows]
+        known = [value for value in values if value is not None]
+        return sum(known) / len(known) if known and len(known) == len(values) else None
+
+
+@dataclass(frozen=True)
+class BenchReport:
+    """Every run of a `bench`, in the order in which they were planned."""
+
+    output: Path
+    runs: tuple[RunReport, ...]
+
+    @property
+    def failed(self) -> tuple[RunReport, ...]:
+        return tuple(run for run in self.runs if run.outcome == "failed")
+
+    @property
+    def outcomes(self) -> dict[Outcome, int]:
+        """How many runs were trained, kept, skipped or failed."""
+        return dict(Counter(run.outcome for run in self.runs))
+
+    @property
+    def folders(self) -> tuple[Path, ...]:
+        """A folder for each length and choice of effects: `read` takes one of them."""
+        return tuple(dict.fromkeys(self.output / run.group for run in self.runs))
+
+    def read(self, folder: Path | None = None) -> Runs:
+        """All results below a folder as pandas tables, e.g. for `tables.comparison.comparison`.
+
+        Args:
+            folder: one of `folders`; None = the first.
+        """
+        from ambiguous_wild.harness.running.store import read_runs
+
+        return read_runs(self.folders[0] if folder is None else folder)
+
+
+def bench(
+    methods: str | Sequence[str],
+    scenes: Words | Sequence[Words],
+    *,
+    output: Words = "runs",
+    seeds: Sequence[int] = (0,),
+    iterations: int | None = None,
+    budgets_s: Sequence[float] = (),
+    effects: str | Sequence[str] = "default",
+    plan: Plan | Words | None = None,
+    settings: Sequence[str] = (),
+    parts: Mapping[Place, str] | None = None,
+    train: TrainSettings | None = None,
+    plugins: Sequence[Words] = (),
+    device: Literal["auto", "cpu", "cuda"] = "auto",
+    threads: int | None = None,
+    jobs: int | None = None,
+    engine: Engine | None = None,
+    gpus: int = 1,
+    factor: int | None = None,
+    protocol: Protocol = "full",
+    overwrite: Overwrite = "missing",
+    cache: Words | None = None,
+    pictures: bool = True,
+    callbacks: Callbacks | None = None,
+) -> BenchReport:
+    """Train every method on every scene with every seed, and measure the test views.
+
+    Args:
+        methods: names of `aw methods`, FILE.py:RECIPE, external:FILE.yaml or nerfbaselines:METHOD.
+        scenes: scene folders.
+        output: folder of the runs: OUTPUT/[GROUP/]SCENE/METHOD/seed0.
+        seeds: of training.
+        iterations: length of a training; None = 30000.
+        budgets_s: seconds of training instead; several = every length, each in a group of its own.
+        effects: "none", "all", "auto", "default" (auto where the method allows it), or names with commas;
+            several = every choice, each in a group of its own.
+        plan: of `aw plan`, or its file, for the one scene; None = made where one is needed.
+        settings: options of methods, "METHOD.KEY=VALUE".
+        parts: parts of other methods that every method takes, e.g. {"mask": "refinesplat"}.
+        train: other settings of training.
+        plugins: Python files that register methods.
+        device: where to train; "auto" = the GPU where it can be used.
+        threads: of the CPU kernels; None = all cores. The result does not depend on it.
+        jobs: cells at a time on this machine; None = what `engine` says.
+        engine: where cells run; None = this machine.
+        gpus: that share one model, for a scene too large for one.
+        factor: which images_N; None = what the scene was built for.
+        protocol: "full" measures whole test photos, "half" the right half (NeRF-W).
+        overwrite: "missing" keeps what is finished and resumes what stopped, "always" starts anew, "never"
+            leaves folders that exist as they are.
+        cache: for features and instance masks; None = OUTPUT/.cache.
+        pictures: draw what the method saw into RUN/pictures.
+        callbacks: told what happens; None = nothing is. `Lines()` prints a line a run.
+
+    Returns:
+        A report with every run. A run that failed is in it too: look at `failed`.
+
+    Raises:
+        AwError: unknown method, scene, effect or option, or a folder of another configuration; all found
+            before anything is trained.
+    """
+    told = Callbacks() if callbacks is None else callbacks
+    where = Engine() if engine is None else engine
+    where = where if jobs is None else dataclasses.replace(where, jobs=jobs)
+    where.check()
+    names = _check_methods([methods] if isinstance(methods, str) else methods, plugins, parts or {})
+    folders = [Path(scenes)] if isinstance(scenes, str | Path) else [Path(scene) for scene in scenes]
+    choices = [effects] if isinstance(effects, str) else list(effects)
+    _check_effects(choices, plan, folders)
+    if iterations is not None and budgets_s:
+        raise AwError("iterations and budgets_s exclude each other: a run is as long as one of them says")
+    out = Path(output)
+    with Session(where, threads, told) as session:
+        from ambiguous_wild.harness.running.grid import plan_cells, run_cells
+        from ambiguous_wild.harness.running.groups import grouped
+        from ambiguous_wild.harness.running.prepare import prepare_cpu
+        from ambiguous_wild.io.atomic import check_output
+        from ambiguous_wild.splat.pace import TrainConfig
+
+        chosen = session.device(device)
+        config = TrainConfig(
+            iterations=iterations or TrainConfig.iterations,
+            budget_s=budgets_s[0] if budgets_s else None,
+            **(train or {}),
+        )
+        read = _read_plan(plan)
+        planned = {
+            wanted: plan_cells(
+                names,
+                folders,
+                seeds,
+                config,
+                settings=settings,
+                device=chosen,
+                factor=factor,
+                effects=wanted,
+                plan=read,
+                protocol=protocol,
+            )
+            for wanted in dict.fromkeys(choices)
+        }
+        cells = grouped(planned, budgets_s)
+        if gpus > 1:
+            cells = _on_several_gpus(cells, gpus, where)
+        for line in _remarks(cells):
+            told.say(line)
+        check_output(out / "run")  # before half a minute of compiling
+        if chosen == "cpu" and not where.remote and any(cell.method.program is None for cell in cells):
+            prepare_cpu(threads, told.say)
+        one_by_one = gpus > 1 or session.in_process(cells)
+        told.planned(cells, one_by_one)
+        place = out / ".cache" if cache is None else Path(cache)
+        if one_by_one:
+            reports = run_cells(
+                cells,
+                out,
+                overwrite=overwrite,
+                cache_dir=place,
+                tick=told.tick,
+                pictures=pictures,
+                on_start=told.started,
+                on_end=told.ended,
+            )
+        else:
+            files = [Path(plugin) for plugin in plugins]
+            reports = session.run(Grid(cells, out, overwrite, place, pictures, files, names))
+    return BenchReport(out, tuple(_run_report(cell, report) for cell, report in zip(cells, reports)))
+
+
+def _check_methods(methods: Sequence[str], plugins: Sequence[Words], parts: Mapping[Place, str]) -> list[str]:
+    """The methods' names with the parts they take; a misspelt one is answered before torch is imported."""
+    from ambiguous_wild.methods.graft import graft_name
+    from ambiguous_wild.methods.registry import get_method, load_plugin
+
+    for plugin in plugins:
+        load_plugin(Path(plugin))
+    donors: dict[str, str | None] = dict(parts.items())
+    names = [graft_name(name, donors) for name in methods]
+    for name in names:
+        get_method(name)
+    return names
+
+
+def _check_effects(choices: Sequence[str], plan: Plan | Words | None, scenes: Sequence[Path]) -> None:
+    from ambiguous_wild.harness.running.choosing import check_wanted
+
+    for wanted in choices:
+        check_wanted(wanted)
+    if plan is not None and len(scenes) > 1:
+        name = plan if isinstance(plan, str | Path) else plan.scene
+        raise AwError(f"--plan {name} is of one scene; bench {len(scenes)} scenes one by one, or without it")
+
+
+def _read_plan(plan: Plan | Words | None) -> Plan | None:
+    if not isinstance(plan, str | Path):
+        return plan
+    from ambiguous_wild.harness.planning.file import read_plan
+
+    return read_plan(Path(plan))
+
+
+def _on_several_gpus(cells: list[Cell], gpus: int, engine: Engine) -> list[Cell]:
+    """The cells with one model on so many GPUs.
+
+    Raises:
+        AwError: a cell cannot be trained so, or there are fewer GPUs.
+    """
+    import torch
+
+    from ambiguous_wild.harness.running.multi_gpu import check_multi_gpu
+    from ambiguous_wild.splat.multi_gpu.refuse import refuse_more_than
+
+    if engine.remote or (engine.jobs or 1) > 1:
+        raise AwError("--gpus gives all GPUs to one run at a time: leave --jobs and --engine out")
+    sharing = [dataclasses.replace(cell, gpus=gpus) for cell in cells]
+    for cell in sharing:
+        check_multi_gpu(cell)
+    refuse_more_than(torch.cuda.device_count(), gpus)
+    return sharing
+
+
+def _remarks(cells: Sequence[Cell]) -> list[str]:
+    """Effects that are on, warnings of the scenes, regularisers that do nothing; each once."""
+    from ambiguous_wild.methods.graft import idle_regulariser
+
+    lines = []
+    for method, name, on in dict.fromkeys((c.method.name, c.scene.name, c.chosen.effects) for c in cells):
+        if on:
+            lines.append(f"{method} on {name}: {', '.join(on)}")
+    for scene in {cell.scene.name: cell.scene for cell in cells}.values():
+        lines += [f"warning: {scene.name}: {warning}" for warning in scene.info.get("warnings", ())]
+    for cell in {cell.method.name: cell for cell in cells}.values():
+        if idle := idle_regulariser(cell.method, cell.options):
+            lines.append(
+                f"warning: {cell.method.name}: {idle} adds no loss on the render with these options; "
+                f"switch it on with --set {idle}.KEY=VALUE, or leave the regulariser out"
+            )
+    return lines
+
+
+def _run_report(cell: Cell, report: CellReport) -> RunReport:
+    from ambiguous_wild.harness.running.result_file import RESULT, read_result
+    from ambiguous_wild.harness.running.run_folder import is_finished
+
+    result = report.result
+    if result is None and report.outcome != "failed" and is_finished(report.folder):
+        result = read_result(report.folder / RESULT)
+    return RunReport(
+        method=cell.method.name,
+        scene=cell.scene.name,
+        seed=cell.train.seed,
+        group=cell.group,
+        effects=cell.chosen.effects,
+        folder=report.folder,
+        outcome=report.outcome,
+        error=report.error,
+        result=result,
+    )

@@ -1,1 +1,0 @@
-"""Where cells run: in this process, in several on this machine, or on a Ray cluster."""

@@ -1,0 +1,1 @@
+"""One run and many: plan, train, measure, write and read results."""

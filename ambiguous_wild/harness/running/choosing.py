@@ -1,0 +1,95 @@
+"""Choose the effects that each method trains with, from `--effects` and the plan of the scene.
+
+Imports no torch before a plan is needed: a misspelt name is answered at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ambiguous_wild.core import AwError, Scene
+from ambiguous_wild.methods.registry import MethodEntry
+from ambiguous_wild.splat.effects import ALL, DEGREES, check_effects
+
+if TYPE_CHECKING:
+    from ambiguous_wild.harness.planning.decide import Plan
+
+WORDS = ("default", "auto", "none", "all")
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """The effects of one run, and why these."""
+
+    effects: tuple[str, ...] = ()
+    asked: str = ""  # empty: no effects were asked for, and no effects.json is written
+    plan: Plan | None = None
+
+    def write(self, path: Path) -> None:
+        """effects.json of the run."""
+        if not self.asked:
+            return
+        from ambiguous_wild.io.atomic import write_json
+
+        plan = None if self.plan is None else self.plan.plain()
+        write_json(path, {"schema": 1, "asked": self.asked, "effects": list(self.effects), "plan": plan})
+
+
+def check_wanted(wanted: str) -> tuple[str, ...]:
+    """The names in a list of effects, in the order in which they act; none for a word such as "auto".
+
+    Raises:
+        AwError: no word and no list of effects.
+    """
+    if wanted in WORDS:
+        return ()
+    names = [name.strip() for name in wanted.split(",") if name.strip()]
+    if not names:
+        raise AwError("--effects is empty: write auto, none, all, or names with commas; 'aw plan' lists them")
+    mixed = [name for name in names if name in WORDS]
+    if mixed:
+        raise AwError(f"--effects {wanted!r}: {mixed[0]!r} stands alone")
+    return check_effects(names)
+
+
+def choose(
+    wanted: str, scene: Scene, methods: Sequence[MethodEntry], plan: Plan | None = None
+) -> dict[str, Chosen]:
+    """What every method trains with on this scene, by its name.
+
+    Args:
+        wanted: as `--effects` takes it; "default" is auto for the methods that allow effects, of those alone.
+        scene: the scene.
+        methods: the methods.
+        plan: made before; None = made now if any method needs it.
+
+    Raises:
+        AwError: unknown effect, or a plan of another scene.
+    """
+    named = check_wanted(wanted)
+    if plan is not None and plan.scene != scene.name:
+        raise AwError(f"the plan is of scene {plan.scene}, not of {scene.name}: run 'aw plan {scene.root}'")
+    if wanted not in ("auto", "default"):
+        effects = ALL if wanted == "all" else named
+        return {m.name: Chosen(effects, "" if wanted == "none" else wanted) for m in methods}
+    # a graft takes none: its name says all that it is made of
+    allowed = {m.name: None if wanted == "auto" else m.auto_effects for m in methods}
+    if plan is None and any(names is None or names for names in allowed.values()):
+        from ambiguous_wild.harness.planning.decide import plan_without_training
+
+        plan = plan_without_training(scene)
+    out = {}
+    for name, among in allowed.items():
+        if plan is None or among == ():
+            out[name] = Chosen()
+        else:
+            out[name] = Chosen(check_effects(plan.effects(among)), "auto", plan)
+    return out
+
+
+def describe(effects: Sequence[str]) -> str:
+    """For a line of text."""
+    return ", ".join(f"SH degree {DEGREES[e]}" if e in DEGREES else e for e in effects) or "none"

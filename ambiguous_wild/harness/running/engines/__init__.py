@@ -1,0 +1,1 @@
+"""Engines: run cells in this process, in several on this machine, or on a Ray cluster."""

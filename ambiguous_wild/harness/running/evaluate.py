@@ -1,0 +1,170 @@
+"""Renders, masks and numbers of a trained model; every number comes from the saved 8-bit images."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ambiguous_wild.core import Camera, Scene, View
+from ambiguous_wild.harness.running.records import Cost, ImageRow, MaskScores, image_row
+from ambiguous_wild.harness.running.regions import Regions, find_regions, true_distractor
+from ambiguous_wild.io.atomic import atomic_dir
+from ambiguous_wild.io.images import read_png_rgb, to_uint8, write_png
+from ambiguous_wild.metrics import image as image_metrics
+from ambiguous_wild.metrics import lpips
+from ambiguous_wild.metrics import masks as mask_metrics
+from ambiguous_wild.metrics.flip import flip
+from ambiguous_wild.splat import device
+from ambiguous_wild.splat.trainer import Trainer
+
+FPS_ROUNDS = 5
+FPS_SECONDS = 2.0  # of all rounds together: long enough to average over scheduling noise
+FULL_IMAGE = image_metrics.METRICS | {"flip": flip}
+
+
+@dataclass(frozen=True)
+class TestPhoto:
+    """A test view with its photo, [H, W, 3] uint8."""
+
+    __test__ = False  # the name is the field's term, not a pytest class
+
+    view: View
+    photo: np.ndarray
+
+
+def load_test_photos(scene: Scene) -> list[TestPhoto]:
+    """The test views' photos as 8-bit RGB.
+
+    Raises:
+        AwError: one is too small to be measured; said here, before anything is trained.
+    """
+    for view in scene.test:
+        image_metrics.check_size(view.camera.height, view.camera.width)
+    return [TestPhoto(view, read_png_rgb(view.image_path)) for view in scene.test]
+
+
+def mean_psnr(truth: list[TestPhoto], draw: Callable[[Camera], np.ndarray]) -> float:
+    """Mean PSNR in dB over the test views, from 8-bit images."""
+    return float(np.mean([image_metrics.psnr(to_uint8(draw(t.view.camera)), t.photo) for t in truth]))
+
+
+def render_and_measure(
+    trainer: Trainer,
+    truth: list[TestPhoto],
+    folder: Path,
+    *,
+    half: bool = False,
+    scene: Scene | None = None,
+) -> tuple[list[ImageRow], dict[str, str]]:
+    """Render the test views to PNG and measure what was written.
+
+    Args:
+        trainer: holds the model.
+        truth: the test photos.
+        folder: for the PNG files.
+        half: NeRF-W's protocol: colour effects are fitted on the left half of each test photo, columns
+            0 to ceil(W / 2), everything else stays, and the right half, from W // 2, is measured.
+        scene: what the metrics of regions are about; None = the trainer's.
+
+    Returns:
+        Per-image metrics, and for each metric that is missing the reason.
+    """
+    missing = {name: reason for name, reason in lpips.available().items() if reason is not None}
+    if not truth:
+        missing |= dict.fromkeys(FULL_IMAGE, "the scene has no test views")
+        return [], missing
+    scene = getattr(trainer.data, "scene", None) if scene is None else scene
+    regions = Regions({}, {}) if scene is None else find_regions(scene)
+    missing |= regions.missing
+    names = [name for name in lpips.available() if name not in missing]
+    networks = {name: lpips.load(name) for name in names}
+    rows: list[ImageRow] = []
+    with atomic_dir(folder) as temporary:
+        for t in truth:
+            path = temporary / Path(t.view.name).with_suffix(".png")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            image = _fitted(trainer, t) if half else trainer.render(t.view.camera).image
+            write_png(path, to_uint8(image.cpu().numpy()))
+            drawn, photo = read_png_rgb(path), t.photo
+            if half:
+                right = slice(photo.shape[1] // 2, None)
+                drawn, photo = (np.ascontiguousarray(picture[:, right]) for picture in (drawn, photo))
+            values = {name: metric(drawn, photo) for name, metric in FULL_IMAGE.items()}
+            values |= regions.psnr(t.view.name, drawn, photo)
+            values |= {name: network(drawn, photo) for name, network in networks.items()}
+            rows.append(image_row(t.view.name, values))
+    return rows, missing
+
+
+def _fitted(trainer: Trainer, test: TestPhoto) -> torch.Tensor:
+    photo = torch.from_numpy(test.photo.astype(np.float32) / 255.0).to(trainer.data.device)
+    keep = torch.zeros(photo.shape[:2], device=photo.device)
+    keep[:, : -(-photo.shape[1] // 2)] = 1.0
+    return trainer.render_fitted(test.view.camera, photo, keep)
+
+
+def write_masks(trainer: Trainer, folder: Path) -> MaskScores | None:
+    """Write every train view's keep map and score it, see `write_keeps`."""
+
+    def keeps() -> Iterator[tuple[View, np.ndarray]]:
+        for index, view in enumerate(trainer.data.scene.train):
+            step = trainer.make_step(max(trainer.iteration, 1), index, divisor=1)
+            keep = trainer.combine_user_keep(step, trainer.parts.mask.predict(step))
+            if keep is not None:
+                yield view, (keep > 0.5).cpu().numpy()
+
+    return write_keeps(trainer.data.scene, keeps(), folder)
+
+
+def write_keeps(scene: Scene, keeps: Iterable[tuple[View, np.ndarray]], folder: Path) -> MaskScores | None:
+    """Write keep maps [H, W] bool of train views (white = keep) and score them where the truth is known.
+
+    Returns:
+        IoU, precision and recall of the distractor pixels, counted over all photos together (a photo
+        where nothing is masked has no precision of its own), or None without truth.
+    """
+    counts = []
+    with atomic_dir(folder) as temporary:
+        for view, keep in keeps:
+            path = temporary / Path(view.name).with_suffix(".png")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_png(path, keep.astype(np.uint8) * 255)
+            truth = true_distractor(scene, view)
+            if truth is not None:
+                counts.append(mask_metrics.confusion(keep, ~truth))
+    if not counts:
+        return None
+    total = mask_metrics.pooled(counts)
+    return {"iou": total.iou, "precision": total.precision, "recall": total.recall, "images": len(counts)}
+
+
+def frames_per_second(trainer: Trainer) -> Cost:
+    """Rendered frames a second over the views of the scene, after a warm-up.
+
+    Returns:
+        fps, the median of several rounds, and fps_low and fps_high, the slowest and the fastest of them.
+    """
+    cameras = [v.camera for v in (trainer.data.scene.test or trainer.data.scene.train)]
+    with torch.no_grad():
+        for camera in cameras[:3]:
+            trainer.render(camera)
+    device.wait(trainer.data.device)
+    rounds = [_frames_per_second(trainer, cameras, FPS_SECONDS / FPS_ROUNDS) for _ in range(FPS_ROUNDS)]
+    return {"fps": float(np.median(rounds)), "fps_low": min(rounds), "fps_high": max(rounds)}
+
+
+@torch.no_grad()
+def _frames_per_second(trainer: Trainer, cameras: list[Camera], least_s: float) -> float:
+    frames, begin = 0, time.perf_counter()
+    while True:
+        trainer.render(cameras[frames % len(cameras)])
+        device.wait(trainer.data.device)
+        frames += 1
+        seconds = time.perf_counter() - begin
+        if seconds >= least_s:
+            return frames / seconds

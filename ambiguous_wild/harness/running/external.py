@@ -1,0 +1,140 @@
+"""Run an external method as a cell: its program trains and renders, its files are measured as any other."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import torch
+
+from ambiguous_wild.core import AwError, Camera, Scene, View
+from ambiguous_wild.harness.running import evaluate
+from ambiguous_wild.harness.running.cell import Cell
+from ambiguous_wild.harness.running.records import Cost, MaskScores, RunResult
+from ambiguous_wild.harness.running.result import finished_result
+from ambiguous_wild.io.atomic import atomic_path
+from ambiguous_wild.io.images import image_size, read_gray, read_png_rgb
+from ambiguous_wild.io.ply import splat_count
+from ambiguous_wild.methods.external.program import LOGS, WORK, Produced, Task
+from ambiguous_wild.splat.trainer import Trainer
+
+
+def run_program(cell: Cell, folder: Path) -> RunResult:
+    """Run the method's program and measure what it left; the result as in metrics.json.
+
+    Raises:
+        AwError: the program failed, or a picture is missing, no 8-bit PNG, or of another size.
+    """
+    program = cell.method.program
+    if program is None:
+        raise AwError(f"{cell.method.name} is no external method")
+    if cell.chosen.effects:
+        raise AwError(f"{cell.method.name} is an external program and takes no effects: use --effects none")
+    (folder / WORK).mkdir(exist_ok=True)
+    produced = program.run(
+        Task(
+            scene=cell.scene,
+            options=cell.options,
+            seed=cell.train.seed,
+            iterations=cell.train.iterations,
+            budget_s=cell.train.budget_s,
+            device=cell.device,
+            folder=folder,
+            work=folder / WORK,
+            logs=folder / LOGS,
+        )
+    )
+    truth = evaluate.load_test_photos(cell.scene)
+    drawn = _Drawn(truth, produced.renders)
+    per_image, missing = evaluate.render_and_measure(
+        cast(Trainer, drawn),
+        truth,
+        folder / "renders" / "test",
+        half=cell.protocol == "half",
+        scene=cell.scene,
+    )
+    return finished_result(
+        cell,
+        per_image=per_image,
+        missing=missing,
+        masks=_masks(cell.scene, produced.masks, folder / "masks"),
+        facts=dict(produced.facts) | ({} if cell.protocol == "full" else {"protocol": cell.protocol}),
+        cost=cast(Cost, {"device": cell.device, **produced.cost, **_model(produced, folder)}),
+    )
+
+
+@dataclass(frozen=True)
+class _Picture:
+    image: torch.Tensor  # [H, W, 3] float32 in [0, 1]
+
+
+class _Drawn:
+    """Stands in for a trained model: its renders are the program's files.
+
+    So every method is measured by the same function.
+    """
+
+    def __init__(self, truth: list[evaluate.TestPhoto], renders: Mapping[str, Path]) -> None:
+        # Every view has a camera object of its own, which identifies the view.
+        self.paths = {id(t.view.camera): (t.view, renders[t.view.name]) for t in truth}
+        self.data = SimpleNamespace(device=torch.device("cpu"))
+
+    def render(self, camera: Camera) -> _Picture:
+        view, path = self.paths[id(camera)]
+        _check_picture(view, path, "render")
+        return _Picture(torch.from_numpy(read_png_rgb(path).astype(np.float32) / 255.0))
+
+    def render_fitted(self, camera: Camera, photo: torch.Tensor, keep: torch.Tensor) -> torch.Tensor:
+        """The plain render: effects of a program cannot be fitted here."""
+        return self.render(camera).image
+
+
+def _check_picture(view: View, path: Path, what: str) -> None:
+    """Raise AwError unless the file is a PNG of 8 bits at the size of the view."""
+    with open(path, "rb") as f:
+        head = f.read(25)
+    if head[:8] != b"\x89PNG\r\n\x1a\n":
+        raise AwError(f"{what} {path} is no PNG: what is measured must not have lost anything on the way")
+    if head[24] != 8:
+        raise AwError(f"{what} {path} has {head[24]} bits a channel; write 8, as every method does")
+    width, height = image_size(path)
+    if (width, height) != (view.camera.width, view.camera.height):
+        raise AwError(
+            f"{what} {path} is {width}x{height}, its photo {view.name} {view.camera.width}x"
+            f"{view.camera.height}: nothing is resized, so let the program work at that size ({{images}}, "
+            "{factor}) or run with --factor"
+        )
+
+
+def _masks(scene: Scene, masks: Mapping[str, Path], folder: Path) -> MaskScores | None:
+    """Copy the keep maps of the train views and score them where the truth is known."""
+    if not masks:
+        return None
+
+    def keeps() -> Iterator[tuple[View, np.ndarray]]:
+        for view in scene.train:
+            if view.name in masks:
+                _check_picture(view, masks[view.name], "mask")
+                yield view, read_gray(masks[view.name]) >= 128
+
+    return evaluate.write_keeps(scene, keeps(), folder)
+
+
+def _model(produced: Produced, folder: Path) -> dict[str, float]:
+    """Number and size of the splats, which become point_cloud.ply of the run."""
+    if produced.ply is None:
+        return {}
+    target = folder / "point_cloud.ply"
+    with atomic_path(target) as temporary:
+        temporary.unlink()
+        try:
+            os.link(produced.ply, temporary)
+        except OSError:  # another file system, or one without hard links
+            shutil.copyfile(produced.ply, temporary)
+    return {"gaussians": splat_count(target), "model_mb": target.stat().st_size / 1e6}

@@ -1,0 +1,90 @@
+"""Replay a run that met a value that is not finite, from its last good state."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.core.config import from_plain
+from ambiguous_wild.io import plain_yaml
+from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.methods.registry import get_method
+from ambiguous_wild.splat.data import load_train_data
+from ambiguous_wild.splat.effects import with_effects
+from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.trainer import Trainer
+from ambiguous_wild.splat.watchdog import FOLDER, GOOD, REPORT, NonFinite
+
+
+@dataclass(frozen=True)
+class Replay:
+    """What the run reported, and what the replay found."""
+
+    reported: str
+    found: str  # "" = nothing was found
+    started_at: int  # iteration
+
+    @property
+    def same(self) -> bool:
+        return self.reported == self.found
+
+
+def replay(run: Path) -> Replay:
+    """Train a copy of the run from its last good state to where it failed; the run itself stays as it is.
+
+    Args:
+        run: a run folder with `nonfinite/` in it; the first finding is replayed.
+
+    Raises:
+        AwError: no finding there, a method or scene that is gone, a damaged file.
+    """
+    findings = sorted(p.parent for p in (run / FOLDER).glob(f"*/{REPORT}"))
+    if not findings:
+        raise AwError(f"{run} holds no {FOLDER}/*/{REPORT}: its watchdog found nothing; name another run")
+    report, config = _read(findings[0] / REPORT), _read(run / "config.yaml")
+    try:
+        method, train, device = config["method"], config["train"], torch.device(config["device"])
+        options, path, factor = config["options"], config["scene"]["path"], config["scene"]["factor"]
+        last, message = int(report["iteration"]), str(report["message"])
+    except (KeyError, TypeError) as error:
+        raise AwError(f"{run} cannot be replayed: its config or report lacks {error}") from None
+    entry = get_method(method)
+    parts = entry.build(from_plain(type(entry.options()), options, f"options of {run}"))
+    parts = with_effects(parts, tuple(config.get("effects", ())))
+    settings = replace(from_plain(TrainConfig, train, f"train of {run}"), on_nonfinite="stop")
+    scene = load_scene(path, factor=factor)
+    with tempfile.TemporaryDirectory(prefix="aw-replay-") as name:
+        folder = Path(name)
+        data = load_train_data(scene, device=device, seed=settings.seed, cache_dir=folder / "cache")
+        trainer = Trainer(data, parts, settings, folder=folder)
+        if (findings[0] / GOOD).exists():
+            trainer.checkpoint_path.parent.mkdir(parents=True)
+            shutil.copyfile(findings[0] / GOOD, trainer.checkpoint_path)
+            trainer.resume()
+        start = trainer.iteration
+        try:
+            while trainer.iteration < last:
+                trainer.step()
+            trainer.check_parameters()  # as the loop does before it saves
+        except NonFinite as error:
+            return Replay(message, str(error), start)
+    return Replay(message, "", start)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    if path.suffix != ".json":
+        return plain_yaml.read_mapping(path)
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise AwError(f"cannot read {path}: {error}") from None
+    if not isinstance(found, dict):
+        raise AwError(f"{path} is damaged: a mapping was expected")
+    return found

@@ -1,0 +1,168 @@
+"""One result file: `metrics.json` of a run, or `failed.json`; checked when written and when read.
+
+Per-image values are kept, never only their mean. JSON has no infinity: it is written as the string
+"inf" and read back as a number. A missing value is ``null`` in the file, and its reason stands under
+"missing".
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NoReturn, cast
+
+import numpy as np
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.running.records import RunResult
+from ambiguous_wild.io.atomic import write_json
+
+SCHEMA = 1
+RESULT = "metrics.json"
+FAILED = "failed.json"  # same schema, status "failed"; counts where there is no metrics.json
+# key -> type of a result file; a number may also be an int, "inf" or null
+FIELDS: dict[str, type | tuple[type, ...]] = {
+    "method": str,
+    "scene": str,
+    "seed": int,
+    "status": str,
+    "error": (str, type(None)),
+    "options": dict,
+    "per_image": list,
+    "missing": dict,
+    "masks": (dict, type(None)),
+    "facts": dict,
+    "cost": dict,
+    "config_hash": str,
+    "scene_hash": str,
+    "version": str,
+}
+# Fields that results of earlier versions lack.
+OPTIONAL: dict[str, type | tuple[type, ...]] = {"environment": dict, "code_hash": str, "reproduce": str}
+
+
+def write_result(path: Path | str, result: Mapping[str, Any]) -> None:
+    """Check a result and write it atomically.
+
+    Args:
+        path: of the file, by custom RUNS/<scene>/<method>/seed<k>/metrics.json.
+        result: a `RunResult`; infinite numbers become "inf", NaN becomes null.
+
+    Raises:
+        AwError: the result does not follow the schema.
+    """
+    encoded = _encode(result)
+    _check(encoded, str(path))
+    write_json(path, encoded)
+
+
+def read_result(path: Path | str) -> RunResult:
+    """Read and check a result file.
+
+    Returns:
+        The result with numbers decoded: "inf" is ``math.inf`` again; null stays None.
+
+    Raises:
+        AwError: no such file, no JSON, another schema version, or a field that is absent or of the wrong
+            type; names the file and the field.
+    """
+    path = Path(path)
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"), parse_constant=_no_constant)
+    except FileNotFoundError:
+        raise AwError(f"no result file {path}") from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise AwError(f"{path} is damaged ({error}); run 'aw bench' again to replace it") from None
+    _check(data, str(path))
+    data["per_image"] = [
+        {k: v if k == "name" else _decode(v) for k, v in row.items()} for row in data["per_image"]
+    ]
+    data["cost"] = {k: _decode(v) for k, v in data["cost"].items()}
+    if data["masks"] is not None:
+        data["masks"] = {k: _decode(v) for k, v in data["masks"].items()}
+    return cast(RunResult, data)
+
+
+def _check(data: Any, where: str) -> None:
+    if not isinstance(data, dict):
+        _wrong(where, "it must hold one JSON object")
+    if data.get("schema") != SCHEMA:
+        _wrong(where, f"schema version {data.get('schema')!r}, this version reads {SCHEMA}")
+    for name, kind in FIELDS.items():
+        if name not in data:
+            _wrong(where, f"{name!r} is absent")
+        if not isinstance(data[name], kind) or (kind is int and isinstance(data[name], bool)):
+            _wrong(where, f"{name!r} has the wrong type: {_short(data[name])}")
+    for name, kind in OPTIONAL.items():
+        if name in data and not isinstance(data[name], kind):
+            _wrong(where, f"{name!r} has the wrong type: {_short(data[name])}")
+    for name in ("method", "scene"):
+        if not data[name].strip():
+            _wrong(where, f"{name!r} is empty")
+    if data["status"] not in ("ok", "failed"):
+        _wrong(where, f"'status' must be 'ok' or 'failed', not {_short(data['status'])}")
+    if data["status"] == "failed" and not data["error"]:
+        _wrong(where, "a failed run must say its error")
+    if not all(isinstance(reason, str) for reason in data["missing"].values()):
+        _wrong(where, "'missing' must map a metric to a reason")
+    _check_images(data["per_image"], where)
+    for name, value in (data["masks"] or {}).items():
+        _check_number(value, f"masks.{name}", where)
+    for name, value in data["cost"].items():
+        if name not in ("device", "ms_parts"):
+            _check_number(value, f"cost.{name}", where)
+
+
+def _check_images(rows: list[Any], where: str) -> None:
+    names = set()
+    for row in rows:
+        if not isinstance(row, dict) or not isinstance(row.get("name"), str):
+            _wrong(where, f"an entry of 'per_image' has no name: {_short(row)}")
+        if row["name"] in names:
+            _wrong(where, f"image {row['name']!r} is there twice")
+        names.add(row["name"])
+        for metric, value in row.items():
+            if metric != "name":
+                _check_number(value, f"{metric} of {row['name']}", where)
+
+
+def _check_number(value: Any, what: str, where: str) -> None:
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    # JSON's whole numbers have no end, floats have
+    number = number and (isinstance(value, float) or abs(value) < 2**1000)
+    if not number and value is not None and value not in ("inf", "-inf"):
+        _wrong(where, f"{what} is no number: {_short(value)}")
+
+
+def _wrong(where: str, what: str) -> NoReturn:
+    raise AwError(f"{where} is no result file of ours: {what}; run 'aw bench' again to replace it")
+
+
+def _short(value: Any) -> str:
+    try:
+        text = repr(value)
+    except ValueError:  # a whole number of thousands of digits
+        text = "a number without end"
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _no_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is not JSON")
+
+
+def _encode(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(k): _encode(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_encode(v) for v in value]
+    if isinstance(value, (np.bool_, np.integer, np.floating)):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None if math.isnan(value) else ("inf" if value > 0 else "-inf")
+    return value
+
+
+def _decode(value: Any) -> Any:
+    return float(value) if value in ("inf", "-inf") else value

@@ -1,0 +1,98 @@
+"""What a run folder holds: whether it is ours, of the same configuration, and finished."""
+
+from __future__ import annotations
+
+import traceback
+from pathlib import Path
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.core.config import flatten
+from ambiguous_wild.harness.running.cell import Cell
+from ambiguous_wild.harness.running.identity import IGNORED
+from ambiguous_wild.harness.running.provenance import with_provenance
+from ambiguous_wild.harness.running.result import failed_result
+from ambiguous_wild.harness.running.result_file import FAILED, RESULT, read_result, write_result
+from ambiguous_wild.io import plain_yaml
+from ambiguous_wild.io.atomic import write_text
+from ambiguous_wild.methods.external.program import DONE, LOGS, WORK
+
+CONFIG = "config.yaml"
+ENVIRONMENT = "env.json"
+TRACEBACK = "traceback.txt"
+EFFECTS = "effects.json"
+# What a run leaves before anything worth keeping exists in its folder.
+_WORTHLESS = {CONFIG, ENVIRONMENT, EFFECTS, FAILED, TRACEBACK}
+
+
+def is_finished(folder: Path) -> bool:
+    """Whether the folder has a result that can be read; a damaged one is made again."""
+    if not (folder / RESULT).is_file():
+        return False
+    try:
+        read_result(folder / RESULT)
+    except AwError:
+        return False
+    return True
+
+
+def record_failure(cell: Cell, folder: Path, error: Exception) -> None:
+    """Write failed.json, and the traceback where the error is a fault of this package."""
+    if not isinstance(error, (AwError, OSError)):
+        write_text(folder / TRACEBACK, "".join(traceback.format_exception(error)))
+    write_result(folder / FAILED, with_provenance(failed_result(cell, error_line(error)), cell))
+
+
+def error_line(error: Exception) -> str:
+    """One line that says what went wrong."""
+    if isinstance(error, AwError):
+        return str(error)
+    if isinstance(error, OSError):
+        return f"{error.filename or 'input or output'}: {error.strerror or error}"
+    return f"{type(error).__name__}: {error}"
+
+
+def refuse_strange_folder(folder: Path) -> None:
+    """Raise AwError if the folder holds files, and no run of this package."""
+    if not folder.is_dir():
+        raise AwError(f"{folder} is a file, not a run folder; choose another -o")
+    names = {p.name for p in folder.iterdir() if not p.name.startswith(".")}
+    if names and not names & {RESULT, FAILED, TRACEBACK} and not _is_our_config(folder / CONFIG):
+        raise AwError(
+            f"{folder} is not empty and no run of ours (no config.yaml with a config_hash); choose another -o"
+        )
+
+
+def _is_our_config(path: Path) -> bool:
+    """Whether it holds the settings of a run; a damaged file may, another program's does not."""
+    if not path.is_file():
+        return False
+    try:
+        return "config_hash" in plain_yaml.read_mapping(path)
+    except AwError:
+        return True
+
+
+def refuse_other_config(folder: Path, cell: Cell) -> None:
+    """Raise AwError if the folder was made by another configuration; names the keys that differ."""
+    path = folder / CONFIG
+    present = {p.name for p in folder.iterdir() if not p.name.startswith(".")}
+    if not (folder / WORK / DONE).exists():
+        present -= {WORK, LOGS}  # of an external program that has not finished training
+    if not path.exists() or present <= _WORTHLESS:
+        return  # it stopped before the first checkpoint: there is nothing to lose
+    try:
+        old = plain_yaml.read_mapping(path)
+    except AwError as error:
+        raise AwError(f"{error}; start anew with --overwrite always") from None
+    if old.get("config_hash") == cell.identity:
+        return
+    ignored = {f"{part}.{key}" for part, keys in IGNORED.items() for key in keys} | {"config_hash"}
+    before, now = flatten(old), flatten(dict(cell.config))
+    names = [
+        k for k in sorted(before.keys() | now.keys()) if before.get(k) != now.get(k) and k not in ignored
+    ]
+    shown = ", ".join(f"{k} was {before.get(k)}, is {now.get(k)}" for k in names[:4]) or "its hash"
+    raise AwError(
+        f"{folder} holds a run of another configuration ({shown}); "
+        "choose another -o, or replace it with --overwrite always"
+    )

@@ -1,0 +1,181 @@
+"""Read run folders into tidy tables; a missing value is NaN, and its reason has a row."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.measures import PARTIAL
+from ambiguous_wild.harness.running.records import RunResult, metrics_of
+from ambiguous_wild.harness.running.result_file import FAILED, RESULT, read_result
+from ambiguous_wild.io import plain_yaml
+
+CONFIG = "config.yaml"
+MASK_SCORES = ("iou", "precision", "recall")
+FoundResult = tuple[Path, RunResult]  # of this run folder
+
+
+@dataclass(frozen=True)
+class Incomplete:
+    """A run folder without a usable result, and why."""
+
+    folder: Path
+    reason: str
+    method: str
+    scene: str
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Every result below a folder, tidy.
+
+    images: one row per run, image and metric: scene, method, seed, image, metric, value (NaN = missing).
+    runs: one row per run: scene, method, seed, status, error, folder, images, config_hash, scene_hash,
+        version, device, the numbers of "cost", and mask_iou, mask_precision, mask_recall.
+    missing: one row per run and missing metric: scene, method, seed, metric, reason.
+    """
+
+    images: pd.DataFrame
+    runs: pd.DataFrame
+    missing: pd.DataFrame
+    incomplete: tuple[Incomplete, ...] = ()
+
+
+def read_runs(folder: Path | str) -> Runs:
+    """Every result below a folder of runs, at any depth.
+
+    A run is a folder with config.yaml, metrics.json or failed.json in it. One without a result (still
+    running, or stopped) and a damaged result are listed under `incomplete`, not dropped.
+
+    Raises:
+        AwError: no such folder, no run in it, or two results for the same method, scene and seed.
+    """
+    root = Path(folder)
+    if not root.is_dir():
+        raise AwError(f"no folder of runs {root}: give the folder that 'aw bench -o' wrote")
+    results: list[FoundResult] = []
+    incomplete: list[Incomplete] = []
+    for run in run_folders(root):
+        paths = [run / name for name in (RESULT, FAILED) if (run / name).exists()]
+        try:
+            if not paths:
+                raise AwError(
+                    f"no {RESULT}: still running, or stopped; run the same command again to finish it"
+                )
+            results.append((run, read_result(paths[0])))
+        except AwError as error:
+            incomplete.append(Incomplete(run, str(error), *_method_and_scene(run)))
+    if not results and not incomplete:
+        raise AwError(f"no run in {root}: 'aw bench --method NAME --scene SCENE -o {root}' makes one")
+    _refuse_duplicates(results)
+    return Runs(
+        images=_frame(_image_rows(results), ["scene", "method", "seed", "image", "metric", "value"]),
+        runs=_frame(
+            (_run_row(run, result) for run, result in results),
+            ["scene", "method", "seed", "status", "error", "folder", "images"],
+        ),
+        missing=_frame(_missing_rows(results), ["scene", "method", "seed", "metric", "reason"]),
+        incomplete=tuple(incomplete),
+    )
+
+
+def run_folders(root: Path) -> Iterator[Path]:
+    """Folders that hold a result or the settings of a run, in the order of their paths.
+
+    A name alone makes no run: a scene may be called seed1.
+    """
+    for name, folders, files in os.walk(root):
+        # Caches and half-written folders begin with a dot.
+        folders[:] = sorted(f for f in folders if not f.startswith("."))
+        if not {RESULT, FAILED, CONFIG}.isdisjoint(files):
+            folders.clear()
+            yield Path(name)
+
+
+def read_config(run: Path) -> dict[str, Any]:
+    """The run's config.yaml; empty where it is absent or damaged."""
+    try:
+        return plain_yaml.read_mapping(run / CONFIG)
+    except AwError:
+        return {}
+
+
+def _method_and_scene(run: Path) -> tuple[str, str]:
+    """Whose run it is, for one without a result: by its settings, else by its path."""
+    config, method_folder = read_config(run), run.absolute().parent
+    scene = config.get("scene")
+    name = scene.get("name") if isinstance(scene, dict) else None
+    return str(config.get("method") or method_folder.name), str(name or method_folder.parent.name)
+
+
+def _refuse_duplicates(results: list[FoundResult]) -> None:
+    seen: dict[tuple[str, str, int], tuple[Path, str]] = {}
+    for run, result in results:
+        key = (result["scene"], result["method"], result["seed"])
+        if key in seen:
+            other, settings = seen[key]
+            # of the same settings they are copies, which `aw cost` refuses too
+            both = " ('aw cost' takes both)" if settings != result["config_hash"] else ""
+            raise AwError(
+                f"two results for method {key[1]!r} on scene {key[0]!r} with seed {key[2]}: {other} and "
+                f"{run}; give one of their folders, or move one of them elsewhere{both}"
+            )
+        seen[key] = run, result["config_hash"]
+
+
+def _key(result: RunResult) -> dict[str, Any]:
+    return {"scene": result["scene"], "method": result["method"], "seed": result["seed"]}
+
+
+def _image_rows(results: list[FoundResult]) -> Iterator[dict[str, Any]]:
+    for _, result in results:
+        # A metric that one image lacks, or the whole run, has a row of its own: NaN is not "not asked".
+        measured = [(row["name"], metrics_of(row)) for row in result["per_image"]]
+        metrics = dict.fromkeys(metric for _, values in measured for metric in values)
+        metrics |= dict.fromkeys(result["missing"])
+        for name, values in measured:
+            for metric in metrics:
+                if metric in PARTIAL and metric not in values:
+                    continue
+                value = values.get(metric)
+                yield _key(result) | {
+                    "image": name,
+                    "metric": metric,
+                    "value": math.nan if value is None else float(value),
+                }
+
+
+def _run_row(run: Path, result: RunResult) -> dict[str, Any]:
+    masks: Mapping[str, Any] = result["masks"] or {}
+    cost = {k: v for k, v in result["cost"].items() if not isinstance(v, (dict, list))}
+    return (
+        _key(result)
+        | {
+            "status": result["status"],
+            "error": result["error"],
+            "config_hash": result["config_hash"],
+            "scene_hash": result["scene_hash"],
+            "version": result["version"],
+        }
+        | {"folder": str(run), "images": len(result["per_image"])}
+        | cost
+        | {f"mask_{k}": math.nan if masks.get(k) is None else masks[k] for k in MASK_SCORES}
+    )
+
+
+def _missing_rows(results: list[FoundResult]) -> Iterator[dict[str, Any]]:
+    for _, result in results:
+        for metric, reason in result["missing"].items():
+            yield _key(result) | {"metric": metric, "reason": reason}
+
+
+def _frame(rows: Iterator[dict[str, Any]], columns: list[str]) -> pd.DataFrame:
+    listed = list(rows)
+    return pd.DataFrame(listed) if listed else pd.DataFrame(columns=columns)

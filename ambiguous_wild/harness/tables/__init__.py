@@ -1,0 +1,1 @@
+"""Comparisons of runs: one table, its formats, and the layouts of papers."""

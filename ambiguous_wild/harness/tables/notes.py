@@ -1,0 +1,109 @@
+"""Notes below a comparison: missing, failed and unfinished runs, and results that do not compare."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+
+from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.harness.measures import Measure
+from ambiguous_wild.harness.running.store import Runs
+from ambiguous_wild.methods.registry import knows_truth
+
+LENGTHS_DIFFER = 1.1  # a note is due where the longest training has this many times the shortest's steps
+
+
+def notes(
+    runs: Runs, columns: Sequence[Measure], methods: Sequence[str], scenes: Sequence[str]
+) -> tuple[str, ...]:
+    """One line a fact, the gravest first."""
+    return (
+        *_failed(runs),
+        *_absent(runs, methods, scenes),
+        *(f"incomplete: {i.folder}: {i.reason}" for i in runs.incomplete),
+        *_not_ranked(runs),
+        *_oracles(methods),
+        *_missing(runs, columns),
+        *_not_comparable(runs, columns),
+    )
+
+
+def _failed(runs: Runs) -> list[str]:
+    frame = runs.runs[runs.runs["status"] == "failed"]
+    return [f"failed: {r.method} on {r.scene}, seed {r.seed}: {r.error}" for r in frame.itertuples()]
+
+
+def _absent(runs: Runs, methods: Sequence[str], scenes: Sequence[str]) -> list[str]:
+    done = set(zip(runs.runs["method"], runs.runs["scene"]))
+    lines = []
+    for method in methods:
+        gone = [scene for scene in scenes if (method, scene) not in done]
+        if gone:
+            lines.append(f"no result: {method} on {shortlist(gone)}; its mean over scenes is missing")
+    return lines
+
+
+def _not_ranked(runs: Runs) -> list[str]:
+    done = set(zip(runs.runs["method"], runs.runs["scene"]))
+    open_runs = Counter((i.method, i.scene) for i in runs.incomplete)
+    return [
+        f"not ranked: {method} on {scene}: {count} run{'' if count == 1 else 's'} of it incomplete"
+        for (method, scene), count in open_runs.items()
+        if (method, scene) in done
+    ]
+
+
+def _oracles(methods: Sequence[str]) -> list[str]:
+    known = [method for method in methods if knows_truth(method)]
+    return [f"oracle (not ranked): {shortlist(known)}: shown exact masks or clean photos"] if known else []
+
+
+def _missing(runs: Runs, columns: Sequence[Measure]) -> list[str]:
+    """One line a metric and reason; names the runs unless it concerns all of them."""
+    lines = []
+    ok = runs.runs[runs.runs["status"] == "ok"]
+    for column in columns:
+        rows = runs.missing[runs.missing["metric"] == column.key]
+        for reason, group in rows.groupby("reason", sort=False):
+            names = [f"{r.method} on {r.scene}" for r in group.itertuples()]
+            who = "" if len(group) >= len(ok) else f" for {shortlist(dict.fromkeys(names))}"
+            lines.append(f"missing: {column.key}{who}: {reason}")
+        # A null without a reason must not pass in silence.
+        told = set(zip(rows["scene"], rows["method"], rows["seed"]))
+        gaps = runs.images[(runs.images["metric"] == column.key) & runs.images["value"].isna()]
+        silent = [r for r in gaps.itertuples() if (r.scene, r.method, r.seed) not in told]
+        if silent:
+            names = [f"{r.image} ({r.method} on {r.scene})" for r in silent]
+            lines.append(f"missing: {column.key}, no reason given, for {shortlist(names)}")
+    return lines
+
+
+def _not_comparable(runs: Runs, columns: Sequence[Measure]) -> list[str]:
+    lines = []
+    ok = runs.runs[runs.runs["status"] == "ok"]
+    for scene, group in ok.groupby("scene"):
+        if group["scene_hash"].nunique() > 1:
+            lines.append(
+                f"not comparable: results for {scene} come from {group['scene_hash'].nunique()} versions of "
+                "the scene (scene_hash differs); run them again on one"
+            )
+        images = runs.images[runs.images["scene"] == scene].groupby(["method", "seed"])["image"]
+        if len({frozenset(names) for _, names in images}) > 1:
+            lines.append(f"not comparable: methods were measured on different test images of {scene}")
+    if "iterations" in ok:
+        lengths = ok["iterations"].astype(float)
+        longest = lengths[np.isfinite(lengths)].groupby(ok["method"]).max()
+        if len(longest) and longest.max() > LENGTHS_DIFFER * longest.min():
+            each = shortlist((f"{m} {n:.10g}" for m, n in longest.items()), limit=12)
+            lines.append(f"trainings differ in length (iterations): {each}")
+    shows_cost = any(not c.quality for c in columns)
+    if shows_cost and "device" in ok and ok["device"].nunique() > 1:
+        each = shortlist(sorted({f"{m} {d}" for m, d in zip(ok["method"], ok["device"])}), limit=12)
+        lines.append(f"costs were measured on different devices: {each}")
+    if ok["version"].nunique() > 1:
+        lines.append(
+            "results of different versions of ambiguous_wild: " + ", ".join(sorted(set(ok["version"])))
+        )
+    return lines

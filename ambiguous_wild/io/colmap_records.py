@@ -1,0 +1,127 @@
+"""What a COLMAP sparse model holds, and the names and ids of its camera models."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ambiguous_wild.core.errors import AwError
+
+# name -> (COLMAP's id, number of parameters)
+MODELS = {
+    "SIMPLE_PINHOLE": (0, 3),
+    "PINHOLE": (1, 4),
+    "SIMPLE_RADIAL": (2, 4),
+    "RADIAL": (3, 5),
+    "OPENCV": (4, 8),
+    "OPENCV_FISHEYE": (5, 8),
+    "FULL_OPENCV": (6, 12),
+    "FOV": (7, 5),
+    "SIMPLE_RADIAL_FISHEYE": (8, 4),
+    "RADIAL_FISHEYE": (9, 5),
+    "THIN_PRISM_FISHEYE": (10, 12),
+}
+LARGEST_SIDE = 1_000_000  # px
+LARGEST_COORDINATE = 1e18  # world units; its square is finite in float32
+FOCAL_RANGE = (1e-3, 1e6)  # focal length over the longer side
+_TWO_FOCALS = {"PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE"}
+_BY_ID = {number: (name, count) for name, (number, count) in MODELS.items()}
+
+
+@dataclass(frozen=True)
+class ModelCamera:
+    """One camera of the model, at the size the model was made with."""
+
+    camera_id: int
+    model: str  # a key of MODELS
+    width: int  # px
+    height: int  # px
+    params: tuple[float, ...]  # px and distortion, in COLMAP's order
+
+    def pinhole(self) -> tuple[float, float, float, float]:
+        """(fx, fy, cx, cy) in px.
+
+        Raises:
+            AwError: the camera has lens distortion; training needs undistorted photos.
+        """
+        if self.model == "PINHOLE":
+            fx, fy, cx, cy = self.params
+            return fx, fy, cx, cy
+        if self.model == "SIMPLE_PINHOLE":
+            f, cx, cy = self.params
+            return f, f, cx, cy
+        raise AwError(
+            f"camera {self.camera_id} is {self.model}, which has lens distortion; training needs PINHOLE: "
+            "undistort the photos with 'aw build-scene PHOTOS -o SCENE'"
+        )
+
+
+@dataclass(frozen=True)
+class ModelImage:
+    """One registered photo."""
+
+    image_id: int
+    qvec: np.ndarray  # [4] float64 (w, x, y, z), world to camera
+    tvec: np.ndarray  # [3] float64
+    camera_id: int
+    name: str  # relative to the image folder
+    xys: np.ndarray  # [K, 2] float64, px; pixel centres at +0.5
+    point_ids: np.ndarray  # [K] int64, -1 = no point
+
+    def cam_from_world(self) -> np.ndarray:
+        """[4, 4] float64, rigid."""
+        pose = np.eye(4)
+        pose[:3, :3] = rotation_from_quaternion(self.qvec)
+        pose[:3, 3] = self.tvec
+        return pose
+
+
+@dataclass(frozen=True)
+class ModelPoints:
+    """All points, ordered as in the file; tracks in compressed rows."""
+
+    ids: np.ndarray  # [M] int64
+    xyz: np.ndarray  # [M, 3] float64
+    rgb: np.ndarray  # [M, 3] uint8
+    error_px: np.ndarray  # [M] float64
+    track_offsets: np.ndarray  # [M + 1] int64
+    track_image_ids: np.ndarray  # [L] int64
+    track_point2d: np.ndarray  # [L] int64, index into ModelImage.xys
+
+
+@dataclass(frozen=True)
+class Model:
+    """cameras, images and points of one sparse model."""
+
+    cameras: dict[int, ModelCamera]
+    images: dict[int, ModelImage]
+    points: ModelPoints
+
+
+def rotation_from_quaternion(q: np.ndarray) -> np.ndarray:
+    """[3, 3] rotation of the quaternion (w, x, y, z); it is normalised first."""
+    norm = float(np.linalg.norm(q))
+    if not np.isfinite(norm) or norm == 0.0:
+        raise AwError(f"pose with the quaternion {[float(v) for v in q]}: the COLMAP model is damaged")
+    w, x, y, z = np.asarray(q, dtype=np.float64) / norm
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def model_of_id(number: int, where: str) -> tuple[str, int]:
+    """(name, number of parameters) of COLMAP's camera model id.
+
+    Raises:
+        AwError: an unknown id.
+    """
+    if number not in _BY_ID:
+        raise AwError(
+            f"{where}: camera model {number} is not known; convert it with COLMAP's model_converter"
+        )
+    return _BY_ID[number]

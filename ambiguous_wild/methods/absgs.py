@@ -1,0 +1,91 @@
+"""AbsGS: large Gaussians are split by the absolute screen gradient, where the signed one cancels out.
+
+Source: the defaults of the released code, TY424/AbsGS; what its paper's tables used is unverified. The clamp
+of opacity ends with growth (ours). Pruning by screen size and by blending weight (off there) are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from ambiguous_wild.core.config import check_limits
+from ambiguous_wild.splat.density import DensityConfig, DensityControl, Growth, largest
+from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.optim import SplatAdam
+from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.rendered import Gradients
+from ambiguous_wild.splat.step import Step
+
+
+@dataclass(frozen=True)
+class AbsGsConfig(DensityConfig):
+    """Plain density control with a threshold of its own for splits; times in nominal iterations."""
+
+    grow_scale: float = 0.001  # of the scene extent: clone below, split above; 3DGS has 0.01
+    split_grad: float = 4e-4  # mean norm of the absolute gradient; `grow_grad` is that of clones
+    clamp_every: float = 500.0
+    min_clamp_every: int = 500  # real iterations
+    clamp_opacity: float = 0.8  # 1 = never
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_limits(
+            self, "absgs", split_grad=(1e-12, 1e9), clamp_every=(1e-6, 1e9),
+            min_clamp_every=(1, 1e9), clamp_opacity=(1e-3, 1),
+        )  # fmt: skip
+
+
+def build(options: AbsGsConfig) -> Parts:
+    """Growth by two gradients; the rest of the loop is 3DGS."""
+    return Parts(density=AbsDensity, density_config=options)
+
+
+class AbsDensity(DensityControl):
+    """Small Gaussians grow by the signed gradient, large ones by the absolute."""
+
+    config: AbsGsConfig
+    needs: ClassVar[frozenset[str]] = frozenset({"absolute"})
+    sums: ClassVar[Mapping[str, tuple[int, ...]]] = {"grad_sum": (), "abs_sum": (), "seen": ()}
+    abs_sum: Tensor  # [N] sum of the absolute gradient's norm over views that saw the row
+    last_clamp = 0  # iteration
+
+    @torch.no_grad()
+    def observe(self, step: Step, gradients: Gradients, keep: Tensor | None = None) -> None:
+        super().observe(step, gradients, keep)
+        if step.nominal > self.config.stop:
+            return
+        assert gradients.screen_abs is not None
+        scale = self._half(step.camera.width, step.camera.height, gradients.screen.device)
+        norms = torch.linalg.vector_norm(gradients.screen_abs * scale, dim=1)
+        self.abs_sum += torch.where(step.rendered.visible, norms, torch.zeros_like(norms))
+
+    def choose(self, step: Step, gaussians: Gaussians) -> Growth:
+        """Both kinds share the room: those furthest above their own threshold go first."""
+        seen, small = self.seen.clamp(min=1), self.small(gaussians)
+        signed = self.grad_sum / seen / max(self.config.grow_grad, 1e-12)
+        score = torch.where(small, signed, self.abs_sum / seen / self.config.split_grad)
+        chosen = largest(score, score >= 1.0, self.room(step, gaussians))
+        return Growth(*(torch.nonzero(chosen & rows).squeeze(1) for rows in (small, ~small)))
+
+    @torch.no_grad()
+    def refine(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> tuple[Gaussians, list[str]]:
+        gaussians, events = super().refine(step, gaussians, optimiser)
+        config, since = self.config, step.iteration - self.last_clamp
+        due = since >= config.min_clamp_every and since * step.nominal / step.iteration >= config.clamp_every
+        if due and step.nominal <= config.stop and config.clamp_opacity < 1:
+            gaussians.opacity_logits.clamp_(max=torch.logit(torch.tensor(config.clamp_opacity)).item())
+            optimiser.reset_moments(["opacity_logits"])
+            self.last_clamp = step.iteration
+        return gaussians, events
+
+    def state_dict(self) -> dict[str, Any]:
+        return super().state_dict() | {"last_clamp": self.last_clamp}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        super().load_state_dict(state)
+        self.last_clamp = int(state["last_clamp"])

@@ -1,0 +1,100 @@
+"""AsymGS in its EMA-GS form: the model agrees with a slow average of itself, under two masks in turn.
+
+Source: arXiv 2506.03538 and its released code. Ours: features (Lab and HOG for DINOv2's patch embedding) and
+instances (graph segments for Semantic-SAM's) without weights, both options; masks weigh SSIM's map, not its
+gradient; the base is 3DGS without Mip-Splatting's filters and growth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ambiguous_wild.methods.dronesplat import nearest, unit_range
+from ambiguous_wild.methods.robustsplat.supervision import residual, resized
+from ambiguous_wild.splat.density import DensityConfig
+from ambiguous_wild.splat.effects.base import RowAdam
+from ambiguous_wild.splat.effects.slow import SlowAverage, SlowDensity, slow_gaussians
+from ambiguous_wild.splat.parts import MaskPolicy, Parts, Schedule, State
+from ambiguous_wild.splat.rendered import Cotangents
+from ambiguous_wild.splat.step import Step, TrainData
+from ambiguous_wild.vision.backends import make_features, make_instances
+from ambiguous_wild.vision.precompute import instance_labels, photo_features
+from ambiguous_wild.vision.support import standing, unsupported
+
+
+@dataclass(frozen=True)
+class AsymGsConfig:
+    """Times in nominal iterations (of 30 000)."""
+
+    features: str = "labhog"  # see vision/backends.py
+    instances: str = "graph"
+    density: DensityConfig = field(default_factory=lambda: DensityConfig(every=1000.0, resets=()))
+    warm_up: float = 1000.0  # before it soft masks do not learn and nothing is compared with the average
+    consistency: float = 0.1  # of mean |picture - slow picture| in the loss
+    colour: float = 0.95  # quantile of the residual above which a pixel is suspect
+    feature: float = 0.9  # quantile of the features' distance
+    support: float = 0.1  # instances with this share of the photo's density of points are static
+
+
+def build(options: AsymGsConfig) -> Parts:
+    """Masks, the average as an effect, and growth that carries it."""
+    masks, rates, average = AsymMask(options), Schedule(lr_opacity=0.1), (SlowAverage(0.8),)
+    return Parts(masks, SlowDensity, options.density, rates, effects=average)
+
+
+class AsymMask(MaskPolicy):
+    """Even iterations: instances that residual and features suspect. Odd ones: a map learnt for the photo."""
+
+    def __init__(self, config: AsymGsConfig) -> None:
+        self.config, self.features = config, make_features(config.features)
+        self.instances = make_instances(config.instances)
+
+    def setup(self, data: TrainData) -> None:
+        self.features.fit(data.photos)
+        self.phi = photo_features(self.features, data.photos, data.cache_dir)
+        names, least = [view.name for view in data.scene.train], self.config.support
+        found = zip(instance_labels(self.instances, data.photos, names, data.cache_dir).labels, names)
+        left = (unsupported(labels, data.scene, name, least) for labels, name in found)
+        self.labels = [torch.from_numpy(labels).to(data.device) for labels in left]
+        self.soft = [RowAdam(torch.ones(1, *x.shape, device=data.device)) for x in self.labels]
+
+    def keep(self, step: Step) -> Tensor:
+        keep = self.predict(step)
+        if step.iteration % 2 and step.nominal > self.config.warm_up:
+            soft = self.soft[step.view]
+            share, wanted = torch.sigmoid(8 * soft.values[0]), 1.0 - unit_range(self._distance(step))
+            soft.step(0, (share - wanted).sign() * 8 * share * (1 - share) / share.numel(), 0.1)
+        return keep
+
+    def predict(self, step: Step) -> Tensor:
+        size, soft = step.photo.shape[:2], self.soft[step.view].values[0]
+        if step.iteration % 2:
+            return resized(torch.sigmoid(8 * soft), *size)
+        distance, error = resized(self._distance(step), *size), residual(step.photo, step.rendered.image)
+        suspect = error > torch.quantile(error, self.config.colour)
+        suspect &= distance > torch.quantile(distance, self.config.feature)
+        return standing(nearest(self.labels[step.view], *size), suspect)
+
+    def cotangent(self, step: Step, keep: Tensor | None) -> Cotangents | None:
+        if step.nominal <= self.config.warm_up or not (teacher := slow_gaussians(step.gaussians)):
+            return None
+        apart = step.rendered.image - step.draw(gaussians=teacher).image
+        return Cotangents(image=apart.sign() * (self.config.consistency / apart.numel()))
+
+    @torch.no_grad()
+    def _distance(self, step: Step) -> Tensor:
+        """1 - cosine of the features of render and photo, [H, W] of the photo."""
+        size, chw = self.labels[step.view].shape, step.rendered.image.permute(2, 0, 1)
+        seen = self.features(F.interpolate(chw[None], size=size, mode="bilinear")[0].permute(1, 2, 0))
+        return resized(1.0 - F.cosine_similarity(self.phi[step.view], seen, dim=2), *size)
+
+    def state_dict(self) -> State:
+        return {str(view): soft.state_dict() for view, soft in enumerate(self.soft)}
+
+    def load_state_dict(self, state: State) -> None:
+        for view, soft in enumerate(self.soft):
+            soft.load_state_dict(state[str(view)])

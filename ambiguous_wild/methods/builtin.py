@@ -1,0 +1,93 @@
+"""The methods that come with the package, as names of recipes: listing them imports none of their code."""
+
+from __future__ import annotations
+
+from ambiguous_wild.methods.entry import MethodEntry
+
+BUILTIN = (
+    MethodEntry(
+        name="3dgs",
+        summary="plain 3D Gaussian Splatting: treats all pixels as static",
+        recipe="ambiguous_wild.methods.threedgs:build",
+        paper="Kerbl et al., SIGGRAPH 2023",
+    ),
+    MethodEntry(
+        name="refinesplat",
+        summary="entropy-aware masks, density control and merging for ambiguous distractors",
+        recipe="ambiguous_wild.methods.refinesplat.recipe:build",
+        config="ambiguous_wild.methods.refinesplat.recipe:Config",
+        paper="Rectifying Mask via Entropy for Distractor-Free 3DGS in Ambiguous Scenarios",
+        ablations="ambiguous_wild.methods.refinesplat.ablations:ABLATIONS",
+        auto_effects=("exposure", "appearance", "antialias", "poses"),
+    ),
+    MethodEntry(
+        name="robustsplat",
+        summary="densification delayed until masks are stable; a net on frozen features, "
+        "taught coarse to fine",
+        recipe="ambiguous_wild.methods.robustsplat.recipe:build",
+        config="ambiguous_wild.methods.robustsplat.recipe:Config",
+        paper="Fu et al., ICCV 2025 (arXiv 2506.02751)",
+    ),
+    MethodEntry(
+        name="dronesplat",
+        summary="masks instances whose residual is high for their photo",
+        recipe="ambiguous_wild.methods.dronesplat:build",
+        config="ambiguous_wild.methods.dronesplat:DroneSplatConfig",
+        paper="Tang et al., CVPR 2025 (arXiv 2503.16964)",
+    ),
+    MethodEntry(
+        name="wildgaussians",
+        summary="appearance of every photo: an embedding per Gaussian and per photo changes colours",
+        recipe="ambiguous_wild.methods.wildgaussians:build",
+        config="ambiguous_wild.methods.wildgaussians:Config",
+        paper="Kulhanek et al., NeurIPS 2024 (arXiv 2407.08447); its appearance only",
+    ),
+    MethodEntry(
+        name="absgs",
+        summary="large blurred Gaussians split by the absolute screen gradient",
+        recipe="ambiguous_wild.methods.absgs:build",
+        config="ambiguous_wild.methods.absgs:AbsGsConfig",
+        paper="AbsGS, 2024",
+    ),
+    MethodEntry(
+        name="mcmc",
+        summary="a fixed number of Gaussians: dead ones move onto live ones, noise explores",
+        recipe="ambiguous_wild.methods.mcmc:build",
+        config="ambiguous_wild.methods.mcmc:McmcConfig",
+        paper="3DGS-MCMC",
+    ),
+    MethodEntry(
+        name="pup-3dgs",
+        summary="after growth, removes the Gaussians that pictures depend on least, then refines",
+        recipe="ambiguous_wild.methods.pup:build",
+        config="ambiguous_wild.methods.pup:PupConfig",
+        paper="PUP 3D-GS, CVPR 2025",
+    ),
+    MethodEntry(
+        name="desplat",
+        summary="every photo has Gaussians of its own in front of its camera for what only it shows",
+        recipe="ambiguous_wild.methods.desplat:build",
+        config="ambiguous_wild.methods.desplat:DeSplatConfig",
+        paper="DeSplat, CVPR 2025 (arXiv 2411.19756)",
+    ),
+    MethodEntry(
+        name="asymgs",
+        summary="agrees with a slow average of itself, under two kinds of masks in turn",
+        recipe="ambiguous_wild.methods.asymgs:build",
+        config="ambiguous_wild.methods.asymgs:AsymGsConfig",
+        paper="AsymGS, NeurIPS 2025 (arXiv 2506.03538), its EMA-GS form",
+    ),
+    MethodEntry(
+        name="3dgs+truth",
+        summary="reference: 3dgs with the capture's exact masks",
+        recipe="ambiguous_wild.methods.truth:build_masked",
+        config="ambiguous_wild.methods.truth:TruthConfig",
+        needs="a capture with exact truth",
+    ),
+    MethodEntry(
+        name="3dgs-clean",
+        summary="reference: 3dgs on the capture's photos without distractors",
+        recipe="ambiguous_wild.methods.truth:build_clean",
+        needs="a capture with exact truth",
+    ),
+)

@@ -1,0 +1,300 @@
+"""Render one photo: trace its rays, then apply the effects that the spec names, in this order.
+
+    light (time of day, moving shadow, polished surfaces) -> rays -> lens, shutter, blur -> defocus
+    -> vignetting -> exposure -> white balance -> noise -> 8 bits -> JPEG
+
+A training photo and its clean version get the same effects with the same random numbers: before JPEG they
+are equal to the bit outside ``mask`` and ``shadow``. Test photos get only effects that are the same in all
+photos (specular, lens distortion).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ambiguous_wild.core.camera import Camera
+from ambiguous_wild.simulate.atlas import linear_to_srgb
+from ambiguous_wild.simulate.distractors import Placement, movers
+from ambiguous_wild.simulate.image_effects import (
+    defocus,
+    exposure_drift,
+    iso_noise,
+    jpeg,
+    lens_distortion,
+    motion_blur,
+    moving_shadow,
+    rolling_shutter,
+    specular,
+    time_of_day,
+    vignetting,
+    warp,
+    white_balance,
+)
+from ambiguous_wild.simulate.image_effects.hand_motion import hand_velocity
+from ambiguous_wild.simulate.image_effects.photo_random import PhotoRandom
+from ambiguous_wild.simulate.image_effects.settings import Effects
+from ambiguous_wild.simulate.kernels import DOME
+from ambiguous_wild.simulate.records import DrawnEffects
+from ambiguous_wild.simulate.shapes import Shape, shape_table
+from ambiguous_wild.simulate.spec import CaptureSpec
+from ambiguous_wild.simulate.tracer import Light, ShapeTable, TracedPhoto, trace
+from ambiguous_wild.simulate.world import World
+
+_MAX_INSTANTS = 24  # of an exposure
+ImageFilter = Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class PlannedPhoto:
+    """One photo to render."""
+
+    name: str  # IMG_0001.jpg
+    split: str  # train or test
+    camera: Camera
+    placements: tuple[Placement, ...]
+
+
+@dataclass(frozen=True)
+class RenderedPhoto:
+    """The photo and its truth."""
+
+    photo: np.ndarray  # [H, W, 3] uint8, as stored
+    clean: np.ndarray  # [H, W, 3] uint8, without distractors and moving shadow, before JPEG
+    owner: np.ndarray  # [H, W] uint8: number of the first distractor in the pixel, 0 = none
+    shadow: np.ndarray | None  # [H, W] bool: darkened by a moving shadow; None: no such effect
+    effects: DrawnEffects
+
+
+@dataclass(frozen=True)
+class _LitScene:
+    """The static world and its light at the time of the photo."""
+
+    static: ShapeTable
+    shadow_casters: ShapeTable | None
+    light: Light
+
+
+@dataclass(frozen=True)
+class PreparedPhoto:
+    """A photo before its rays are traced."""
+
+    effects: Effects
+    scene: _LitScene
+    camera: Camera  # of the rays; where an effect moves pixels, finer and larger than the photo's
+    distractors: ShapeTable
+    move: ImageFilter | None  # effects that move pixels
+    drawn: DrawnEffects  # so far
+
+
+def render_photo(
+    spec: CaptureSpec, world: World, planned: PlannedPhoto, random: PhotoRandom
+) -> RenderedPhoto:
+    """Render one photo: `prepare_photo`, `trace_photo` and `finish_photo`.
+
+    Args:
+        spec: names the effects.
+        world: the static world.
+        planned: the camera and the placed distractors.
+        random: random numbers of the effects.
+    """
+    prepared = prepare_photo(spec, world, planned, random)
+    return finish_photo(planned, random, prepared, trace_photo(world, prepared))
+
+
+def prepare_photo(
+    spec: CaptureSpec, world: World, planned: PlannedPhoto, random: PhotoRandom
+) -> PreparedPhoto:
+    """The steps before the rays."""
+    effects = spec.effects if planned.split == "train" else _lasting(spec.effects)
+    drawn: DrawnEffects = {}
+    scene = _lit(effects, world, random, drawn)
+    move, camera, light = _optics(effects, planned.camera, scene.light, random, drawn)
+    distractors = movers(spec, planned.placements, world)
+    return PreparedPhoto(effects, replace(scene, light=light), camera, distractors, move, drawn)
+
+
+def trace_photo(world: World, prepared: PreparedPhoto) -> TracedPhoto:
+    """Trace the rays. They use all cores: one photo at a time."""
+    scene = prepared.scene
+    return trace(
+        prepared.camera, scene.static, prepared.distractors, world.atlas, scene.light, scene.shadow_casters
+    )
+
+
+def finish_photo(
+    planned: PlannedPhoto, random: PhotoRandom, prepared: PreparedPhoto, traced: TracedPhoto
+) -> RenderedPhoto:
+    """The steps after the rays."""
+    effects, drawn = prepared.effects, prepared.drawn
+    distracted, clean, owner, shadow = _moved(prepared.move, traced)
+    sensor = _sensor(effects, planned.camera, random, drawn)
+    clean_pixels = _to_uint8(sensor(clean))
+    pixels = clean_pixels if distracted is clean else _to_uint8(sensor(distracted))
+    if effects.jpeg is not None:
+        quality = jpeg.draw(effects.jpeg, random)
+        pixels = jpeg.jpeg(pixels, quality)
+        drawn["jpeg"] = {"quality": quality}
+    return RenderedPhoto(pixels, clean_pixels, owner, shadow, drawn)
+
+
+def depth_m(world: World, camera: Camera) -> np.ndarray:
+    """z of the static surface in the pinhole camera, [H, W] float32, m."""
+    return trace(camera, world.table(), _no_shapes(world), world.atlas, world.light).depth_m
+
+
+def _lasting(effects: Effects) -> Effects:
+    """The effects that are the same in all photos: those of test photos."""
+    return Effects(specular=effects.specular, lens_distortion=effects.lens_distortion)
+
+
+def _no_shapes(world: World) -> ShapeTable:
+    return shape_table((), world.atlas)
+
+
+def _lit(effects: Effects, world: World, random: PhotoRandom, drawn: DrawnEffects) -> _LitScene:
+    shapes: list[Shape] = list(world.shapes)
+    light, shadow_casters = world.light, None
+    if effects.time_of_day is not None:
+        day = effects.time_of_day
+        hour = time_of_day.draw(day, random)
+        light, sky = time_of_day.time_of_day(light, hour, day.strength, day.sweep_deg)
+        shapes = [_sky(s, sky) if s.mapping == DOME else s for s in shapes]
+        drawn["time_of_day"] = {"hour": hour}
+    if effects.specular is not None:
+        gloss = effects.specular
+        shapes = specular.specular(shapes, gloss.textures, gloss.strength, gloss.sharpness)
+        drawn["specular"] = {}
+    if effects.moving_shadow is not None:
+        lobes = moving_shadow.draw(effects.moving_shadow, random)
+        shadow_casters = shape_table(moving_shadow.moving_shadow(lobes, light.sun.mean(0)), world.atlas)
+        drawn["moving_shadow"] = {"lobes": [list(lobe) for lobe in lobes]}
+    return _LitScene(shape_table(shapes, world.atlas), shadow_casters, light)
+
+
+def _sky(shape: Shape, gain: np.ndarray) -> Shape:
+    r, g, b = (float(t * k) for t, k in zip(shape.tint, gain))
+    return replace(shape, tint=(r, g, b))
+
+
+def _optics(
+    effects: Effects, camera: Camera, light: Light, random: PhotoRandom, drawn: DrawnEffects
+) -> tuple[ImageFilter | None, Camera, Light]:
+    """The filter from the traced to the photo's pixels (linear; None: the same), and the traced camera."""
+    steps: list[ImageFilter] = []
+    traced = camera
+    shutter = (effects.rolling_shutter, effects.motion_blur)
+    if effects.lens_distortion is not None or any(s is not None for s in shutter):
+        fine = math.isqrt(len(light.sun))  # the number of rays stays: one in each finer pixel
+        sources = _sources(effects, camera, fine, random, drawn)
+        traced, border = warp.enlarged(camera, sources, fine)
+        light = replace(light, sun=np.ascontiguousarray(light.sun[:1]))
+        steps.append(lambda image: warp.resample(image, sources, border, fine))
+    if effects.defocus is not None:
+        radius = defocus.draw(effects.defocus, random)
+        drawn["defocus"] = {"radius_px": radius * camera.width}
+        if radius > 0:
+            kernel = defocus.disc(radius * camera.width)
+            steps.append(lambda image: defocus.defocus(image, kernel))
+    if not steps:
+        return None, traced, light
+
+    def move(image: np.ndarray) -> np.ndarray:
+        for step in steps:
+            image = step(image)
+        return image
+
+    return move, traced, light
+
+
+def _sources(
+    effects: Effects, camera: Camera, fine: int, random: PhotoRandom, drawn: DrawnEffects
+) -> list[np.ndarray]:
+    """Source of the photo's fine pixels in the pinhole camera, one array per instant of the exposure."""
+    points = warp.fine_points(camera, fine)
+    if effects.lens_distortion is not None:
+        lens = effects.lens_distortion
+        points = lens_distortion.lens_distortion(points, lens.k1, lens.k2)
+        drawn["lens_distortion"] = {"k1": lens.k1, "k2": lens.k2}
+    rows = camera.height * fine
+    turns = np.zeros((rows, 3))
+    instants = np.zeros((1, 3))
+    if effects.rolling_shutter is not None:
+        roll = effects.rolling_shutter
+        velocity = hand_velocity(random, roll.speed_deg_s)
+        turns = rolling_shutter.rolling_shutter(velocity, roll.readout_s, rows)
+        drawn["rolling_shutter"] = {"deg_s": np.rad2deg(velocity).tolist(), "readout_s": roll.readout_s}
+    if effects.motion_blur is not None:
+        blur = effects.motion_blur
+        velocity = hand_velocity(random, blur.speed_deg_s)
+        length = float(np.linalg.norm(velocity)) * blur.exposure_s * camera.fx
+        count = min(max(2, math.ceil(length * fine)), _MAX_INSTANTS)
+        instants = motion_blur.motion_blur(velocity, blur.exposure_s, count)
+        drawn["motion_blur"] = {"exposure_s": blur.exposure_s, "length_px": length}
+    if not turns.any() and not instants.any():
+        return [warp.in_pixels(points, camera)]
+    return [warp.in_pixels(warp.turned(points, turns + now), camera) for now in instants]
+
+
+def _moved(
+    move: ImageFilter | None, traced: TracedPhoto
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
+    """Distracted, clean, owner and shadow after moved pixels; equal bits where nothing differs."""
+    clean, owner, shadow = traced.clean, traced.owner, traced.shadow
+    if move is None:
+        return traced.distracted, clean, owner, shadow
+    clean = move(clean)
+    if not owner.any() and (shadow is None or not shadow.any()):
+        shape = clean.shape[:2]
+        return clean, clean, np.zeros(shape, np.uint8), None if shadow is None else np.zeros(shape, bool)
+    distracted = move(traced.distracted)
+    owner_moved = np.zeros(clean.shape[:2], np.uint8)
+    for number in reversed([int(n) for n in np.unique(owner) if n]):
+        owner_moved[_support(move, owner == number)] = number
+    touched = owner_moved > 0
+    if shadow is not None:
+        shadow = _support(move, shadow)
+        touched = touched | shadow
+    # Copied, not computed: equal bits outside distractors and shadow.
+    return np.where(touched[..., None], distracted, clean), clean, owner_moved, shadow
+
+
+def _support(move: ImageFilter, mask: np.ndarray) -> np.ndarray:
+    """Every pixel that a masked pixel contributes to, beyond rounding."""
+    return np.asarray(move(mask.astype(np.float32)) > 1e-6)
+
+
+def _sensor(effects: Effects, camera: Camera, random: PhotoRandom, drawn: DrawnEffects) -> ImageFilter:
+    """Vignetting, exposure, white balance and noise as one filter."""
+    steps: list[ImageFilter] = []
+    if effects.vignetting is not None:
+        falloff = effects.vignetting.falloff
+        drawn["vignetting"] = {"falloff": falloff}
+        steps.append(lambda image: vignetting.vignetting(image, falloff))
+    if effects.exposure_drift is not None:
+        stops = exposure_drift.draw(effects.exposure_drift, random)
+        drawn["exposure_drift"] = {"stops": stops}
+        steps.append(lambda image: exposure_drift.exposure_drift(image, stops))
+    if effects.white_balance is not None:
+        gains = white_balance.draw(effects.white_balance, random)
+        drawn["white_balance"] = {"gains": list(gains)}
+        steps.append(lambda image: white_balance.white_balance(image, gains))
+    if effects.iso_noise is not None:
+        iso = iso_noise.draw(effects.iso_noise, random)
+        normal = iso_noise.pattern(random, camera.height, camera.width)
+        drawn["iso_noise"] = {"iso": iso}
+        steps.append(lambda image: iso_noise.iso_noise(image, normal, iso))
+
+    def develop(image: np.ndarray) -> np.ndarray:
+        for step in steps:
+            image = step(image)
+        return image
+
+    return develop
+
+
+def _to_uint8(linear: np.ndarray) -> np.ndarray:
+    return np.round(255.0 * linear_to_srgb(linear)).astype(np.uint8)

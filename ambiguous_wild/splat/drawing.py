@@ -1,0 +1,145 @@
+"""One call that draws a shot as a run does: effects, fields, SH degree, background and filter."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.splat import device
+from ambiguous_wild.splat.effects.chain import Chain
+from ambiguous_wild.splat.field import Field
+from ambiguous_wild.splat.fields import STATIC, Composite, FieldStart
+from ambiguous_wild.splat.gaussians import PARAMETERS, Gaussians
+from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.render import render
+from ambiguous_wild.splat.rendered import Gradients, Rendered, Shade, check_needs
+from ambiguous_wild.splat.step import Shot, Step, TrainData
+
+
+class Drawing:
+    """Draws for one run, and holds the fields beside the static one."""
+
+    def __init__(self, data: TrainData, parts: Parts, static: Field, effects: Chain | None) -> None:
+        """
+        Args:
+            data: the training side.
+            parts: the method.
+            static: the first field.
+            effects: of the run.
+
+        Raises:
+            AwError: a field is called as the static one is.
+        """
+        self.parts, self.effects, self.static = parts, effects, static
+        self.others: dict[str, Field] = {}
+        self._most: dict[str, int] = {}
+        if parts.fields is not None:
+            for name, start in parts.fields.setup(data, static.gaussians, self._static_rates).items():
+                self._add(name, start, data)
+
+    def _static_rates(self, progress: float) -> dict[str, float]:
+        """Of the static field's parameters; those of effects' rows are not another field's."""
+        rates = self.static.rates(progress)
+        return {name: rates[name] for name in PARAMETERS}
+
+    def _add(self, name: str, start: FieldStart, data: TrainData) -> None:
+        if name == STATIC:
+            raise AwError(f"a field beside the static one cannot be called {STATIC!r}")
+        self.others[name] = Field(start.gaussians, start.rates, start.density)
+        self._most[name] = start.most
+        if start.density is not None:
+            check_needs(start.density.needs, accelerated=device.accelerated(data.device))
+            start.density.setup(data)
+
+    # -- pictures ---------------------------------------------------------------------------------
+
+    def __call__(self, gaussians: Gaussians, shot: Shot, without: Collection[str] = ()) -> Rendered:
+        """Draw the model; the shot's camera is as the effects have it."""
+        if self.effects is None:
+            return self._compose(gaussians, shot, None)
+        return self.effects.render(gaussians, shot, self._compose, without)
+
+    def again(self, gaussians: Gaussians, shot: Shot, without: Collection[str] = ()) -> Rendered:
+        """Another picture of a step, see `Step.draw`."""
+        if gaussians is self.static.gaussians:
+            return self(gaussians, shot, without)
+        shot = replace(shot, other_gaussians=True)
+        if self.effects is None:
+            return self._draw(gaussians, shot, None)
+        return self.effects.render(gaussians, shot, self._draw, without)
+
+    def fit(self, gaussians: Gaussians, shot: Shot, photo: Tensor, keep: Tensor) -> Tensor:
+        """A picture under the colours of its photo, see `Chain.fit_view`."""
+        if self.effects is None:
+            return self(gaussians, shot).image
+        return self.effects.fit_view(gaussians, shot, photo, keep, self._draw)
+
+    def neutral_model(self, gaussians: Gaussians, iteration: int) -> Gaussians:
+        """The Gaussians as they are drawn for no photo in particular."""
+        if self.effects is None:
+            return gaussians
+        return self.effects.neutral_model(gaussians, iteration)
+
+    def _draw(self, gaussians: Gaussians, shot: Shot, shade: Shade | None) -> Rendered:
+        parts = self.parts
+        return render(
+            gaussians,
+            shot.camera,
+            sh_degree=min(int(shot.nominal // parts.schedule.sh_every), parts.sh_degree, gaussians.sh_degree),
+            background=parts.background,
+            antialias=parts.antialias,
+            blur=parts.blur,
+            shade=shade,
+        )
+
+    def _compose(self, gaussians: Gaussians, shot: Shot, shade: Shade | None) -> Rendered:
+        rendered = self._draw(gaussians, shot, shade)
+        fields = self.parts.fields
+        if fields is None or shot.view is None:
+            return rendered
+        drawn = {name: self._draw(self.others[name].gaussians, shot, None) for name in fields.drawn(shot)}
+        needs = {name: control.needs for name in drawn if (control := self.others[name].density) is not None}
+        return Composite(fields, {STATIC: rendered, **drawn}, needs, shot)
+
+    # -- the other fields -------------------------------------------------------------------------
+
+    def with_other_pictures(self, step: Step, keep: Tensor | None, gradients: Gradients) -> Gradients:
+        """The step's gradients with those of pictures that the fields drew by themselves."""
+        if self.parts.fields is None:
+            return gradients
+        more = dict(self.parts.fields.gradients(step, keep))
+        static = more.pop(STATIC, None)
+        if static is not None:
+            gradients = gradients + static
+        known = gradients.fields
+        summed = {name: known[name] + g if name in known else g for name, g in more.items()}
+        return replace(gradients, fields={**known, **summed})
+
+    def learn(
+        self, step: Step, gradients: Mapping[str, Gradients], progress: float, called_off: Tensor | None
+    ) -> None:
+        """A step of every other field that has gradients, and its density control."""
+        for name, own in gradients.items():
+            field = self.others[name]
+            seen = replace(step, gaussians=field.gaussians, ceiling=self._most[name])
+            if called_off is not None and own.visible is not None:
+                own.visible = own.visible & (called_off == 0)
+            field.learn(own, progress, called_off)
+            field.refine(seen, own, None)
+
+    def state_dict(self) -> dict[str, object]:
+        """Of the other fields; nothing where there are none."""
+        return {name: field.state_dict() for name, field in self.others.items()}
+
+    def load_state_dict(self, state: Mapping[str, dict[str, object]], device: torch.device) -> None:
+        """Restore what `state_dict` returned.
+
+        Raises:
+            KeyError: a field is missing.
+        """
+        for name, field in self.others.items():
+            field.load_state_dict(state[name], device)

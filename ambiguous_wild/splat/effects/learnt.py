@@ -1,0 +1,282 @@
+"""Base of effects that a recipe writes as a forward in torch.
+
+A recipe says what is learnt (`leaves`, `rows`) and how colours come of it (`forward`, over the visible
+Gaussians; `change`, over all of them; `tone`, over the picture). Adam, the row of a test photo, checkpoints
+and the pulls by autograd are done here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.splat.effects.base import Effect, RowAdam, State, decayed
+from ambiguous_wild.splat.gaussians import PARAMETERS, Gaussians
+from ambiguous_wild.splat.rendered import (
+    Cotangents,
+    Frame,
+    FramePull,
+    Gradients,
+    Pull,
+    ShadeGradients,
+    ShadePull,
+    sum_own,
+)
+from ambiguous_wild.splat.step import Shot, TrainData
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """A tensor that an effect learns."""
+
+    values: Tensor  # of any shape; with `per_photo` [train photos, ...]
+    rate: float  # Adam's
+    final: float = 1.0  # it decays exponentially to this share
+    per_photo: bool = False  # a row for every photo, and one for a test photo
+    fit_rate: float = 0.1  # Adam's while a test photo's row is fitted (WildGaussians)
+
+
+@dataclass(frozen=True)
+class Visible:
+    """The Gaussians that a picture shows."""
+
+    base: Tensor  # [M, 3] colours of the harmonics in this direction, SH + 0.5, not clamped
+    means: Tensor  # [M, 3] world
+    extra: Mapping[str, Tensor] = field(default_factory=dict)  # [M, ...] rows of `Gaussians.extra`
+
+
+class Learnt(Effect):
+    """Override `leaves`, and one or more of `forward`, `change` and `tone`.
+
+    Each gets `leaf`: the leaves by name, those per photo as the row of the shot's photo.
+    """
+
+    # row of a photo that was not trained on: where a fit starts, and what a picture without a photo gets
+    unseen: ClassVar[Literal["zero", "mean"]] = "zero"
+
+    def leaves(self, data: TrainData, rng: np.random.Generator) -> Mapping[str, Leaf]:
+        """What is learnt beside the Gaussians' own rows (`Effect.rows`)."""
+        return {}
+
+    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
+        """Colours [M, 3] of the visible Gaussians; the renderer clamps them below at 0."""
+        return visible.base
+
+    def change(self, gaussians: Gaussians, leaf: Mapping[str, Tensor], shot: Shot) -> Mapping[str, Tensor]:
+        """Raw parameters as they are drawn, [N, ...] each by name: those that differ from the given ones."""
+        return {}
+
+    def tone(self, image: Tensor, alpha: Tensor, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
+        """The picture [H, W, 3] as it is compared with the photo."""
+        return image
+
+    # -- what a recipe need not know ----------------------------------------------------------------
+
+    def setup(self, data: TrainData) -> None:
+        self.photos = len(data.photos)
+        seed = [data.seed, *self.name.encode()]
+        self._leaves = dict(self.leaves(data, np.random.default_rng(seed)))
+        self._adam = {name: RowAdam(self._table(leaf).to(data.device)) for name, leaf in self._leaves.items()}
+
+    def _table(self, leaf: Leaf) -> Tensor:
+        values = leaf.values.detach().to(torch.float32)
+        if not leaf.per_photo:
+            return values.clone()[None]
+        return torch.cat([values, torch.zeros_like(values[:1])])
+
+    def _leaf(self, shot: Shot) -> dict[str, Tensor]:
+        """Copies to differentiate, and to read after the optimiser moved on."""
+        return {name: self._row(name, shot).detach().clone() for name in self._leaves}
+
+    def _row(self, name: str, shot: Shot) -> Tensor:
+        values = self._adam[name].values
+        if not self._leaves[name].per_photo:
+            return values[0]
+        row = shot.row(self.photos)
+        return self._unseen(name) if row is None else values[row]
+
+    def _unseen(self, name: str) -> Tensor:
+        rows = self._adam[name].values[: self.photos]
+        return rows.mean(dim=0) if self.unseen == "mean" else torch.zeros_like(rows[0])
+
+    def acts(self, hook: str) -> bool:
+        written = _WRITTEN.get(hook)
+        return (
+            super().acts(hook)
+            if written is None
+            else getattr(type(self), written) is not getattr(Learnt, written)
+        )
+
+    def model(self, gaussians: Gaussians, shot: Shot) -> tuple[Gaussians, Pull]:
+        leaf, given = self._leaf(shot), {n: t.detach().clone() for n, t in gaussians.rows()}
+        graph = _Graph(leaf, given)
+        with torch.enable_grad():
+            extra = {name: given[name] for name in gaussians.extra}
+            inputs = Gaussians(**{name: given[name] for name in PARAMETERS}, extra=extra)
+            changed = dict(self.change(inputs, leaf, shot))
+
+        def pull(gradients: Gradients) -> Gradients:
+            d = {name: getattr(gradients, name) for name in changed}
+            found = graph.pull([changed[name] for name in changed], [d[name] for name in changed])
+            sums: dict[str, Any] = {}
+            for name in PARAMETERS:
+                unchanged = None if name in changed else getattr(gradients, name)
+                sums[name] = _sum(unchanged, found.get(name), given[name])
+            extra = {
+                name: _sum(gradients.extra.get(name), found.get(name), given[name]) for name in inputs.extra
+            }
+            own = {name: found[name] for name in leaf if name in found}
+            return replace(gradients, **sums, extra=extra).with_own(self.name, own)
+
+        drawn: dict[str, Any] = {name: value.detach().contiguous() for name, value in changed.items()}
+        return replace(gaussians, **drawn), pull
+
+    def shade(
+        self, gaussians: Gaussians, rows: Tensor | slice, base: Tensor, shot: Shot
+    ) -> tuple[Tensor, ShadePull]:
+        leaf = self._leaf(shot)
+        extra = {name: values[rows].detach() for name, values in gaussians.extra.items()}
+        means, base = gaussians.means[rows].detach(), base.detach()
+        graph = _Graph(leaf, {"base": base, "means": means}, extra)
+        with torch.enable_grad():
+            colours = self.forward(Visible(base, means, extra), leaf, shot)
+
+        def pull(d_colours: Tensor) -> ShadeGradients:
+            found = graph.pull([colours], [d_colours])
+            through = found.get("base")
+            return ShadeGradients(
+                torch.zeros_like(base) if through is None else through.contiguous(),
+                {name: found[name] for name in extra if name in found},
+                found.get("means"),
+                {self.name: {name: found[name] for name in leaf if name in found}},
+            )
+
+        return colours.detach(), pull
+
+    def image(self, frame: Frame, shot: Shot) -> tuple[Frame, FramePull]:
+        leaf, image, alpha = self._leaf(shot), frame.image.detach().clone(), frame.alpha.detach().clone()
+        graph = _Graph(leaf, {"image": image, "alpha": alpha})
+        with torch.enable_grad():
+            toned = self.tone(image, alpha, leaf, shot)
+
+        def pull(c: Cotangents) -> Cotangents:
+            main = {} if c.image is None else graph.pull([toned], [c.image])
+            second = {} if c.extra is None else graph.pull([toned], [c.extra])
+            alphas = [a for a in (c.alpha, main.get("alpha"), second.get("alpha")) if a is not None]
+            own = {name: main[name] for name in leaf if name in main}
+            return replace(
+                c,
+                image=None if c.image is None else _sum(None, main.get("image"), image),
+                extra=None if c.extra is None else _sum(None, second.get("image"), image),
+                alpha=sum(alphas[1:], alphas[0]).contiguous() if alphas else None,
+                own=sum_own(c.own, {self.name: own}) if own else c.own,
+            )
+
+        return replace(frame, image=toned.detach().contiguous()), pull
+
+    def step(self, own: Mapping[str, Tensor], shot: Shot, called_off: Tensor | None = None) -> None:
+        for name, gradient in own.items():
+            leaf = self._leaves[name]
+            row = shot.view if leaf.per_photo else 0
+            assert row is not None
+            rate = decayed(leaf.rate, leaf.rate * leaf.final, shot.progress)
+            self._adam[name].step(row, gradient, rate, called_off)
+
+    def begin_fit(self) -> None:
+        for name, leaf in self._leaves.items():
+            if leaf.per_photo:
+                self._adam[name].reset(self.photos)
+                self._adam[name].values[self.photos] = self._unseen(name)
+
+    def fit(self, own: Mapping[str, Tensor]) -> None:
+        for name, gradient in own.items():
+            if self._leaves[name].per_photo:
+                self._adam[name].step(self.photos, gradient, self._leaves[name].fit_rate)
+
+    def facts(self) -> dict[str, Any]:
+        tables = {
+            n: self._adam[n].values[: self.photos] for n, leaf in self._leaves.items() if leaf.per_photo
+        }
+        return {f"{name}_std": float(rows.std(dim=0, unbiased=False).mean()) for name, rows in tables.items()}
+
+    def state_dict(self) -> State:
+        return {name: adam.state_dict() for name, adam in self._adam.items()}
+
+    def load_state_dict(self, state: State) -> None:
+        for name, adam in self._adam.items():
+            adam.load_state_dict(state[name])
+
+
+# which function of a recipe fills which hook
+_WRITTEN = {"model": "change", "shade": "forward", "image": "tone"}
+
+
+class _Graph:
+    """Inputs of one forward, and their gradients; may be pulled more than once."""
+
+    def __init__(self, *named: dict[str, Tensor]) -> None:
+        self.inputs: dict[str, Tensor] = {}
+        self.recorded = torch.is_grad_enabled()
+        for group in named:
+            for name, tensor in group.items():
+                if name in self.inputs:
+                    raise AwError(
+                        f"{name!r} names two inputs of an effect: call its leaf or its row otherwise"
+                    )
+                group[name] = tensor.requires_grad_(self.recorded)
+                self.inputs[name] = group[name]
+
+    def pull(self, outputs: Sequence[Tensor], cotangents: Sequence[Tensor]) -> dict[str, Tensor]:
+        """By name, of those inputs that the outputs depend on.
+
+        Raises:
+            RuntimeError: the forward ran under `torch.no_grad`.
+        """
+        if not self.recorded:
+            raise RuntimeError("drawn under torch.no_grad: there is no backward pass")
+        pairs = [(o, c.to(o)) for o, c in zip(outputs, cotangents) if o.requires_grad]
+        if not pairs:
+            return {}
+        found = torch.autograd.grad(
+            [o for o, _ in pairs], list(self.inputs.values()), [c for _, c in pairs], retain_graph=True,
+            allow_unused=True,
+        )  # fmt: skip
+        return {name: gradient for name, gradient in zip(self.inputs, found) if gradient is not None}
+
+
+def _sum(a: Tensor | None, b: Tensor | None, like: Tensor) -> Tensor:
+    if a is None or b is None:
+        known = b if a is None else a
+        return torch.zeros_like(like) if known is None else known.contiguous()
+    return (a + b).contiguous()
+
+
+def mlp_leaves(name: str, widths: Sequence[int], rng: np.random.Generator, rate: float) -> dict[str, Leaf]:
+    """Weights and biases of a net with these widths, uniform in +-1/sqrt(inputs) as torch.nn.Linear's."""
+    found = {}
+    for i, (inputs, outputs) in enumerate(pairwise(widths)):
+        for kind, shape in (("weight", (inputs, outputs)), ("bias", (outputs,))):
+            values = rng.uniform(-1, 1, shape) / np.sqrt(inputs)
+            found[f"{name}_{kind}{i}"] = Leaf(torch.tensor(values, dtype=torch.float32), rate)
+    return found
+
+
+def mlp(
+    x: Tensor,  # [M, inputs]
+    leaf: Mapping[str, Tensor],
+    name: str,
+    activation: Callable[[Tensor], Tensor] = torch.relu,
+) -> Tensor:
+    """The net of `mlp_leaves`, [M, outputs]; no activation after the last layer."""
+    layers = sum(key.startswith(f"{name}_weight") for key in leaf)
+    for i in range(layers):
+        x = torch.addmm(leaf[f"{name}_bias{i}"], x, leaf[f"{name}_weight{i}"])
+        x = activation(x) if i + 1 < layers else x
+    return x

@@ -1,0 +1,203 @@
+"""The calls of gsplat that a picture is made of, whichever of its versions is installed.
+
+No other module imports gsplat. Differences between its versions are handled here.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.core.extras import install_command
+
+NEAR = 0.01  # world units, as on the CPU
+BLUR = 0.3  # px^2, as on the CPU
+TILE = 16  # px
+
+
+@dataclass(frozen=True)
+class Splats:
+    """N Gaussians projected for one camera, before blending. All but `radii` have gradients."""
+
+    radii: Tensor  # [N, 2] int32 px along x and y; 0 where culled
+    means2d: Tensor  # [N, 2] px
+    depths: Tensor  # [N]
+    conics: Tensor  # [N, 3] a, b, c of the inverse covariance
+    opacities: Tensor  # [N], antialiasing included
+
+
+@dataclass(frozen=True)
+class Tiles:
+    """The splats of every tile, ordered by depth."""
+
+    offsets: Tensor  # [1, rows, columns] int32
+    flatten_ids: Tensor  # [intersections] int32
+
+
+@functools.cache
+def gsplat() -> Any:
+    """The installed package.
+
+    Raises:
+        AwError: there is none; says the command that installs it.
+    """
+    try:
+        import gsplat
+    except ImportError:
+        raise AwError(
+            f"the Gaussians are on a GPU and gsplat is not installed: {install_command('cuda')}, "
+            "or run with --device cpu"
+        ) from None
+    return gsplat
+
+
+@functools.cache
+def ready(kind: str) -> None:
+    """Raise AwError, with what to do, where gsplat cannot compute on devices of this kind."""
+    gsplat()
+    if kind == "cuda":
+        from ambiguous_wild.splat.gpu.readiness import look, why_not
+
+        lack = why_not(look())
+        if lack is not None:
+            raise AwError(f"gsplat cannot use the GPU: {lack}")
+
+
+def version() -> str:
+    """Of the installed gsplat."""
+    return str(gsplat().__version__)
+
+
+@functools.cache
+def max_alpha(device: str = "cuda") -> float:
+    """Where alpha is clamped: 0.99 as on the CPU, but 0.999 up to release 1.5.3.
+
+    The constant is compiled into the kernels, and sources after that release have the same version number.
+    So it is measured: an opaque splat is drawn over one pixel. The clamp matters only for Gaussians with an
+    opacity above 0.99, and changes how much light passes through them.
+    """
+    one = torch.ones(1, device=device)
+    means2d, conics = 0.5 * one.expand(1, 2), torch.tensor([[1.0, 0.0, 1.0]], device=device)
+    splats = Splats(one.expand(1, 2).to(torch.int32), means2d, one, conics, one)
+    tiles = sort(splats, 1, 1)
+    _, alpha, _ = blend(means2d, conics, one[:, None], one, tiles, 1, 1)
+    return round(float(alpha), 4)
+
+
+def project(
+    means: Tensor,  # [N, 3]
+    quats: Tensor,  # [N, 4]
+    scales: Tensor,  # [N, 3]
+    opacities: Tensor,  # [N]
+    viewmat: Tensor,  # [1, 4, 4] cam_from_world
+    intrinsics: Tensor,  # [1, 3, 3]
+    width: int,
+    height: int,
+    *,
+    antialias: bool,
+    blur: float = BLUR,  # px^2 added to both variances
+) -> Splats:
+    """EWA projection and culls; differentiable."""
+    if not len(means):  # gsplat divides by their number, in C++: the process would end
+        none = means.new_zeros((0, 2), dtype=torch.int32)
+        return Splats(none, means[:, :2], means[:, 2], scales, opacities)
+    radii, means2d, depths, conics, compensations = gsplat().fully_fused_projection(
+        means=means,
+        covars=None,
+        quats=quats,
+        scales=scales,
+        viewmats=viewmat,
+        Ks=intrinsics,
+        width=width,
+        height=height,
+        eps2d=blur,
+        near_plane=NEAR,
+        packed=False,
+        calc_compensations=antialias,
+        opacities=opacities,
+    )
+    if antialias:
+        opacities = opacities * compensations[0]
+    return Splats(radii[0], means2d[0], depths[0], conics[0], opacities)
+
+
+def shade(
+    degree: int,
+    directions: Tensor,  # [N, 3] from the camera, any length
+    coefficients: Tensor,  # [N, K, 3], K at least (degree + 1)^2
+    visible: Tensor,  # [N] bool; the others' colours are not computed
+) -> Tensor:
+    """Colours [N, 3] of spherical harmonics, 0.5 not added; differentiable."""
+    return gsplat().spherical_harmonics(degree, directions, coefficients, masks=visible)
+
+
+def sort(splats: Splats, width: int, height: int) -> Tiles:
+    """Tiles and order. The host waits here for their number, which decides how much memory is allocated."""
+    columns, rows = math.ceil(width / TILE), math.ceil(height / TILE)
+    finer = {}
+    if _tests_tiles_by_ellipse():
+        finer = {"conics": splats.conics.detach()[None], "opacities": splats.opacities.detach()[None]}
+    _, ids, flatten_ids = gsplat().isect_tiles(
+        splats.means2d.detach()[None],
+        splats.radii[None],
+        splats.depths.detach()[None],
+        TILE,
+        columns,
+        rows,
+        packed=False,
+        **finer,
+    )
+    return Tiles(gsplat().isect_offset_encode(ids, 1, columns, rows), flatten_ids)
+
+
+@functools.cache
+def _tests_tiles_by_ellipse() -> bool:
+    """Whether gsplat can leave out tiles that a splat's box touches and its ellipse does not: after 1.5.3."""
+    return "conics" in inspect.signature(gsplat().isect_tiles).parameters
+
+
+def blend(
+    means2d: Tensor,  # [N, 2]
+    conics: Tensor,  # [N, 3]
+    colours: Tensor,  # [N, C]
+    opacities: Tensor,  # [N]
+    tiles: Tiles,
+    width: int,
+    height: int,
+    *,
+    background: Tensor | None = None,  # [1, C]
+    absolute: bool = False,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Pictures [H, W, C], alpha [H, W], and the tensor for `absolute_gradient`; differentiable.
+
+    Args:
+        absolute: the backward pass also sums absolute values over pixels (AbsGS).
+    """
+    batch = means2d[None]
+    picture, alpha = gsplat().rasterize_to_pixels(
+        batch,
+        conics[None],
+        colours[None],
+        opacities[None],
+        width,
+        height,
+        TILE,
+        tiles.offsets,
+        tiles.flatten_ids,
+        backgrounds=background,
+        packed=False,
+        absgrad=absolute,
+    )
+    return picture[0], alpha[0, ..., 0], batch
+
+
+def absolute_gradient(batch: Tensor) -> Tensor:
+    """Sums over pixels of |dL/du| and |dL/dv|, [N, 2], after the backward pass of `blend(absolute=True)`."""
+    return batch.absgrad[0]  # type: ignore[attr-defined]  # gsplat stores it on its argument

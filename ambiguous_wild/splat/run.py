@@ -1,0 +1,196 @@
+"""A run from its first to its last iteration: the clock, probes, the timeline, checkpoints, rollbacks."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ambiguous_wild.core import Camera
+from ambiguous_wild.splat import checkpoint
+from ambiguous_wild.splat.clock import Clock, clock_for
+from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.gpu.sentinel import Sentinel
+from ambiguous_wild.splat.optim import SplatAdam
+from ambiguous_wild.splat.pace import Pace, TrainConfig
+from ambiguous_wild.splat.rendered import Rendered
+from ambiguous_wild.splat.step import TrainData
+from ambiguous_wild.splat.timeline import ROWS, Timeline
+from ambiguous_wild.splat.watchdog import NonFinite, Watchdog
+
+Probe = Callable[[Callable[[Camera], Tensor]], float]
+
+
+class Run(ABC):
+    """What a trainer does around its steps; stops and resumes at any iteration with the same bits."""
+
+    pace: Pace
+    sentinel: Sentinel | None
+
+    def __init__(self, data: TrainData, config: TrainConfig, folder: Path, probe: Probe | None) -> None:
+        """
+        Args:
+            data: the training side.
+            config: length and bookkeeping.
+            folder: where checkpoint and timeline go.
+            probe: gets a function that renders a camera, returns PSNR in dB of the test views.
+        """
+        self.data, self.config, self.folder, self.probe = data, config, folder, probe
+        names = [view.name for view in data.scene.train]
+        self.watchdog = Watchdog(folder, config.on_nonfinite, config.seed, names)
+        self.clock: Clock = clock_for(data.device)
+        self.setup_s = 0.0  # seconds before the first step, of the process that began the run
+        self.iteration = 0
+        self.timeline = Timeline()
+        self._skipped: set[int] = set()  # views that were all masked at some step
+
+    @property
+    @abstractmethod
+    def gaussians(self) -> Gaussians:
+        """The model."""
+
+    @property
+    @abstractmethod
+    def optimiser(self) -> SplatAdam:
+        """The model's."""
+
+    @abstractmethod
+    def step(self) -> float | Tensor:
+        """One iteration; returns its loss."""
+
+    @abstractmethod
+    def render(self, camera: Camera) -> Rendered:
+        """The model as it stands."""
+
+    @abstractmethod
+    def check_parameters(self) -> None:
+        """Raise NonFinite, as of the last step, where a parameter is not finite."""
+
+    @abstractmethod
+    def state(self) -> dict[str, Any]:
+        """Everything that decides how the run goes on."""
+
+    @abstractmethod
+    def restore(self, state: dict[str, Any], path: Path) -> None:
+        """Go on from what `state` gave and `path` held.
+
+        Raises:
+            AwError: a key is missing.
+        """
+
+    def progress(self, iteration: int) -> float:
+        """Share of the run that lies behind after `iteration` steps, in [0, 1]."""
+        return self.pace.progress(iteration, self.clock.now())
+
+    @property
+    def done(self) -> bool:
+        return self.progress(self.iteration) >= 1.0
+
+    def train(self, *, tick: Callable[[Any], None] | None = None) -> None:
+        """Run to the end; saves as it goes, probes on schedule.
+
+        Args:
+            tick: called after every iteration with the clock stopped (progress bars).
+
+        Raises:
+            NonFinite: names view, iteration and parameters.
+        """
+        if self.config.on_nonfinite == "rollback" and not self.checkpoint_path.exists():
+            self.save()  # something to go back to, from the first iteration on
+        last_save = time.monotonic()
+        while True:
+            if self.done:
+                if self._save_if_sound():
+                    return
+                continue  # rolled back: there is more to do
+            self._advance(tick)
+            if time.monotonic() - last_save > self.config.checkpoint_every_s and not self.done:
+                self._save_if_sound()
+                last_save = time.monotonic()
+
+    def _advance(self, tick: Callable[[Any], None] | None) -> None:
+        """One iteration with its bookkeeping, or one step back."""
+        before = self.progress(self.iteration)
+        self.clock.start()
+        try:
+            loss = self.step()
+        except NonFinite as error:
+            self.clock.stop()
+            self.watchdog.handle(self, error)
+            return
+        after = self.progress(self.iteration)
+        probing = int(after * self.config.probes) > int(before * self.config.probes)
+        due = probing or int(after * ROWS) > int(before * ROWS)
+        if due:
+            self.clock.settle()
+        self.clock.stop()
+        self.timeline.loss(loss)
+        if due:
+            self._log(probing)
+        if tick is not None:
+            tick(self)
+
+    def _save_if_sound(self) -> bool:
+        """Save, unless a parameter is not finite: then it is as if the last step had found that."""
+        try:
+            self.check_parameters()
+        except NonFinite as error:
+            self.watchdog.handle(self, error)
+            return False
+        self.save()
+        return True
+
+    def _log(self, probing: bool) -> None:
+        row = self.timeline.add(self.iteration, len(self.gaussians), self.clock)
+        if probing and self.probe is not None:
+            spent = dict(self.clock.parts_s)
+            row["psnr_probe"] = self.probe(self._probe_image)
+            self.clock.parts_s = spent
+
+    @torch.no_grad()
+    def _probe_image(self, camera: Camera) -> Tensor:
+        # Rows the optimiser has put off are brought up to date first; it computes what a later step
+        # would have computed, so that probing changes nothing (a test compares the bits).
+        self.optimiser.prepare(camera)
+        return self.render(camera).image
+
+    @property
+    def ms_per_iteration(self) -> float:
+        return 1e3 * self.clock.now() / max(self.iteration, 1)
+
+    @property
+    def skipped_views(self) -> list[str]:
+        """Train photos that were all masked at some step and taught nothing then."""
+        return sorted(self.data.scene.train[i].name for i in self.skipped)
+
+    @property
+    def skipped(self) -> set[int]:
+        """Those photos' indices."""
+        return self._skipped | (self.sentinel.empty_views() if self.sentinel is not None else set())
+
+    def note_skipped(self, views: Iterable[int]) -> None:
+        """Of the part of the run before it was resumed."""
+        self._skipped = set(views)
+
+    @property
+    def checkpoint_path(self) -> Path:
+        return self.folder / "checkpoint" / "last.safetensors"
+
+    def save(self) -> None:
+        """Write the whole state and the timeline, each atomically."""
+        checkpoint.save(self.checkpoint_path, self.state())
+        self.timeline.write(self.folder / "timeline.csv")
+
+    def resume(self) -> bool:
+        """Go on from the last checkpoint, if there is one; returns whether there was."""
+        if not self.checkpoint_path.exists():
+            return False
+        self.restore(checkpoint.load(self.checkpoint_path), self.checkpoint_path)
+        if self.sentinel is not None:
+            self.sentinel.reset()
+        return True

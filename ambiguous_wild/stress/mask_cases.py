@@ -1,0 +1,211 @@
+"""Rows 11 to 18: entropy, thresholds, masks, the regulariser, and degenerate cases of printed formulas."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+from ambiguous_wild.methods.refinesplat import masking
+from ambiguous_wild.methods.refinesplat.entropy import Variant, entropy
+from ambiguous_wild.methods.refinesplat.losses import consistency_loss
+from ambiguous_wild.methods.refinesplat.merging import overlap
+from ambiguous_wild.methods.refinesplat.threshold import LearntWeight, objective, t_ent
+from ambiguous_wild.stress.case import UNIT, Measured, case, failed_checks, worst
+
+
+def _logits(n: int, channels: int, scale: float, seed: int = 0) -> torch.Tensor:
+    return scale * torch.randn(n, channels, generator=torch.Generator().manual_seed(seed))
+
+
+@case(11, "entropy at logits of 1e4 either way, for 1, 2 and 255 identities")
+def entropy_saturated(device: str) -> Measured:
+    parts = []
+    variants: tuple[Variant, ...] = ("sigmoid", "softmax")
+    for variant in variants:
+        for channels in (1, 2, 255):
+            extremes = torch.full((2, channels), 1e4) * torch.tensor([[1.0], [-1.0]])
+            logits = torch.cat([_logits(40, channels, 8.0), extremes]).requires_grad_(True)
+            found = entropy(logits, variant)
+            (gradient,) = torch.autograd.grad(found.sum(), logits)
+            exact = entropy(logits.detach().double(), variant)
+            error = float((found.detach() - exact).abs().max() / exact.abs().max().clamp(min=1e-30))
+            sound = bool(torch.isfinite(gradient).all()) and float(found.detach().min()) >= 0
+            # x e^x changes by (1 + |x|) u if x = log p changes by u, and |x| e^x <= 1 / e
+            tolerance = (8 + channels) * UNIT
+            parts.append(Measured(error if sound else math.inf, tolerance, "8 + P roundings", ""))
+    m = worst(parts)
+    return Measured(m.error, m.tolerance, m.why, "0 where saturated, gradient finite", 1.0)
+
+
+@case(12, "0, 1 and 2 instances, equal values, gaps and negative labels")
+def few_instances(device: str) -> Measured:
+    none = np.zeros((8, 8), np.int32)
+    labels = np.array([[-2, 1, 1, 0], [3, 3, -1, 1], [0, 3, 3, 3], [1, 1, 1, 1]], np.int32)  # no label 2
+    grid = np.arange(16.0).reshape(4, 4)
+    means, areas = masking.instance_means(grid, labels, 3)
+    one_pixel = none.copy()
+    one_pixel[5, 6] = 1
+    two = t_ent(np.array([0.1, 0.9]))
+    checks = {
+        "none": not t_ent(np.array([])).flagged.size and masking.instance_means(grid, none, 0)[0].size == 0,
+        "one": not t_ent(np.array([0.4]), gate=3.0).flagged.any(),
+        "two": two.flagged.tolist() == [False, True] and 0.1 < two.threshold < 0.9,
+        "equal": not t_ent(np.full(50, 0.2), gate=3.0).flagged.any(),
+        "means": np.isclose(means[0], grid[labels == 1].mean())
+        and np.isclose(means[2], grid[labels == 3].mean()),
+        "a label without pixels": bool(np.isnan(means[1]) and areas[1] == 0),
+        "one over the photo": masking.instance_means(np.full((2, 2), 0.25), none + 1, 1)[0][0] == 0.25,
+        "one pixel": masking.local_mask(one_pixel, np.array([True])).sum() == 1,
+        "negative labels": not masking.local_mask(none - 1, np.array([True])).any(),
+    }
+    return failed_checks({k: bool(v) for k, v in checks.items()}, "no mask without outliers")
+
+
+@case(13, "1 of 50 far away, 49 of 50, heavy tails")
+def skewed(device: str) -> Measured:
+    rng = np.random.default_rng(0)
+    checks = {}
+    for high in (1, 3, 20):
+        low, far = rng.normal(0.1, 0.01, 50 - high), rng.normal(0.8, 0.03, high)
+        threshold = t_ent(np.r_[low, far], gate=5.0).threshold
+        checks[f"{high} of 50 apart"] = bool(low.max() < threshold < far.min())
+    many = np.r_[0.05, rng.normal(0.8, 0.01, 49)]
+    checks["49 of 50: the majority is the scene"] = bool(t_ent(many, gate=5.0).flagged.mean() < 0.1)
+    tail = rng.pareto(1.5, 400) + 0.1
+    cut = t_ent(tail, gate=3.0)
+    checks["heavy tail"] = bool(0 < cut.flagged.mean() < 0.3 and cut.threshold > np.quantile(tail, 0.7))
+    return failed_checks(checks, "the threshold lies between the groups")
+
+
+@case(14, "a photo without distractors")
+def nothing_to_mask(device: str) -> Measured:
+    rng = np.random.default_rng(1)
+    shares = []
+    for _ in range(10):
+        h, cosine = rng.uniform(0.4, 0.6, (34, 60)), rng.uniform(0.9, 1.0, (34, 60))
+        mask = masking.global_mask(masking.ratio(masking.uncertainty(cosine), h), spread="std", gate=6.0)
+        local = t_ent(rng.normal(0.3, 0.03, 40), gate=5.0).flagged
+        shares += [float(mask.mean()), float(local.mean())]
+    return Measured(max(shares), 0.02, "share of masked pixels and instances, from the list", "below 2 %")
+
+
+@case(15, "H of 0 over half the photo, cosines of -1, 1 and none")
+def planted_region(device: str) -> Measured:
+    rng = np.random.default_rng(0)
+    h, cosine = rng.uniform(0.3, 0.6, (34, 60)), rng.uniform(0.85, 1.0, (34, 60))
+    h[:, :30] = 0.0
+    cosine[10:16, 8:16], cosine[0, 0], cosine[1, 1] = -1.0, np.nan, 1.0
+    r = masking.ratio(masking.uncertainty(cosine), h)
+    found = masking.global_mask(r, spread="std", gate=6.0)
+    grown = np.zeros_like(found)
+    grown[9:17, 7:17] = True
+    checks = {
+        "finite": bool(np.isfinite(r).all()),
+        "H of 0 counts at most a hundred times": bool(r[20:, :30].max() < 100 * r[20:, 30:].max()),
+        "the region is found": bool(found[11:15, 9:15].all()),
+        "nothing else is": not bool((found & ~grown).any()),
+        "U is at least 1": bool((masking.uncertainty(np.array([-1.0, 1.0, np.nan, np.inf])) >= 1).all()),
+    }
+    return failed_checks(checks, "U / H finite, the planted region found")
+
+
+@case(16, "printed formulas where they degenerate")
+def literal(device: str) -> Measured:
+    values = np.r_[np.full(20, 0.05), 0.25, 0.3] + np.arange(22) * 1e-4
+    scores = objective(np.sort(values), np.arange(22), 0.5, "literal")
+    unit, zero = np.eye(3)[None], np.zeros((1, 3))
+    away = np.array([[-2.0, 0, 0], [2.0, 0, 0]])
+    printed = (np.eye(3) + away[:, :, None] * -away[:, None, :]).mean(0)
+    rng = np.random.default_rng(0)
+    h, cosine = rng.uniform(0.3, 0.6, (34, 60)), rng.uniform(0.85, 1.0, (34, 60))
+    h[:, :30], cosine[10:16, 8:16] = 0.0, -0.99
+    raw = masking.uncertainty(cosine) / (h + 1e-6)
+    checks = {
+        "Ent: w2 below 1/2 flags all": bool(t_ent(values, 0.4, "literal").flagged.all()),
+        "Ent: w2 above 1/2 flags one": t_ent(values, 0.6, "literal").flagged.sum() == 1,
+        "Ent: w2 of 1/2 decides nothing": bool(np.ptp(scores) < 1e-12),
+        "overlap: depends on the unit": bool(
+            overlap(zero, unit, unit, "literal")[0]
+            < 0.3
+            < overlap(zero, unit * 1e-6, unit * 1e-6, "literal")[0]
+        ),
+        "merged covariance: indefinite": bool(np.linalg.eigvalsh(printed).min() < 0),
+        "global mask: the variance swallows it": not bool(masking.global_mask(raw, spread="var").any()),
+    }
+    return failed_checks(
+        {k: bool(v) for k, v in checks.items()}, "each fails as described in docs/refinesplat.md"
+    )
+
+
+def _double_loop(logits: torch.Tensor) -> float:
+    """Mean over pairs of KL in float64, as printed."""
+    log_s, log_r = F.logsigmoid(logits), F.logsigmoid(-logits)
+    one = (log_s.exp()[:, None] * (log_s[:, None] - log_s[None])).sum(2)
+    two = (log_r.exp()[:, None] * (log_r[:, None] - log_r[None])).sum(2)
+    return float((one + two).mean())
+
+
+@case(17, "consistency in closed form against the double loop, 1, 2 and 500 cells")
+def consistency(device: str) -> Measured:
+    parts = []
+    for n in (1, 2, 500):
+        logits = _logits(n, 6, 3.0, n)
+        exact = _double_loop(logits.double())
+        found = float(consistency_loss(logits.double(), torch.ones(1, n, dtype=torch.float64)))
+        parts.append(Measured(abs(found - exact) / max(exact, 1e-3), 1e-6, "the list's own", ""))
+        # float32: sums of terms of size |s log s| cancel down to the loss
+        size = float((torch.sigmoid(logits) * F.logsigmoid(logits)).abs().sum(1).mean()) * 2
+        condition = max(size / max(exact, 1e-3), 1.0)
+        found = float(consistency_loss(logits, torch.ones(1, n)))
+        parts.append(
+            Measured(
+                abs(found - exact) / max(exact, 1e-3),
+                32 * condition * UNIT,
+                "32 roundings x condition",
+                "",
+                condition,
+            )
+        )
+    m = worst(parts)
+    return Measured(m.error, m.tolerance, m.why, "the double loop's value", m.condition)
+
+
+@case(17, "consistency of saturated logits")
+def consistency_saturated(device: str) -> Measured:
+    checks = {}
+    for variant in ("sigmoid", "softmax"):
+        logits = torch.tensor([[1e4, -1e4], [-1e4, 1e4], [1e30, 0.0]], requires_grad=True)
+        loss = consistency_loss(logits, torch.ones(1, 3), variant)
+        (gradient,) = torch.autograd.grad(loss, logits)
+        checks[f"{variant}: loss"] = bool(torch.isfinite(loss))
+        checks[f"{variant}: gradient"] = bool(torch.isfinite(gradient).all())
+    return failed_checks(checks, "finite, gradient finite")
+
+
+@case(18, "w2 driven to 0 and to 1")
+def learnt_weight(device: str) -> Measured:
+    checks = {}
+    for name, residual in (("down", 1e6), ("up", 0.0)):
+        rng, weight = np.random.default_rng(0), LearntWeight(rate=5.0)  # much larger than in use
+        for _ in range(300):
+            weight.learn(rng.gamma(2.0, 1.0, 40), np.full(40, residual), np.ones(40), floor=0.5)
+        single = float(torch.sigmoid(torch.tensor(weight.theta, dtype=torch.float32)))
+        checks[f"{name}: inside (0, 1), in float32 too"] = 0 < weight.value < 1 and 0 < single < 1
+        checks[f"{name}: moved that way"] = (weight.value < 0.5) == (name == "down")
+    return failed_checks(checks, "stays inside (0, 1)")
+
+
+CASES = (
+    entropy_saturated,
+    few_instances,
+    skewed,
+    nothing_to_mask,
+    planted_region,
+    literal,
+    consistency,
+    consistency_saturated,
+    learnt_weight,
+)

@@ -1,0 +1,80 @@
+"""Results of runs as pandas tables: means, differences between methods, the hardest images.
+
+    python examples/05_results_with_pandas.py                    trains two methods on a small scene first
+    python examples/05_results_with_pandas.py --runs runs        reads a folder that 'aw bench' wrote
+
+Every number comes from the metrics.json of a run. `docs/metrics.md` says what each metric is.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import pandas as pd
+
+from ambiguous_wild import bench
+from ambiguous_wild.builder.pipeline import build_scene
+from ambiguous_wild.harness.bench import Lines
+from ambiguous_wild.harness.running.store import read_runs
+from ambiguous_wild.harness.tables.tidy import tidy
+from ambiguous_wild.simulate.capture import simulate
+from ambiguous_wild.simulate.presets import preset
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--runs", type=Path, help="folder of runs; without it two methods are trained")
+    parser.add_argument("-o", "--output", type=Path, default=Path("example_results"))
+    parser.add_argument("--iterations", type=int, default=100)
+    wanted = parser.parse_args()
+    folder = wanted.runs or train_two_methods(wanted.output, wanted.iterations)
+
+    # One row for each method, scene, seed, image and metric. A missing value is NaN, and `reason` says why.
+    results = tidy(read_runs(folder))
+    print(results.head(), "\n")
+
+    # Numbers of an image have its name; those of a whole run (cost, masks) have an empty one.
+    images = results[results["image"] != ""]
+    whole = results[results["image"] == ""]
+
+    # Mean over images, then over seeds, then over scenes. skipna=False: a mean with a gap is no mean.
+    means = images
+    for level in (["method", "metric", "scene", "seed"], ["method", "metric", "scene"], ["method", "metric"]):
+        means = means.groupby(level, as_index=False)["value"].agg(lambda v: v.mean(skipna=False))
+    print(means.pivot(index="method", columns="metric", values="value").round(3), "\n")
+
+    # The cost of each method: seconds, Gaussians and size, averaged over its runs.
+    cost = whole[whole["metric"].isin(["train_s", "gaussians", "model_mb", "fps"])]
+    print(cost.pivot_table(index="method", columns="metric", values="value").round(1), "\n")
+
+    # Differences image by image, on the same scene with the same seed: these tell two methods apart
+    # better than two means do.
+    psnr = images[images["metric"] == "psnr"].pivot(
+        index=["scene", "seed", "image"], columns="method", values="value"
+    )
+    first, *others = psnr.columns
+    differences = psnr[others].sub(psnr[first], axis=0).add_suffix(f" - {first}")
+    print(differences.describe().loc[["mean", "min", "max"]].round(2), "\n")
+
+    # The images that are hardest for every method.
+    print(psnr.mean(axis=1).sort_values().head(3).rename("mean PSNR").round(2))
+
+    path = wanted.output / "results.csv"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pd.DataFrame(results).to_csv(path, index=False)
+    print(f"wrote {path}")
+
+
+def train_two_methods(output: Path, iterations: int) -> Path:
+    """A simulated capture, built and benched; returns the folder of the runs."""
+    simulate(preset("tiny"), output / "raw")
+    scene = build_scene(output / "raw", output / "scene").scene
+    methods = ["3dgs", "refinesplat"]
+    return bench(
+        methods, scene, output=output / "runs", iterations=iterations, pictures=False, callbacks=Lines()
+    ).output
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,125 @@
+"""DeSplat: where the layers lie, how pictures are composed, what the alpha terms pull, and what is tested."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from ambiguous_wild.methods.desplat import DeSplatConfig, Layers
+from ambiguous_wild.splat.fields import STATIC, frames_of
+from ambiguous_wild.splat.rendered import Cotangents, Frame
+from ambiguous_wild.splat.step import Shot
+from tests.methods.baselines import bits, data_of, parts_of, resumed_equals_whole, trained, trainer_of
+from tests.tiny_scene import write_tiny_scene
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
+
+
+@pytest.fixture(scope="module")
+def starts(scene, tmp_path_factory):
+    data = data_of(scene, tmp_path_factory.mktemp("cache"))
+    return data, Layers(DeSplatConfig(points=300, speed=2.0)).setup(
+        data, None, lambda progress: {"means": 0.5 - progress}
+    )
+
+
+def shot(view=0):
+    return Shot(iteration=1, nominal=1.0, view=view, camera=SimpleNamespace())
+
+
+def frame(value, alpha):
+    return Frame(torch.full((2, 3, 3), value), torch.full((2, 3), alpha), lambda: torch.zeros(2, 3))
+
+
+def test_a_layer_covers_the_frame_of_its_photo_just_in_front_of_it(starts):
+    data, found = starts
+    assert list(found) == [str(view) for view in range(6)]
+    for view, camera in enumerate(data.cameras):
+        g = found[str(view)].gaussians
+        local = g.means.double().numpy() @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+        assert local[:, 2] == pytest.approx(max(0.02 * data.scene.extent, 0.02), abs=1e-5)
+        u = camera.fx * local[:, 0] / local[:, 2] + camera.cx
+        v = camera.fy * local[:, 1] / local[:, 2] + camera.cy
+        assert -0.1 < u.min() < 5 and 59 < u.max() < 64.1 and -0.1 < v.min() < 5 and 43 < v.max() < 48.1
+        assert g.sh_degree == 0 and len(g) == 300
+        assert torch.sigmoid(g.opacity_logits).tolist() == pytest.approx([0.1] * 300)
+    assert not torch.equal(found[str(0)].gaussians.sh0, found[str(1)].gaussians.sh0)
+
+
+def test_learning_rates_are_the_released_ones_times_the_speed(starts):
+    rates = starts[1][str(0)].rates(0.2)
+    assert rates["means"] == pytest.approx(0.6)  # of the static field, decay included
+    assert rates["sh0"] * 0.28209479 == pytest.approx(0.05)
+    assert (rates["opacity_logits"], rates["log_scales"], rates["quats"]) == (0.1, 0.1, 0.02)
+
+
+def test_the_composite_by_hand():
+    layers = Layers(DeSplatConfig())
+    frames = {STATIC: frame(0.8, 0.9), str(0): frame(0.3, 0.4)}
+    made, pull = layers.compose(frames, shot())
+    assert made.image[0, 0].tolist() == pytest.approx([0.3 + 0.6 * 0.8] * 3)
+    assert made.alpha[0, 0].item() == pytest.approx(0.4 + 0.6 * 0.9)
+    back = pull(Cotangents(image=torch.ones(2, 3, 3)))
+    assert back[STATIC].image[0, 0].tolist() == pytest.approx([0.6] * 3)
+    assert back[str(0)].image[0, 0].tolist() == [1.0] * 3
+    assert back[str(0)].alpha[0, 0].item() == pytest.approx(-3 * 0.8)
+
+
+def test_the_alpha_terms_pull_static_up_and_the_layer_down():
+    layers = Layers(DeSplatConfig(alpha_static=0.6, alpha_own=0.3))
+    terms = layers.regularise({STATIC: frame(0.8, 0.9), str(2): frame(0.3, 0.4)}, shot(2))
+    assert terms[STATIC].alpha.tolist() == [[pytest.approx(-0.1)] * 3] * 2  # 0.6 over 6 pixels
+    assert terms[str(2)].alpha.tolist() == [[pytest.approx(0.05)] * 3] * 2
+
+
+def test_only_the_layer_of_the_view_learns(scene, tmp_path):
+    trainer = trainer_of(scene, tmp_path, parts_of("desplat", points="200"))
+    others = trainer.drawing.others
+    before = {name: field.gaussians.sh0.clone() for name, field in others.items()}
+    trainer.step()
+    seen = str(trainer.pace.view(1))
+    assert {name for name, field in others.items() if not torch.equal(field.gaussians.sh0, before[name])} == {
+        seen
+    }
+
+
+def test_test_views_show_the_static_field_alone_and_the_mask_is_what_the_layer_leaves(scene, tmp_path):
+    trainer = trained(scene, tmp_path, parts_of("desplat", points="200"), iterations=60)
+    for view, camera in enumerate(trainer.data.cameras):
+        step = trainer.make_step(trainer.iteration, view)
+        alpha = frames_of(step.rendered)[str(view)].alpha
+        assert float(alpha.max()) > 0.02
+        assert torch.equal(trainer.parts.mask.predict(step), 1.0 - alpha)
+        assert trainer.parts.mask.keep(step) is None
+        alone = trainer.render(camera).image
+        assert torch.equal(alone, frames_of(step.rendered)[STATIC].image)
+        assert not torch.equal(alone, step.rendered.image)
+
+
+def test_layers_take_up_distractors(scene, tmp_path):
+    """The red squares of the photos are covered more than the rest of them."""
+    trainer = trained(scene, tmp_path, parts_of("desplat", points="200"), iterations=400)
+    inside, outside = [], []
+    for view in range(6):
+        keep = trainer.parts.mask.predict(trainer.make_step(trainer.iteration, view)).numpy()
+        square = np.zeros(keep.shape, bool)
+        square[14:26, 14 + 4 * view : 26 + 4 * view] = True
+        inside.append(keep[square].mean()), outside.append(keep[~square].mean())
+    assert np.mean(inside) < np.mean(outside) - 0.15
+
+
+def test_it_resumes_to_the_same_bits_layers_included(scene, tmp_path):
+    def make():
+        return parts_of("desplat", points="100", **{"density.every": "2000", "density.min_every": "10"})
+
+    resumed_equals_whole(scene, tmp_path, make)
+    whole, again = (trainer_of(scene, tmp_path / name, make()) for name in ("whole", "parts"))
+    assert whole.resume() and again.resume() and bits(whole) == bits(again)
+    for name, own in whole.drawing.others.items():
+        theirs = again.drawing.others[name]
+        assert all(torch.equal(a, dict(theirs.gaussians.items())[k]) for k, a in own.gaussians.items())
+        assert own.optimiser.steps == theirs.optimiser.steps > 0

@@ -1,0 +1,71 @@
+"""WildGaussians' appearance: its formula by hand, its start, and what it carries."""
+
+import numpy as np
+import pytest
+import torch
+
+from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.methods import get_method
+from ambiguous_wild.methods.wildgaussians import GAUSSIAN, PHOTO, WildAppearance, WildGaussiansConfig, fourier
+from ambiguous_wild.splat.data import load_train_data
+from ambiguous_wild.splat.effects.learnt import Visible
+from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.step import Shot
+from ambiguous_wild.splat.trainer import Trainer
+from tests.splat.scenes import camera
+from tests.tiny_scene import write_tiny_scene
+
+
+def test_fourier_features_by_hand():
+    means = torch.tensor([[-1.0, 0.0, 2.0], [1.0, 0.0, -2.0], [0.0, 0.0, 0.0]])
+    found = fourier(means)
+    assert found.shape == (3, GAUSSIAN) == (3, 24)
+    spread = np.quantile([1.0, 1.0, 0.0], 0.97)
+    unit = 0.5 * 1.0 / spread + 0.5  # of the second point's x
+    for k in range(4):
+        assert found[1, 3 * k] == pytest.approx(np.sin(2 * np.pi * 2**k * unit), abs=1e-5)
+        assert found[1, 12 + 3 * k] == pytest.approx(np.cos(2 * np.pi * 2**k * unit), abs=1e-5)
+
+
+def test_the_formula_by_hand():
+    effect = WildAppearance(WildGaussiansConfig(scale=0.5))
+    base, code = torch.tensor([[0.2, 0.4, 0.6]]), torch.full((1, GAUSSIAN), 0.1)
+    inputs = 3 + GAUSSIAN + PHOTO
+    leaf = {
+        "photo": torch.full((PHOTO,), 0.2),
+        "net_weight0": torch.ones(inputs, 1), "net_bias0": torch.tensor([0.5]),
+        "net_weight1": torch.tensor([[2.0]]), "net_bias1": torch.tensor([-1.0]),
+        "net_weight2": torch.tensor([[1.0, 0.0, 0.0, 0.0, 1.0, 0.0]]), "net_bias2": torch.zeros(6),
+    }  # fmt: skip
+    hidden = 2.0 * (1.2 + 24 * 0.1 + 32 * 0.2 + 0.5) - 1.0  # both layers are positive
+    shot = Shot(iteration=1, nominal=0, view=0, camera=camera())
+    found = effect.forward(Visible(base, torch.zeros(1, 3), {"wild_embedding": code}), leaf, shot)
+    # offset on red, gain on green, blue as it was
+    expected = torch.tensor([[0.2 + 0.5 * hidden, (1 + 0.5 * hidden) * 0.4, 0.6]])
+    torch.testing.assert_close(found, expected)
+
+
+def test_it_trains_resumes_and_carries_its_embeddings(tmp_path):
+    scene = load_scene(write_tiny_scene(tmp_path / "scene", distractors=False))
+
+    def trainer(folder):
+        entry = get_method("wildgaussians")
+        data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=tmp_path)
+        config = TrainConfig(iterations=130, probes=0, max_gaussians=500)
+        return Trainer(data, entry.build(entry.options()), config, folder=tmp_path / folder)
+
+    whole = trainer("whole")
+    start = whole.gaussians.extra["wild_embedding"].clone()
+    whole.train()
+    first = trainer("cut")
+    while first.iteration < 71:
+        first.step()
+    first.save()
+    second = trainer("cut")
+    second.resume()
+    second.train()
+    for (name, a), (_, b) in zip(whole.gaussians.rows(), second.gaussians.rows(), strict=True):
+        assert torch.equal(a, b), name
+    after = whole.gaussians.extra["wild_embedding"]
+    assert len(after) == len(whole.gaussians) and not torch.equal(after[: len(start)], start)
+    assert whole.effects.facts()["wildgaussians"]["photo_std"] > 0

@@ -19,7 +19,7 @@ import pandas as pd
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist, unknown
 from ambiguous_wild.harness.measures import ALWAYS, COST, MEASURES, Measure, measure
-from ambiguous_wild.harness.running.store import Runs
+from ambiguous_wild.harness.running.store import TEXT_OF_RUNS, Runs
 from ambiguous_wild.harness.tables.notes import notes
 from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.metrics import stats
@@ -139,8 +139,7 @@ class _Index:
 def _columns(runs: Runs, metrics: Sequence[str]) -> tuple[Measure, ...]:
     images = runs.images.dropna(subset=["value"])
     measured = list(dict.fromkeys([*MEASURES, *sorted(images["metric"].unique())]))
-    text = {"scene", "method", "status", "error", "folder", "device", "version", "config_hash", "scene_hash"}
-    of_runs = set(runs.runs.columns) - text
+    of_runs = set(runs.runs.columns) - {"scene", "method", *TEXT_OF_RUNS}
     if metrics:
         choices = set(MEASURES) | set(runs.images["metric"]) | of_runs
         for name in metrics:

@@ -4,10 +4,10 @@
     why = why_not_ranked(costs)              # "" = rank these runs by cost["reference_s"]
     text = seconds_range([c["train_s"] for c in costs])     # shown instead, unranked
 
-A run is *alone* where nothing else used its processors, and *contended* otherwise. `reference_s` is the training
-time in seconds of a stated machine: how often the calibration kernel (`splat/calibration.py`) would have run in
-that time, times the kernel's seconds on that machine. It corrects for load and for the machine's speed; a
-contended run keeps it, but is not ranked.
+A run is *alone* where nothing else used its processors, and *contended* otherwise. `reference_s` is the
+training time in seconds of a stated machine: how often the calibration kernel (`splat/calibration.py`) would
+have run in that time, times the kernel's seconds on that machine. It corrects for load and for the machine's
+speed; a contended run keeps it, but is not ranked.
 """
 
 from __future__ import annotations
@@ -88,8 +88,8 @@ def in_reference_seconds(
 ) -> np.ndarray:
     """Seconds of training as seconds of the reference machine.
 
-    Between two samples the machine's speed is their mean (kernels a second); before the first and after the last it
-    is theirs.
+    Between two samples the machine's speed is their mean (kernels a second); before the first and after the
+    last it is theirs.
 
     Returns:
         [n] float64, increasing with `at`; NaN without samples.

@@ -26,7 +26,7 @@ def pytest_collection_modifyitems(items):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
-    """Once modules are imported. Scenes of tests are tiny: a second thread doubles the work and takes a core from another process.
+    """Scenes of tests are tiny: a second thread doubles the work and takes a core from another process.
 
     Kernels give the same bits for any number of threads; tests of that set the number themselves.
     """

@@ -41,7 +41,7 @@ LAYOUTS = ("blocks", "paper", "means", "memory", "ablation")
 @click.option("--reported", is_flag=True, help="Show what papers print below, in rows of their own.")
 @click.option(
     "--reported-from", type=PathName(exists=True),
-    help="Their tables, as 'aw audit' reads them.  [default: leaderboard/reported]",
+    help="Their tables, as 'aw audit' reads them.  [default: those that come with the package]",
 )  # fmt: skip
 @click.option(
     "--sheet",

@@ -1,8 +1,8 @@
-"""A fixed piece of training whose seconds say how fast the machine is now: blending and Adam on a fixed scene.
+"""A fixed piece of training whose seconds say how fast the machine is now: blending and Adam.
 
 It runs the trainer's own code with the trainer's threads, so that other programs slow it down as they slow a
-training down. The scene never changes: learning rates are 0. A change of the work needs a new name in `KERNELS`,
-because seconds of different kernels cannot be compared.
+training down. The scene never changes: learning rates are 0. A change of the work needs a new name in
+`KERNELS`, because seconds of different kernels cannot be compared.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ class Size:
     steps: int
 
 
-# Reference machine of the CPU: 2 threads of an AMD EPYC virtual machine, nothing else running. That of a GPU is
-# nominal: the kernel takes a tenth of a second there.
+# Reference machine of the CPU: 2 threads of an AMD EPYC virtual machine, nothing else running. That of a GPU
+# is nominal: the kernel takes a tenth of a second there.
 KERNELS = {
     "cpu": Size("cpu-1", 0.25, 12_000, 240, 136, 12),
     "cuda": Size("gpu-1", 0.10, 100_000, 960, 544, 24),

@@ -154,8 +154,8 @@ class Run(ABC):
             return
         self.clock.stop()
         self.timeline.loss(loss)
-        # Marks are compared with those of the last step, not with the clock before this one: under a budget the
-        # clock may pass a mark between two steps.
+        # Marks are compared with those of the last step, not with the clock before this one: under a budget
+        # the clock may pass a mark between two steps.
         before, passed = self._marks, self._passed()
         done, meter = self.progress(self.iteration), self.meter
         calibrating = meter is not None and meter.due(self.clock.now(), done)

@@ -1,4 +1,4 @@
-"""What a run notes about the machine: alone or contended, reference seconds, and state that survives a kill."""
+"""What a run notes about the machine: alone or contended, reference seconds, state."""
 
 from __future__ import annotations
 

@@ -18,6 +18,8 @@ from ambiguous_wild.harness.running.timing import (
     timing_of,
     why_not_ranked,
 )
+from ambiguous_wild.harness.tables.comparison import comparison
+from ambiguous_wild.harness.tables.render import to_text
 from tests.harness.fake_runs import fake_result, save
 
 
@@ -86,9 +88,51 @@ def test_a_record_survives_the_file_and_stands_in_the_table_of_runs(tmp_path: Pa
     result = fake_result("a")
     record = {"verdict": "contended", "reason": "2 runs at once", "kernel": "cpu-1", "samples": [[0.0, 0.3]]}
     result["cost"] |= {"timing": record, "reference_s": 8.0}
-    save(tmp_path, result, fake_result("b"))
+    early = fake_result("b")
+    del early["cost"]["timing"]
+    save(tmp_path, result, early)
     assert read_result(tmp_path / "yard" / "a" / "seed0" / "metrics.json")["cost"]["timing"] == record
     frame = read_runs(tmp_path).runs.set_index("method")
     assert list(frame["timing"]) == ["contended", "unknown"]
     assert frame.loc["a", "timing_reason"] == "2 runs at once"
     assert frame.loc["a", "reference_s"] == 8.0
+
+
+def test_tables_rank_only_times_that_compare(tmp_path: Path) -> None:
+    runs = [fake_result(m, seed=s) for m in ("a", "b", "c") for s in (0, 1)]
+    for k, run in enumerate(runs):
+        run["cost"] |= {"train_s": 10.0 + k, "reference_s": 5.0 + k, "fps": 30.0 + k}
+    runs[-1]["cost"]["timing"] = {"verdict": "contended", "reason": "2 runs at once", "kernel": "cpu-1"}
+    table = comparison(
+        read_runs(save(tmp_path, *runs)), metrics=["psnr", "train_s", "reference_s", "gaussians"]
+    )
+    rows = {row.method: row.cells for row in table.blocks[0].rows}
+    assert [rows[m][1].rank for m in "abc"] == [1, 2, None]
+    assert [rows[m][2].rank for m in "abc"] == [1, 2, None]
+    text = to_text(table)
+    assert "14.0 to 15.0" in text and "9.0 to 10.0" in text
+    assert "times not ranked, lowest to highest run: c on yard: contended: 2 runs at once" in text
+    assert "times not ranked" not in to_text(comparison(read_runs(tmp_path), metrics=["psnr"]))
+
+
+def test_times_of_other_machines_are_ranked_by_reference_seconds(tmp_path: Path) -> None:
+    runs = [fake_result(m) for m in ("a", "b")]
+    for k, run in enumerate(runs):
+        run["environment"] = {"cpu": f"CPU {k}", "packages": {}}
+        run["cost"] |= {"train_s": 10.0 + k, "reference_s": 9.0 - k}
+    table = comparison(read_runs(save(tmp_path, *runs)), metrics=["train_s", "reference_s"])
+    ranks = [[cell.rank for cell in row.cells] for row in table.blocks[0].rows]
+    assert ranks == [[None, 2], [None, 1]]
+    assert any("CPU 0, 2 threads, CPU 1, 2 threads" in note for note in table.notes)
+    runs[1]["cost"]["timing"]["kernel"] = "gpu-1"
+    table = comparison(read_runs(save(tmp_path, *runs)), metrics=["reference_s"])
+    assert [row.cells[0].rank for row in table.blocks[0].rows] == [None, None]
+
+
+def test_the_mean_over_scenes_is_a_range_where_one_scene_is(tmp_path: Path) -> None:
+    runs = [fake_result(m, scene) for m in ("a", "b") for scene in ("one", "two")]
+    runs[0]["cost"] |= {"train_s": 30.0, "timing": {"verdict": "unknown", "reason": "not measured"}}
+    table = comparison(read_runs(save(tmp_path, *runs)), metrics=["train_s"])
+    mean = {row.method: row.cells[0] for row in table.blocks[0].rows}
+    assert mean["a"].ranged and (mean["a"].low, mean["a"].high) == (20.0, 20.0)
+    assert mean["b"].rank is None and not mean["b"].ranged  # alone in its column: nothing to rank

@@ -27,7 +27,7 @@ def cores() -> int:
 
 
 def busy_s() -> float | None:
-    """Seconds that these processors have worked since the start of the machine, for anybody; None = not known.
+    """Seconds that these processors have worked since the machine started, for anybody; None = not known.
 
     What a hypervisor gave to other machines counts as work of others.
     """
@@ -40,7 +40,7 @@ def busy_s() -> float | None:
     if not rows:
         return None
     ticks = sum(n for row in rows for k, n in enumerate(row) if k not in _IDLE and k not in _GUEST)
-    return ticks / os.sysconf("SC_CLK_TCK")
+    return ticks / float(os.sysconf("SC_CLK_TCK"))
 
 
 def own_s() -> float:

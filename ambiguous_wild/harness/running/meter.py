@@ -1,7 +1,7 @@
 """Measures how busy the machine is while a run trains, and what its time is worth elsewhere.
 
-The trainer calls the meter with its clock stopped: before the first step, now and then, after the last one. Each
-time a calibration kernel is timed. Its work and the record's are no part of the training time.
+The trainer calls the meter with its clock stopped: before the first step, now and then, after the last one.
+Each time a calibration kernel is timed. Its work and the record's are no part of the training time.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ MASK_SCORES = ("iou", "precision", "recall")
 # Columns of `Runs.runs` that hold words, beside scene and method.
 TEXT_OF_RUNS = (
     "status", "error", "folder", "device", "version", "config_hash", "scene_hash", "timing", "timing_reason",
-    "timing_kernel",
+    "timing_kernel", "hardware",
 )  # fmt: skip
 FoundResult = tuple[Path, RunResult]  # of this run folder
 
@@ -45,7 +45,7 @@ class Runs:
     images: one row per run, image and metric: scene, method, seed, image, metric, value (NaN = missing).
     runs: one row per run: scene, method, seed, status, error, folder, images, config_hash, scene_hash,
         version, device, the numbers of "cost", timing ("alone", "contended", "unknown"), timing_reason,
-        timing_kernel, and mask_iou, mask_precision, mask_recall.
+        timing_kernel, hardware, and mask_iou, mask_precision, mask_recall.
     missing: one row per run and missing metric: scene, method, seed, metric, reason.
     """
 
@@ -175,8 +175,18 @@ def _run_row(run: Path, result: RunResult) -> dict[str, Any]:
         | {"folder": str(run), "images": len(result["per_image"])}
         | cost
         | {"timing": timing.verdict, "timing_reason": timing.reason, "timing_kernel": timing.kernel}
+        | {"hardware": _hardware(result)}
         | {f"mask_{k}": math.nan if masks.get(k) is None else masks[k] for k in MASK_SCORES}
     )
+
+
+def _hardware(result: RunResult) -> str:
+    """What times depend on: the GPU, or the processor and the threads; empty where it is not known."""
+    known: Mapping[str, Any] = result.get("environment") or {}
+    if known.get("gpu"):
+        return str(known["gpu"])
+    threads = result["cost"].get("threads")
+    return f"{known['cpu']}, {threads} threads" if known.get("cpu") and threads else ""
 
 
 def _missing_rows(results: list[FoundResult]) -> Iterator[dict[str, Any]]:

@@ -69,6 +69,8 @@ class CostRun:
     timing: Timing
     samples: tuple[tuple[float, float], ...] = ()  # (wall seconds of training, seconds of the calibration)
     kernel_reference_s: float = math.nan
+    scene_hash: str = ""
+    reproduce: str = ""  # the command that makes it again; empty in results of earlier versions
     error: str = ""
     blind: str = ""  # why PSNR over time is unknown; empty: it was probed, or the run failed
 
@@ -207,6 +209,8 @@ def _run(folder: Path, result: RunResult) -> CostRun:
         timing=timing_of(cost),
         samples=tuple((float(at), float(kernel)) for at, kernel in record.get("samples", ())),
         kernel_reference_s=_number(record.get("kernel_reference_s")),
+        scene_hash=result["scene_hash"],
+        reproduce=str(result.get("reproduce", "")),
         error=result["error"] or "",
         blind="" if result["error"] else damage or unprobed,
     )

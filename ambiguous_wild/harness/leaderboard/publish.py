@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.audit.table import REPORTED
 from ambiguous_wild.harness.leaderboard import pictures
 from ambiguous_wild.harness.leaderboard.board import files_of, read_board
 from ambiguous_wild.harness.leaderboard.entry import Entry, in_order
-from ambiguous_wild.harness.audit.table import REPORTED
 from ambiguous_wild.harness.leaderboard.reported import SOURCE, Printed, read_reported, reported_csv
 from ambiguous_wild.harness.leaderboard.sheet import to_number
 from ambiguous_wild.harness.measures import measure

@@ -104,6 +104,14 @@ class Provenance(TypedDict):
     reproduce: str
 
 
+class Rescore(TypedDict):
+    """Metrics that `aw rescore` added to a result, and by which code."""
+
+    metrics: list[str]
+    version: str
+    code_hash: str
+
+
 class RunResult(TypedDict):
     """A result file: metrics.json, or failed.json of a run that failed."""
 
@@ -126,6 +134,7 @@ class RunResult(TypedDict):
     environment: NotRequired[Environment]
     code_hash: NotRequired[str]
     reproduce: NotRequired[str]
+    rescored: NotRequired[list[Rescore]]
 
 
 class SceneConfig(TypedDict):

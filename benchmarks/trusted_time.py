@@ -3,9 +3,9 @@
     python benchmarks/trusted_time.py -o /tmp/trusted            # an otherwise idle machine; about 15 minutes
     python benchmarks/trusted_time.py -o /tmp/short --scene scene --iterations 60 --seeds 1 --methods 3dgs
 
-3 methods x 2 captures x 2 seeds, 300 iterations. The second grid runs beside two processes that compute without
-a pause, one in its cache and one through memory. Passes where reference seconds of every cell agree within
-10 %, every cell of the busy grid is contended, none of it is ranked, and every cell of the quiet grid is alone.
+3 methods x 2 captures x 2 seeds, 300 iterations. The second grid runs beside two processes that never pause,
+one in its cache and one through memory. Passes where reference seconds of every cell agree within 10 %,
+every cell of the busy grid is contended, none of it is ranked, and every cell of the quiet grid is alone.
 """
 
 from __future__ import annotations

@@ -38,4 +38,4 @@ def test_the_commands_of_the_checklist_exist() -> None:
     from ambiguous_wild.cli.main import COMMANDS
 
     text = (ROOT / "docs" / "release.md").read_text(encoding="utf-8")
-    assert {word for word in re.findall(r"bin/aw (\S+)", text)} <= COMMANDS.keys()
+    assert set(re.findall(r"bin/aw (\S+)", text)) <= COMMANDS.keys()

@@ -151,7 +151,10 @@ def _in_reference(run: CostRun) -> CostRun:
     else:
         times = np.array(walls) * ratio
     points = tuple((float(at), psnr) for at, (_, psnr) in zip(times, run.points))
-    return replace(run, train_s=total, setup_s=run.setup_s * early, points=points)
+    late = run.kernel_reference_s / run.samples[-1][1] if run.samples else ratio
+    per_second = {"ms_per_iteration": ratio, "fps": 1.0 / late if late > 0.0 else math.nan}
+    numbers = {name: value * per_second.get(name, 1.0) for name, value in run.numbers.items()}
+    return replace(run, train_s=total, setup_s=run.setup_s * early, points=points, numbers=numbers)
 
 
 def why_unranked(runs: Iterable[CostRun]) -> str:

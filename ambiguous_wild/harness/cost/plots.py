@@ -153,7 +153,7 @@ def draw_front(report: CostReport) -> Any | None:
         return None
     figure, axes = new_figure(
         len(panels),
-        reading="grey: Pareto front; hollow: time not ranked, see the table; bars: sample deviation over seeds",
+        reading="grey: Pareto front; hollow: time not ranked; bars: sample deviation over seeds",
     )
     for panel, (key, label, less_is_better) in zip(axes, panels):
         known = [p for p in report.points if finite(_x(p, key, unit).mean, p.psnr.mean)]

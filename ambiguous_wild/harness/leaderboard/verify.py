@@ -13,6 +13,7 @@ from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.harness.leaderboard.entry import COST, FIRST, LAST, Entry
 from ambiguous_wild.harness.leaderboard.photos import check_photos
+from ambiguous_wild.harness.leaderboard.reproduce import preparation
 from ambiguous_wild.harness.leaderboard.scenes import Scenes
 from ambiguous_wild.harness.leaderboard.settings import command, hardware, options_hash, setting
 from ambiguous_wild.harness.leaderboard.sheet import check_text
@@ -69,7 +70,7 @@ def verify(run: Path, scenes: Scenes, *, quick: bool = False) -> Verified:
     dataset = scenes.dataset(run, scene, result["scene_hash"])
     quality, missing = _qualities(run, result)
     cost = {k: float(v) for k, v in result["cost"].items() if isinstance(v, (int, float)) and v == v}
-    words, again = _words(run, config)
+    words, again = _words(run, config, preparation(scene))
     entry = Entry(
         dataset=check_text("dataset", dataset),
         scene=check_text(f"scene name of {run}", result["scene"]),
@@ -125,10 +126,10 @@ def _config(run: Path) -> RunConfig:
     return cast(RunConfig, config)
 
 
-def _words(run: Path, config: RunConfig) -> tuple[str, str]:
-    """(setting, command) of a configuration that a stranger wrote."""
+def _words(run: Path, config: RunConfig, before: list[str]) -> tuple[str, str]:
+    """(setting, commands) of a configuration that a stranger wrote."""
     try:
-        return check_text(f"setting of {run}", setting(config)), command(config)
+        return check_text(f"setting of {run}", setting(config)), command(config, before)
     except AwError as error:
         raise AwError(f"{run}: {error}") from None
     except (TypeError, ValueError, AttributeError, KeyError) as error:

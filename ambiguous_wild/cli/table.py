@@ -42,7 +42,7 @@ LAYOUTS = ("blocks", "paper", "means", "memory", "ablation")
 @click.option("--reported", is_flag=True, help="Show what papers print below, in rows of their own.")
 @click.option(
     "--reported-from", type=PathName(exists=True),
-    help="Their tables, as 'aw audit' reads them.  [default: leaderboard/reported]",
+    help="Their tables, as 'aw audit' reads them.  [default: those that come with the package]",
 )  # fmt: skip
 @click.option(
     "--sheet",
@@ -198,9 +198,7 @@ def _known() -> list:
     return read_reported() if FOLDER.is_dir() else []
 
 
-def _laid_out(
-    made: list[Layout], style: str, made_by: str, color: bool, everything: bool
-) -> tuple[str, str]:
+def _laid_out(made: list[Layout], style: str, made_by: str, color: bool, everything: bool) -> tuple[str, str]:
     from ambiguous_wild.harness.tables.fit import divided
     from ambiguous_wild.harness.tables.layouts import plain_formats
     from ambiguous_wild.harness.tables.layouts.html_page import to_html

@@ -21,7 +21,7 @@ from ambiguous_wild.harness.audit.table import read_tables
 from tests.harness.clean_tables import COLUMNS, Row, clean_tables, write
 
 ROOT = Path(__file__).resolve().parents[2]
-REPORTED = ROOT / "leaderboard/reported"
+REPORTED = ROOT / "ambiguous_wild/harness/audit/reported"
 
 
 def findings(rows: list[Row], folder: Path) -> list[Finding]:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ambiguous_wild.harness.cost import pairs
 from ambiguous_wild.harness.cost.curves import Curve, Summary, longest, summary, timeline
 from ambiguous_wild.harness.cost.front import Point
 from ambiguous_wild.harness.cost.pairs import Change
@@ -32,7 +33,7 @@ AXES = (
     ("model_mb", "model size (MB)", True),
     ("fps", "frames a second", False),
 )
-KINDS = {"effect": 0, "interval": 1, "option": 2}
+KINDS = {kind: k for k, kind in enumerate(pairs.KINDS)}
 
 
 def draw_all(report: CostReport, folder: Path) -> list[Path]:
@@ -155,7 +156,8 @@ def draw_front(report: CostReport) -> Any | None:
     )
     for panel, (key, label, less_is_better) in zip(axes, panels):
         known = [p for p in report.points if finite(_x(p, key, unit).mean, p.psnr.mean)]
-        rivals = [p for p in known if not knows_truth(p.method)]
+        # a time that is not ranked is drawn, and never on the front
+        rivals = [p for p in known if not knows_truth(p.method) and not (p.unranked and key != "model_mb")]
         _front_line(panel, [(_x(p, key, unit).mean, p.psnr.mean) for p in rivals], less_is_better)
         for p in known:
             _dot(panel, _x(p, key, unit), p.psnr, look[p.curve]["color"])

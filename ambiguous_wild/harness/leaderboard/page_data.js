@@ -98,8 +98,9 @@ const isOracle = (group) => DATA.oracles.includes(group.method);
 /** What is ranked of summaries: no oracle, no time of a shared machine, no times of different machines. */
 function rankable(found, summaries, key) {
   const open = found.map((g, i) => !isOracle(g) && summaries[i].comparable && !Number.isNaN(summaries[i].value));
-  const machines = unique(found.filter((_, i) => open[i]).flatMap((g) => g.runs.map((r) => r.hardware)));
-  const apart = isTime(key) && key !== "reference_s" && machines.length > 1;
+  const of = (what) => unique(found.filter((_, i) => open[i]).flatMap((g) => g.runs.map((r) => r[what])));
+  // Reference seconds compare machines, but not a CPU with a GPU.
+  const apart = isTime(key) && of(key === "reference_s" ? "device" : "hardware").length > 1;
   return summaries.map((s, i) => (open[i] && !apart ? s.value : NaN));
 }
 

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from ambiguous_wild.harness.leaderboard.entry import Entry, in_order
+from ambiguous_wild.harness.leaderboard.entry import ALONE, Entry, in_order
 from ambiguous_wild.harness.leaderboard.reported import Reported
 from ambiguous_wild.harness.leaderboard.sheet import to_number
 from ambiguous_wild.harness.measures import PARTIAL, measure
@@ -62,7 +62,6 @@ def facts(
         for k in (*order, *sorted(missing), *COSTS, "lpips_alex")
         for m in (measure(k),)
     }
-    measures["reference_s"] |= {"better": "lower", "digits": 1}
     for n in reported.numbers:
         m = measure(n.metric)
         label = PRINTED_LABELS.get(n.metric, m.label)
@@ -89,7 +88,7 @@ def _run(e: Entry) -> dict[str, Any]:
     quality = dict(e.quality)
     if "mask_recall" not in quality:  # no distractor to find: an IoU of 0 says nothing
         quality = {k: v for k, v in quality.items() if k not in MASKS}
-    alone = e.cost.get("alone")
+    alone = e.cost.get(ALONE)
     return {k: getattr(e, k) for k in COLUMNS} | {
         "quality": _numbers(quality),
         "cost": _numbers({k: v for k, v in e.cost.items() if k in COSTS}),

@@ -40,7 +40,7 @@ def to_text(report: CostReport) -> str:
     parts += ["±: sample standard deviation over seeds"] if _has_spread(report) else []
     parts += [TIMES[report.reference]]
     parts += [plain(note) for note in report.notes]
-    parts += [f"made by: {plain(report.made_by)}"] if report.made_by else []
+    parts += [f"command: {plain(report.made_by)}"] if report.made_by else []
     return "\n".join(parts) + "\n"
 
 

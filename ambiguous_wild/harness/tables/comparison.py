@@ -1,15 +1,16 @@
 """From runs to a comparison: rows are methods, columns are measures, one block a scene.
 
-The mean is taken over images, then over seeds, then over scenes, in that order. A mean over missing cells
-is missing; a failed run makes its cell "failed", so that no method gains by failing where it is hard, and
-a method with an unfinished run shows what it has but is not ranked.
-`render_tables.py` writes a `Table` as text, Markdown, CSV or LaTeX.
+The mean is taken over images, then over seeds, then over scenes, in that order. No mean is shown where a
+value is missing. A scene that cannot have a value, such as a mask score without distractors, is left out of
+the mean, for every method. A failed run makes its cell "failed", so that no method gains by failing where
+it is hard, and a method with an unfinished run shows what it has but is not ranked.
+`render.py` writes a `Table` as text, Markdown, CSV or LaTeX.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -18,13 +19,15 @@ import pandas as pd
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist, unknown
-from ambiguous_wild.harness.measures import ALWAYS, COST, MEASURES, Measure, measure
+from ambiguous_wild.harness.measures import ALWAYS, COST, MEASURES, PARTIAL, Measure, measure
 from ambiguous_wild.harness.running.store import TEXT_OF_RUNS, Runs
 from ambiguous_wild.harness.tables.notes import notes
 from ambiguous_wild.harness.tables.times import incomparable, untimed
 from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.metrics import stats
 
+MASK_COLUMNS = ("mask_iou", "mask_precision")
+UNDEFINED_ON_SOME = (*PARTIAL, *MASK_COLUMNS, "mask_recall")
 State = Literal["ok", "missing", "failed", "absent"]
 
 
@@ -71,7 +74,9 @@ class Table:
         return replace(self, notes=(*self.notes, note))
 
 
-def comparison(runs: Runs, *, metrics: Sequence[str] = (), scenes: Sequence[str] = ()) -> Table:
+def comparison(
+    runs: Runs, *, metrics: Sequence[str] = (), scenes: Sequence[str] = (), drop_empty: bool | None = None
+) -> Table:
     """The comparison of every method over the scenes.
 
     Args:
@@ -79,6 +84,8 @@ def comparison(runs: Runs, *, metrics: Sequence[str] = (), scenes: Sequence[str]
         metrics: columns by key, in this order; empty: PSNR, SSIM, LPIPS, whatever else was measured, mask
             IoU and cost.
         scenes: only these, in this order; empty: all, by name.
+        drop_empty: leave out columns without any value; a note says why they are empty. None: unless
+            `metrics` names them.
 
     Raises:
         AwError: a metric or scene that no run has, or no finished run.
@@ -98,20 +105,54 @@ def comparison(runs: Runs, *, metrics: Sequence[str] = (), scenes: Sequence[str]
         images=runs.images[runs.images["scene"].isin(chosen)],
         missing=runs.missing[runs.missing["scene"].isin(chosen)],
     )
-    columns = _columns(runs, metrics)
     methods = sorted(runs.runs["method"].unique())
     index = _Index(runs)
+    columns = _columns(runs, metrics)
+    defined = {c.key: [s for s in chosen if index.can_have(s, c, methods)] for c in columns}
     unranked = incomparable(runs.runs, columns)
     blocks = [Block(scene, tuple(_scene_row(index, m, scene, columns) for m in methods)) for scene in chosen]
     if len(chosen) > 1:
-        mean = tuple(_mean_row(index, m, chosen, columns, blocks) for m in methods)
+        mean = tuple(_mean_row(index, m, chosen, columns, blocks, defined) for m in methods)
         blocks.insert(0, Block(None, mean))
-    return Table(
-        columns,
-        tuple(_ranked(b, columns, unranked) for b in blocks),
-        chosen,
-        notes(runs, columns, methods, chosen),
-    )
+    told = (*notes(runs, columns, methods, chosen), *_undefined(columns, chosen, defined))
+    if drop_empty if drop_empty is not None else not metrics:
+        columns, blocks = _without_empty(columns, blocks)
+    return Table(columns, tuple(_ranked(b, columns, unranked) for b in blocks), chosen, told)
+
+
+def _without_empty(
+    columns: tuple[Measure, ...], blocks: list[Block]
+) -> tuple[tuple[Measure, ...], list[Block]]:
+    """Without the columns that have no value anywhere; where none has any, everything stays."""
+    kept = [
+        i
+        for i in range(len(columns))
+        if any(row.cells[i].state == "ok" for block in blocks for row in block.rows)
+    ]
+    return (columns, blocks) if not kept else selected(columns, blocks, kept)
+
+
+def selected(
+    columns: tuple[Measure, ...], blocks: Sequence[Block], kept: Sequence[int]
+) -> tuple[tuple[Measure, ...], list[Block]]:
+    """Columns and blocks with the columns of these numbers alone."""
+    chosen = [
+        replace(b, rows=tuple(replace(r, cells=tuple(r.cells[i] for i in kept)) for r in b.rows))
+        for b in blocks
+    ]
+    return tuple(columns[i] for i in kept), chosen
+
+
+def _undefined(
+    columns: tuple[Measure, ...], scenes: tuple[str, ...], defined: Mapping[str, Sequence[str]]
+) -> list[str]:
+    """A line for the columns whose mean leaves the same scenes out."""
+    lines: dict[str, list[str]] = {}
+    for column in columns:
+        out = [s for s in scenes if s not in defined[column.key]]
+        if out and len(out) < len(scenes):
+            lines.setdefault(shortlist(out), []).append(column.label)
+    return [f"undefined on {out}, left out of the mean: {', '.join(c)}" for out, c in lines.items()]
 
 
 class _Index:
@@ -128,11 +169,23 @@ class _Index:
         rows = self.runs[method, scene].set_index("seed")
         if not column.per_image:
             values = rows[column.key] if column.key in rows else pd.Series(math.nan, index=rows.index)
-            return values.astype(float).sort_index()
+            values = values.astype(float)
+            if column.key in MASK_COLUMNS and "mask_recall" in rows:
+                # Without a distractor recall is undefined, and an IoU of 0 says nothing.
+                values = values.where(rows["mask_recall"].notna())
+            return values.sort_index()
         images = self.images.get((method, scene, column.key))
         found = {} if images is None else {seed: g["value"].to_numpy() for seed, g in images.groupby("seed")}
         means = {seed: stats.mean(found.get(seed, np.empty(0))) for seed in sorted(rows.index)}
         return pd.Series(means, dtype=float)
+
+    def can_have(self, scene: str, column: Measure, methods: Sequence[str]) -> bool:
+        """Whether the measure is defined on the scene: some method has a value, or it always is."""
+        if column.key not in UNDEFINED_ON_SOME:
+            return True
+        return any(
+            (m, scene) in self.runs and bool(self.seeds(m, scene, column).notna().any()) for m in methods
+        )
 
     def state(self, method: str, scene: str) -> State:
         if (method, scene) not in self.runs:
@@ -186,13 +239,19 @@ def _scene_row(index: _Index, method: str, scene: str, columns: tuple[Measure, .
 
 
 def _mean_row(
-    index: _Index, method: str, scenes: tuple[str, ...], columns: tuple[Measure, ...], blocks: list[Block]
+    index: _Index,
+    method: str,
+    scenes: tuple[str, ...],
+    columns: tuple[Measure, ...],
+    blocks: list[Block],
+    defined: Mapping[str, Sequence[str]],  # column -> scenes that can have a value
 ) -> Row:
     rows = [next(r for r in block.rows if r.method == method) for block in blocks]
     states = [index.state(method, scene) for scene in scenes]
     cells = []
     for i, column in enumerate(columns):
-        value = stats.mean([row.cells[i].value for row in rows])
+        over = defined[column.key]
+        value = stats.mean([row.cells[i].value for row, s in zip(rows, scenes) if s in over])
         if "failed" in states:
             cells.append(TableCell(state="failed"))
         elif math.isnan(value):
@@ -203,7 +262,7 @@ def _mean_row(
             cells.append(TableCell(value, math.nan, low, high, ranged=True))
         else:
             # Seed by seed, so that the spread is that of the number shown; needs the same seeds everywhere.
-            by_seed = pd.concat([index.seeds(method, s, column) for s in scenes], axis=1).to_numpy()
+            by_seed = pd.concat([index.seeds(method, s, column) for s in over], axis=1).to_numpy()
             cells.append(TableCell(value, stats.spread(by_seed.mean(axis=1))))
     return Row(method, tuple(cells), sum(row.runs for row in rows), ranked=all(row.ranked for row in rows))
 

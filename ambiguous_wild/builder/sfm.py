@@ -82,7 +82,7 @@ def extract_features(
         "seed": settings.seed,
         "jobs": jobs,
     }
-    _run(job, folder, lambda: bar.at(_count(database, "keypoints")))
+    run_job(job, folder, lambda: bar.at(_count(database, "keypoints")))
     bar.finish()
     with closing(sqlite3.connect(database)) as db:
         rows = db.execute(
@@ -126,7 +126,7 @@ def match(
         "seed": settings.seed,
         "jobs": jobs,
     }
-    _run(job, folder, lambda: bar.at(_count(database, "two_view_geometries")))
+    run_job(job, folder, lambda: bar.at(_count(database, "two_view_geometries")))
     bar.finish()
     with closing(sqlite3.connect(database)) as db:
         inliers = [r[0] for r in db.execute("SELECT rows FROM two_view_geometries WHERE rows > 0")]
@@ -150,7 +150,7 @@ def map_scene(
         "mapper": settings.mapper,
         "seed": settings.seed,
     }
-    _run(job, folder, lambda: bar.at(_number(progress)))
+    run_job(job, folder, lambda: bar.at(_number(progress)))
     bar.finish()
     database.unlink()
     progress.unlink(missing_ok=True)
@@ -158,7 +158,7 @@ def map_scene(
     return {"models": listing}
 
 
-def _run(job: SfmJob, folder: Path, watch: Callable[[], None]) -> None:
+def run_job(job: SfmJob, folder: Path, watch: Callable[[], None]) -> None:
     """Run one task of the worker; `watch` is called while it runs."""
     write_json(folder / "job.json", {**job, "parent": os.getpid()})
     log = folder / LOG

@@ -47,4 +47,16 @@ class MappingJob(TypedDict):
     parent: NotRequired[int]
 
 
-SfmJob = FeatureJob | MatchJob | MappingJob
+class TriangulationJob(TypedDict):
+    """Triangulate points with known poses."""
+
+    task: Literal["triangulation"]
+    database: str
+    photos: str  # folder
+    model: str  # folder; cameras and poses, numbered as in the database
+    output: str  # folder
+    seed: int
+    parent: NotRequired[int]
+
+
+SfmJob = FeatureJob | MatchJob | MappingJob | TriangulationJob

@@ -18,7 +18,7 @@ from typing import Any
 
 from ambiguous_wild.builder.pairs import sequential_pairs
 from ambiguous_wild.builder.records import ModelSummary
-from ambiguous_wild.builder.sfm_jobs import FeatureJob, MappingJob, MatchJob, SfmJob
+from ambiguous_wild.builder.sfm_jobs import FeatureJob, MappingJob, MatchJob, SfmJob, TriangulationJob
 from ambiguous_wild.io.atomic import write_json
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
@@ -98,6 +98,19 @@ def run_mapping(job: MappingJob) -> None:
     write_json(output / "models.json", listing)
 
 
+def run_triangulation(job: TriangulationJob) -> None:
+    """Points from the matches; poses and intrinsics stay as they are."""
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = 1
+    options.ba_min_num_residuals_for_cpu_multi_threading = 10**9
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = job["seed"]
+    known = pycolmap.Reconstruction(job["model"])
+    found = pycolmap.triangulate_points(
+        known, job["database"], job["photos"], job["output"], options=options, refine_intrinsics=False
+    )
+    found.write_binary(job["output"])
+
+
 def _map_incrementally(job: MappingJob, output: Path) -> dict[int, Any]:
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1
@@ -154,8 +167,10 @@ def main() -> None:
         run_features(job)
     elif job["task"] == "matches":
         run_matches(job)
-    else:
+    elif job["task"] == "mapping":
         run_mapping(job)
+    else:
+        run_triangulation(job)
 
 
 if __name__ == "__main__":

@@ -87,9 +87,7 @@ def parse_budget(text: str) -> float:
 @click.option(
     "--protocol",
     type=click.Choice(["full", "half"]),
-    default="full",
-    show_default=True,
-    help="half: colour effects see the left half of a test photo, the right one is measured (NeRF-W).",
+    help="half: colour effects see the left half of a test photo, the right one is measured (NeRF-W).  [default: as scene.json says, else full]",
 )
 @click.option("-o", "--output", type=PathName(), default=Path("runs"), show_default=True)
 @click.option(
@@ -147,7 +145,7 @@ def command(
     plugins: tuple[Path, ...],
     effects: tuple[str, ...],
     plan_file: Path | None,
-    protocol: str,
+    protocol: str | None,
     output: Path,
     probes: int,
     overwrite: str,

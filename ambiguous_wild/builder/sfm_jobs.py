@@ -13,6 +13,7 @@ class FeatureJob(TypedDict):
     photos: str  # folder
     names: list[str]
     camera: str
+    groups: list[list[str]]  # names that share a camera, where the camera is "per-device"
     masks: str | None  # folder
     max_features: int
     max_side: int  # px

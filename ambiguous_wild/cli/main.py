@@ -26,6 +26,8 @@ COMMANDS = {
         "Build a scene from a folder of photos: check, COLMAP, downsample, split.",
     ),
     "import": ("import_dataset", "Import a scene of a public dataset: On-the-go, RobustNeRF, COLMAP, ..."),
+    "fetch": ("fetch", "Download a public dataset, resumed and checked by its hash."),
+    "export-scene": ("export_scene", "Write a scene for nerfstudio, NerfBaselines, COLMAP, or as On-the-go."),
     "package": ("package", "Pack scenes for release: archives, checksums, Croissant, data card."),
     "verify": ("verify", "Check a package, its archives and their scenes."),
     "ambiguity-report": ("ambiguity_report", "Measure how similar the distractors are to the scene."),

@@ -23,6 +23,7 @@ from ambiguous_wild.datasets.foreign import SIDES, ForeignScene
 from ambiguous_wild.datasets.photos import PhotoPlan, PlacedPhoto, place_mask, place_photo, plan_photos
 from ambiguous_wild.datasets.points import drop_test_only, random_points, triangulate
 from ambiguous_wild.datasets.recognise import read_foreign
+from ambiguous_wild.datasets.suites import differences, suite_of
 from ambiguous_wild.io import colmap_binary
 from ambiguous_wild.io.atomic import check_output, write_json, write_text
 from ambiguous_wild.io.colmap_records import Model
@@ -280,6 +281,10 @@ def _record(
         for side, names in foreign.missing.items()
         if names
     ]
+    suite = suite_of(settings.dataset, foreign.root)
+    if suite is not None:
+        full = {(c.width, c.height) for c in foreign.model.cameras.values()}
+        warnings += differences(suite, settings.name or foreign.root.name, sorted(full), foreign.factor)
     record: dict[str, Any] = {
         "schema": "ambiguous_wild.scene",
         "schema_version": SCENE_SCHEMA,

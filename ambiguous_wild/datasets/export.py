@@ -18,7 +18,7 @@ from ambiguous_wild.datasets.photos import link_file
 from ambiguous_wild.io import colmap_binary
 from ambiguous_wild.io.atomic import atomic_dir, check_output
 from ambiguous_wild.io.colmap_model import read_model
-from ambiguous_wild.io.colmap_records import Model
+from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage, ModelPoints
 from ambiguous_wild.io.images import read_gray, write_png
 from ambiguous_wild.io.scene_folder import load_scene
 
@@ -61,7 +61,7 @@ def export_scene(path: Path, form: str, output: Path, *, copy: bool = False) -> 
     check_output(output)
     with atomic_dir(output) as folder:
         place = _copy if copy else link_file
-        left_out = WRITERS[form](scene, folder, place)  # type: ignore[index]
+        left_out = WRITERS[form](scene, folder, place)
     return Exported(output, len(scene.views), len(scene.train), len(scene.test), tuple(left_out))
 
 
@@ -84,7 +84,7 @@ def _sized_model(scene: Scene) -> Model:
 
     model = read_model(model_folder(scene.root))
     by_name = {view.name: view for view in scene.views}
-    cameras: dict[tuple[Any, ...], Any] = {}
+    cameras: dict[tuple[Any, ...], ModelCamera] = {}
     images = {}
     for number, image in model.images.items():
         view = by_name.get(image.name)
@@ -94,10 +94,9 @@ def _sized_model(scene: Scene) -> Model:
         params = (c.fx, c.fy, c.cx, c.cy)
         key = (c.width, c.height, *params)
         if key not in cameras:
-            fields = {"camera_id": len(cameras) + 1, "model": "PINHOLE", "width": c.width, "height": c.height}
-            cameras[key] = type(full)(**fields, params=params)
+            cameras[key] = ModelCamera(len(cameras) + 1, "PINHOLE", c.width, c.height, params)
         scale = np.array([c.width / full.width, c.height / full.height])
-        images[number] = type(image)(
+        images[number] = ModelImage(
             number,
             image.qvec,
             image.tvec,
@@ -112,7 +111,7 @@ def _sized_model(scene: Scene) -> Model:
     kept = np.bincount(owner[rows], minlength=len(points.ids))
     offsets = np.concatenate([[0], np.cumsum(kept)]).astype(np.int64)
     tracks = (points.track_image_ids[rows], points.track_point2d[rows])
-    trimmed = type(points)(points.ids, points.xyz, points.rgb, points.error_px, offsets, *tracks)
+    trimmed = ModelPoints(points.ids, points.xyz, points.rgb, points.error_px, offsets, *tracks)
     return Model({c.camera_id: c for c in cameras.values()}, images, trimmed)
 
 

@@ -93,7 +93,7 @@ def fetch(
     archive = folder / _file_name(data)
     with build_lock(archive):
         known = _read_record(folder).get(data.name)
-        digest = data.sha256 or (known or {}).get("sha256", "")
+        digest = data.sha256 or (known["sha256"] if known is not None else "")
         moved, first = 0, False
         if not archive.is_file():
             moved = _download(data, archive, known, tries, wait_s, tick, say)

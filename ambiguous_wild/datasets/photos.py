@@ -218,7 +218,8 @@ def _read(path: Path, background: tuple[int, int, int] | None) -> np.ndarray:
         return read_png_rgb(path)
     alpha = data[..., 3:].astype(np.float32) / 255
     rgb = data[..., 2::-1].astype(np.float32)
-    return (rgb * alpha + np.float32(background) * (1 - alpha) + 0.5).astype(np.uint8)
+    behind = np.array(background, np.float32) * (1 - alpha)
+    return np.asarray(rgb * alpha + behind + 0.5).astype(np.uint8)
 
 
 def _reduce(pixels: np.ndarray, path: Path, factor: int) -> None:

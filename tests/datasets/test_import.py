@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.builder.downsample import downsample_photo
+from ambiguous_wild.cli import bench, import_dataset
 from ambiguous_wild.core import AwError
-from ambiguous_wild.datasets.recognise import recognise
+from ambiguous_wild.datasets.recognise import READERS, recognise
+from ambiguous_wild.datasets.suites import suites
 from ambiguous_wild.datasets.write import ImportSettings, import_scene
 from ambiguous_wild.harness.running.grid import plan_cells
 from ambiguous_wild.io.images import read_gray, read_png_rgb
@@ -296,3 +298,46 @@ def test_a_wrong_dataset_is_one_line_and_nothing_is_left(spoil, message, tmp_pat
     assert message in done.stderr
     assert done.stderr.count("\n") == 1 and "Traceback" not in done.stderr
     assert [p.name for p in tmp_path.iterdir()] == ["raw"]
+
+
+def test_points_are_triangulated_where_the_dataset_has_poses_alone(tmp_path):
+    """Oracle: photos of two walls with exact cameras; the points must lie on the walls."""
+    from tests.builder import capture_maker as maker
+
+    paths = maker.write_capture(tmp_path / "raw" / "images", 6)
+    frames = []
+    for path, eye in zip(paths, maker.eyes(6)):
+        z = np.array([0.0, 0.0, 5.2]) - eye
+        z /= np.linalg.norm(z)
+        x = np.cross([0.0, 1.0, 0.0], z)
+        x /= np.linalg.norm(x)
+        c2w = np.eye(4)
+        c2w[:3, :3], c2w[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), eye
+        matrix = (c2w @ layouts.OPENGL).tolist()
+        frames.append({"file_path": f"images/{path.name}", "transform_matrix": matrix})
+    shared = {"w": maker.WIDTH, "h": maker.HEIGHT, "fl_x": maker.FOCAL, "fl_y": maker.FOCAL}
+    (tmp_path / "raw" / "transforms.json").write_text(json.dumps({**shared, "frames": frames}))
+    done = import_scene(tmp_path / "raw", tmp_path / "scene", jobs=2)
+    assert done.info["imported"]["layout"] == "instant-ngp"
+    scene = load_scene(done.scene)
+    for view, eye in zip(scene.views, maker.eyes(6)):
+        assert np.allclose(view.camera.center, eye, atol=1e-6)
+    assert len(scene.points) > 100
+    distances = []
+    for corner, u, v, _ in maker.walls():
+        normal = np.cross(u, v)
+        distances.append(np.abs((scene.points.xyz - corner) @ normal / np.linalg.norm(normal)))
+    assert np.median(np.min(distances, axis=0)) < 0.02
+    assert (scene.points.track_views >= 0).all()
+
+
+def test_too_few_matches_give_random_points_and_say_so(imported):
+    done = imported("instant-ngp")[1]
+    assert "too few points could be triangulated: initial points are random" in done.info["imported"]["notes"]
+    assert done.info["counts"]["points"] == 100_000
+
+
+def test_the_command_offers_what_there_is():
+    """The command line lists names without importing the readers."""
+    assert set(import_dataset.KINDS) == set(READERS)
+    assert set(bench.SUITES) == set(suites())

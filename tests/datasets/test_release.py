@@ -26,7 +26,7 @@ from tests.datasets import layouts
 INFO = ReleaseInfo(
     title="Toy",
     description="Waves.",
-    creators=["Ada"],
+    creators=("Ada",),
     license="CC-BY-4.0",
     consent="nobody is seen",
     contact="ada@example.org",

@@ -167,7 +167,7 @@ def read_drone(root: Path) -> ForeignScene:
     """Drone Imagery of DroneSplat: two lists, names compared up to their first dot, at most 1920 px wide."""
     model = read_named_model(root)
     split, missing = split_by_lists(model_names(model), read_lists(root), root, first_dot)
-    notes = ()
+    notes: tuple[str, ...] = ()
     if (root / "masks").is_dir():
         notes = (f"masks/ holds the instances of a segmentation, which {_NO_KEEP_MASKS}",)
     return ForeignScene(

@@ -68,7 +68,7 @@ def read_table(path: Path) -> dict[Split, list[str]]:
             continue
         if side not in found or not name:
             raise AwError(f"{path}, line {number}: side {side!r} of {name!r} is neither train nor test")
-        found[side].append(name)  # type: ignore[index]
+        found[side].append(name)
     return found
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -139,7 +139,7 @@ def frame_camera(
     return ModelCamera(number, "PINHOLE", *size_px, (fx, fy, cx, cy))
 
 
-def model_of_frames(frames: list[tuple[str, Mapping[str, Any], ModelCamera]]) -> Model:
+def model_of_frames(frames: Sequence[tuple[str, Mapping[str, Any], ModelCamera]]) -> Model:
     """A model without points; equal cameras are one."""
     cameras: dict[tuple[Any, ...], ModelCamera] = {}
     images: dict[int, ModelImage] = {}
@@ -215,9 +215,16 @@ def read_transforms(root: Path) -> ForeignScene:
         xyz, rgb = read_point_ply(root / inside(points, root))
         model = Model(model.cameras, model.images, points_without_tracks(xyz, rgb))
         notes.append(f"points from {points}, without the photos that see them")
-    where = "model" if len(model.points.ids) else "triangulate"
     return ForeignScene(
-        kind, root, model, folder, split, missing=missing, masks=masks, notes=tuple(notes), points=where
+        kind,
+        root,
+        model,
+        folder,
+        split,
+        missing=missing,
+        masks=masks,
+        notes=tuple(notes),
+        points="model" if len(model.points.ids) else "triangulate",
     )
 
 

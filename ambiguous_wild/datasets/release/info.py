@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 from ambiguous_wild.core.config import from_plain
@@ -35,7 +35,7 @@ class ReleaseInfo:
 
     title: str = ""
     description: str = ""
-    creators: list[str] = field(default_factory=list)
+    creators: tuple[str, ...] = ()
     license: str = ""
     consent: str = ""
     contact: str = ""
@@ -43,7 +43,7 @@ class ReleaseInfo:
     date: str = ""
     url: str = ""
     cite_as: str = ""
-    keywords: list[str] = field(default_factory=list)
+    keywords: tuple[str, ...] = ()
     collection: str = ""
     limitations: str = ""
 

@@ -183,14 +183,14 @@ def _pack(
             [name, archive.name, "scene.json", "record", "", hashlib.sha256(data).hexdigest(), len(data)]
         )
     bar.finish()
-    known = info.get("photos") if isinstance(info.get("photos"), dict) else {}
+    known: Any = info.get("photos")
     photos = []
     for photo, side in sorted(split.items()):
-        fact = known.get(photo) if isinstance(known.get(photo), dict) else {}
+        fact = known.get(photo) if isinstance(known, dict) else None
+        fact = fact if isinstance(fact, dict) else {}
         done = "; ".join(map(str, fact.get("notes") or [])) or "undistorted and stored as PNG where needed"
-        photos.append(
-            [name, photo, side, fact.get("source", ""), done, ", ".join(sorted(removed.get(photo, ())))]
-        )
+        dropped_here = ", ".join(sorted(removed.get(photo, ())))
+        photos.append([name, photo, side, fact.get("source", ""), done, dropped_here])
     return rows, photos
 
 

@@ -31,7 +31,7 @@ def _detectors() -> tuple[Any, Any]:
     from skimage.feature import Cascade
 
     hog = cv2.HOGDescriptor()
-    hog.setSVMDetector(cv2.HOGDescriptor.getDefaultPeopleDetector())
+    hog.setSVMDetector(np.asarray(cv2.HOGDescriptor.getDefaultPeopleDetector(), np.float32))
     return hog, Cascade(data.lbp_frontal_face_cascade_filename())
 
 

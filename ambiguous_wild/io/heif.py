@@ -78,7 +78,8 @@ def read_heif(path: Path) -> tuple[np.ndarray, Exif, list[str]]:
                 f"{width}x{height} is {width * height / 1e6:.0f} megapixels, more than the limit of "
                 f"{MAX_PIXELS // 1_000_000}; reduce it"
             )
-        pixels = np.asarray(picture)
+        # A copy, as libheif's memory goes with `picture`; its rows may be longer than the picture is wide.
+        pixels = np.array(picture)[:, :width]
         depth = int(picture.info.get("bit_depth", 8) or 8)
         raw = picture.info.get("exif")
         others = len(picture) - 1

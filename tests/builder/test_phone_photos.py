@@ -22,11 +22,12 @@ EXIF_SECOND = "2026:11:23 10:00:00"
 def with_exif(path, *, make="Phone", model="A", focal=5.0, taken=EXIF_SECOND):
     """Write EXIF into a JPEG."""
     from PIL import Image
+    from PIL.TiffImagePlugin import IFDRational
 
     with Image.open(path) as image:
         exif = image.getexif()
         exif[271], exif[272] = make, model
-        exif.get_ifd(34665).update({37386: focal, 36867: taken})
+        exif.get_ifd(34665).update({37386: IFDRational(round(1000 * focal), 1000), 36867: taken})
         pixels = image.copy()
     pixels.save(path, "JPEG", quality=97, exif=exif)
 
@@ -119,7 +120,7 @@ def test_heic_photos_build_as_their_jpegs_do(tmp_path):
     encoder.register_heif_opener()
     for path in write_capture(tmp_path / "jpeg", 6):
         (tmp_path / "heic").mkdir(exist_ok=True)
-        Image.open(path).save(tmp_path / "heic" / f"{path.stem}.heic", quality=95)
+        Image.open(path).save(tmp_path / "heic" / f"{path.stem}.heic", quality=95, chroma=444)
     counts = [
         build_scene(tmp_path / kind, tmp_path / f"{kind}-scene", SETTINGS, jobs=2).info["counts"][
             "registered"
@@ -127,6 +128,20 @@ def test_heic_photos_build_as_their_jpegs_do(tmp_path):
         for kind in ("jpeg", "heic")
     ]
     assert counts == [6, 6]
+
+
+def test_pixels_are_those_of_the_picture_at_any_width(tmp_path):
+    encoder = pytest.importorskip("pillow_heif", reason="pillow-heif, which can write HEIC, is not installed")
+    from PIL import Image
+
+    encoder.register_heif_opener()
+    rows, columns = np.mgrid[:45, :61]
+    wanted = np.stack([4 * columns, 5 * rows, 255 - 4 * columns], axis=2).astype(np.uint8)
+    for _ in range(3):
+        Image.fromarray(wanted).save(tmp_path / "a.heic", quality=95, chroma=444)
+        _, pixels = read_photo(tmp_path / "a.heic")
+        assert pixels.shape == wanted.shape
+        assert np.abs(pixels.astype(int) - wanted).max() <= 8
 
 
 def test_ten_bits_are_reduced_and_said(tmp_path):

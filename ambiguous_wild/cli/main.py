@@ -35,6 +35,7 @@ COMMANDS = {
     "bench": ("bench", "Train methods on scenes and evaluate them."),
     "ablate": ("ablate", "Measure the gain and cost of each part of a method."),
     "table": ("table", "Compare runs: Markdown, CSV, LaTeX."),
+    "rescore": ("rescore", "Measure what was missing when runs ended, from their saved pictures."),
     "cost": ("cost", "Accuracy against training time: tables and plots."),
     "audit": ("audit", "Find errors in tables of results."),
     "leaderboard": ("leaderboard", "Add checked runs to CSV files and publish them as a page."),

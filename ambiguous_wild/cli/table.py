@@ -41,7 +41,7 @@ LAYOUTS = ("blocks", "paper", "means", "memory", "ablation")
 @click.option("--reported", is_flag=True, help="Show what papers print below, in rows of their own.")
 @click.option(
     "--reported-from", type=PathName(exists=True),
-    help="Their tables, as 'aw audit' reads them.  [default: leaderboard/reported]",
+    help="Their tables, as 'aw audit' reads them.  [default: those that come with the package]",
 )  # fmt: skip
 @click.option(
     "--sheet",
@@ -169,7 +169,7 @@ def _layouts(
         return build.blocks(found, metrics=metrics, scenes=scenes)
     numbers = read_reported(reported_from) if reported or reported_from else []
     if not datasets:
-        datasets = datasets_of(numbers or _known(), sorted(set(found.runs["scene"])))
+        datasets = datasets_of(numbers or read_reported(), sorted(set(found.runs["scene"])))
     if layout == "memory":
         metrics = metrics or build.MEMORY
     if layout == "means":
@@ -178,13 +178,6 @@ def _layouts(
         subject = "memory" if layout == "memory" else ""
         made = build.paper(found, metrics=metrics, scenes=scenes, datasets=datasets, subject=subject)
     return [with_reported(one, numbers) for one in made] if numbers else made
-
-
-def _known() -> list:
-    """What the checkout's reported tables tell of datasets; nothing where there are none."""
-    from ambiguous_wild.harness.tables.layouts.reported import FOLDER, read_reported
-
-    return read_reported() if FOLDER.is_dir() else []
 
 
 def _laid_out(made: list[Layout], style: str, made_by: str, color: bool) -> tuple[str, str]:

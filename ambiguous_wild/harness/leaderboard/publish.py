@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.audit.table import REPORTED
 from ambiguous_wild.harness.leaderboard import pictures
 from ambiguous_wild.harness.leaderboard.board import files_of, read_board
 from ambiguous_wild.harness.leaderboard.entry import Entry, in_order
@@ -62,7 +63,7 @@ def publish(
     Args:
         board: folder of the leaderboard.
         out: for index.html, data/*.csv and images/.
-        reported: show what papers print, too: BOARD/reported/*.csv.
+        reported: show what papers print, too: BOARD/reported/*.csv, else the tables of this package.
         reported_from: show what papers print, too, from this folder.
         title: of the page.
 
@@ -75,7 +76,9 @@ def publish(
         raise AwError(
             f"no folder of reported numbers {reported_from}: give one with *.csv, see docs/audit.md"
         )
-    source = board / SOURCE if reported and reported_from is None else reported_from
+    source = reported_from
+    if reported and source is None:
+        source = board / SOURCE if (board / SOURCE).is_dir() else REPORTED
     check_output(out)
     out = Path(os.path.realpath(out))
     with folder_lock(out, "aw leaderboard publish"):

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numba
 import torch
 
 from ambiguous_wild.core import AwError, Camera
@@ -19,6 +20,7 @@ from ambiguous_wild.harness.running.memory import (
     peak_memory,
     reset_peak,
 )
+from ambiguous_wild.harness.running.meter import Meter
 from ambiguous_wild.harness.running.multi_gpu import multi_gpu_cost, train_multi_gpu
 from ambiguous_wild.harness.running.records import Cost, RunResult
 from ambiguous_wild.harness.running.result import finished_result
@@ -72,6 +74,8 @@ def _make_trainer(cell: Cell, folder: Path, cache_dir: Path, truth: list[evaluat
     trainer = Trainer(data, parts, cell.train, folder=folder, probe=probe if truth else None)
     # Frozen inputs, instance masks and identities are part of what a method costs.
     trainer.setup_s = time.perf_counter() - before
+    if cell.gpus == 1:
+        trainer.meter = Meter(cell.device, int(numba.get_num_threads()) if cell.device == "cpu" else 1)
     return trainer
 
 
@@ -126,17 +130,18 @@ def _effect_facts(cell: Cell, trainer: Trainer) -> dict[str, Any]:
 
 
 def _cost(cell: Cell, trainer: Trainer) -> Cost:
-    import numba
-
     n = max(trainer.iteration, 1)
     cost: Cost = {
         "train_s": trainer.clock.now(),
+        "cpu_s": trainer.clock.cpu_s,
         "setup_s": trainer.setup_s,
         "iterations": trainer.iteration,
         "ms_per_iteration": trainer.ms_per_iteration,
         "ms_parts": {name: 1e3 * seconds / n for name, seconds in trainer.clock.parts_s.items()},
         "gaussians": len(trainer.gaussians),
     }
+    if isinstance(trainer.meter, Meter):
+        cost |= trainer.meter.cost(trainer.clock.now())
     cost |= peak_memory(cell.device)
     cost["device"] = cell.device
     cost["threads"] = int(numba.get_num_threads())

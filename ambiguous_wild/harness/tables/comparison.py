@@ -19,8 +19,9 @@ import pandas as pd
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist, unknown
 from ambiguous_wild.harness.measures import ALWAYS, COST, MEASURES, Measure, measure
-from ambiguous_wild.harness.running.store import Runs
+from ambiguous_wild.harness.running.store import TEXT_OF_RUNS, Runs
 from ambiguous_wild.harness.tables.notes import notes
+from ambiguous_wild.harness.tables.times import incomparable, untimed
 from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.metrics import stats
 
@@ -36,6 +37,7 @@ class TableCell:
     low: float = math.nan  # 95 % bootstrap interval over the images of one scene
     high: float = math.nan
     rank: int | None = None  # 1, 2, 3 or None
+    ranged: bool = False  # a time that cannot be compared: shown from `low` to `high`, its least and its most
     state: State = "ok"
 
 
@@ -99,13 +101,14 @@ def comparison(runs: Runs, *, metrics: Sequence[str] = (), scenes: Sequence[str]
     columns = _columns(runs, metrics)
     methods = sorted(runs.runs["method"].unique())
     index = _Index(runs)
+    unranked = incomparable(runs.runs, columns)
     blocks = [Block(scene, tuple(_scene_row(index, m, scene, columns) for m in methods)) for scene in chosen]
     if len(chosen) > 1:
         mean = tuple(_mean_row(index, m, chosen, columns, blocks) for m in methods)
         blocks.insert(0, Block(None, mean))
     return Table(
         columns,
-        tuple(_ranked(b, columns) for b in blocks),
+        tuple(_ranked(b, columns, unranked) for b in blocks),
         chosen,
         notes(runs, columns, methods, chosen),
     )
@@ -118,6 +121,7 @@ class _Index:
         self.runs = dict(iter(runs.runs.groupby(["method", "scene"])))
         self.images = dict(iter(runs.images.groupby(["method", "scene", "metric"])))
         self.unfinished = {(i.method, i.scene) for i in runs.incomplete}
+        self.untimed = set(untimed(runs.runs))
 
     def seeds(self, method: str, scene: str, column: Measure) -> pd.Series:
         """The run's value by seed, NaN where missing."""
@@ -139,8 +143,7 @@ class _Index:
 def _columns(runs: Runs, metrics: Sequence[str]) -> tuple[Measure, ...]:
     images = runs.images.dropna(subset=["value"])
     measured = list(dict.fromkeys([*MEASURES, *sorted(images["metric"].unique())]))
-    text = {"scene", "method", "status", "error", "folder", "device", "version", "config_hash", "scene_hash"}
-    of_runs = set(runs.runs.columns) - text
+    of_runs = set(runs.runs.columns) - {"scene", "method", *TEXT_OF_RUNS}
     if metrics:
         choices = set(MEASURES) | set(runs.images["metric"]) | of_runs
         for name in metrics:
@@ -168,6 +171,9 @@ def _scene_row(index: _Index, method: str, scene: str, columns: tuple[Measure, .
             cells.append(TableCell(state="missing"))
             continue
         low = high = math.nan
+        if column.timed and (method, scene) in index.untimed:
+            cells.append(TableCell(value, math.nan, float(values.min()), float(values.max()), ranged=True))
+            continue
         if column.per_image:
             images = index.images[method, scene, column.key].pivot_table(
                 index="image", columns="seed", values="value", aggfunc="mean", dropna=False
@@ -191,6 +197,10 @@ def _mean_row(
             cells.append(TableCell(state="failed"))
         elif math.isnan(value):
             cells.append(TableCell(state="missing"))
+        elif any(row.cells[i].ranged for row in rows):
+            own = [(c.low, c.high) if c.ranged else (c.value, c.value) for c in (r.cells[i] for r in rows)]
+            low, high = (float(np.mean(ends)) for ends in zip(*own))
+            cells.append(TableCell(value, math.nan, low, high, ranged=True))
         else:
             # Seed by seed, so that the spread is that of the number shown; needs the same seeds everywhere.
             by_seed = pd.concat([index.seeds(method, s, column) for s in scenes], axis=1).to_numpy()
@@ -198,16 +208,19 @@ def _mean_row(
     return Row(method, tuple(cells), sum(row.runs for row in rows), ranked=all(row.ranked for row in rows))
 
 
-def _ranked(block: Block, columns: tuple[Measure, ...]) -> Block:
-    """The block with the first, second and third of every column marked; equal in print = equal rank."""
+def _ranked(block: Block, columns: tuple[Measure, ...], unranked: frozenset[str]) -> Block:
+    """The block with the first, second and third of every column marked; equal in print = equal rank.
+
+    `unranked`: columns of times that were measured on machines that differ.
+    """
     rows = [list(row.cells) for row in block.rows]
     for i, column in enumerate(columns):
         values = {
             k: round(row.cells[i].value, column.digits)
             for k, row in enumerate(block.rows)
-            if row.ranked and row.cells[i].state == "ok"
+            if row.ranked and row.cells[i].state == "ok" and not row.cells[i].ranged
         }
-        if column.better is None or len(set(values.values())) < 2:
+        if column.better is None or column.key in unranked or len(set(values.values())) < 2:
             continue
         for k, value in values.items():
             ahead = sum(v > value if column.better == "higher" else v < value for v in values.values())

@@ -254,6 +254,7 @@ def _extras() -> list[Check]:
 
     packages = {
         "ray": ("ray", "aw bench --engine ray"),
+        "pi-heif": ("heic", "HEIC photos of phones"),
         "choix": ("study", "aw study score: ranking"),
         "nltk": ("study", "aw study score: agreement"),
     }

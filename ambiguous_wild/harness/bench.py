@@ -121,7 +121,7 @@ def bench(
     engine: Engine | None = None,
     gpus: int = 1,
     factor: int | None = None,
-    protocol: Protocol = "full",
+    protocol: Protocol | None = None,
     overwrite: Overwrite = "missing",
     cache: Words | None = None,
     pictures: bool = True,
@@ -149,7 +149,8 @@ def bench(
         engine: where cells run; None = this machine.
         gpus: that share one model, for a scene too large for one.
         factor: which images_N; None = what the scene was built for.
-        protocol: "full" measures whole test photos, "half" the right half (NeRF-W).
+        protocol: "full" measures whole test photos, "half" the right half (NeRF-W); None = what the scene's
+            scene.json says, else "full".
         overwrite: "missing" keeps what is finished and resumes what stopped, "always" starts anew, "never"
             leaves folders that exist as they are.
         cache: for features and instance masks; None = OUTPUT/.cache.

@@ -40,6 +40,7 @@ BUILTIN = (
         summary="appearance of every photo: an embedding per Gaussian and per photo changes colours",
         recipe="ambiguous_wild.methods.wildgaussians:build",
         config="ambiguous_wild.methods.wildgaussians:Config",
+        ablations="ambiguous_wild.methods.plug_in:WILDGAUSSIANS",
         paper="Kulhanek et al., NeurIPS 2024 (arXiv 2407.08447); its appearance only",
     ),
     MethodEntry(
@@ -103,6 +104,7 @@ BUILTIN = (
         summary="colours by a net, from what each Gaussian is and what it samples in maps of its photo",
         recipe="ambiguous_wild.methods.gsw.recipe:build",
         config="ambiguous_wild.methods.gsw.recipe:GswConfig",
+        ablations="ambiguous_wild.methods.plug_in:GSW",
         paper="Gaussian in the Wild, from its code",
     ),
     MethodEntry(

@@ -38,7 +38,7 @@ class Runs:
 
     images: one row per run, image and metric: scene, method, seed, image, metric, value (NaN = missing).
     runs: one row per run: scene, method, seed, status, error, folder, images, config_hash, scene_hash,
-        version, device, the numbers of "cost", and mask_iou, mask_precision, mask_recall.
+        version, fit (what was done with test photos, see tables/notes.py), device, the numbers of "cost",
     missing: one row per run and missing metric: scene, method, seed, metric, reason.
     """
 
@@ -163,11 +163,22 @@ def _run_row(run: Path, result: RunResult) -> dict[str, Any]:
             "config_hash": result["config_hash"],
             "scene_hash": result["scene_hash"],
             "version": result["version"],
+            "fit": _fit(result["facts"]),
         }
         | {"folder": str(run), "images": len(result["per_image"])}
         | cost
         | {f"mask_{k}": math.nan if masks.get(k) is None else masks[k] for k in MASK_SCORES}
     )
+
+
+def _fit(facts: Mapping[str, Any]) -> str:
+    """What the method did with test photos, a key of `notes.FITTED`."""
+    if facts.get("protocol", "full") != "half":
+        return "full"
+    fitted = facts.get("fitted")
+    if not isinstance(fitted, dict):
+        return "unknown"
+    return "fitted" if fitted.get("steps") else "read" if fitted.get("read_by") else "plain"
 
 
 def _missing_rows(results: list[FoundResult]) -> Iterator[dict[str, Any]]:

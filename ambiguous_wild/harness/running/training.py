@@ -135,7 +135,13 @@ def _train_and_measure(
 
 def _effect_facts(cell: Cell, trainer: Trainer) -> dict[str, Any]:
     """Which effects were on and what they learnt; empty without any."""
-    facts: dict[str, Any] = {} if cell.protocol == "full" else {"protocol": cell.protocol}
+    facts: dict[str, Any] = {}
+    if cell.protocol == "half":
+        nothing = {"effects": [], "steps": 0}
+        facts |= {
+            "protocol": "half",
+            "fitted": nothing if trainer.effects is None else trainer.effects.fitted(),
+        }
     if cell.chosen.effects:
         facts["effects"] = list(cell.chosen.effects)
     return facts if trainer.effects is None else facts | {"effect_facts": trainer.effects.facts()}

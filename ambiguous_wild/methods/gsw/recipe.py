@@ -70,7 +70,7 @@ def build(options: GswConfig) -> Parts:
 class GswAppearance(Learnt):
     """colour = net(position, intrinsic feature, samples of three maps, direction)."""
 
-    name = "gs-w"
+    name, reads_photo = "gs-w", True
 
     def __init__(self, config: GswConfig) -> None:
         self.config = config

@@ -81,6 +81,8 @@ def parse_budget(text: str) -> float:
 @click.option("--mask", metavar="METHOD", help="Masks of another method, none, or truth (exact ones).")
 @click.option("--density", metavar="METHOD", help="Density control of another method.")
 @click.option("--regulariser", metavar="METHOD", help="Loss on the render of another method.")
+@click.option("--passes", type=click.IntRange(1, 2), default=1, show_default=True,
+              help="2: train again from the start with the final masks; both trainings count as its cost.")  # fmt: skip
 @click.option(
     "--set", "settings", multiple=True, metavar="METHOD.KEY=VALUE", help="An option of a method; repeatable."
 )
@@ -156,6 +158,7 @@ def command(
     mask: str | None,
     density: str | None,
     regulariser: str | None,
+    passes: int,
     settings: tuple[str, ...],
     plugins: tuple[Path, ...],
     effects: tuple[str, ...],
@@ -221,6 +224,7 @@ def command(
         plan=plan_file,
         settings=settings,
         parts={place: donor for place, donor in parts.items() if donor},  # type: ignore[misc]
+        passes=passes,
         train=train,  # type: ignore[arg-type]
         plugins=plugins,
         device=device,  # type: ignore[arg-type]

@@ -113,6 +113,7 @@ def bench(
     plan: Plan | Words | None = None,
     settings: Sequence[str] = (),
     parts: Mapping[Place, str] | None = None,
+    passes: int = 1,
     train: TrainSettings | None = None,
     plugins: Sequence[Words] = (),
     device: Literal["auto", "cpu", "cuda"] = "auto",
@@ -141,6 +142,7 @@ def bench(
         plan: of `aw plan`, or its file, for the one scene; None = made where one is needed.
         settings: options of methods, "METHOD.KEY=VALUE".
         parts: parts of other methods that every method takes, e.g. {"mask": "refinesplat"}.
+        passes: 2 = train again from the start with the final masks; the runs are called METHOD+2passes.
         train: other settings of training.
         plugins: Python files that register methods.
         device: where to train; "auto" = the GPU where it can be used.
@@ -168,7 +170,7 @@ def bench(
     where = Engine() if engine is None else engine
     where = where if jobs is None else dataclasses.replace(where, jobs=jobs)
     where.check()
-    names = _check_methods([methods] if isinstance(methods, str) else methods, plugins, parts or {})
+    names = _check_methods([methods] if isinstance(methods, str) else methods, plugins, parts or {}, passes)
     folders = [Path(scenes)] if isinstance(scenes, str | Path) else [Path(scene) for scene in scenes]
     choices = [effects] if isinstance(effects, str) else list(effects)
     _check_effects(choices, plan, folders)
@@ -178,6 +180,7 @@ def bench(
     with Session(where, threads, told) as session:
         from ambiguous_wild.harness.running.grid import plan_cells, run_cells
         from ambiguous_wild.harness.running.groups import grouped
+        from ambiguous_wild.harness.running.passes import check_passes
         from ambiguous_wild.harness.running.prepare import prepare_cpu
         from ambiguous_wild.io.atomic import check_output
         from ambiguous_wild.splat.pace import TrainConfig
@@ -207,6 +210,8 @@ def bench(
         cells = grouped(planned, budgets_s)
         if gpus > 1:
             cells = _on_several_gpus(cells, gpus, where)
+        for cell in {cell.method.name: cell for cell in cells}.values():
+            check_passes(cell)
         for line in _remarks(cells):
             told.say(line)
         check_output(out / "run")  # before half a minute of compiling
@@ -235,15 +240,21 @@ def bench(
     return made
 
 
-def _check_methods(methods: Sequence[str], plugins: Sequence[Words], parts: Mapping[Place, str]) -> list[str]:
+def _check_methods(
+    methods: Sequence[str], plugins: Sequence[Words], parts: Mapping[Place, str], passes: int
+) -> list[str]:
     """The methods' names with the parts they take; a misspelt one is answered before torch is imported."""
     from ambiguous_wild.methods.graft import graft_name
     from ambiguous_wild.methods.registry import get_method, load_plugin
+    from ambiguous_wild.methods.second_pass import second_pass_name, trained_once
 
     for plugin in plugins:
         load_plugin(Path(plugin))
     donors: dict[str, str | None] = dict(parts.items())
-    names = [graft_name(name, donors) for name in methods]
+    names = []
+    for name in methods:
+        once = trained_once(name)
+        names.append(second_pass_name(graft_name(once, donors), passes if once == name else 2))
     for name in names:
         get_method(name)
     return names

@@ -25,7 +25,7 @@ class Variant:
     features: str = (
         ""  # a features back end it needs, see vision/backends.py; without its weights the row is missing
     )
-    method: str = ""  # another method at its defaults, if the paper compares with one
+    method: str = ""  # another method, a graft too, if the paper compares with one; `settings` are then its
 
 
 @dataclass(frozen=True)

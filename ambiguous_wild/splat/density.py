@@ -147,11 +147,15 @@ class DensityControl:
             self.last_growth = step.iteration
             events.append("grow")
         if self._reset_due(step):
-            gaussians.opacity_logits.clamp_(max=_logit(config.reset_opacity))
+            self.reset_opacity(gaussians)
             optimiser.reset_moments(["opacity_logits"])
             self.last_reset = step.iteration
             events.append("reset")
         return gaussians, events
+
+    def reset_opacity(self, gaussians: Gaussians) -> None:
+        """Hook: lower the opacities, in place."""
+        gaussians.opacity_logits.clamp_(max=_logit(self.config.reset_opacity))
 
     def after_growth(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> Gaussians:
         """Hook: change the set once more after growth and pruning (merging, for one)."""

@@ -110,6 +110,8 @@ def plan_study(
             try:
                 if variant.method:
                     cells = plan_cells([variant.method], scenes, seeds, train, device=device, factor=factor)
+                    if variant.settings:
+                        cells = _renamed(cells, variant, folder_name(method, group, variant))
                     rows.append(Planned(group.name, variant, tuple(cells)))
                     continue
                 options = names.options(variant)
@@ -139,6 +141,15 @@ def earlier_groups(study: Study, output: Path) -> list[str]:
         return []
     there = {group.name for group in get_method(study.method).ablation_groups()}
     return [n for n in names if n in there and n not in {group.name for group in study.groups}]
+
+
+def _renamed(cells: Sequence[Cell], variant: Variant, name: str) -> list[Cell]:
+    """Cells of another method with the variant's settings, under a name of their own."""
+    pairs = [setting.partition("=") for setting in variant.settings]
+    given = {key: value for key, _, value in pairs}
+    options = with_options(cells[0].options, given, f"option of {variant.method}")
+    entry = dataclasses.replace(cells[0].method, name=name)
+    return [dataclasses.replace(cell, method=entry, options=options) for cell in cells]
 
 
 class _Names:

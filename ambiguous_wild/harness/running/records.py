@@ -68,6 +68,8 @@ class Cost(TypedDict, total=False):
     timing: TimeRecord
     setup_s: float  # features, masks and compilation before the first step
     iterations: int
+    passes: int  # trainings that all of this counts, where there was more than one
+    first_pass_s: float  # of train_s, that of the first
     ms_per_iteration: float
     ms_parts: dict[str, float]  # by part of an iteration
     gaussians: int

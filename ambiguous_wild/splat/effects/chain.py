@@ -165,6 +165,13 @@ class Chain:
                     effect.fit(own[effect.name])
         return self.render(gaussians, shot, draw).image
 
+    def fitted(self) -> dict[str, Any]:
+        """What `fit_view` does to a test photo: effects that are fitted and steps, effects that read it."""
+        names = [effect.name for effect in self._with("fit")]
+        found: dict[str, Any] = {"effects": names, "steps": FIT_STEPS if names else 0}
+        reading = [effect.name for effect in self.effects if effect.reads_photo]
+        return found | ({"read_by": reading} if reading else {})
+
     def facts(self) -> dict[str, Any]:
         """What every effect says of itself, by its name."""
         return {effect.name: effect.facts() for effect in self.effects}

@@ -184,7 +184,9 @@ def row_of(
         "gain_db": fmean(gains),
         "gain_sd": stdev(gains) if len(gains) > 1 else None,
         "gaussians": fmean(float(r["cost"]["gaussians"]) for r in mine),
-        "ms_ratio": fmean(a["cost"]["ms_per_iteration"] / b["cost"]["ms_per_iteration"] for a, b in zip(mine, plain)),
+        "ms_ratio": fmean(
+            a["cost"]["ms_per_iteration"] / b["cost"]["ms_per_iteration"] for a, b in zip(mine, plain)
+        ),
         "iou": (mine[0]["masks"] or {}).get("iou"),
     }  # fmt: skip
     if section == "transient":
@@ -254,7 +256,8 @@ def to_markdown(data: dict[str, Any]) -> str:
         f"{data['iterations']} iterations, at most {data['max_gaussians']} Gaussians, seeds "
         f"{', '.join(map(str, data['seeds']))}, one thread. Made by `benchmarks/baselines.py`.",
         "",
-        "| section | method | lines | scene | PSNR | gain dB | sd | gap closed | IoU | Gaussians | x 3dgs ms/it |",
+        "| section | method | lines | scene | PSNR | gain dB | sd | gap closed | IoU | Gaussians "
+        "| x 3dgs ms/it |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for row in data["rows"]:

@@ -25,7 +25,8 @@ class Variant:
     features: str = (
         ""  # a features back end it needs, see vision/backends.py; without its weights the row is missing
     )
-    method: str = ""  # another method at its defaults, if the paper compares with one
+    # another method, if the paper compares with one; `settings` are then those of this method as its donor
+    method: str = ""
 
 
 @dataclass(frozen=True)

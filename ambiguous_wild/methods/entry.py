@@ -42,6 +42,7 @@ class MethodEntry:
     program: Program | None = None
     # of a method named by its file: what --method was given, with the absolute path, see references.py
     given_as: str = ""
+    note: str = ""  # what every table of its runs says below
 
     def options(self) -> Any:
         """The method's options at their defaults (a frozen dataclass instance).

@@ -109,7 +109,14 @@ def plan_study(
         for variant in group.variants:
             try:
                 if variant.method:
-                    cells = plan_cells([variant.method], scenes, seeds, train, device=device, factor=factor)
+                    _check_features(variant)
+                    given = _settings_of(variant, method, own)
+                    cells = plan_cells(
+                        [variant.method], scenes, seeds, train, settings=given, device=device, factor=factor
+                    )
+                    if given:  # at its defaults the run has the method's own name
+                        peer = dataclasses.replace(cells[0].method, name=folder_name(method, group, variant))
+                        cells = [dataclasses.replace(cell, method=peer) for cell in cells]
                     rows.append(Planned(group.name, variant, tuple(cells)))
                     continue
                 options = names.options(variant)
@@ -124,6 +131,14 @@ def plan_study(
             same = "" if name == own_name else DEFAULT if name == method else name.partition("@")[2]
             rows.append(Planned(group.name, variant, tuple(cells), same_as=same))
     return Study(method, chosen, tuple(settings), default, tuple(rows))
+
+
+def _settings_of(variant: Variant, method: str, own: Sequence[str]) -> list[str]:
+    """What a variant that is another method is trained with: the study's settings where it is a graft of the
+    method, and its own."""
+    peer = get_method(variant.method)
+    shared = own if peer.option_keys(method, "key") else []
+    return [*shared, *(f"{method}.{text}" for text in variant.settings)]
 
 
 def earlier_groups(study: Study, output: Path) -> list[str]:

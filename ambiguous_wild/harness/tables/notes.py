@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from pathlib import Path
+from string import Formatter
+from typing import Any
 
 import numpy as np
 
+from ambiguous_wild.core.config import flatten
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.harness.measures import Measure
-from ambiguous_wild.harness.running.store import Runs
-from ambiguous_wild.methods.registry import knows_truth
+from ambiguous_wild.harness.running.store import Runs, read_config
+from ambiguous_wild.methods.graft import members
+from ambiguous_wild.methods.registry import all_methods, knows_truth
 
 LENGTHS_DIFFER = 1.1  # a note is due where the longest training has this many times the shortest's steps
 
@@ -27,6 +32,7 @@ def notes(
         *_oracles(methods),
         *_missing(runs, columns),
         *_not_comparable(runs, columns),
+        *_about(runs, methods),
     )
 
 
@@ -58,6 +64,38 @@ def _not_ranked(runs: Runs) -> list[str]:
 def _oracles(methods: Sequence[str]) -> list[str]:
     known = [method for method in methods if knows_truth(method)]
     return [f"oracle (not ranked): {shortlist(known)}: shown exact masks or clean photos"] if known else []
+
+
+def _about(runs: Runs, methods: Sequence[str]) -> list[str]:
+    """What each method, or donor of a graft, says about itself; `{key}` stands for an option of its runs."""
+    known = all_methods()
+    lines = []
+    for name in dict.fromkeys(member for method in methods for member in members(method)):
+        if name not in known or not known[name].note:
+            continue
+        own = runs.runs[[name in members(method) for method in runs.runs["method"]]]
+        options = [_options_of(Path(folder), name) for folder in own["folder"]]
+        keys = [key for _, key, _, _ in Formatter().parse(known[name].note) if key]
+        values = {
+            key: "/".join(dict.fromkeys(str(o[key]) for o in options if key in o)) or "not recorded"
+            for key in keys
+        }
+        lines.append(f"{name}: {known[name].note.format_map(values)}")
+    return lines
+
+
+def _options_of(folder: Path, name: str) -> dict[str, Any]:
+    """The options of that method in a run, flat; those of a graft stand below its places."""
+    config = read_config(folder)
+    options = config.get("options")
+    flat = flatten(options) if isinstance(options, dict) else {}
+    written = str(config.get("method"))
+    if "=" not in written:
+        return flat
+    host, _, rest = written.rpartition("@")
+    places = {"host": host} | dict(pair.split("=", 1) for pair in rest.split(",") if "=" in pair)
+    place = next((p for p, member in places.items() if member == name), "")
+    return {k.removeprefix(f"{place}."): v for k, v in flat.items() if k.startswith(f"{place}.")}
 
 
 def _missing(runs: Runs, columns: Sequence[Measure]) -> list[str]:

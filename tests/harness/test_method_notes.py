@@ -4,10 +4,14 @@ from pathlib import Path
 
 import yaml
 
+from ambiguous_wild.harness.ablation.plan import plan_study
+from ambiguous_wild.harness.ablation.report import report, to_markdown
 from ambiguous_wild.harness.running.store import read_runs
 from ambiguous_wild.harness.tables.comparison import comparison
 from ambiguous_wild.methods import MethodEntry, register, registry
+from ambiguous_wild.splat.pace import TrainConfig
 from tests.harness.fake_runs import fake_result, save
+from tests.tiny_scene import write_tiny_scene
 
 
 def notes_of(root: Path, *methods: tuple[str, dict]) -> list[str]:  # type: ignore[type-arg]
@@ -43,6 +47,19 @@ def test_variants_and_grafts_are_their_methods(tmp_path):
     )
     (note,) = [n for n in notes if n.startswith("refinesplat-paper: ")]
     assert "features labhog/sceneconv, instances graph" in note
+
+
+def test_a_graft_in_an_ablation_names_the_options_of_its_donor(tmp_path):
+    options = {"host": {"features": "x"}, "mask": {"features": "sceneconv", "instances": "graph"}}
+    notes = notes_of(tmp_path, ("refinesplat-paper@plug-in-wildgaussians-t-ent", options))
+    assert any("features sceneconv, instances graph" in n for n in notes)
+
+
+def test_the_report_of_an_ablation_says_it_too(tmp_path):
+    scene = write_tiny_scene(tmp_path / "scene")
+    plan = plan_study("refinesplat-paper", [scene], [0], TrainConfig(iterations=9), groups=["alpha1"])
+    data = report(plan, tmp_path / "runs")
+    assert "features labhog, instances graph" in to_markdown(data)
 
 
 def test_a_note_of_a_plugin_may_hold_options(tmp_path, monkeypatch):

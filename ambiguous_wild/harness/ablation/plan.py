@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.core.config import config_hash, to_plain, with_options
+from ambiguous_wild.core.config import config_hash, flatten, to_plain, with_options
 from ambiguous_wild.harness.ablation.records import StudyFacts
 from ambiguous_wild.harness.running.cell import Cell
 from ambiguous_wild.harness.running.grid import cell_folder, plan_cells
@@ -47,6 +47,11 @@ class Study:
     settings: tuple[str, ...]  # on top of the defaults, in every row
     default: tuple[Cell, ...]
     rows: tuple[Planned, ...]  # in the order of the groups; each group begins with the default
+
+    @property
+    def note(self) -> str:
+        """What the method says about itself, with the options of the default rows."""
+        return get_method(self.method).about([flatten(to_plain(self.default[0].options))])
 
     def facts(self) -> StudyFacts:
         """Facts that two studies must share before one report can hold both."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from string import Formatter
 from typing import Any
 
 import numpy as np
@@ -75,12 +74,7 @@ def _about(runs: Runs, methods: Sequence[str]) -> list[str]:
             continue
         own = runs.runs[[name in members(method) for method in runs.runs["method"]]]
         options = [_options_of(Path(folder), name) for folder in own["folder"]]
-        keys = [key for _, key, _, _ in Formatter().parse(known[name].note) if key]
-        values = {
-            key: "/".join(dict.fromkeys(str(o[key]) for o in options if key in o)) or "not recorded"
-            for key in keys
-        }
-        lines.append(f"{name}: {known[name].note.format_map(values)}")
+        lines.append(f"{name}: {known[name].about(options)}")
     return lines
 
 
@@ -88,14 +82,16 @@ def _options_of(folder: Path, name: str) -> dict[str, Any]:
     """The options of that method in a run, flat; those of a graft stand below its places."""
     config = read_config(folder)
     options = config.get("options")
-    flat = flatten(options) if isinstance(options, dict) else {}
+    if not isinstance(options, dict):
+        return {}
     written = str(config.get("method"))
-    if "=" not in written:
-        return flat
-    host, _, rest = written.rpartition("@")
-    places = {"host": host} | dict(pair.split("=", 1) for pair in rest.split(",") if "=" in pair)
-    place = next((p for p, member in places.items() if member == name), "")
-    return {k.removeprefix(f"{place}."): v for k, v in flat.items() if k.startswith(f"{place}.")}
+    if "=" in written:
+        host, _, rest = written.rpartition("@")
+        places = {"host": host} | dict(pair.split("=", 1) for pair in rest.split(",") if "=" in pair)
+        options = next((options.get(p) for p, member in places.items() if member == name), {})
+    elif "host" in options:  # a graft that is the variant of an ablation: the method is its donor
+        options = next((value for place, value in options.items() if place != "host"), {})
+    return flatten(options) if isinstance(options, dict) else {}
 
 
 def _missing(runs: Runs, columns: Sequence[Measure]) -> list[str]:

@@ -73,6 +73,12 @@ def knows_truth(name: str) -> bool:
     return host == "3dgs-clean" or masks[-1] == "3dgs+truth"
 
 
+def members(name: str) -> list[str]:
+    """The host and the donors in a method's name; of an ablation's variant, its method."""
+    host, _, rest = name.rpartition("@") if "@" in name else (name, "", "")
+    return list(dict.fromkeys([host, *(ALIASES.get(donor, donor) for _, donor in _written(rest) if donor)]))
+
+
 def grafted(name: str, host: MethodEntry, methods: Mapping[str, MethodEntry]) -> MethodEntry:
     """The method that `graft_name` names.
 

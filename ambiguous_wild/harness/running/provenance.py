@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +15,7 @@ from ambiguous_wild.harness.running.environment import environment
 from ambiguous_wild.harness.running.published import scene_protocol
 from ambiguous_wild.harness.running.records import Provenance, RunResult
 from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.methods.graft import Graft
 from ambiguous_wild.methods.registry import MethodEntry, all_methods
 from ambiguous_wild.splat.pace import TrainConfig
 
@@ -52,7 +54,7 @@ def reproduce(cell: Cell) -> str:
     Where it is written to is left to whoever runs it (-o, by default runs/).
     """
     method, train = cell.method, cell.train
-    name = method.name if "=" in method.name else _base(method).name
+    name = _base(method).name
     given = method.given_as or name
     words = ["aw", "bench", "--method", given, "--scene", str(cell.scene.root.resolve())]
     words += ["--seed", str(train.seed), *_length(train), "--device", cell.device.partition(":")[0]]
@@ -76,6 +78,8 @@ def _length(train: TrainConfig) -> list[str]:
 
 def _base(method: MethodEntry) -> MethodEntry:
     """The method that a variant of an ablation is one of: same recipe, another name."""
+    if isinstance(method.recipe, Graft):
+        return replace(method, name=method.recipe.name)
     known = all_methods()
     if method.name in known:
         return method

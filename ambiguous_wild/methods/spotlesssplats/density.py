@@ -45,6 +45,9 @@ class SpotLessDensity(DensityControl):
             self.cut = True
         return gaussians, events
 
+    def due(self, step: Step) -> bool:
+        return super().due(step) or (not self.cut and step.nominal >= self.config.free_colour)
+
     def state_dict(self) -> dict[str, Any]:
         return super().state_dict() | {"cut": self.cut}
 

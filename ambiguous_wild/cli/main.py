@@ -41,6 +41,7 @@ COMMANDS = {
     "leaderboard": ("leaderboard", "Add checked runs to CSV files and publish them as a page."),
     "study": ("study", "Blind user study: which distractor is hard to see, which render is better."),
     "stress": ("stress", "Numerical stress tests against float64; replay of a training that met a NaN."),
+    "weights": ("weights", "Pretrained networks: list, download, check."),
     "methods": ("methods", "List the available methods."),
 }
 

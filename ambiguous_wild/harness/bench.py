@@ -12,6 +12,7 @@ Imports nothing heavy until names and options are checked.
 from __future__ import annotations
 
 import dataclasses
+import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -121,7 +122,7 @@ def bench(
     engine: Engine | None = None,
     gpus: int = 1,
     factor: int | None = None,
-    protocol: Protocol = "full",
+    protocol: Protocol | None = None,
     overwrite: Overwrite = "missing",
     cache: Words | None = None,
     pictures: bool = True,
@@ -150,7 +151,8 @@ def bench(
         engine: where cells run; None = this machine.
         gpus: that share one model, for a scene too large for one.
         factor: which images_N; None = what the scene was built for.
-        protocol: "full" measures whole test photos, "half" the right half (NeRF-W).
+        protocol: "full" measures whole test photos, "half" the right half (NeRF-W); None = what the scene's
+            scene.json says, else "full".
         overwrite: "missing" keeps what is finished and resumes what stopped, "always" starts anew, "never"
             leaves folders that exist as they are.
         cache: for features and instance masks; None = OUTPUT/.cache.
@@ -232,7 +234,10 @@ def bench(
         else:
             files = [Path(plugin) for plugin in plugins]
             reports = session.run(Grid(cells, out, overwrite, place, pictures, files, names))
-    return BenchReport(out, tuple(_run_report(cell, report) for cell, report in zip(cells, reports)))
+    made = BenchReport(out, tuple(_run_report(cell, report) for cell, report in zip(cells, reports)))
+    if said := _rescorable(made):
+        told.say(said)
+    return made
 
 
 def _check_methods(
@@ -310,6 +315,20 @@ def _remarks(cells: Sequence[Cell]) -> list[str]:
                 f"switch it on with --set {idle}.KEY=VALUE, or leave the regulariser out"
             )
     return lines
+
+
+def _rescorable(made: BenchReport) -> str:
+    """What `aw rescore` could add to runs that were kept; empty where it could add nothing."""
+    kept = [run.result for run in made.runs if run.outcome in ("kept", "skipped") and run.result is not None]
+    if not any(result["missing"] for result in kept):
+        return ""
+    from ambiguous_wild.harness.rescore import could_be_measured
+
+    names = could_be_measured(kept)
+    command = f"aw rescore {shlex.quote(str(made.output))}"
+    return (
+        f"runs that were kept lack {', '.join(names)}, which can be measured now: {command}" if names else ""
+    )
 
 
 def _run_report(cell: Cell, report: CellReport) -> RunReport:

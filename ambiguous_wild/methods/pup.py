@@ -69,8 +69,8 @@ class PupDensity(DensityControl):
     @torch.no_grad()
     def refine(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> tuple[Gaussians, list[str]]:
         gaussians, events = super().refine(step, gaussians, optimiser)
-        config, due = self.config, self.config.prune_at + self.done * self.config.between
-        if self.done == config.rounds or step.nominal < due or events:  # rows that changed cannot be drawn
+        config = self.config
+        if events or not self._round_due(step):  # rows that changed cannot be drawn
             return gaussians, events
         self.done += 1
         share = 1.0 - (1.0 - config.share) ** (1.0 / config.rounds)
@@ -82,6 +82,13 @@ class PupDensity(DensityControl):
         self.log.begin(step.iteration)
         self.log.now.pruned, self.log.now.count = int(drop.sum()), int((~drop).sum())
         return self.keep_rows(gaussians, optimiser, ~drop), ["prune"]
+
+    def due(self, step: Step) -> bool:
+        return super().due(step) or self._round_due(step)
+
+    def _round_due(self, step: Step) -> bool:
+        config = self.config
+        return self.done < config.rounds and step.nominal >= config.prune_at + self.done * config.between
 
     def blocks(self, step: Step, gaussians: Gaussians) -> Tensor:
         """[N, 6, 6] float64: sum over views of the mean g g^T, g = d(sum(signs picture))/d(mean, log s)."""

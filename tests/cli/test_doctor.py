@@ -35,8 +35,26 @@ def test_whatever_lacks_comes_with_a_way_to_get_it(report: list[Check]) -> None:
     for c in report:
         assert c.detail
         assert bool(c.fix) is (not c.ok and c.group != "planned"), c
-        if c.name not in ("torch cuda", "gsplat kernels"):  # their words are those of --device
+        if c.fix:
             assert subprocess.run(["bash", "-n", "-c", c.fix]).returncode == 0, c.fix
+            assert c.fix.startswith((*checks.COMMANDS, "export ", "unset ", "df ")), c.fix
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        ("nothing to do without a GPU", "# nothing to do without a GPU"),
+        ("install a newer driver, then restart", "# install a newer driver, then restart"),
+        ("unset CUDA_VISIBLE_DEVICES", "unset CUDA_VISIBLE_DEVICES"),
+        (
+            "export CUDA_VISIBLE_DEVICES=1, which is built for",
+            "export CUDA_VISIBLE_DEVICES=1  # which is built for",
+        ),
+        (f"{sys.executable} -m pip install x", f"{sys.executable} -m pip install x"),
+    ],
+)
+def test_words_that_are_no_command_are_a_comment(words: str, line: str) -> None:
+    assert checks.pastable(words) == line
 
 
 @pytest.mark.parametrize("tool", ["apt-get", "brew", ""])

@@ -136,7 +136,7 @@ def to_markdown(data: StudyReport, picture: str = "") -> str:
         lines += [f"- {r['variant']} {r['status']}: {r['reason']}" for r in rows if r["status"] != "ok"]
         lines += [""] if lines[-1] else []
     if data["made_by"]:
-        lines += [f"made by: `{data['made_by']}`", ""]
+        lines += [f"command: `{data['made_by']}`", ""]
     return "\n".join(lines)
 
 

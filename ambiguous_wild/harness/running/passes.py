@@ -17,6 +17,7 @@ from torch import Tensor
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.running.cell import Cell
 from ambiguous_wild.harness.running.costs import cost_of
+from ambiguous_wild.harness.running.meter import Meter
 from ambiguous_wild.harness.running.records import Cost
 from ambiguous_wild.io.atomic import atomic_dir, write_json
 from ambiguous_wild.io.images import read_keep_map, write_png
@@ -89,6 +90,7 @@ def _train(cell: Cell, place: Path, cache_dir: Path, tick: Callable[[Any], None]
     before = time.perf_counter()
     trainer = Trainer(data, parts, replace(of_one_pass(cell), probes=0), folder=place)
     trainer.setup_s = time.perf_counter() - before
+    trainer.meter = Meter.of(cell.device)
     trainer.resume()
     trainer.train(tick=tick)
     cost = cost_of(cell, trainer)

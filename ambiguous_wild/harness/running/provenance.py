@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import ambiguous_wild
 from ambiguous_wild.core.config import config_hash, flatten, to_plain
 from ambiguous_wild.harness.running.environment import environment
+from ambiguous_wild.harness.running.published import scene_protocol
 from ambiguous_wild.harness.running.records import Provenance, RunResult
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.methods.registry import MethodEntry, all_methods
@@ -59,7 +60,7 @@ def reproduce(cell: Cell) -> str:
     factor = cell.scene.info.get("loaded_factor")
     words += ["--factor", str(factor)] if factor else []
     words += ["--max-gaussians", str(train.max_gaussians)] if train.max_gaussians is not None else []
-    words += ["--protocol", cell.protocol] if cell.protocol != "full" else []
+    words += ["--protocol", cell.protocol] if cell.protocol != scene_protocol(cell.scene) else []
     for setting in _settings(method, name, cell.options):
         words += ["--set", setting]
     for plugin in _plugins(method):

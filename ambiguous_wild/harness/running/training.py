@@ -16,6 +16,7 @@ from ambiguous_wild.harness.running import evaluate
 from ambiguous_wild.harness.running.cell import Cell
 from ambiguous_wild.harness.running.costs import both_passes, cost_of
 from ambiguous_wild.harness.running.memory import is_out_of_gpu_memory, out_of_gpu_memory, reset_peak
+from ambiguous_wild.harness.running.meter import Meter
 from ambiguous_wild.harness.running.multi_gpu import multi_gpu_cost, train_multi_gpu
 from ambiguous_wild.harness.running.passes import FirstPass, first_pass, of_one_pass
 from ambiguous_wild.harness.running.records import RunResult
@@ -79,6 +80,8 @@ def _make_trainer(
     trainer = Trainer(data, parts, train, folder=folder, probe=probe if truth else None)
     # Frozen inputs, instance masks and identities are part of what a method costs.
     trainer.setup_s = time.perf_counter() - before
+    if cell.gpus == 1:
+        trainer.meter = Meter.of(cell.device)
     if first is not None:
         trainer.timeline.before_s = first.cost["train_s"]
     return trainer

@@ -10,6 +10,7 @@ import numpy as np
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.harness.measures import Measure
 from ambiguous_wild.harness.running.store import Runs
+from ambiguous_wild.harness.tables.times import time_notes
 from ambiguous_wild.methods.registry import knows_truth
 
 LENGTHS_DIFFER = 1.1  # a note is due where the longest training has this many times the shortest's steps
@@ -28,6 +29,7 @@ def notes(
         *_fitted(runs),
         *_missing(runs, columns),
         *_not_comparable(runs, columns),
+        *time_notes(runs.runs, columns),
     )
 
 

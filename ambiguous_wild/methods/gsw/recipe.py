@@ -98,10 +98,9 @@ class GswAppearance(Learnt):
         rng, means, rate = np.random.default_rng([self.seed, 0x65]), gaussians.means, self.config.lr_places
         low, high = means.amin(dim=0), means.amax(dim=0)
         unit = 2.0 * (means - low) / (high - low).clamp(min=1e-9) - 1.0
-        mixing = rng.uniform(size=(FREE * 2, 3))  # rows sum to one
-        mixing = torch.tensor(mixing / mixing.sum(axis=1, keepdims=True), dtype=torch.float32).to(
-            means.device
-        )
+        weights = rng.uniform(size=(FREE * 2, 3))
+        weights /= weights.sum(axis=1, keepdims=True)
+        mixing = torch.tensor(weights, dtype=torch.float32).to(means.device)
         intrinsic = torch.cat([gaussians.sh0, torch.zeros_like(gaussians.sh0).repeat(1, 15)], dim=1)
         box = rate / max(self.all_photos[0].shape[:2])
         return {

@@ -40,7 +40,15 @@ class Chain:
     """Knows which effect acts where; one that does not override a hook is not called there."""
 
     def __init__(self, effects: Sequence[Effect], data: TrainData) -> None:
+        """
+        Raises:
+            AwError: two effects of one name; checkpoints and results hold effects by name.
+        """
         self.effects = tuple(effects)
+        names = [effect.name for effect in self.effects]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise AwError(f"effect {twice[0]} is there twice; a method lists each effect once")
         self.views = len(data.photos)
         for effect in self.effects:
             effect.setup(data)

@@ -1,7 +1,8 @@
 """AbsGS: large Gaussians are split by the absolute screen gradient, where the signed one cancels out.
 
-Source: the defaults of the released code, TY424/AbsGS; what its paper's tables used is unverified. The clamp
-of opacity ends with growth (ours). Pruning by screen size and by blending weight (off there) are left out.
+Source: the defaults of the released code, TY424/AbsGS; what its paper's tables used is unverified. The
+clamp of opacity ends with growth (ours). Pruning by screen size and by blending weight (off there) are
+left out.
 """
 
 from __future__ import annotations

@@ -1,7 +1,10 @@
 """PUP 3D-GS: removes Gaussians that can move or change size without changing a picture, then refines.
 Source: PUP 3D-GS (CVPR 2025) and its code: the score is log det of the 6x6 Gauss-Newton block of mean and log
 scale over all train views. Ours: the block from random signs (Hutchinson; rank correlation not measured),
-growth ends after a third of the run, 80 % go in equal rounds (that code: 80 %, then 50 %)."""
+growth ends after a third of the run, 80 % go in equal rounds (that code: 80 %, then 50 %).
+
+
+"""
 
 from __future__ import annotations
 

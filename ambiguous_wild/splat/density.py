@@ -144,11 +144,15 @@ class DensityControl:
             self.last_growth = step.iteration
             events.append("grow")
         if self._reset_due(step):
-            gaussians.opacity_logits.clamp_(max=_logit(config.reset_opacity))
+            self.reset_opacity(gaussians)
             optimiser.reset_moments(["opacity_logits"])
             self.last_reset = step.iteration
             events.append("reset")
         return gaussians, events
+
+    def reset_opacity(self, gaussians: Gaussians) -> None:
+        """Hook: lower the opacities, in place."""
+        gaussians.opacity_logits.clamp_(max=_logit(self.config.reset_opacity))
 
     def due(self, step: Step) -> bool:
         """Whether `refine` may change something now; whoever overrides `refine` extends this.

@@ -79,7 +79,7 @@ def rehearse(words: list[str]) -> int:
 def main() -> int:
     words = sys.argv[1:]
     # not the site folder first: what the machine has goes before what the kit brings, gsplat excepted
-    sys.path[:0] = [str(HERE), str(HERE / "benchmarks"), str(HERE / "site")]
+    sys.path[:0] = [str(HERE), str(HERE / "benchmarks"), str(HERE / "lib")]
     sys.path.append(str(SITE))
     if importlib.util.find_spec("torch") is None:
         fail(f"{sys.executable} has no torch: run this with the Python that has it")
@@ -89,7 +89,7 @@ def main() -> int:
     os.environ.setdefault("TORCH_EXTENSIONS_DIR", str(HERE / ".kernels"))
     # for processes that this one starts
     os.environ["PYTHONPATH"] = os.pathsep.join(
-        [str(HERE), str(HERE / "benchmarks"), str(HERE / "site"), str(SITE)]
+        [str(HERE), str(HERE / "benchmarks"), str(HERE / "lib"), str(SITE)]
     )
     if "--rehearse" in words:
         return rehearse([word for word in words if word != "--rehearse"])

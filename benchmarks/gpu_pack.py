@@ -87,7 +87,7 @@ def pack(
         raise AwError(f"{out / 'kit'} is there already; remove it, or give another folder")
     with tempfile.TemporaryDirectory() as temporary, atomic_dir(out / "kit") as kit:
         _code(kit)
-        _gsplat(kit / "site" / "gsplat", _found_gsplat(gsplat, Path(temporary)))
+        _gsplat(kit / "lib" / "gsplat", _found_gsplat(gsplat, Path(temporary)))
         if wheels:
             _wheels(kit / "wheels", python)
         if scene is None:

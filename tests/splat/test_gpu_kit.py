@@ -74,11 +74,11 @@ def test_the_kit_holds_what_a_stage_needs_and_nothing_else(small, package, tmp_p
         "ambiguous_wild/splat/trainer.py",
         "benchmarks/fake_kernels.py",
     } <= names
-    assert "site/gsplat/cuda/csrc/IntersectTile.cu" in names
+    assert "lib/gsplat/cuda/csrc/IntersectTile.cu" in names
     assert not [n for n in names if "2DGSFused" in n or "__pycache__" in n or n.startswith("scene/truth")]
     assert str(tmp_path) not in (kit / "kit.json").read_text()
     gsplat_cut.sources.cache_clear()
-    assert gsplat_cut.digest(kit / "site/gsplat") == gsplat_cut.digest(package)
+    assert gsplat_cut.digest(kit / "lib/gsplat") == gsplat_cut.digest(package)
     assert {"scene/images/train_0.png", "scene/sparse/0/points3D.bin", "scene/test_list.txt"} <= names
     with pytest.raises(AwError, match="is there already"):
         small.pack(tmp_path / "out", **given)

@@ -121,6 +121,7 @@ function oneRun(run) {
   return h("div", { class: "run" },
     h("p", {}, h("strong", {}, `${run.scene}, seed ${run.seed}`), `: ${values.join(", ")}`),
     h("p", { class: "small" }, `${run.images} test images; ${checked}; ${run.device}, ${run.hardware}; version ${run.version}; configuration ${run.config_hash.slice(0, 12)}, scene ${run.scene_hash.slice(0, 12)}, result ${run.result_hash.slice(0, 12)}${run.source ? `, its file ${run.source.slice(0, 12)}` : ""}${run.code_hash ? `, code ${run.code_hash.slice(0, 12)}` : ""}`),
+    run.view ? h("p", {}, h("a", { href: run.view }, "Fly through the model")) : null,
     h("div", { class: "row" }, code, h("button", { type: "button", class: "copy", "aria-label": "Copy the command", onclick: (e) => copy(code, e.currentTarget) }, "Copy")));
 }
 

@@ -10,7 +10,7 @@ import math
 import os
 import re
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.leaderboard import pictures
 from ambiguous_wild.harness.leaderboard.board import files_of, read_board
 from ambiguous_wild.harness.leaderboard.entry import Entry, in_order
+from ambiguous_wild.harness.leaderboard.models import ModelPages, write_model_pages
 from ambiguous_wild.harness.leaderboard.reported import SOURCE, Printed, read_reported, reported_csv
 from ambiguous_wild.harness.leaderboard.sheet import to_number
 from ambiguous_wild.harness.measures import measure
@@ -30,7 +31,7 @@ from ambiguous_wild.io.lock import folder_lock
 from ambiguous_wild.methods.registry import knows_truth
 
 GENERATOR = '<meta name="generator" content="aw leaderboard publish">'
-OURS = {"index.html", "data", "images"}
+OURS = {"index.html", "data", "images", "models"}
 MANIFEST = "data/files.json"  # every other file of the page
 SCRIPTS = ("page_data.js", "page_table.js", "page_plot.js", "page_main.js")
 COSTS = ("train_s", "model_mb", "fps", "gaussians", "peak_rss_mb")
@@ -47,6 +48,7 @@ class Published:
     images: int
     reported: int
     reported_from: str | None = None  # the folder that was looked into; None: not asked for
+    model_pages: int = 0
 
 
 def publish(
@@ -56,6 +58,8 @@ def publish(
     reported: bool = False,
     reported_from: Path | None = None,
     title: str = "Leaderboard",
+    models: Sequence[Path] = (),
+    say: Callable[[str], None] = lambda text: None,
 ) -> Published:
     """Write the page; an earlier page in `out` is replaced once the new one is whole.
 
@@ -65,6 +69,8 @@ def publish(
         reported: show what papers print, too: BOARD/reported/*.csv.
         reported_from: show what papers print, too, from this folder.
         title: of the page.
+        models: run folders, or folders of them; their models go into pages of `aw view`, OUT/models/*.html.
+        say: told which entries have no model there.
 
     Raises:
         AwError: the board is damaged, or `out` holds something else.
@@ -90,7 +96,8 @@ def publish(
                 _copy_picture(
                     pictures.folder_of(board) / row["file"], folder / "images" / row["file"], row["sha256"]
                 )
-            text = page(title, _facts(entries, index, printed, names))
+            pages = write_model_pages(entries, models, folder, say) if models else ModelPages({}, 0)
+            text = page(title, _facts(entries, index, printed, names, pages.links))
             (folder / "index.html").write_text(text, encoding="utf-8")
             write_json(folder / MANIFEST, list_names(folder))
     return Published(
@@ -99,6 +106,7 @@ def publish(
         images=len(index),
         reported=len(printed),
         reported_from=None if source is None else str(source),
+        model_pages=pages.pages,
     )
 
 
@@ -160,7 +168,11 @@ def _copy_picture(source: Path, target: Path, digest: str) -> None:
 
 
 def _facts(
-    entries: Sequence[Entry], index: Iterable[Mapping[str, str]], printed: Sequence[Printed], files: list[str]
+    entries: Sequence[Entry],
+    index: Iterable[Mapping[str, str]],
+    printed: Sequence[Printed],
+    files: list[str],
+    views: Mapping[str, str],  # page of the model by result hash
 ) -> dict[str, Any]:
     """What the page's script reads."""
     order = in_order({k for e in entries for k in e.quality})
@@ -187,6 +199,7 @@ def _facts(
                 "quality": _numbers(e.quality),
                 "cost": _numbers({k: v for k, v in e.cost.items() if k in COSTS}),
             }
+            | ({"view": views[e.result_hash]} if e.result_hash in views else {})
             for e in entries
         ],
         "images": [

@@ -19,7 +19,7 @@ from tests.tiny_scene import TEST, TRAIN, write_tiny_scene
 
 viser = pytest.importorskip("viser", reason="extra [view] is not installed")
 
-ITERATIONS = 120
+ITERATIONS = 60
 PATIENCE_S = 120.0
 
 

@@ -1,4 +1,7 @@
-"""Tests that need a GPU are skipped elsewhere. Parallel test processes use one kernel thread each."""
+"""Tests that need a GPU are skipped elsewhere. Parallel test processes use one kernel thread each.
+
+The calibration of the machine is a small one in tests: their runs are shorter than the real one.
+"""
 
 from __future__ import annotations
 
@@ -27,6 +30,9 @@ def pytest_runtest_setup(item):
 
     Kernels give the same bits for any number of threads; tests of that set the number themselves.
     """
+    calibration = sys.modules.get("ambiguous_wild.splat.calibration")
+    if calibration is not None:
+        calibration.KERNELS["cpu"] = calibration.Size("cpu-1", 0.25, 300, 32, 32, 1)
     numba = sys.modules.get("numba")
     if numba is not None and "PYTEST_XDIST_WORKER" in os.environ:
         numba.set_num_threads(1)

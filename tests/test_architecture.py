@@ -17,11 +17,12 @@ from ambiguous_wild.cli.main import COMMANDS
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "ambiguous_wild"
-BELOW_HARNESS = {"core", "io", "builder", "simulate", "vision", "metrics", "splat", "methods"}
+BELOW_HARNESS = {"core", "io", "builder", "datasets", "simulate", "vision", "metrics", "splat", "methods"}
 ALLOWED: dict[str, set[str]] = {
     "core": set(),
     "io": {"core"},
     "builder": {"core", "io"},
+    "datasets": {"core", "io", "builder"},
     "simulate": {"core", "io"},
     "vision": {"core", "io"},
     "metrics": {"core"},

@@ -83,14 +83,17 @@ def photos_from_folder(folder: Path, out: Path, *, jobs: int = 1, bar: Bar | Non
 def photos_from_video(video: Path, out: Path, *, frames: int, bar: Bar | None = None) -> CaptureRecord:
     """Save the sharpest frame of each of `frames` equal parts of a video; one frame is in memory at a time.
 
+    A video with fewer frames gives all it has.
+
     Raises:
-        AwError: OpenCV cannot read the video, it has too few frames, or `out` exists.
+        AwError: OpenCV cannot read the video, it has fewer frames than a scene needs, or `out` exists.
     """
     check_free(out)
     bar = bar or Bar(False)
     total, announced = _count(video, bar)
-    if total < frames:
-        raise AwError(f"{video} has {total} frames, {frames} were asked for; pass --frames {total} or fewer")
+    if total < MIN_PHOTOS:
+        raise AwError(f"{video} has {total} frames, a scene needs {MIN_PHOTOS}; give a longer video")
+    frames = min(frames, total)
     bar.start("frames", total)
     parts = [round(k * total / frames) for k in range(frames + 1)]
     with atomic_dir(out) as folder:

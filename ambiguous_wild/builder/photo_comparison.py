@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -93,6 +94,7 @@ def _coarse_colours(small: np.ndarray) -> np.ndarray:
 def compare_photos(
     features: Sequence[PhotoFeatures],  # in the order of capture, where known
     step: Callable[[], None] = lambda: None,
+    jobs: int = 1,  # threads; the result does not depend on it
 ) -> PhotoComparison:
     """Match each photo with the next and the most similar ones; solve for one offset a photo."""
     count = len(features)
@@ -100,8 +102,12 @@ def compare_photos(
     rows: list[tuple[int, int, np.ndarray, float]] = []
     forward: list[bool] = []
 
-    def try_pair(i: int, j: int) -> None:
-        found = _match(features[i], features[j])
+    def matched(pair: tuple[int, int]) -> tuple[np.ndarray, np.ndarray] | None:
+        found = _match(features[pair[0]], features[pair[1]])
+        step()
+        return found
+
+    def enter(i: int, j: int, found: tuple[np.ndarray, np.ndarray] | None) -> None:
         if found is None:
             return
         graph[i, j] = graph[j, i] = True
@@ -112,16 +118,18 @@ def compare_photos(
             rows.append((i, j, np.median(difference[good], axis=0), float(np.sqrt(good.sum()))))
 
     tried = set(candidate_pairs(features))
-    for i, j in sorted(tried):
-        try_pair(i, j)
-        step()
+    ordered = sorted(tried)
+    # OpenCV's random numbers are a thread's own, and each match seeds them.
+    with ThreadPoolExecutor(jobs) as pool:
+        for (i, j), found in zip(ordered, pool.map(matched, ordered)):
+            enter(i, j, found)
     # A photo that overlaps with few is tried against more candidates before it counts as isolated.
     groups = _groups(graph)
     for i in np.flatnonzero((groups != 0) | (graph.sum(axis=1) < 2)).tolist():
         for j in most_similar(features, i, EXTRA_CANDIDATES):
             if (pair := (min(i, j), max(i, j))) not in tried:
                 tried.add(pair)
-                try_pair(*pair)
+                enter(*pair, _match(features[pair[0]], features[pair[1]]))
     share = float(np.mean(forward)) if forward else math.nan
     return PhotoComparison(_solve(count, rows), graph.sum(axis=1), _groups(graph), share)
 

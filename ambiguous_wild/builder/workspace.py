@@ -6,20 +6,20 @@ the stages it reads. A changed setting changes the keys of later stages only.
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import os
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.atomic import atomic_dir, write_json
+from ambiguous_wild.io.lock import Held, file_lock, lock_path
 
 _RESULT = "stage.json"
 Facts = TypeVar("Facts", bound=Mapping[str, object])  # a record of `records.py`
@@ -94,26 +94,14 @@ def build_lock(target: Path) -> Iterator[None]:
     Raises:
         AwError: another process builds the same folder; names it.
     """
-    path = target.parent / f".{target.name}.lock"
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        handle = open(path, "a+", encoding="utf-8")  # noqa: SIM115  closed below, held meanwhile
-    except OSError as error:
-        raise AwError(f"cannot write beside {target}: {error.strerror}; choose another -o") from error
-    with handle:
+    with ExitStack() as stack:
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            handle.seek(0)
-            holder = handle.read().strip() or "another process"
+            target.parent.mkdir(parents=True, exist_ok=True)
+            text = f"process {os.getpid()} since {time.strftime('%H:%M:%S')}"
+            stack.enter_context(file_lock(lock_path(target), text))
+        except OSError as error:
+            raise AwError(f"cannot write beside {target}: {error.strerror}; choose another -o") from error
+        except Held as held:
+            holder = str(held) or "another process"
             raise AwError(f"{target} is being built by {holder}; wait for it or choose another -o") from None
-        if not (path.exists() and os.path.samestat(os.fstat(handle.fileno()), path.stat())):
-            # The holder finished and removed its file between our open and our lock.
-            raise AwError(f"{target} was being built until this moment; run the command again")
-        handle.truncate(0)
-        handle.write(f"process {os.getpid()} since {time.strftime('%H:%M:%S')}")
-        handle.flush()
-        try:
-            yield
-        finally:
-            path.unlink(missing_ok=True)
+        yield

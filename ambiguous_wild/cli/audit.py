@@ -24,23 +24,17 @@ from ambiguous_wild.cli.paths import PathName
 @click.option("-o", "--output", type=PathName(dir_okay=False), help="Write to a file instead.")
 @click.option("--strict", is_flag=True, help="Exit with code 1 if anything is found.")
 def command(tables: tuple[Path, ...], style: str, output: Path | None, strict: bool) -> None:
-    """Check TABLES (CSV, or folders of them; default: leaderboard/reported).
+    """Check TABLES (CSV, or folders of them; default: the paper's tables, which come with the package).
 
     Finds suspiciously equal numbers, contradictions between tables, exchanged numbers, means that do not match
     their values, implausible SSIM and LPIPS, and wrong ranks. The correct values are not known: a finding is a
     question to the authors of the table.
     """
-    from ambiguous_wild.core.errors import AwError
     from ambiguous_wild.harness.audit.run import audit, to_csv, to_markdown, to_text
-    from ambiguous_wild.harness.audit.table import read_tables
+    from ambiguous_wild.harness.audit.table import REPORTED, read_tables
     from ambiguous_wild.io.atomic import write_text
 
-    if not tables:
-        reported = Path(__file__).resolve().parents[2] / "leaderboard" / "reported"
-        if not reported.is_dir():
-            raise AwError("no tables given, and there is no folder leaderboard/reported; name CSV files")
-        tables = (reported,)
-    numbers = read_tables(tables)
+    numbers = read_tables(tables or (REPORTED,))
     findings = audit(numbers)
     if style == "json":
         text = json.dumps([dataclasses.asdict(f) for f in findings], indent=2, ensure_ascii=False) + "\n"

@@ -22,7 +22,7 @@ BROKEN_BELOW = 0.9  # of the frames in a video's header, which is often wrong by
     type=click.IntRange(3, 5000),
     default=60,
     show_default=True,
-    help="Photos to take from a video or a camera.",
+    help="Photos to take from a video or a camera; a short video gives as many as it has.",
 )
 @click.option(
     "--every",
@@ -59,6 +59,9 @@ def command(source: str, output: Path, frames: int, every: float, jobs: int | No
         raise AwError(f"unknown camera {source!r}: write 'camera' or 'camera:1'")
     else:
         raise AwError(f"{source} does not exist: give a video, a folder of photos, or 'camera'")
+    total = facts.get("frames_read")
+    if total is not None and total < frames:
+        click.echo(f"{source} has {total} frames: took all of them, fewer than --frames {frames}", err=True)
     announced = facts.get("frames_announced")
     if announced and facts["frames_read"] < BROKEN_BELOW * announced:
         click.echo(

@@ -29,6 +29,8 @@ DISTRIBUTION = "ambiguous-wild"
 SMALL_MEMORY_GB = 2.0  # COLMAP and a training of 100 000 Gaussians need this much
 UNUSED = "not used by this version yet"
 SMALL_DISK_GB = 1.0  # photos, features and one run
+# What a remedy that is a command begins with.
+COMMANDS = (f"{sys.executable} ", f"{shlex.quote(sys.executable)} ", "sudo ", "brew ", "python3 ", "#")
 _PIP = f"{shlex.quote(sys.executable)} -m pip"
 
 
@@ -230,8 +232,20 @@ def _driver_install() -> str:
 
 def _part(name: str, fine: str, lack: readiness.Lack | None) -> Check:
     return Check(
-        "optional", name, lack is None, fine if lack is None else lack.what, lack.fix if lack else ""
+        "optional",
+        name,
+        lack is None,
+        fine if lack is None else lack.what,
+        pastable(lack.fix) if lack else "",
     )
+
+
+def pastable(fix: str) -> str:
+    """The remedy as a shell line: words that are no command become a comment."""
+    if fix.startswith(("export ", "unset ")):
+        line, comma, why = fix.partition(", ")
+        return f"{line}  # {why}" if comma else line
+    return fix if fix.startswith(COMMANDS) else f"# {fix}"
 
 
 def _extras() -> list[Check]:
@@ -240,6 +254,7 @@ def _extras() -> list[Check]:
 
     packages = {
         "ray": ("ray", "aw bench --engine ray"),
+        "pi-heif": ("heic", "HEIC photos of phones"),
         "choix": ("study", "aw study score: ranking"),
         "nltk": ("study", "aw study score: agreement"),
     }
@@ -278,11 +293,13 @@ def _vision() -> list[Check]:
     detail = f"{version or 'not installed'} (DINO features, SAM masks)"
     fix = "" if version else install_command("masks")
     checks = [Check("optional", "transformers", version is not None, detail, fix)]
-    hub = {w.name: w.used_for for w in weights.KNOWN if w.kind == "hub"}
+    # those of LPIPS are listed by metric
+    listed = {w.name: w for w in weights.KNOWN if "LPIPS" not in w.used_for}
     checks += [
-        Check("optional", line.name, line.present, f"{hub[line.name]}: {line.where}", line.command)
-        for line in weights.status()
-        if line.name in hub
+        Check(
+            "optional", line.name, line.present, f"{listed[line.name].used_for}: {line.where}", line.command
+        )
+        for line in weights.status(listed.values())
     ]
     return checks
 
@@ -306,7 +323,7 @@ def _metrics() -> list[Check]:
     for metric in lpips.VARIANTS:
         missing = lpips.missing_weights(metric)
         detail = f"weights missing: {', '.join(missing)}" if missing else "weights found"
-        fix = weights.download_command(*map(weights.named, missing)) if missing else ""
+        fix = weights.get_command(*missing) if missing else ""
         checks.append(Check("optional", metric, not missing, detail, fix))
     return checks
 

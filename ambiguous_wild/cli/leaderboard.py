@@ -51,9 +51,9 @@ def command() -> None:
 @click.option(
     "--images",
     type=click.IntRange(0, 20),
-    default=1,
+    default=3,
     show_default=True,
-    help="Test images a scene of which small copies are kept for the page.",
+    help="Test images, and train photos with masks, a scene of which copies are kept for the page.",
 )
 @click.option("--replace", is_flag=True, help="A run with other numbers replaces the one on the board.")
 @click.option("--quick", is_flag=True, help="Recompute PSNR alone, not every metric.")

@@ -15,6 +15,11 @@ from ambiguous_wild.cli.paths import PathName
 if TYPE_CHECKING:
     from ambiguous_wild.harness.planning.decide import Decision, Plan
 
+MASKS = (
+    "masks: no effect to switch on; a method makes them while it trains (aw bench --method refinesplat, or "
+    "another of 'aw methods'), or you give your own (aw build-scene --masks FOLDER)"
+)
+
 
 @click.command("plan")
 @click.argument("scene", type=PathName())
@@ -105,7 +110,8 @@ def table(plan: Plan) -> list[str]:
     widths = [max(len(row[k]) for row in rows) for k in range(len(head) - 1)]
     lines = ["  ".join([*(cell.ljust(w) for cell, w in zip(row, widths)), row[-1]]).rstrip() for row in rows]
     effects = ",".join(plan.effects()) or "none"
-    return [*lines, f"{plan.scene}: --effects {effects}"]
+    masks = [MASKS] if any(d.effect == "masks" for d in plan.decisions) else []
+    return [*lines, *masks, f"{plan.scene}: --effects {effects}"]
 
 
 def _row(d: Decision) -> tuple[str, ...]:

@@ -38,10 +38,11 @@ LAYOUTS = ("blocks", "paper", "means", "memory", "ablation")
     "--dataset", "datasets", multiple=True, metavar="NAME=SCENE,SCENE",
     help="Scenes that have tables and a mean of their own; repeatable.  [default: as the reported tables have them]",
 )  # fmt: skip
+@click.option("--all", "everything", is_flag=True, help="As text: every column side by side, however wide.")
 @click.option("--reported", is_flag=True, help="Show what papers print below, in rows of their own.")
 @click.option(
     "--reported-from", type=PathName(exists=True),
-    help="Their tables, as 'aw audit' reads them.  [default: leaderboard/reported]",
+    help="Their tables, as 'aw audit' reads them.  [default: those that come with the package]",
 )  # fmt: skip
 @click.option(
     "--sheet",
@@ -56,6 +57,7 @@ def command(
     metrics: tuple[str, ...],
     scenes: tuple[str, ...],
     datasets: tuple[str, ...],
+    everything: bool,
     reported: bool,
     reported_from: Path | None,
     sheet: Path | None,
@@ -97,15 +99,15 @@ def command(
 
         shown = write_sheet(found, sheet, scene=scenes[0] if scenes else None)
         click.echo(f"wrote {sheet}: {shown} methods side by side", err=True)
-    made_by = "made by: " + command_line(
+    made_by = "command: " + command_line(
         runs, style, metrics, scenes, layout, datasets, reported, reported_from
     )
     color = style == "text" and output is None and sys.stdout.isatty()
     if found is not None and layout == "blocks" and style != "html":
-        text, told = _blocks(found, style, metrics, scenes, made_by, color)
+        text, told = _blocks(found, style, metrics, scenes, made_by, color, everything)
     else:
         made = _layouts(found, runs, layout, metrics, scenes, _named(datasets), reported, reported_from)
-        text, told = _laid_out(made, style, made_by, color)
+        text, told = _laid_out(made, style, made_by, color, everything)
     if output is None:
         click.echo(text, nl=False)
         return
@@ -134,12 +136,21 @@ def _write_tidy(found: Runs, output: Path | None, metrics: Sequence[str], scenes
 
 
 def _blocks(
-    found: Runs, style: str, metrics: Sequence[str], scenes: Sequence[str], made_by: str, color: bool
+    found: Runs,
+    style: str,
+    metrics: Sequence[str],
+    scenes: Sequence[str],
+    made_by: str,
+    color: bool,
+    everything: bool,
 ) -> tuple[str, str]:
     from ambiguous_wild.harness.tables.comparison import comparison
+    from ambiguous_wild.harness.tables.fit import fitted
     from ambiguous_wild.harness.tables.render import RENDERERS, plain, to_text
 
     table = comparison(found, metrics=metrics, scenes=scenes)
+    if style == "text" and not metrics and not everything:
+        table = fitted(table)
     if style == "csv":
         for note in (*table.notes, made_by):
             click.echo(plain(note), err=True)
@@ -169,7 +180,7 @@ def _layouts(
         return build.blocks(found, metrics=metrics, scenes=scenes)
     numbers = read_reported(reported_from) if reported or reported_from else []
     if not datasets:
-        datasets = datasets_of(numbers or _known(), sorted(set(found.runs["scene"])))
+        datasets = datasets_of(numbers or read_reported(), sorted(set(found.runs["scene"])))
     if layout == "memory":
         metrics = metrics or build.MEMORY
     if layout == "means":
@@ -180,14 +191,8 @@ def _layouts(
     return [with_reported(one, numbers) for one in made] if numbers else made
 
 
-def _known() -> list:
-    """What the checkout's reported tables tell of datasets; nothing where there are none."""
-    from ambiguous_wild.harness.tables.layouts.reported import FOLDER, read_reported
-
-    return read_reported() if FOLDER.is_dir() else []
-
-
-def _laid_out(made: list[Layout], style: str, made_by: str, color: bool) -> tuple[str, str]:
+def _laid_out(made: list[Layout], style: str, made_by: str, color: bool, everything: bool) -> tuple[str, str]:
+    from ambiguous_wild.harness.tables.fit import divided
     from ambiguous_wild.harness.tables.layouts import plain_formats
     from ambiguous_wild.harness.tables.layouts.html_page import to_html
     from ambiguous_wild.harness.tables.layouts.latex import to_latex
@@ -200,6 +205,7 @@ def _laid_out(made: list[Layout], style: str, made_by: str, color: bool) -> tupl
         return plain_formats.to_csv(made), told
     made = [one.with_notes(made_by) for one in made]
     if style == "text":
+        made = made if everything else [part for one in made for part in divided(one)]
         return plain_formats.to_text(made, color=color), told
     writers = {"markdown": plain_formats.to_markdown, "latex": to_latex, "html": to_html}
     return writers[style](made), told

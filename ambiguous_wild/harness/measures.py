@@ -15,6 +15,7 @@ class Measure:
     better: Literal["higher", "lower", None]  # None: not ranked
     digits: int
     per_image: bool = True  # else one number a run
+    timed: bool = False  # a busy machine changes it: ranked only between runs that were alone
 
     @property
     def quality(self) -> bool:
@@ -38,15 +39,17 @@ MEASURES: dict[str, Measure] = {
         Measure("mask_iou", "mask IoU", "higher", 3, per_image=False),
         Measure("mask_precision", "mask precision", "higher", 3, per_image=False),
         Measure("mask_recall", "mask recall", "higher", 3, per_image=False),
-        Measure("train_s", "train s", "lower", 1, per_image=False),
-        Measure("setup_s", "setup s", "lower", 1, per_image=False),
+        Measure("train_s", "train s", "lower", 1, per_image=False, timed=True),
+        Measure("reference_s", "ref s", "lower", 1, per_image=False, timed=True),
+        Measure("cpu_s", "cpu s", "lower", 1, per_image=False),
+        Measure("setup_s", "setup s", "lower", 1, per_image=False, timed=True),
         Measure("iterations", "iterations", None, 0, per_image=False),
-        Measure("ms_per_iteration", "ms/iter", "lower", 1, per_image=False),
-        Measure("fps", "FPS", "higher", 1, per_image=False),
+        Measure("ms_per_iteration", "ms/iter", "lower", 1, per_image=False, timed=True),
+        Measure("fps", "FPS", "higher", 1, per_image=False, timed=True),
         Measure("gaussians", "Gaussians", "lower", 0, per_image=False),
         Measure("model_mb", "MB", "lower", 1, per_image=False),
-        Measure("fps_low", "FPS low", "higher", 1, per_image=False),
-        Measure("fps_high", "FPS high", "higher", 1, per_image=False),
+        Measure("fps_low", "FPS low", "higher", 1, per_image=False, timed=True),
+        Measure("fps_high", "FPS high", "higher", 1, per_image=False, timed=True),
         Measure("peak_rss_mb", "peak RSS MB", "lower", 0, per_image=False),
         Measure("peak_cuda_mb", "peak CUDA MB", "lower", 0, per_image=False),
     )
@@ -54,7 +57,7 @@ MEASURES: dict[str, Measure] = {
 # Measured on part of a picture: one without such a pixel has no value, and is no gap in a mean.
 PARTIAL = ("psnr_valid", "psnr_covered", "psnr_uncovered")
 ALWAYS = ("psnr", "ssim", "lpips_alex")  # shown even where missing: the reason stands below the table
-COST = ("train_s", "ms_per_iteration", "fps", "gaussians", "model_mb")
+COST = ("train_s", "reference_s", "ms_per_iteration", "fps", "gaussians", "model_mb")
 # A metric that is not listed takes its direction from its family: psnr_distractor is a PSNR.
 FAMILIES: tuple[tuple[str, Literal["higher", "lower"], int], ...] = (
     ("psnr", "higher", 2),

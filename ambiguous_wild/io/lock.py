@@ -1,24 +1,33 @@
-"""Folder locks: one command at a time on one folder."""
+"""Folder locks: one command at a time on one folder; on every system, through filelock."""
 
 from __future__ import annotations
 
-import fcntl
+import contextlib
 import os
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+from filelock import FileLock, Timeout
+
 from ambiguous_wild.core.errors import AwError
+
+# Long enough to look again where the holder unlinked the file between our open and our lock.
+_TRY_S, _AGAIN_S = 0.05, 0.005
 
 
 class Busy(AwError):
     """Another process works on the folder."""
 
 
+class Held(Exception):
+    """Another process holds the file; the text is what it wrote there, or empty."""
+
+
 @contextmanager
 def folder_lock(folder: Path | str, doing: str) -> Iterator[None]:
-    """Lock `.<name>.lock` beside the folder; the kernel frees it even after kill -9.
+    """Lock `.<name>.lock` beside the folder; the system frees it even after kill -9.
 
     Args:
         folder: it need not exist yet.
@@ -29,16 +38,15 @@ def folder_lock(folder: Path | str, doing: str) -> Iterator[None]:
     """
     folder = Path(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
-    path = folder.parent / f".{folder.name}.lock"
-    handle = _locked(path, folder)
-    try:
-        os.truncate(handle, 0)
-        os.write(handle, f"{doing} (process {os.getpid()})".encode())
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(file_lock(lock_path(folder), f"{doing} (process {os.getpid()})"))
+        except Held as held:
+            holder = str(held) or "another process"
+            raise Busy(
+                f"{folder} is being worked on by {holder}; wait for it to end, or choose another folder"
+            ) from None
         yield
-    finally:
-        # Unlinked while it is locked: no stale file is left.
-        path.unlink(missing_ok=True)
-        os.close(handle)
 
 
 @contextmanager
@@ -61,22 +69,37 @@ def patient_lock(folder: Path | str, doing: str, patience_s: float) -> Iterator[
         yield
 
 
-def _locked(path: Path, folder: Path) -> int:
-    while True:
-        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            holder = os.read(handle, 200).decode(errors="replace").strip() or "another process"
-            os.close(handle)
-            raise Busy(
-                f"{folder} is being worked on by {holder}; wait for it to end, or choose another folder"
-            ) from None
-        # The previous holder may unlink the file between our open and our lock. Then other processes would
-        # lock a new file of this name, so try again.
-        try:
-            if os.path.samestat(os.fstat(handle), os.stat(path)):
-                return handle
-        except FileNotFoundError:
-            pass
-        os.close(handle)
+def lock_path(folder: Path) -> Path:
+    """The file that is locked for a folder."""
+    return folder.parent / f".{folder.name}.lock"
+
+
+@contextmanager
+def file_lock(path: Path, text: str) -> Iterator[None]:
+    """Lock a file and write `text` into it, for whoever finds it locked; it is removed afterwards.
+
+    Raises:
+        Held: another process, or another call of this one, holds it.
+        OSError: it cannot be written.
+    """
+    lock = FileLock(path, timeout=_TRY_S, thread_local=False)
+    try:
+        lock.acquire(poll_interval=_AGAIN_S)
+    except Timeout:
+        raise Held(_read(path)) from None
+    try:
+        with contextlib.suppress(OSError):  # Windows may refuse a second handle
+            path.write_text(text, encoding="utf-8")
+        yield
+    finally:
+        # Unlinked while it is locked: no stale file is left. Where the system refuses that, afterwards.
+        with contextlib.suppress(OSError):
+            path.unlink()
+        lock.release()
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8", errors="replace")[:200].strip()
+    except OSError:
+        return ""

@@ -15,19 +15,23 @@ SAMPLED = 17
 
 
 class Clock:
-    """Seconds of training so far, and of each of its parts."""
+    """Seconds of training so far, by the wall and of all processors, and of each of its parts."""
 
     def __init__(self, elapsed_s: float = 0.0, parts_s: dict[str, float] | None = None) -> None:
         self.elapsed_s = elapsed_s
         self.parts_s = {} if parts_s is None else parts_s
+        self.cpu_s = 0.0  # processor seconds of this process, all threads
         self._since: float | None = None
+        self._cpu_since = 0.0
 
     def start(self) -> None:
+        self._cpu_since = time.process_time()
         self._since = time.perf_counter()
 
     def stop(self) -> None:
         if self._since is not None:
             self.elapsed_s += time.perf_counter() - self._since
+            self.cpu_s += time.process_time() - self._cpu_since
             self._since = None
 
     def now(self) -> float:
@@ -44,6 +48,9 @@ class Clock:
 
     def settle(self) -> None:
         """Wait for what was started but not finished; call it before the clock is stopped to be read."""
+
+    def settle_stopped(self) -> None:
+        """`settle` of a clock that has been stopped: what was started before counts."""
 
 
 class GpuClock(Clock):
@@ -86,6 +93,11 @@ class GpuClock(Clock):
             spent = SAMPLED * begin.elapsed_time(end) / 1e3
             self.parts_s[name] = self.parts_s.get(name, 0.0) + spent
         self._open = []
+
+    def settle_stopped(self) -> None:
+        begin = time.perf_counter()
+        self.settle()
+        self.elapsed_s += time.perf_counter() - begin
 
 
 def clock_for(device: torch.device, elapsed_s: float = 0.0, parts_s: dict[str, float] | None = None) -> Clock:

@@ -61,9 +61,20 @@ class Pace:
             return min(elapsed_s / self.config.budget_s, 1.0)
         return min(iteration / self.config.iterations, 1.0)
 
+    def marks(self, count: int, iteration: int, elapsed_s: float) -> int:
+        """How many of `count` evenly spaced marks, the last at the end, lie behind; exact for iterations."""
+        if self.config.budget_s is not None:
+            return int(self.progress(iteration, elapsed_s) * count)
+        return min(iteration, self.config.iterations) * count // self.config.iterations
+
     def divisor(self, progress: float) -> int:
         """Photos are trained at their size over this."""
         return divisor_at(self.levels, progress)
+
+    @property
+    def divisors(self) -> tuple[int, ...]:
+        """All that the run trains at."""
+        return tuple(sorted({level.divisor for level in self.levels}))
 
     def ceiling(self, divisor: int, progress: float) -> int:
         """Growth stops at this many Gaussians now."""

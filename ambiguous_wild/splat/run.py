@@ -6,7 +6,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -24,6 +24,22 @@ from ambiguous_wild.splat.timeline import ROWS, Timeline
 from ambiguous_wild.splat.watchdog import NonFinite, Watchdog
 
 Probe = Callable[[Callable[[Camera], Tensor]], float]
+
+
+class Meter(Protocol):
+    """Watches the machine while a run trains; called with the run's clock stopped."""
+
+    def begin(self, trained_s: float) -> None: ...
+
+    def due(self, trained_s: float, progress: float) -> bool: ...
+
+    def look(self, trained_s: float) -> None: ...
+
+    def end(self, trained_s: float) -> None: ...
+
+    def state_dict(self) -> dict[str, Any]: ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> None: ...
 
 
 class Run(ABC):
@@ -44,6 +60,8 @@ class Run(ABC):
         names = [view.name for view in data.scene.train]
         self.watchdog = Watchdog(folder, config.on_nonfinite, config.seed, names)
         self.clock: Clock = clock_for(data.device)
+        self.meter: Meter | None = None
+        self._marks: tuple[int, int] | None = None  # probes and rows that were due after the last step
         self.setup_s = 0.0  # seconds before the first step, of the process that began the run
         self.iteration = 0
         self.timeline = Timeline()
@@ -102,6 +120,16 @@ class Run(ABC):
         """
         if self.config.on_nonfinite == "rollback" and not self.checkpoint_path.exists():
             self.save()  # something to go back to, from the first iteration on
+        if self.meter is None or self.done:
+            self._train(tick)
+            return
+        self.meter.begin(self.clock.now())
+        try:
+            self._train(tick)
+        finally:
+            self.meter.end(self.clock.now())
+
+    def _train(self, tick: Callable[[Any], None] | None) -> None:
         last_save = time.monotonic()
         while True:
             if self.done:
@@ -115,7 +143,8 @@ class Run(ABC):
 
     def _advance(self, tick: Callable[[Any], None] | None) -> None:
         """One iteration with its bookkeeping, or one step back."""
-        before = self.progress(self.iteration)
+        if self._marks is None:
+            self._marks = self._passed()
         self.clock.start()
         try:
             loss = self.step()
@@ -123,17 +152,32 @@ class Run(ABC):
             self.clock.stop()
             self.watchdog.handle(self, error)
             return
-        after = self.progress(self.iteration)
-        probing = int(after * self.config.probes) > int(before * self.config.probes)
-        due = probing or int(after * ROWS) > int(before * ROWS)
-        if due:
-            self.clock.settle()
         self.clock.stop()
         self.timeline.loss(loss)
-        if due:
-            self._log(probing)
+        # Marks are compared with those of the last step, not with the clock before this one: under a budget
+        # the clock may pass a mark between two steps.
+        before, passed = self._marks, self._passed()
+        done, meter = self.progress(self.iteration), self.meter
+        calibrating = meter is not None and meter.due(self.clock.now(), done)
+        if passed != before or calibrating:
+            self.clock.settle_stopped()
+            passed = self._passed()
+        self._marks = passed
+        if passed != before:
+            self._log(passed[0] > before[0])
         if tick is not None:
             tick(self)
+        if meter is not None and calibrating:
+            meter.look(self.clock.now())
+
+    def _passed(self) -> tuple[int, int]:
+        """Probes and rows of the timeline that are due by now, since the start of the run."""
+        done = (self.iteration, self.clock.now())
+        return self.pace.marks(self.config.probes, *done), self.pace.marks(ROWS, *done)
+
+    def forget_marks(self) -> None:
+        """After the state was replaced: marks are those of the new state."""
+        self._marks = None
 
     def _save_if_sound(self) -> bool:
         """Save, unless a parameter is not finite: then it is as if the last step had found that."""

@@ -21,6 +21,8 @@ def take(trainer: Trainer) -> dict[str, Any]:
         "elapsed_s": trainer.clock.now(),
         "setup_s": trainer.setup_s,
         "parts_s": trainer.clock.parts_s,
+        "cpu_s": trainer.clock.cpu_s,
+        **({} if trainer.meter is None else {"meter": trainer.meter.state_dict()}),
         **trainer.field.state_dict(),
         **({"fields": others} if others else {}),
         "mask": trainer.parts.mask.state_dict(),
@@ -49,6 +51,10 @@ def restore(trainer: Trainer, state: dict[str, Any], path: Path) -> None:
         trainer.iteration = state["iteration"]
         trainer.setup_s = state["setup_s"]
         trainer.clock = clock_for(trainer.data.device, state["elapsed_s"], dict(state["parts_s"]))
+        trainer.clock.cpu_s = state.get("cpu_s", 0.0)
+        if trainer.meter is not None and "meter" in state:
+            trainer.meter.load_state_dict(state["meter"])
+        trainer.forget_marks()
         trainer.timeline.rows = list(state["timeline"])
         trainer.timeline.loss_sum, trainer.timeline.loss_count = state["loss"]
         trainer.note_skipped(state["skipped"])

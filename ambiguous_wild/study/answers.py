@@ -18,9 +18,21 @@ from ambiguous_wild.study.key import KIND_PAIR, KIND_PHOTO, Key
 
 FORMAT, VERSION = "aw-study-answers", 1
 CHOICES = {KIND_PAIR: ("x", "y", "tie"), KIND_PHOTO: ("1", "2", "3", "4", "5", "none")}
+# As JSON and CSV have it: whether the outline was shown.
+OUTLINES: dict[str | bool | None, bool | None] = {
+    True: True,
+    False: False,
+    "yes": True,
+    "no": False,
+    "": None,
+    None: None,
+}
 LARGEST = 5_000_000  # bytes; ten times the size of a thousand answers
 LONGEST = 80  # characters of a rater's id or name, as in the page
-_COLUMNS = ("study", "rater", "name", "question", "answer", "left", "ms")
+_COLUMNS = ("study", "rater", "name", "question", "answer", "left", "ms", "outline")
+# Seconds on a question below which nobody can have looked: one photo, or two renders and a photo. Such
+# answers are read, counted and left out of every score.
+TOO_FAST_S = {KIND_PHOTO: 0.7, KIND_PAIR: 1.0}
 
 
 @dataclass(frozen=True)
@@ -30,7 +42,11 @@ class Answer:
     question: str  # token of the key
     answer: str  # one of `CHOICES`
     left: str  # "x" or "y": the render shown on the left; empty for photos
-    seconds: float  # from the question to the answer
+    seconds: float  # spent on the question
+    too_fast: bool = False  # see `TOO_FAST_S`
+    outline: bool | None = (
+        None  # whether the distractor's outline was shown; None: not recorded, or no outline
+    )
 
 
 @dataclass(frozen=True)
@@ -173,7 +189,8 @@ def _csv(path: Path, text: str) -> dict[str, Any]:
         rows = list(csv.DictReader(io.StringIO(text, newline=""), strict=True))
     except csv.Error as error:
         raise AwError(f"{path} is malformed CSV ({error}): ask the rater to save again") from None
-    if not rows or tuple(rows[0]) != _COLUMNS:
+    # Pages of before the outline was recorded lack the last column.
+    if not rows or tuple(rows[0]) not in (_COLUMNS, _COLUMNS[:-1]):
         raise AwError(
             f"{path} is no answer file: its first line must be {','.join(_COLUMNS)}, followed by rows"
         )
@@ -210,7 +227,12 @@ def _answer(path: Path, row: Any, key: Key) -> Answer:
         seconds = -1.0
     if not 0 <= seconds < 1e7:
         raise AwError(f"{path} has no valid time for {question} ({_short(row.get('ms'))}): it was edited")
-    return Answer(str(question), answer, left, seconds)
+    shown = row.get("outline")
+    if not isinstance(shown, (str, bool, type(None))) or shown not in OUTLINES:
+        raise AwError(
+            f"{path} has {_short(shown)} as outline of {question}: it was edited; ask the rater to save again"
+        )
+    return Answer(str(question), answer, left, seconds, seconds < TOO_FAST_S[entry["kind"]], OUTLINES[shown])
 
 
 def _short(value: Any) -> str:

@@ -18,14 +18,16 @@ let state = load();
 function load() {
   try {
     const found = JSON.parse(localStorage.getItem(SLOT));
-    if (found && typeof found.rater === "string" && found.answers && typeof found.answers === "object") return found;
+    if (found && typeof found.rater === "string" && found.answers && typeof found.answers === "object")
+      return { ...fresh(), ...found };
   } catch (error) { /* no storage, or not our data: start again */ }
   return fresh();
 }
 function fresh() {
   const bytes = crypto.getRandomValues(new Uint8Array(6));
   const rater = Array.from(bytes, (b) => b.toString(16).padStart(2, "0")).join("");
-  return { rater, name: "", answers: {} };
+  // spent: ms on a question so far; opened: questions whose outline was shown.
+  return { rater, name: "", answers: {}, spent: {}, opened: {} };
 }
 function keep() {
   try { localStorage.setItem(SLOT, JSON.stringify(state)); keeps = true; } catch (error) { keeps = false; }
@@ -64,6 +66,16 @@ const answered = () => order.filter((q) => q.id in state.answers).length;
 function firstOpen() {
   const i = order.findIndex((q) => !(q.id in state.answers));
   return i < 0 ? order.length : i;
+}
+/** The time on a question counts from visit to visit: who comes back has already looked. */
+function spend() {
+  const q = order[index];
+  if (!q || $("ask").hidden) return 0;
+  const before = Number(state.spent?.[q.id]) || 0;
+  const spent = before + Math.round(performance.now() - since);
+  state.spent = { ...state.spent, [q.id]: spent };
+  since = performance.now();
+  return spent;
 }
 function show(name) {
   for (const id of ["intro", "ask", "done"]) $(id).hidden = id !== name;
@@ -126,12 +138,29 @@ function ask() {
   bar.setAttribute("aria-valuenow", String(count));
   bar.firstElementChild.style.width = (100 * count / order.length) + "%";
   $("back").disabled = index === 0;
+  layOut();
   since = performance.now();
+}
+/** As many columns as make the pictures largest in this window; a phone held upright has its own layout. */
+function layOut() {
+  const box = $("pictures"), figures = [...box.children], first = box.querySelector("img");
+  const phone = matchMedia("(max-width: 720px) and (orientation: portrait)").matches;
+  if (phone || !first) { box.style.gridTemplateColumns = ""; return; }
+  if (!first.naturalWidth) { first.addEventListener("load", layOut, { once: true }); return; }
+  const ratio = first.naturalWidth / first.naturalHeight, caption = 30, gap = 10;
+  const width = (columns) => {
+    const rows = Math.ceil(figures.length / columns);
+    const across = (box.clientWidth - gap * (columns + 1)) / columns;
+    return Math.min(across, ratio * ((box.clientHeight - gap * (rows - 1)) / rows - caption));
+  };
+  const best = figures.map((_, i) => i + 1).sort((a, b) => width(b) - width(a) || b - a)[0];
+  box.style.gridTemplateColumns = `repeat(${best}, 1fr)`;
 }
 function answer(value) {
   const q = order[index];
-  const entry = { answer: value, ms: Math.round(performance.now() - since) };
+  const entry = { answer: value, ms: spend() };
   if (q.kind === "preference") entry.left = q.left;
+  if (q.images.outline) entry.outline = Boolean(state.opened?.[q.id]);
   state.answers[q.id] = entry;
   dirty = true;
   keep();
@@ -144,6 +173,7 @@ function outline() {
   const q = order[index];
   const on = $("outline").getAttribute("aria-pressed") !== "true";
   $("outline").setAttribute("aria-pressed", String(on));
+  if (on) { state.opened = { ...state.opened, [q.id]: true }; keep(); }
   document.querySelector("#pictures img").src = data.images[on ? q.images.outline : q.images.photo];
 }
 function zoom(source) {
@@ -166,8 +196,9 @@ function asCsv() {
     const s = String(v === undefined ? "" : v).replace(/^(\s*[=+\-@])/, "'$1");
     return '"' + s.replace(/"/g, '""') + '"';
   };
-  const lines = [["study", "rater", "name", "question", "answer", "left", "ms"]];
-  for (const r of rows()) lines.push([data.study, state.rater, state.name, r.question, r.answer, r.left, r.ms]);
+  const lines = [["study", "rater", "name", "question", "answer", "left", "ms", "outline"]];
+  for (const r of rows()) lines.push([data.study, state.rater, state.name, r.question, r.answer, r.left, r.ms,
+    r.outline === undefined ? "" : r.outline ? "yes" : "no"]);
   return lines.map((line) => line.map(cell).join(",")).join("\n") + "\n";
 }
 function save(text, suffix, type) {
@@ -222,14 +253,16 @@ $("anew").addEventListener("click", () => {
   if (!confirm("This forgets the answers given here. Have they been saved to a file?")) return;
   state = fresh(); dirty = false; keep(); arrange(); intro();
 });
-$("back").addEventListener("click", () => { if (index > 0) { index -= 1; ask(); } });
+$("name").addEventListener("keydown", (e) => { if (e.key === "Enter" && !e.isComposing) { e.preventDefault(); $("start").click(); } });
+$("back").addEventListener("click", () => { if (index > 0) { spend(); keep(); index -= 1; ask(); } });
 $("outline").addEventListener("click", outline);
-$("pause").addEventListener("click", finish);
+$("pause").addEventListener("click", () => { spend(); keep(); finish(); });
 $("resume").addEventListener("click", () => { index = Math.min(firstOpen(), order.length - 1); ask(); });
 $("json").addEventListener("click", () => save(asJson(), ".json", "application/json"));
 $("csv").addEventListener("click", () => save(asCsv(), ".csv", "text/csv"));
 $("show").addEventListener("click", () => { $("text").hidden = false; $("text").value = asJson(); $("text").select(); });
 $("zoom").addEventListener("click", () => $("zoom").close());
+addEventListener("resize", layOut);
 addEventListener("beforeunload", (e) => { if (dirty && !keeps) e.preventDefault(); });
 addEventListener("keydown", (e) => {
   if ($("ask").hidden || $("zoom").open || e.repeat || e.ctrlKey || e.metaKey || e.altKey) return;

@@ -83,6 +83,7 @@ class Ratings(Counted):
     mean_high: float | None
     hard: float | None  # share rated `scores.HARD` or more
     none: int  # answers "see nothing move"
+    outlined: int  # answers given after the distractor's outline was shown
 
 
 class SceneRatings(Ratings):
@@ -114,6 +115,8 @@ class RaterSummary(TypedDict):
     name: str
     answers: int
     asked: int
+    too_fast: int  # of the answers; left out of the scores
+    outlined: int  # answers given after the distractor's outline was shown
     median_s: float
     file: str
 
@@ -124,6 +127,7 @@ class Scores(TypedDict):
     study: str
     title: str
     seed: int
+    too_fast_s: dict[str, float]  # kind -> seconds below which an answer is left out
     raters: list[RaterSummary]
     preference: Preference | None
     ambiguity: Ambiguity | None

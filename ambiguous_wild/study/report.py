@@ -61,9 +61,26 @@ def to_markdown(scores: Scores) -> str:
         parts += _preference(scores[KIND_PAIR])
     if scores[KIND_PHOTO] is not None:
         parts += _ambiguity(scores[KIND_PHOTO])
-    head = ("rater", "name", "answers", "median s")
-    rows = [(r["rater"], r["name"], f"{r['answers']} of {r['asked']}", r["median_s"]) for r in raters]
+    head = ("rater", "name", "answers", "too fast", "outline shown", "median s")
+    rows = [
+        (
+            r["rater"],
+            r["name"],
+            f"{r['answers']} of {r['asked']}",
+            r["too_fast"],
+            r["outlined"],
+            r["median_s"],
+        )
+        for r in raters
+    ]
     parts += ["", "## Raters", "", *_table(head, rows), ""]
+    fast = sum(r["too_fast"] for r in raters)
+    limits = scores["too_fast_s"]
+    parts += [
+        f"{fast} of {counted(answers, 'answer')} took less than {limits[KIND_PHOTO]:g} s (photos) or "
+        f"{limits[KIND_PAIR]:g} s (renders), too little to look, and are left out of the scores.",
+        "",
+    ]
     parts.append(
         "Intervals are 95 %: [a, b] is Wilson's, for independent answers; {a, b} is a bootstrap over "
         f"raters, seed {scores['seed']}; intervals of strengths are a jackknife over raters."
@@ -105,14 +122,15 @@ def _preference(found: Preference) -> list[str]:
 def _ambiguity(found: Ambiguity) -> list[str]:
     rows = [
         (s["scene"], _with(s["mean"], s["mean_low"], s["mean_high"], 2, "{}"),
-         _share(s["hard"], s), s["n"], s["none"])
+         _share(s["hard"], s), s["n"], s["none"], s["outlined"])
         for s in found["scenes"]
     ]  # fmt: skip
+    head = ("scene", "mean", f"share rated {HARD} or 5", "ratings", "no moving object seen", "outline shown")
     return [
         "", "## How hard the distractor is to see", "",
         f"{found['questions']} questions, {found['answers']} answers; 1: easy to see, 5: like the scene.",
         "",
-        *_table(("scene", "mean", f"share rated {HARD} or 5", "ratings", "no moving object seen"), rows),
+        *_table(head, rows),
         "", f"Agreement: {_agreement(found['agreement'], 'interval metric')}.",
     ]  # fmt: skip
 

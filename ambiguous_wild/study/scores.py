@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from itertools import combinations
 from statistics import median
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 
 from ambiguous_wild.metrics.ambiguity import ratio_interval
 from ambiguous_wild.study.agreement import agreement
-from ambiguous_wild.study.answers import Answer, Rater
+from ambiguous_wild.study.answers import TOO_FAST_S, Answer, Rater
 from ambiguous_wild.study.key import KIND_PAIR, KIND_PHOTO, Key
 from ambiguous_wild.study.ranking import Strength, bradley_terry
 from ambiguous_wild.study.records import (
@@ -35,18 +36,22 @@ Counts = np.ndarray  # [raters, 2]: successes, trials
 def score(key: Key, raters: list[Rater], seed: int = 0) -> Scores:
     """All scores of a study, as written to scores.json; None = not defined.
 
+    Answers that were too fast are left out of every score and counted in each rater's summary.
+
     Args:
         key: of the study.
         raters: at least one, from `read_answers`.
         seed: of the bootstrap over raters.
     """
+    kept = [replace(r, answers=tuple(a for a in r.answers if not a.too_fast)) for r in raters]
     return {
         "study": key.study,
         "title": key.title,
         "seed": seed,
+        "too_fast_s": TOO_FAST_S,
         "raters": [_rater(r, key) for r in raters],
-        KIND_PAIR: _preference(key, raters, seed),
-        KIND_PHOTO: _ambiguity(key, raters, seed),
+        KIND_PAIR: _preference(key, kept, seed),
+        KIND_PHOTO: _ambiguity(key, kept, seed),
     }
 
 
@@ -56,6 +61,8 @@ def _rater(rater: Rater, key: Key) -> RaterSummary:
         "name": rater.name,
         "answers": len(rater.answers),
         "asked": len(key.questions),
+        "too_fast": sum(a.too_fast for a in rater.answers),
+        "outlined": sum(a.outline is True for a in rater.answers),
         "median_s": round(median(a.seconds for a in rater.answers), 2),
         "file": rater.path.name,
     }
@@ -201,6 +208,7 @@ def _ratings(answers: list[list[Answer]], seed: int) -> Ratings:
         "raters_low": hard["raters_low"],
         "raters_high": hard["raters_high"],
         "none": sum(a.answer == "none" for one in answers for a in one),
+        "outlined": sum(a.outline is True for one in answers for a in one),
     }
 
 

@@ -67,6 +67,14 @@ def test_frames_are_the_sharp_ones_and_evenly_spaced(tmp_path: Path) -> None:
     assert np.abs(saved - texture(1)[100:220, 8:168].astype(int)).mean() < 12  # two times JPEG
 
 
+def test_a_short_video_gives_all_it_has(tmp_path: Path) -> None:
+    video, out = write_video(tmp_path / "v.avi", 5), tmp_path / "raw"
+    done = CliRunner().invoke(command, [str(video), "-o", str(out)], catch_exceptions=False)
+    assert done.exit_code == 0 and "5 photos in" in done.output
+    assert "has 5 frames: took all of them, fewer than --frames 60" in done.output
+    assert [p["frame"] for p in json.loads((out / "capture.json").read_text())["photos"]] == [0, 1, 2, 3, 4]
+
+
 def test_stretches_of_equals_keep_their_distance() -> None:
     flat = np.full((16, 16, 3), 7, np.uint8)
     frames = ((i, i / 10, flat) for i in range(40))
@@ -105,8 +113,8 @@ def test_bad_sources_are_one_line_and_leave_nothing(tmp_path: Path) -> None:
     assert "does not exist" in error(tmp_path / "absent", "-o", out)
     assert "unknown camera" in error("camera:front", "-o", out)
     assert "there is no camera 99" in error("camera:99", "-o", out)
-    video = write_video(tmp_path / "v.avi", 5)
-    assert "has 5 frames, 6 were asked for" in error(video, "-o", out, "--frames", 6)
+    video = write_video(tmp_path / "v.avi", 2)
+    assert "has 2 frames, a scene needs 3" in error(video, "-o", out)
     pattern = tmp_path / "%02d.avi"
     video.rename(pattern)
     assert "'%' in its name" in error(pattern, "-o", out, "--frames", 3)

@@ -190,7 +190,10 @@ def test_names_are_escaped_on_the_page() -> None:
         COLOUR_METRIC: {**interval, "ambiguous": True, "unknown_px": 0, "distractor_px": 1},
         SEMANTIC_METRIC: {**interval, "ambiguous": True, "compared_with": "o", "same_surface": None},
     }  # fmt: skip
-    text = page(summary, [{"photo": "<script>"}], b"", [('"><img src=x', [b"j"])])
+    text = page(
+        summary, [{"photo": "<script>"}], b"", [('"><img src=x', [("<i>photo", b"j"), ("masks", b"k")])]
+    )
+    assert text.count("<figure>") == 2 and "<i>photo" not in text and "prefers-color-scheme:dark" in text
     assert "<script>" not in text and "<b>x" not in text and '"><img src=x' not in text
 
 
@@ -218,4 +221,7 @@ def test_a_cosine_near_its_limit_is_told_apart_from_it(scene: Path, tmp_path: Pa
     look = summary[SEMANTIC_METRIC] | {"value": 0.6964, "low": 0.6951, "high": 0.7049}
     real = summary | {"features": "dinov2-small", "semantic_cosine_dinov2_small": look}
     assert "cosine 0.696 [0.695, 0.705]" in "\n".join(describe(real))
-    assert "] of the distractor pixels are as like" in "\n".join(describe(summary))
+    assert (
+        "] of the distractor pixels lie in regions that resemble a static region of another photo"
+        in "\n".join(describe(summary))
+    )

@@ -24,7 +24,7 @@ def test_tables_on_standard_output_and_files_beside(tmp_path: Path) -> None:
     done = CliRunner().invoke(command, [str(runs), "--target", "17", "-o", str(out), "--no-plots"])
     assert done.exit_code == 0, done.output
     assert "minutes of training to reach a test PSNR (yard)" in done.stdout and "2.50" in done.stdout
-    assert f"made by: aw cost '{runs}' -o {out} --target 17" in done.stdout
+    assert f"command: aw cost '{runs}' -o {out} --target 17" in done.stdout
     assert sorted(p.name for p in out.iterdir()) == [
         "cost.csv",
         "cost.json",

@@ -23,6 +23,7 @@ def test_a_plan_is_a_table_and_a_file_and_leaves_the_scene_alone(scene, tmp_path
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
     assert lines[0].split()[:2] == ["effect", "evidence"]
+    assert "a method makes them while it trains" in lines[-3] and "--masks FOLDER" in lines[-3]
     plan = json.loads((tmp_path / "plan.json").read_text())
     assert plan["probed"] and plan["scene"] == "scene"
     found = {d["effect"]: d for d in plan["decisions"]}

@@ -25,7 +25,7 @@ def test_default_prints_a_table_and_how_it_was_made(tmp_path: Path) -> None:
     before = sorted(tmp_path.rglob("*"))
     out, err = aw_table(tmp_path)
     assert "23.00 (1)" in out and "20.00 (2)" in out and "failed: c on yard" in out
-    assert f"made by: aw table {tmp_path}" in out
+    assert f"command: aw table {tmp_path}" in out
     assert "missing: lpips_alex: weights missing" in out
     assert err == "" and sorted(tmp_path.rglob("*")) == before
 

@@ -7,6 +7,7 @@ import zlib
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import yaml
 
@@ -39,11 +40,15 @@ def write_run(
     iterations: int = 100,
     options: dict[str, Any] | None = None,
     cpu: str = "Test CPU",
+    alone: bool | None = None,
+    masks: dict[str, Any] | None = None,
     **more: Any,
 ) -> Path:
     """RUNS/<scene>/<folder>/seed<k>: renders are the photos with noise, the numbers are measured on them.
 
-    `noise` is in units of 1/255; what `more` holds goes into config.yaml before it is hashed.
+    `noise` is in units of 1/255; `alone` says whether it had the machine alone, None: not recorded; with
+    scores under `masks` there is a mask a train photo; what `more` holds goes into config.yaml before it is
+    hashed.
     """
     opened = load_scene(scene)
     builtin = method.split("@")[0] in ("3dgs", "refinesplat", "robustsplat", "dronesplat")
@@ -81,7 +86,7 @@ def write_run(
     result = {
         "schema": 1, "method": method, "scene": opened.name, "seed": seed, "status": "ok", "error": None,
         "options": config["options"], "per_image": rows,
-        "missing": {"lpips_alex": "weights missing"}, "masks": None,
+        "missing": {"lpips_alex": "weights missing"}, "masks": masks,
         "facts": {"protocol": more["protocol"]} if "protocol" in more else {},
         "cost": {
             "train_s": train_s * rng.uniform(0.95, 1.05), "iterations": iterations, "gaussians": 1000 + seed,
@@ -90,5 +95,15 @@ def write_run(
         },
         "config_hash": config["config_hash"], "scene_hash": config["scene"]["sha256"], "version": "0.1.0",
     }  # fmt: skip
+    if alone is not None:
+        verdict = {"verdict": "alone", "reason": ""}
+        verdict = verdict if alone else {"verdict": "contended", "reason": "two other programs"}
+        result["cost"] |= {"timing": verdict | {"kernel": "cpu-1"}, "reference_s": 2 * train_s}
+    if masks is not None:
+        (run / "masks").mkdir()
+        for view in opened.train:
+            keep = np.full((view.camera.height, view.camera.width), 255, np.uint8)
+            keep[: view.camera.height // 4] = 0
+            cv2.imwrite(str((run / "masks" / view.name).with_suffix(".png")), keep)
     write_result(run / "metrics.json", result)
     return run

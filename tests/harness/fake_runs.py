@@ -35,6 +35,8 @@ def fake_result(
             "model_mb": 0.3,
             "device": "cpu",
             "threads": 2,
+            "reference_s": 8.0 + seed,
+            "timing": {"verdict": "alone", "reason": "", "kernel": "cpu-1"},
         },
         "config_hash": "c",
         "scene_hash": "s",

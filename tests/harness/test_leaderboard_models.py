@@ -48,12 +48,15 @@ def test_every_entry_leads_to_its_model(root: Path, tmp_path: Path) -> None:
     assert sorted(p.name for p in (site / "models").iterdir()) == ["tiny-porch.html", "tiny-yard.html"]
     labels = [m["label"] for m in facts(site / "models" / "tiny-porch.html")["models"]]
     assert len(labels) == 2 and labels[0].startswith("3dgs (") and labels[1].startswith(HOSTILE)
-    runs = facts(site / "index.html")["runs"]
-    assert len(runs) == 6 and all(r["view"].startswith(f"models/tiny-{r['scene']}.html#left=") for r in runs)
+    data = facts(site / "index.html")
+    links = [(r["scene"], data["models"][r["result_hash"]]) for r in data["runs"]]
+    assert len(links) == 6 and all(
+        link.startswith(f"models/tiny-{scene}.html#left=") for scene, link in links
+    )
     assert "<img" not in (site / "models" / "tiny-porch.html").read_text()
     # Without --models an earlier page's models go, and nothing of them is left in the page.
     assert aw("publish", "--board", root / "board", "-o", site).exit_code == 0
-    assert not (site / "models").exists() and "view" not in facts(site / "index.html")["runs"][0]
+    assert not (site / "models").exists() and facts(site / "index.html")["models"] == {}
 
 
 def test_entries_without_a_model_are_named(root: Path, tmp_path: Path) -> None:

@@ -80,7 +80,14 @@ def test_first_second_third_follow_the_direction_of_merit(key: str, order: str, 
     psnr = {"a": 20.0, "b": 21.0, "c": 22.0, "d": 19.0}
     results = []
     for i, (method, value) in enumerate(psnr.items()):
-        cost = {"train_s": 10.0 + i, "iterations": 100 + i, "fps": 5.0 + i}
+        timing = {"verdict": "alone", "reason": "", "kernel": "cpu-1"}
+        cost = {
+            "train_s": 10.0 + i,
+            "iterations": 100 + i,
+            "fps": 5.0 + i,
+            "reference_s": 1.0,
+            "timing": timing,
+        }
         results.append(fake_result(method, psnr=(value,), cost=cost))
     table = table_of(tmp_path, *results, metrics=[key])
     ranks = {m: cell(table, m, key).rank for m in psnr}

@@ -97,7 +97,7 @@ def test_a_lock_file_unlinked_under_ones_hands_is_not_held(tmp_path, monkeypatch
         taken.append(handle)
         real(handle, operation)
 
-    monkeypatch.setattr("ambiguous_wild.io.lock.fcntl.flock", flock)
+    monkeypatch.setattr("filelock._unix.fcntl.flock", flock)
     with folder_lock(tmp_path / "run", "B"):
         assert len(taken) == 2
         assert path.exists()

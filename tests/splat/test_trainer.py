@@ -158,6 +158,9 @@ class FakeTime:
     def monotonic(self):
         return self.now
 
+    def process_time(self):
+        return 2.0 * self.now
+
 
 @pytest.fixture
 def fake_time(monkeypatch):

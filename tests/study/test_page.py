@@ -30,6 +30,11 @@ def shown(browser: Browser) -> str:
     return browser.run("[...document.querySelectorAll('main')].find((m) => !m.hidden).id")
 
 
+def look(browser: Browser) -> None:
+    """Pretend that the rater has looked for a while."""
+    browser.run("since -= 3000")
+
+
 def test_a_rater_s_way_through(study: Path, tmp_path: Path) -> None:
     files = tmp_path / "files"
     key = json.loads((study / "s.key.json").read_text())
@@ -38,7 +43,10 @@ def test_a_rater_s_way_through(study: Path, tmp_path: Path) -> None:
         page.open((study / "s.html").as_uri())
         assert page.run("document.querySelector('h1').textContent") == "<b>A & B</b>"
         page.run("document.querySelector('#name').value = '=<i>Ann</i>'")
-        page.click("#start")
+        page.click("#name")
+        page.call("Input.dispatchKeyEvent", type="keyDown", key="Enter", text="\r", code="Enter",
+                  windowsVirtualKeyCode=13)  # fmt: skip
+        page.call("Input.dispatchKeyEvent", type="keyUp", key="Enter", code="Enter")
         assert (
             shown(page) == "ask"
             and page.run("document.querySelector('#count').textContent") == f"1 of {ASKED}"
@@ -50,9 +58,13 @@ def test_a_rater_s_way_through(study: Path, tmp_path: Path) -> None:
         assert page.run("document.querySelector('#zoom').open")
         page.click("#zoom img")
         for _ in TRAIN:
+            look(page)
             page.key("4")
         assert page.run("document.querySelectorAll('#pictures img').length") == 3
+        pictures_are_as_large_as_the_window_allows(page)
+        look(page)
         page.key("ArrowLeft")
+        look(page)
         page.key("ArrowDown")
         # Closed and opened again: it goes on where it was, in the same order.
         order = page.run("order.map((q) => q.id + q.left).join()")
@@ -65,8 +77,10 @@ def test_a_rater_s_way_through(study: Path, tmp_path: Path) -> None:
         assert page.run("document.querySelector('[aria-pressed=true]').dataset.value") == "tie"
         page.key("ArrowRight")  # changes the mind, and goes on where the answers end
         assert page.run("document.querySelector('#count').textContent") == f"9 of {ASKED}"
-        for _ in range(4):
-            page.click("#choices button:nth-child(3)")
+        for number in range(4):
+            if number < 3:
+                look(page)
+            page.click("#choices button:nth-child(3)")  # the last one without a look
         assert shown(page) == "done"
         page.click("#json")
         page.click("#csv")
@@ -82,15 +96,35 @@ def test_a_rater_s_way_through(study: Path, tmp_path: Path) -> None:
         scores = json.loads(done.stdout)
         assert scores["raters"][0]["name"] == "=<i>Ann</i>" and scores["raters"][0]["answers"] == ASKED
         assert {s["mean"] for s in scores["ambiguity"]["scenes"]} == {4}
+        rater = scores["raters"][0]
+        assert (rater["too_fast"], rater["outlined"]) == (1, 1)
+        assert scores["ambiguity"]["scenes"][0]["outlined"] == 1
         # First pair: left; all others: right. What stood there, the key says.
         pairs = [
             (q, left, answer) for q, left, answer in given if key["questions"][q]["kind"] == "preference"
         ]
         assert [answer == left for _, left, answer in pairs] == [True, *[False] * 5]
-        wins = [key["questions"][q][answer] for q, _, answer in pairs]
+        wins = [key["questions"][q][answer] for q, _, answer in pairs[:-1]]  # the last was too fast
         for row in scores["preference"]["methods"]:
             assert round(row["share"] * row["n"]) == wins.count(row["method"])
-        assert scores["preference"]["left"]["share"] == pytest.approx(1 / 6)
+        assert scores["preference"]["left"]["share"] == pytest.approx(1 / 5)
+
+
+def pictures_are_as_large_as_the_window_allows(page: Browser) -> None:
+    """Whatever the window, no other number of columns would make them larger."""
+    size = "(() => { const b = document.querySelector('#pictures img').getBoundingClientRect();" \
+        "const r = 64 / 48; return Math.min(b.width, b.height * r); })()"  # fmt: skip
+    for width, height in ((1300, 700), (700, 900), (1280, 800)):
+        page.call("Emulation.setDeviceMetricsOverride", width=width, height=height, mobile=False,
+                  deviceScaleFactor=1)  # fmt: skip
+        page.run("layOut()")
+        best = page.run(size)
+        box = "document.querySelector('#pictures')"
+        for columns in (1, 2, 3):
+            page.run(f"{box}.style.gridTemplateColumns = 'repeat({columns}, 1fr)'")
+            assert page.run(size) <= best + 1 or page.run("innerWidth") <= 720
+        page.run("layOut()")
+        assert page.run("document.documentElement.scrollHeight") <= height
 
 
 def test_orders_differ_between_raters(study: Path, tmp_path: Path) -> None:

@@ -147,6 +147,38 @@ def test_without_the_libraries_the_command_that_brings_them(
             assert f"needs {package}" in message and "[study]" in message
 
 
+def test_answers_too_fast_to_have_looked_are_counted_and_left_out(tmp_path: Path) -> None:
+    key = panel_key()
+    files = panel(key, STRENGTHS, 4, np.random.default_rng(0))
+    private = write_key(key, tmp_path / "key.json")
+
+    def scored(name: str) -> dict:
+        folder = write_panel(files, tmp_path / name)
+        return score(folder, "--key", private, "-o", tmp_path / f"{name}-scores")
+
+    kept = scored("kept")
+    # A fifth rater clicks left at once, and shows every outline.
+    clicks = [
+        {"question": q, "answer": "x", "left": "x", "ms": 999} if e["kind"] == "preference"
+        else {"question": q, "answer": "1", "ms": 699, "outline": True}
+        for q, e in key.questions.items()
+    ]  # fmt: skip
+    files["fast"] = {**files["r0"], "rater": "fast", "answers": clicks}
+    found = scored("all")
+    assert found["preference"] == kept["preference"] and found["ambiguity"] == kept["ambiguity"]
+    fast = next(r for r in found["raters"] if r["rater"] == "fast")
+    assert fast["too_fast"] == fast["answers"] == len(key.questions) and fast["outlined"] == 2
+    told = (tmp_path / "all-scores" / "scores.md").read_text()
+    assert f"{len(clicks)} of {5 * len(clicks)} answers took less than 0.7 s (photos) or 1 s" in told
+    # At the limit an answer counts.
+    for a in clicks:
+        a["ms"] = 1000
+    found = scored("slow")
+    assert next(r for r in found["raters"] if r["rater"] == "fast")["too_fast"] == 0
+    assert found["preference"] != kept["preference"]
+    assert [s["outlined"] for s in found["ambiguity"]["scenes"]] == [2]
+
+
 def test_csv_and_json_answers_score_alike(study: tuple[Path, Path, Any], tmp_path: Path) -> None:
     key, answers, files = study
     tables = tmp_path / "tables"
@@ -176,6 +208,7 @@ BAD: dict[str, tuple[Any, str]] = {
     "half a rater": ({"rater": "\udfff"}, "half a character"),
     "rater type": ({"rater": ["a"]}, "no valid rater"),
     "none": ({"answers": []}, "contains no answer"),
+    "outline": ({"answers": [{"question": "k0", "answer": "3", "ms": 900, "outline": "x"}]}, "as outline"),
     "unasked": ({"answers": [{"question": "zz", "answer": "x", "ms": 1}]}, "not in the study: 'zz'"),
     "no question": ({"answers": [{"question": ["p0"], "answer": "x", "ms": 1}]}, "not in the study"),
     "no dict": ({"answers": ["x"]}, "is no answer"),

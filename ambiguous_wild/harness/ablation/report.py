@@ -32,6 +32,7 @@ def report(study: Study, output: Path, made_by: str = "") -> StudyReport:
     return {
         "schema": 1,
         "made_by": made_by,
+        "note": study.note,
         **study.facts(),
         "groups": [{"name": g.name, "title": g.title, "source": g.source} for g in study.groups],
         "rows": rows,
@@ -116,6 +117,8 @@ def to_markdown(data: StudyReport, picture: str = "") -> str:
     """One table a group: quality and cost of each variant."""
     shown = [m for m in METRICS if any(r["values"][m[0]]["mean"] is not None for r in data["rows"])]
     lines = [f"# Ablations of {data['method']}", "", _subtitle(data), ""]
+    if data.get("note"):
+        lines += [f"{data['method']}: {data['note']}", ""]
     if picture:
         lines += [f"![quality against cost]({picture})", ""]
     for group in data["groups"]:
@@ -136,7 +139,7 @@ def to_markdown(data: StudyReport, picture: str = "") -> str:
         lines += [f"- {r['variant']} {r['status']}: {r['reason']}" for r in rows if r["status"] != "ok"]
         lines += [""] if lines[-1] else []
     if data["made_by"]:
-        lines += [f"made by: `{data['made_by']}`", ""]
+        lines += [f"command: `{data['made_by']}`", ""]
     return "\n".join(lines)
 
 

@@ -145,7 +145,7 @@ def _histograms(figure: Any, grid: Any, measured: list[Measured], seen: Look) ->
     limit = seen.usual if seen.whitened else sem.AMBIGUOUS_ABOVE
     if not math.isnan(limit):
         look.axvline(limit, color="k", ls="--", lw=1)
-    what = "the scene is as like itself from" if seen.whitened else "limit"
+    what = "95 % of static regions reach" if seen.whitened else "limit"
     look.set_xlabel(f"cosine of the most similar distractor ({what} {limit:.2f})", fontsize=9)
     for axes in (cover, look):
         axes.set_ylabel("photos", fontsize=9)

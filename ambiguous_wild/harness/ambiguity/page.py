@@ -65,19 +65,21 @@ def write_report(
 
 def _pictures(
     scene: Scene, masks: Masks, background: Background, measured: list[Measured], look: Look
-) -> Iterator[tuple[str, list[bytes]]]:
-    """Name and JPEGs (overlay, residual, cosine) of the photos on the page, by name."""
+) -> Iterator[tuple[str, list[tuple[str, bytes]]]]:
+    """Name and JPEGs (photo, overlay, residual, cosine) of the photos on the page, by name."""
     for index in sorted(figure.chosen(measured, SHOWN)):
         view = scene.train[index]
         photo, distractor = load_photo(view), masks.load(view)
         behind, known = background.load(index, view)
-        images = [figure.overlay(photo, distractor)]
+        plain = (255 * photo + 0.5).astype(np.uint8)
+        images = [("photo", plain), ("distractors", figure.overlay(photo, distractor))]
         if behind is not None:
-            images.append(figure.residual_picture(photo, behind, known, distractor))
+            residual = figure.residual_picture(photo, behind, known, distractor)
+            images.append(("difference in colour to the background", residual))
         cosine = figure.cosine_picture(look, index, photo, distractor)
         if cosine is not None:
-            images.append(cosine)
-        yield view.name, [_jpeg(image) for image in images]
+            images.append(("similarity to the largest distractor", cosine))
+        yield view.name, [(caption, _jpeg(image)) for caption, image in images]
 
 
 def _jpeg(image: np.ndarray) -> bytes:
@@ -92,9 +94,12 @@ def _jpeg(image: np.ndarray) -> bytes:
 
 
 _STYLE = """
-body{font:16px/1.45 system-ui,sans-serif;max-width:80em;margin:1.5em auto;padding:0 1em;color:#222}
+:root{--back:#fff;--text:#222;--line:#ddd}
+@media(prefers-color-scheme:dark){:root{--back:#14181b;--text:#e6e9eb;--line:#343c42}}
+body{font:16px/1.45 system-ui,sans-serif;max-width:90em;margin:1.5em auto;padding:0 1em}
+body{background:var(--back);color:var(--text)}figure{margin:0}figcaption{font-size:13px;opacity:.8}
 img{max-width:100%;height:auto}table{border-collapse:collapse;font-size:14px}
-td,th{padding:3px 9px;text-align:right;border-bottom:1px solid #ddd;white-space:nowrap}
+td,th{padding:3px 9px;text-align:right;border-bottom:1px solid var(--line);white-space:nowrap}
 td:first-child,th:first-child{text-align:left}.wide{overflow-x:auto}.class{font-size:1.25em;font-weight:600}
 .row{display:grid;grid-template-columns:repeat(auto-fit,minmax(15em,1fr));gap:6px;margin-bottom:1.2em}
 .row img{width:100%;display:block}h3{margin:.6em 0 .2em;font-size:1em;overflow-wrap:anywhere}
@@ -120,7 +125,10 @@ _HEADS = {
 
 
 def page(
-    summary: dict[str, Any], rows: list[dict[str, Any]], picture: bytes, photos: list[tuple[str, list[bytes]]]
+    summary: dict[str, Any],
+    rows: list[dict[str, Any]],
+    picture: bytes,
+    photos: list[tuple[str, list[tuple[str, bytes]]]],
 ) -> str:
     """The page; every text of the scene is escaped, every picture is in it."""
     title = html.escape(f"Ambiguity of {summary['scene']}")
@@ -131,7 +139,7 @@ def page(
         f"features: {summary['features']}; 95 % intervals by bootstrap over photos, seed {summary['seed']}"
     )
     shown = "".join(
-        f"<h3>{html.escape(name)}</h3><div class=row>{''.join(_image(j, 'jpeg', name) for j in images)}</div>"
+        f"<h3>{html.escape(name)}</h3><div class=row>{''.join(_shown(name, *i) for i in images)}</div>"
         for name, images in photos
     )
     head = "".join(f"<th>{html.escape(_HEADS.get(k, 'semantic: cosine'))}</th>" for k in rows[0])
@@ -139,15 +147,22 @@ def page(
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width,initial-scale=1">'
+        '<meta name="color-scheme" content="light dark">'
         f"<title>{title}</title><style>{_STYLE}</style></head><body><h1>{title}</h1>"
         f"<p class=class>{html.escape(verdict)}</p><ul>{lines}</ul><p>{html.escape(sources)}</p>"
-        f"<h2>Photos</h2><p>Distractors in red; their residual to the background; and how like the largest "
-        "distractor everything in the photo is.</p><div class=bar></div><div class=ends><span>alike</span>"
+        "<h2>Photos</h2><p>From the left: the photo; its distractors in red; how much they differ from the "
+        "background; how similar everything is to the largest distractor. Colours of the last two:</p>"
+        "<div class=bar></div><div class=ends><span>similar</span>"
         f"<span>different</span></div>{shown}"
         f"<h2>Distributions</h2>{_image(picture, 'png', 'masks, maps and distributions')}"
         f"<h2>Every photo</h2><div class=wide><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody>"
         "</table></div></body></html>\n"
     )
+
+
+def _shown(name: str, caption: str, data: bytes) -> str:
+    picture = _image(data, "jpeg", f"{caption}, {name}")
+    return f"<figure>{picture}<figcaption>{html.escape(caption)}</figcaption></figure>"
 
 
 def _image(data: bytes, kind: str, name: str) -> str:

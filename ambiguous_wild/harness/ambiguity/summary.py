@@ -216,14 +216,18 @@ def _semantic_line(look: SemanticScore, lookalike: bool) -> str:
         return f"semantic: no verdict, for no distractor could be compared with the {look['compared_with']}"
     if lookalike:
         return (
-            f"semantic: {_percent(look)} of the distractor pixels are as like something of the "
-            f"{look['compared_with']} elsewhere as the scene is like itself: {_word(look)} "
+            f"semantic: {_percent(look)} of the distractor pixels lie in regions that resemble a "
+            f"{_one(look)} of another photo as closely as static regions resemble each other: {_word(look)} "
             f"(limit {100 * sem.LOOKALIKE_ABOVE:.0f} %)"
         )
     return (
         f"semantic: cosine {_value(look)} of a photo's most similar distractor to the "
         f"{look['compared_with']}: {_word(look)} (limit {sem.AMBIGUOUS_ABOVE})"
     )
+
+
+def _one(look: SemanticScore) -> str:
+    return "named object" if look["compared_with"] == "objects" else "static region"
 
 
 def _percent(score: Scored) -> str:

@@ -17,6 +17,7 @@ OPTIONAL = ("table", "setting", "dataset", "variant", "mark", "printed")
 UNKNOWN = "unknown"
 MEAN, ALL = "mean", "all"  # of scenes, and of datasets
 LARGEST = 50_000_000  # bytes
+REPORTED = Path(__file__).parent / "reported"  # the RefineSplat paper's tables, see docs/audit.md
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from ambiguous_wild.harness.cost.curves import Curve, Summary, scenes_of, summary
-from ambiguous_wild.harness.cost.read import NUMBERS, CostRun
+from ambiguous_wild.harness.cost.read import NUMBERS, CostRun, why_unranked
 from ambiguous_wild.methods.registry import knows_truth
 
 
@@ -23,11 +23,16 @@ class Point:
     minutes: Summary  # of training; with the set-up before it where `setup` is set
     setup_s: Summary
     numbers: dict[str, Summary]  # ms an iteration, Gaussians, MB, frames a second
+    unranked: str = ""  # why its time is not ranked
+    low: float = math.nan  # minutes of its fastest and its slowest run, shown where it is not ranked
+    high: float = math.nan
     front: bool = False  # Pareto-optimal: no other curve reaches this PSNR in less time
 
 
 def points(curves: Sequence[Curve], scenes: Sequence[str] = (), *, setup: bool = False) -> list[Point]:
-    """One point a curve, with those on the Pareto front of training time and PSNR marked; oracles never are.
+    """One point a curve, with those on the Pareto front of training time and PSNR marked.
+
+    Oracles, and curves with a run that was not alone on its machine, are never on the front.
 
     Args:
         curves: from `curves_of`.
@@ -36,7 +41,7 @@ def points(curves: Sequence[Curve], scenes: Sequence[str] = (), *, setup: bool =
     """
     scenes = tuple(scenes) or scenes_of(curves)
     made = [_point(curve, scenes, setup) for curve in curves]
-    best = {id(p) for p in pareto([p for p in made if not knows_truth(p.method)])}
+    best = {id(p) for p in pareto([p for p in made if not knows_truth(p.method) and not p.unranked])}
     return [replace(p, front=id(p) in best) for p in made]
 
 
@@ -57,13 +62,18 @@ def _point(curve: Curve, scenes: Sequence[str], setup: bool) -> Point:
     def number(name: str) -> Summary:
         return summary(curve, scenes, lambda run: run.numbers[name])
 
+    runs = [run for run in curve.runs if run.scene in scenes]
+    known = [m for m in map(minutes, runs) if math.isfinite(m)]
     return Point(
         curve.name,
         curve.method,
         curve.length.text,
-        len([run for run in curve.runs if run.scene in scenes]),
+        len(runs),
         summary(curve, scenes, lambda run: run.psnr),
         summary(curve, scenes, minutes),
         summary(curve, scenes, lambda run: run.setup_s),
         {name: number(name) for name in NUMBERS},
+        why_unranked(runs),
+        min(known, default=math.nan),
+        max(known, default=math.nan),
     )

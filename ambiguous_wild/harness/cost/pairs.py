@@ -15,20 +15,22 @@ from typing import Any, Literal
 import numpy as np
 
 from ambiguous_wild.harness.cost.curves import Summary
-from ambiguous_wild.harness.cost.read import CostRun
+from ambiguous_wild.harness.cost.read import CostRun, why_unranked
 from ambiguous_wild.metrics import stats
 
 SAME_TIME = 0.01  # of the training: a smaller difference in minutes is no difference
 _ABSENT = "(absent)"
 
-Kind = Literal["effect", "interval", "option"]
+Kind = Literal["effect", "part", "resolution", "gaussians", "interval", "option"]
+KINDS: tuple[Kind, ...] = ("effect", "part", "resolution", "gaussians", "interval", "option")
 
 
 @dataclass(frozen=True)
 class Change:
     """Gain and cost of a change, over all pairs of runs that differ in it alone."""
 
-    kind: Kind  # "interval": an option called *_every, how often something is refreshed
+    # "interval": an option called *_every, how often something is refreshed; "part": a variant of an ablation
+    kind: Kind
     name: str
     method: str
     before: str  # value of the option; empty for an effect
@@ -42,11 +44,12 @@ class Change:
     minutes: Summary  # of training, more than without; over pairs
     ms: Summary  # an iteration, more than without
     share: float  # extra minutes over the training without
+    unranked: str = ""  # why the minutes cannot be trusted; empty where they can
 
     @property
     def per_minute(self) -> float:
-        """dB an extra minute; NaN where it takes no longer."""
-        if not self.minutes.mean > 0.0 or self.same_time:
+        """dB an extra minute; NaN where it takes no longer, or a run was not alone."""
+        if not self.minutes.mean > 0.0 or self.same_time or self.unranked:
             return math.nan
         return self.db.mean / self.minutes.mean
 
@@ -59,10 +62,18 @@ def changes(runs: Sequence[CostRun]) -> list[Change]:
     """Every effect and option that some pair of runs isolates, by kind, name and method."""
     usable = [run for run in runs if not run.error]
     found = [_change("effect", key, pairs) for key, pairs in sorted(_effect_pairs(usable).items())]
+    found += [_change("part", key, pairs) for key, pairs in sorted(_part_pairs(usable).items())]
     for key, pairs in sorted(_option_pairs(usable).items()):
-        kind: Kind = "interval" if key[0].rpartition(".")[2].endswith("_every") else "option"
-        found.append(_change(kind, key, _costlier_second(pairs)))
-    return sorted(found, key=lambda c: (("effect", "interval", "option").index(c.kind), c.name, c.method))
+        found.append(_change(_kind(key[0]), key, _costlier_second(pairs)))
+    return sorted(found, key=lambda c: (KINDS.index(c.kind), c.name, c.method))
+
+
+def _kind(option: str) -> Kind:
+    if option == "resolution":
+        return "resolution"
+    if option == "max_gaussians":
+        return "gaussians"
+    return "interval" if option.rpartition(".")[2].endswith("_every") else "option"
 
 
 Key = tuple[str, ...]  # name, method, length, and for options the two values
@@ -86,10 +97,34 @@ def _effect_pairs(runs: Sequence[CostRun]) -> dict[Key, Pairs]:
     return pairs
 
 
+def _part_pairs(runs: Sequence[CostRun]) -> dict[Key, Pairs]:
+    """Each variant of an ablation against the method as it is; where that was not run, the first variant."""
+    pairs: dict[Key, Pairs] = {}
+    for group in _groups(runs, lambda r: (r.base, r.scene, r.seed, r.length, r.rest, r.effects)):
+        plain = [run for run in group if run.method == run.base]
+        variants = sorted((run for run in group if run.method != run.base and "=" not in run.method),
+                          key=lambda run: run.method)  # fmt: skip
+        if len(plain) > 1:  # several settings of it: not clear which one a variant belongs to
+            continue
+        for of_group in _groups(variants, lambda run: run.method.partition("@")[2].partition("-")[0]):
+            host, *others = [*plain, *of_group]
+            for run in others:
+                name = run.method.partition("@")[2]
+                key = (name, run.base, run.length.text, _part(host), name)
+                pairs.setdefault(key, []).append((host, run))
+    return pairs
+
+
+def _part(run: CostRun) -> str:
+    return run.method.partition("@")[2] or "as it is"
+
+
 def _option_pairs(runs: Sequence[CostRun]) -> dict[Key, Pairs]:
     pairs: dict[Key, Pairs] = {}
     for group in _groups(runs, lambda r: (r.base, r.scene, r.seed, r.length, r.rest, r.effects)):
         for a, b in combinations(group, 2):
+            if a.method != b.method:
+                continue  # a variant of an ablation: see `_part_pairs`
             one, two = dict(a.options), dict(b.options)
             keys = [k for k in one.keys() | two.keys() if one.get(k, _ABSENT) != two.get(k, _ABSENT)]
             if len(keys) != 1:
@@ -114,6 +149,8 @@ def _ms(run: CostRun) -> float:
 def _change(kind: Kind, key: Key, pairs: Pairs) -> Change:
     name, method, length = key[:3]
     before, after = ("", "") if kind == "effect" else (_value(pairs[0][0], name), _value(pairs[0][1], name))
+    if kind == "part":
+        before, after = key[3:]
     without = stats.mean([a.train_s for a, _ in pairs]) / 60.0
     minutes = _summary([(b.train_s - a.train_s) / 60.0 for a, b in pairs])
     interval = _interval(pairs)
@@ -132,6 +169,7 @@ def _change(kind: Kind, key: Key, pairs: Pairs) -> Change:
         minutes,
         _summary([_ms(b) - _ms(a) for a, b in pairs]),
         minutes.mean / without if without > 0.0 else math.nan,
+        why_unranked([run for pair in pairs for run in pair]),
     )
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.harness.cost.curves import Curve, Summary, scenes_of, summary
-from ambiguous_wild.harness.cost.read import CostRun
+from ambiguous_wild.harness.cost.read import CostRun, why_unranked
 from ambiguous_wild.methods.registry import knows_truth
 
 BELOW_BEST = (3.0, 1.0, 0.5)  # dB below what the best curve ends at, where no target is given
@@ -39,6 +39,9 @@ class Reach:
     reached: int  # runs that do
     runs: int
     bound: bool  # some had reached it by their first probe: the time is an upper bound
+    unranked: str = ""  # why these times are not ranked; then they are shown from `low` to `high` minutes
+    low: float = math.nan
+    high: float = math.nan
     missing: str = ""  # why there is no mean, whatever the runs reached: a scene without a run, or no probes
 
 
@@ -134,6 +137,9 @@ def _reach(curve: Curve, target: Target, scene: str | None, level: dict[str, flo
         sum(math.isfinite(at) for at, _ in found.values()),
         len(runs),
         any(early for _, early in found.values()),
+        why_unranked(runs),
+        min((m for m in map(minutes, runs) if math.isfinite(m)), default=math.nan),
+        max((m for m in map(minutes, runs) if math.isfinite(m)), default=math.nan),
         missing,
     )
 

@@ -10,19 +10,23 @@ import csv
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash, flatten
 from ambiguous_wild.harness.running.records import Cost, RunResult
 from ambiguous_wild.harness.running.result_file import FAILED, RESULT, read_result
 from ambiguous_wild.harness.running.store import read_config, run_folders
+from ambiguous_wild.harness.running.timing import Timing, in_reference_seconds, timing_of
 from ambiguous_wild.metrics import stats
 
 # of the training: they change how a run is kept and watched, not its result
 BOOKKEEPING = ("seed", "checkpoint_every_s", "probes", "iterations", "budget_s")
+SETTINGS = ("resolution", "max_gaussians")  # of the training: they change the result as options do
 NUMBERS = ("ms_per_iteration", "gaussians", "model_mb", "fps")
 
 
@@ -62,6 +66,11 @@ class CostRun:
     setup_s: float  # features and masks before the first step; short where a cache held them
     numbers: dict[str, float]  # see NUMBERS; NaN where not measured
     points: tuple[tuple[float, float], ...]  # (seconds of training, PSNR in dB), in order of time
+    timing: Timing
+    samples: tuple[tuple[float, float], ...] = ()  # (wall seconds of training, seconds of the calibration)
+    kernel_reference_s: float = math.nan
+    scene_hash: str = ""
+    reproduce: str = ""  # the command that makes it again; empty in results of earlier versions
     error: str = ""
     blind: str = ""  # why PSNR over time is unknown; empty: it was probed, or the run failed
 
@@ -74,10 +83,11 @@ class CostRun:
 
 @dataclass(frozen=True)
 class Found:
-    """Every run below some folders."""
+    """Every run below some folders. Times are reference seconds where every finished run was calibrated."""
 
     runs: tuple[CostRun, ...]
     notes: tuple[str, ...]  # what could not be read, failed or is not finished
+    reference: bool = False  # times are reference seconds; False: wall seconds
 
 
 def read_cost_runs(folders: Sequence[Path], *, scenes: Sequence[str] = ()) -> Found:
@@ -116,7 +126,42 @@ def read_cost_runs(folders: Sequence[Path], *, scenes: Sequence[str] = ()) -> Fo
         )
     _refuse_twice(runs)
     notes += [f"failed: {r.method} on {r.scene}, seed {r.seed}: {r.error}" for r in runs if r.error]
-    return Found(tuple(runs), tuple(notes))
+    reference = _all_calibrated(runs)
+    if not reference and any(math.isfinite(run.timing.reference_s) for run in runs):
+        notes.append("wall seconds: some runs were not calibrated, or on another kind of device")
+    return Found(tuple(map(_in_reference, runs) if reference else runs), tuple(notes), reference)
+
+
+def _all_calibrated(runs: Iterable[CostRun]) -> bool:
+    done = [run for run in runs if not run.error]
+    calibrated = all(math.isfinite(run.timing.reference_s) for run in done)
+    return calibrated and len({run.timing.kernel for run in done}) == 1
+
+
+def _in_reference(run: CostRun) -> CostRun:
+    """The run with every time in seconds of the reference machine."""
+    if run.error:
+        return run
+    total = run.timing.reference_s
+    ratio = total / run.train_s if run.train_s > 0.0 else 1.0
+    early = run.kernel_reference_s / run.samples[0][1] if run.samples else ratio
+    walls = [at for at, _ in run.points]
+    if run.samples:
+        times = in_reference_seconds(run.samples, run.kernel_reference_s, walls)
+    else:
+        times = np.array(walls) * ratio
+    points = tuple((float(at), psnr) for at, (_, psnr) in zip(times, run.points))
+    late = run.kernel_reference_s / run.samples[-1][1] if run.samples else ratio
+    per_second = {"ms_per_iteration": ratio, "fps": 1.0 / late if late > 0.0 else math.nan}
+    numbers = {name: value * per_second.get(name, 1.0) for name, value in run.numbers.items()}
+    return replace(run, train_s=total, setup_s=run.setup_s * early, points=points, numbers=numbers)
+
+
+def why_unranked(runs: Iterable[CostRun]) -> str:
+    """Why times of these runs are not ranked: a run that was not alone; empty where they are."""
+    timings = [run.timing for run in runs if not run.error]
+    wrong = [timing for timing in timings if timing.verdict != "alone"]
+    return f"{len(wrong)} of {len(timings)} runs {wrong[0].verdict}: {wrong[0].reason}" if wrong else ""
 
 
 def _each_once(folders: Sequence[Path]) -> list[Path]:
@@ -133,14 +178,14 @@ def _each_once(folders: Sequence[Path]) -> list[Path]:
 def _run(folder: Path, result: RunResult) -> CostRun:
     config = read_config(folder)
     train, scene = _mapping(config.get("train")), _mapping(config.get("scene"))
-    cost = result["cost"]
+    cost, record = result["cost"], _mapping(result["cost"].get("timing"))
     images = {row["name"]: _number(row.get("psnr")) for row in result["per_image"]}
     psnr, train_s = stats.mean(list(images.values())), _number(cost.get("train_s"))
     effects = config.get("effects") or result["facts"].get("effects") or []
     rest = {
         "scene": result["scene_hash"],
         "factor": scene.get("factor"),
-        "train": {k: v for k, v in train.items() if k not in BOOKKEEPING},
+        "train": {k: v for k, v in train.items() if k not in (*BOOKKEEPING, *SETTINGS)},
         "device": config.get("device", cost.get("device")),
         "protocol": config.get("protocol", "full"),
         "code": [config.get("source"), result["version"]],
@@ -155,7 +200,7 @@ def _run(folder: Path, result: RunResult) -> CostRun:
         seed=result["seed"],
         asked=_asked(folder) or ", ".join(effects),
         effects=frozenset(map(str, effects)),
-        options=tuple(sorted(_options(result["options"]).items())),
+        options=tuple(sorted((_options(result["options"]) | _settings(train)).items())),
         length=_length(train, cost),
         rest=config_hash(rest),
         psnr=psnr,
@@ -164,9 +209,20 @@ def _run(folder: Path, result: RunResult) -> CostRun:
         setup_s=_number(cost.get("setup_s")),
         numbers={name: _number(cost.get(name)) for name in NUMBERS},
         points=points,
+        timing=timing_of(cost),
+        samples=tuple((float(at), float(kernel)) for at, kernel in record.get("samples", ())),
+        kernel_reference_s=_number(record.get("kernel_reference_s")),
+        scene_hash=result["scene_hash"],
+        reproduce=str(result.get("reproduce", "")),
         error=result["error"] or "",
         blind="" if result["error"] else damage or unprobed,
     )
+
+
+def _settings(train: Mapping[str, Any]) -> dict[str, Any]:
+    """Resolution and number of Gaussians, where config.yaml has them; "auto" is the method's own."""
+    known = {name: train[name] for name in SETTINGS if name in train}
+    return {name: "auto" if value is None else value for name, value in known.items()}
 
 
 def _length(train: Mapping[str, Any], cost: Cost) -> Length:

@@ -7,15 +7,17 @@ import io
 import json
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.harness.cost.answer import Answer, answers
 from ambiguous_wild.harness.cost.curves import Curve, Summary, curves_of
 from ambiguous_wild.harness.cost.front import Point, points
 from ambiguous_wild.harness.cost.pairs import Change, changes
 from ambiguous_wild.harness.cost.reach import Reach, times_to_reach
-from ambiguous_wild.harness.cost.read import CostRun, Found
+from ambiguous_wild.harness.cost.read import CostRun, Found, why_unranked
 from ambiguous_wild.harness.tables.render import csv_text
 from ambiguous_wild.io.atomic import write_json, write_text
 
@@ -34,6 +36,8 @@ class CostReport:
     reach: tuple[Reach, ...]
     changes: tuple[Change, ...]
     notes: tuple[str, ...]
+    answers: tuple[Answer, ...]  # one a scene
+    reference: bool  # times are seconds of the reference machine; else wall seconds
     setup: bool  # whether times count what comes before the first step
     made_by: str
 
@@ -56,10 +60,24 @@ def cost_report(
         tuple(points(curves, setup=setup)),
         tuple(times_to_reach(curves, targets, setup=setup)),
         tuple(changes(found.runs)),
-        (*found.notes, *_gaps(curves, scenes)),
+        (*found.notes, *_gaps(curves, scenes), *_unranked(curves)),
+        tuple(answers(curves, setup=setup)),
+        found.reference,
         setup,
         made_by,
     )
+
+
+def _unranked(curves: Sequence[Curve]) -> list[str]:
+    """One line a reason for times that are not ranked."""
+    reasons: dict[str, list[str]] = {}
+    for curve in curves:
+        if why := why_unranked(curve.runs):
+            reasons.setdefault(why, []).append(f"{curve.name}, {curve.length.text}")
+    return [
+        f"times not ranked, shown from the fastest to the slowest run: {shortlist(names)}: {why}"
+        for why, names in reasons.items()
+    ]
 
 
 def _gaps(curves: Sequence[Curve], scenes: Sequence[str]) -> list[str]:
@@ -127,18 +145,21 @@ def plain_data(report: CostReport) -> dict[str, Any]:
         "schema": 1,
         "made_by": report.made_by,
         "time": "training and what comes before its first step" if report.setup else "training",
+        "seconds": "reference" if report.reference else "wall",
+        "answers": [asdict(answer) | {"text": answer.text} for answer in report.answers],
         "scenes": list(report.scenes),
         "curves": [_point_row(p) for p in report.points],
         "time_to_psnr": [_reach_row(r) for r in report.reach],
         "changes": [_change_row(c) for c in report.changes],
         "notes": list(report.notes),
     }
-    return _finite(data)
+    return dict(finite(data))
 
 
 def _point_row(p: Point) -> dict[str, Any]:
     row: dict[str, Any] = {"curve": p.curve, "method": p.method, "length": p.length, "runs": p.runs}
-    row |= _both("psnr", p.psnr) | _both("minutes", p.minutes) | {"pareto_front": p.front}
+    row |= _both("psnr", p.psnr) | _both("minutes", p.minutes)
+    row |= {"minutes_low": p.low, "minutes_high": p.high, "not_ranked": p.unranked, "pareto_front": p.front}
     row |= _both("setup_s", p.setup_s)
     for name, value in p.numbers.items():
         row |= _both(name, value)
@@ -156,6 +177,7 @@ def _reach_row(r: Reach) -> dict[str, Any]:
     return (
         row
         | _both("minutes", r.minutes)
+        | {"minutes_low": r.low, "minutes_high": r.high, "not_ranked": r.unranked}
         | {"upper_bound": r.bound, "reached": r.reached, "runs": r.runs, "missing": r.missing}
     )
 
@@ -171,7 +193,7 @@ def _change_row(c: Change) -> dict[str, Any]:
     row |= {"length": c.length, "scenes": " ".join(c.scenes), "pairs": c.pairs}
     row |= _both("db", c.db) | {"db_low": c.low, "db_high": c.high}
     row |= _both("minutes", c.minutes) | _both("ms_per_iteration", c.ms)
-    return row | {"db_per_minute": c.per_minute, "same_time": c.same_time}
+    return row | {"db_per_minute": c.per_minute, "same_time": c.same_time, "not_ranked": c.unranked}
 
 
 def _timeline_rows(curves: Iterable[Curve]) -> Iterable[dict[str, Any]]:
@@ -202,12 +224,12 @@ def _cell(value: Any) -> str:
     return csv_text(value) if isinstance(value, str) else str(value)
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
     """NaN is null, as in a result file; infinity is the string it writes."""
     if isinstance(value, dict):
-        return {k: _finite(v) for k, v in value.items()}
-    if isinstance(value, list):
-        return [_finite(v) for v in value]
+        return {k: finite(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite(v) for v in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None if math.isnan(value) else ("inf" if value > 0 else "-inf")
     return value

@@ -7,12 +7,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from ambiguous_wild.harness.cost.curves import Summary
+from ambiguous_wild.harness.cost.front import Point
 from ambiguous_wild.harness.cost.pairs import Change
 from ambiguous_wild.harness.cost.reach import Reach
 from ambiguous_wild.harness.cost.report import CostReport
+from ambiguous_wild.harness.running.timing import seconds_range
 from ambiguous_wild.harness.tables.render import plain
 
 MISSING = "—"
+TIMES = {
+    True: "times: reference seconds, see docs/cost.md; ranked between runs that were alone",
+    False: "times: wall seconds of the machine; ranked between runs that were alone",
+}
 SHORT_MIN = 3.0  # trainings below this are told in seconds
 
 
@@ -30,9 +36,11 @@ def to_text(report: CostReport) -> str:
     parts = []
     for listing in listings(report):
         parts += [plain(listing.title), *_aligned(listing), ""]
+    parts += [f"{plain(answer.text)}" for answer in report.answers]
     parts += ["±: sample standard deviation over seeds"] if _has_spread(report) else []
+    parts += [TIMES[report.reference]]
     parts += [plain(note) for note in report.notes]
-    parts += [f"made by: {plain(report.made_by)}"] if report.made_by else []
+    parts += [f"command: {plain(report.made_by)}"] if report.made_by else []
     return "\n".join(parts) + "\n"
 
 
@@ -53,7 +61,10 @@ def time_unit(report: CostReport) -> Unit:
     minutes = [
         run.train_s / 60.0 for curve in report.curves for run in curve.runs if not math.isnan(run.train_s)
     ]
-    return Unit("s", 60.0, 1) if max(minutes, default=0.0) < SHORT_MIN else Unit("min", 1.0, 2)
+    kind = "ref " if report.reference else ""
+    if max(minutes, default=0.0) < SHORT_MIN:
+        return Unit(f"{kind}s", 60.0, 1)
+    return Unit(f"{kind}min", 1.0, 2)
 
 
 def listings(report: CostReport) -> list[Listing]:
@@ -65,6 +76,9 @@ def listings(report: CostReport) -> list[Listing]:
     tables += [_reached(scene, rows, report) for scene, rows in scenes.items()]
     for kind, title in (
         ("effect", "what each effect brings, on runs that differ in it alone"),
+        ("part", "what each variant of an ablation changes, against the method as it is"),
+        ("resolution", "what another resolution of training brings"),
+        ("gaussians", "what more Gaussians bring"),
         ("interval", "what refreshing more often brings, on runs that differ in the interval alone"),
         ("option", "what other options bring, on runs that differ in one alone"),
     ):
@@ -78,16 +92,17 @@ def _points(report: CostReport) -> Listing:
     unit = time_unit(report)
     rows = []
     for p in report.points:
-        n, front = p.numbers, "yes" if p.front else ""
+        n, front = p.numbers, "not ranked" if p.unranked else "yes" if p.front else ""
         rows.append((
-            p.curve, p.length, str(p.runs), number(p.psnr, 2), number(unit.of(p.minutes), unit.digits),
-            front, number(p.setup_s, 1), number(n["ms_per_iteration"], 1),
+            p.curve, p.length, str(p.runs), number(p.psnr, 2), _time(p.minutes, p, unit), front,
+            number(p.setup_s, 1), number(n["ms_per_iteration"], 1),
             number(n["gaussians"], 0, spread=False), number(n["model_mb"], 1, spread=False),
             number(n["fps"], 1, spread=False),
         ))  # fmt: skip
     took = f"{unit.name} with set-up" if report.setup else unit.name
-    head = ("method", "trained for", "runs", "PSNR dB", took, "on the front", "set-up s", "ms/iter",
-            "Gaussians", "MB", "FPS")  # fmt: skip
+    kind = "ref " if report.reference else ""
+    head = ("method", "trained for", "runs", "PSNR dB", took, "on the front", f"{kind}set-up s",
+            f"{kind}ms/iter", "Gaussians", "MB", f"{kind}FPS")  # fmt: skip
     return Listing(f"what each method reaches, and what it costs ({over})", head, tuple(rows))
 
 
@@ -103,9 +118,9 @@ def _reached(scene: str | None, rows: Sequence[Reach], report: CostReport) -> Li
     psnr = {row.target: row.psnr for row in rows}
     head = [t if math.isnan(psnr[t]) or t == f"{psnr[t]:g} dB" else f"{t} ({psnr[t]:.2f})" for t in targets]
     where = "mean over all scenes" if scene is None else scene
-    counted = (
-        f"{'minutes' if unit.name == 'min' else 'seconds'} of training{' and set-up' if report.setup else ''}"
-    )
+    kind = "reference " if report.reference else ""
+    counted = kind + ("minutes" if unit.per_minute == 1.0 else "seconds") + " of training"
+    counted += " and set-up" if report.setup else ""
     return Listing(f"{counted} to reach a test PSNR ({where})", ("method", *head), tuple(lines))
 
 
@@ -118,13 +133,20 @@ def _when(row: Reach, unit: Unit, several: bool) -> str:
         return "never" if not row.reached else f"{row.reached} of {row.runs} runs"
     if math.isnan(row.minutes.mean):
         return MISSING
-    text = ("≤ " if row.bound else "") + number(unit.of(row.minutes), unit.digits)
+    text = ("≤ " if row.bound else "") + _time(row.minutes, row, unit)
     return f"{text} (in {row.length})" if several else text
+
+
+def _time(minutes: Summary, row: Point | Reach, unit: Unit) -> str:
+    """A mean with its deviation; where it is not ranked, the range over the runs."""
+    if not row.unranked or math.isnan(minutes.mean):
+        return number(unit.of(minutes), unit.digits)
+    return seconds_range([row.low * unit.per_minute, row.high * unit.per_minute], unit.digits)
 
 
 def _changed(title: str, rows: Sequence[Change], unit: Unit) -> Listing:
     head = ("change", "method", "trained for", "pairs", "dB gained", "95 % interval", f"extra {unit.name}",
-            "extra ms/iter", "dB per extra min")  # fmt: skip
+            "extra ms/iter", f"dB per extra {'ref ' if unit.name.startswith('ref') else ''}min")  # fmt: skip
     lines = []
     for c in rows:
         what = c.name if c.kind == "effect" else f"{c.name} {c.before} → {c.after}"
@@ -140,6 +162,8 @@ def per_minute(change: Change) -> str:
     """dB an extra minute, or why there is none."""
     if math.isnan(change.minutes.mean) or math.isnan(change.db.mean):
         return MISSING
+    if change.unranked:
+        return "not ranked"
     if change.same_time:
         return "same time"
     return f"{change.per_minute:+.2f}" if change.minutes.mean > 0.0 else "takes less"

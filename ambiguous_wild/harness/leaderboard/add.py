@@ -37,7 +37,7 @@ def add(
     *,
     dataset: str | None = None,
     scenes: Path | None = None,
-    images: int = 1,
+    images: int = 3,
     replace_other: bool = False,
     quick: bool = False,
     dry: bool = False,
@@ -50,7 +50,7 @@ def add(
         paths: run folders, or folders of runs.
         dataset: of all these runs; None: what their scenes say.
         scenes: where the scenes lie, if not where the runs say.
-        images: test images a scene of which small copies are kept.
+        images: test images, and train photos with masks, a scene of which copies are kept.
         replace_other: a run with other numbers takes the place of the one on the board.
         quick: of the metrics recompute PSNR alone.
         dry: write nothing.
@@ -123,7 +123,9 @@ def _merge(
             reports[v.run] = AddReport(v.run, "there already")
             # A run that was once checked against the photos stays checked.
             better = max(old.checked, v.entry.checked, key=CHECKED.index)
-            entries[v.entry.key] = replace(old, checked=better)
+            # The commands that make the scene are known where the scene is at hand.
+            again = v.entry.reproduce if v.scene is not None else old.reproduce
+            entries[v.entry.key] = replace(old, checked=better, reproduce=again)
         elif replace_other:
             reports[v.run] = AddReport(v.run, "replaced")
             entries[v.entry.key] = v.entry

@@ -19,6 +19,7 @@ from ambiguous_wild.harness.measures import measure
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.metrics import stats
 
+TRUTH = re.compile(r"(\+truth|@mask=truth)$")  # ends the name of a method that is given exact masks
 HASH = re.compile(r"[0-9a-f]{64}")
 
 
@@ -110,13 +111,32 @@ def _pictures(board: Path, entries: Iterable[Entry]) -> Iterator[str]:
         if row["method"] and cell not in {(*k[:5], str(k[5])) for k in known}:
             yield f"picture {path} is of no run on the board: remove it and its row in {pictures.INDEX}"
     listed = {folder / row["file"] for row in index}
-    for path in sorted(folder.rglob("*.jpg")):
+    for path in sorted(p for p in folder.rglob("*") if p.suffix in (".jpg", ".png")):
         if path not in listed:
             yield f"picture {path} is not in {pictures.INDEX}: remove it, or add its runs again"
 
 
+def _without_plain_oracles(entries: Sequence[Entry]) -> list[Entry]:
+    """Without exact masks on scenes without distractors: they mask nothing, so the numbers are the host's."""
+    hosts: dict[object, Entry] = {(*e.key[:2], e.setting, e.seed, e.method): e for e in entries}
+    kept = []
+    for e in entries:
+        host = hosts.get((*e.key[:2], e.setting, e.seed, TRUTH.sub("", e.method)))
+        clean = "mask_recall" not in e.quality and "psnr_covered" not in e.quality
+        if host is None or host is e or not clean or not _same(e, host):
+            kept.append(e)
+    return kept
+
+
+def _same(a: Entry, b: Entry) -> bool:
+    """Whether all metrics of the pictures are equal in all digits."""
+    left, right = ({k: v for k, v in e.quality.items() if not k.startswith("mask_")} for e in (a, b))
+    return left == right
+
+
 def _numbers(entries: Sequence[Entry]) -> list[Number]:
     """Means over seeds, as a table would print them: what an audit reads."""
+    entries = _without_plain_oracles(entries)
     cells: dict[tuple[str, str, str, str], list[Entry]] = defaultdict(list)
     settings: dict[str, set[tuple[str, str]]] = defaultdict(set)
     for e in entries:

@@ -19,6 +19,7 @@ LAST = (
 )  # fmt: skip
 NO_TEXT = ("seed", "images", "missing", "checked", "row_hash")  # columns of others than plain text
 COST = "cost_"  # begins the column of a cost; every other column of numbers is a quality
+ALONE = "alone"  # the cost that says whether the run had the machine alone: 1 or 0
 TIDY = (
     "dataset", "scene", "method", "setting", "options", "seed", "kind", "metric", "value", "device",
     "version", "source", "config_hash", "scene_hash", "checked",

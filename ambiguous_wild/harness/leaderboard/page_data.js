@@ -2,8 +2,8 @@
 // What the page knows, and means that keep what is missing missing.
 const DATA = JSON.parse(document.getElementById("data").textContent);
 const $ = (id) => document.getElementById(id);
-const COSTS = ["train_s", "model_mb", "fps", "gaussians"];
-const state = { dataset: "", scene: "", metric: "", method: "", reported: true, sort: {} };
+const COSTS = ["reference_s", "train_s", "model_mb", "fps", "gaussians"];
+const state = { dataset: "", off: new Set(), metric: "", method: "", reported: true, sort: {}, open: new Set(), cell: null };
 
 /** An element; children that are strings become text, never markup. */
 function h(name, attributes = {}, ...children) {
@@ -29,6 +29,7 @@ const byName = (a, b) => a.localeCompare(b, "en", { numeric: true, sensitivity: 
 const mean = (values) => (values.length ? values.reduce((a, b) => a + b, 0) / values.length : NaN);
 const groupKey = (run) => JSON.stringify([run.method, run.setting, run.options]);
 const measure = (key) => (Object.hasOwn(DATA.measures, key) ? DATA.measures[key] : { label: key, better: null, digits: 3 });
+const isTime = (key) => DATA.times.includes(key);
 
 /** Sample deviation; NaN for one value, or where one is not finite. */
 function spread(values) {
@@ -46,9 +47,10 @@ function shown(value, digits) {
 const valueOf = (run, key) => number(Object.hasOwn(run.quality, key) ? run.quality[key] : Object.hasOwn(run.cost, key) ? run.cost[key] : NaN);
 const runsOf = (dataset) => DATA.runs.filter((r) => r.dataset === dataset);
 const scenesOf = (dataset) => unique(runsOf(dataset).map((r) => r.scene)).sort(byName);
+const chosenScenes = () => scenesOf(state.dataset).filter((s) => !state.off.has(s));
 const measuredDatasets = () => unique(DATA.runs.map((r) => r.dataset)).sort(byName);
 
-/** Groups of runs that differ in scene and seed alone, those the method filter lets through. */
+/** Every group of runs of a dataset that differ in scene and seed alone. No filter: ranks count all of them. */
 function groups(dataset) {
   const found = new Map();
   for (const run of runsOf(dataset)) {
@@ -62,23 +64,45 @@ function groups(dataset) {
     const twins = all.filter((o) => o.method === g.method && o.setting === g.setting);
     g.about = twins.length > 1 && g.options ? `${g.setting}, options ${g.options}` : g.setting;
   }
-  const asked = state.method.trim().toLowerCase();
-  return all.filter((g) => `${g.method} ${g.about}`.toLowerCase().includes(asked));
+  return all;
 }
 
-/** Mean over seeds, then over scenes: {value, spread, seeds: [...]}; missing where a scene or a value is. */
-function summary(group, key, scenes) {
+/** Whether the search lets a method through; it looks at the name alone. */
+const asked = (method) => method.toLowerCase().includes(state.method.trim().toLowerCase());
+
+/** The scenes on which a measure is defined: all, but for parts of a picture and masks only where any run has a value. */
+function definedScenes(key, scenes) {
+  if (!DATA.partial.includes(key)) return scenes;
+  const runs = runsOf(state.dataset);
+  return scenes.filter((s) => runs.some((r) => r.scene === s && !Number.isNaN(valueOf(r, key))));
+}
+
+/** Mean over seeds, then over scenes: {value, spread, seeds, low, high, comparable}; missing where a scene or a value is. */
+function summary(group, key, all) {
+  const scenes = definedScenes(key, all);
   const runs = scenes.map((scene) => group.runs.filter((r) => r.scene === scene).sort((a, b) => a.seed - b.seed));
-  const value = mean(runs.map((of) => mean(of.map((r) => valueOf(r, key)))));
+  const values = runs.map((of) => of.map((r) => valueOf(r, key)));
+  const value = mean(values.map(mean));
   const seeds = runs[0]?.map((r) => r.seed) ?? [];
   // Seed by seed, so that the spread is that of the number shown: needs the same seeds in every scene.
   const same = runs.every((of) => of.length === seeds.length && of.every((r, i) => r.seed === seeds[i]));
   const bySeed = same && !Number.isNaN(value) ? seeds.map((_, i) => mean(runs.map((of) => valueOf(of[i], key)))) : [];
-  return { value, spread: spread(bySeed), seeds: bySeed };
+  const comparable = !isTime(key) || runs.flat().every((r) => r.alone === true);
+  const low = mean(values.map((v) => Math.min(...v))), high = mean(values.map((v) => Math.max(...v)));
+  return { value, spread: spread(bySeed), seeds: bySeed, comparable, low, high };
 }
 
-/** Whether a method is shown exact masks or clean photos: such an oracle is not ranked. */
+/** Whether a method is given exact masks or clean photos: such an oracle is not ranked. */
 const isOracle = (group) => DATA.oracles.includes(group.method);
+
+/** What is ranked of summaries: no oracle, no time of a shared machine, no times of different machines. */
+function rankable(found, summaries, key) {
+  const open = found.map((g, i) => !isOracle(g) && summaries[i].comparable && !Number.isNaN(summaries[i].value));
+  const of = (what) => unique(found.filter((_, i) => open[i]).flatMap((g) => g.runs.map((r) => r[what])));
+  // Reference seconds compare machines, but not a CPU with a GPU.
+  const apart = isTime(key) && of(key === "reference_s" ? "device" : "hardware").length > 1;
+  return summaries.map((s, i) => (open[i] && !apart ? s.value : NaN));
+}
 
 /** Rank 1, 2, 3 of each value, or null; equal in print is equal in rank. */
 function ranks(values, key) {
@@ -92,3 +116,28 @@ function ranks(values, key) {
     return ahead < 3 ? ahead + 1 : null;
   });
 }
+
+/** The text of a cell: a value, or the range of a time that does not compare. */
+function cellText(s, key) {
+  const { digits } = measure(key);
+  if (Number.isNaN(s.value)) return "–";
+  const [low, high] = [shown(s.low, digits), shown(s.high, digits)];
+  return s.comparable || low === high ? shown(s.value, digits) : `${low}–${high}`;
+}
+
+/** Rows of texts as a file; a spreadsheet takes every cell for text or a number. */
+function saveCsv(name, rows) {
+  const cell = (v) => {
+    const text = String(v ?? "");
+    const safe = typeof v === "string" && /^\s*[=+\-@'\t\r\n]/.test(text) ? `'${text}` : text;
+    return /[",\n\r]/.test(safe) ? `"${safe.replaceAll('"', '""')}"` : safe;
+  };
+  const link = h("a", { href: URL.createObjectURL(new Blob([rows.map((r) => r.map(cell).join(",")).join("\n") + "\n"], { type: "text/csv" })), download: name });
+  document.body.append(link);
+  link.click();
+  link.remove();
+  setTimeout(() => URL.revokeObjectURL(link.href), 10000);
+}
+
+const fileName = (what) => `${[state.dataset, what].join("-").toLowerCase().replace(/[^a-z0-9]+/g, "-").replace(/^-|-$/g, "")}.csv`;
+const plainNumber = (v) => (Number.isFinite(v) ? v : Number.isNaN(v) ? "" : v > 0 ? "inf" : "-inf");

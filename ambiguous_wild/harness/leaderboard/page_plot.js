@@ -30,12 +30,23 @@ function axis(values, log) {
   return [low - pad, high + pad];
 }
 
+/** A colour and a shape for every method of the page: no filter changes them. */
+const look = (() => {
+  const names = unique(DATA.runs.map((r) => r.method)).sort(byName);
+  const settings = (method) => unique(DATA.runs.filter((r) => r.method === method).map(groupKey)).sort(byName);
+  return (group) => {
+    const at = names.indexOf(group.method), twin = settings(group.method).indexOf(group.key);
+    return { colour: COLOURS[at % COLOURS.length], shape: SHAPES[(at + Math.floor(at / COLOURS.length) + twin) % SHAPES.length] };
+  };
+})();
+
 function drawPlot() {
-  const scenes = state.scene ? [state.scene] : scenesOf(state.dataset);
+  const scenes = chosenScenes();
   const [kx, ky] = [$("plot-x").value, $("plot-y").value];
-  const points = groups(state.dataset).sort((a, b) => byName(a.method + a.about, b.method + b.about))
+  const every = groups(state.dataset).sort((a, b) => byName(a.method + a.about, b.method + b.about))
     .map((g) => ({ group: g, x: summary(g, kx, scenes), y: summary(g, ky, scenes) }))
     .filter((p) => Number.isFinite(p.x.value) && Number.isFinite(p.y.value));
+  const points = every.filter((p) => asked(p.group.method));
   $("cost").hidden = !DATA.runs.some((r) => r.dataset === state.dataset);
   if (!points.length) {
     $("plot").replaceChildren();
@@ -45,7 +56,7 @@ function drawPlot() {
   const width = Math.min(Math.max($("plot").clientWidth, 300), 1100);
   const height = Math.round(Math.min(Math.max(width * 0.5, 300), 460));
   const [left, right, top, bottom] = [58, width - 16, 16, height - 48];
-  const ends = (s) => [s.value, ...s.seeds, ...(Number.isNaN(s.spread) ? [] : [s.value - s.spread, s.value + s.spread])].filter(Number.isFinite);
+  const ends = (s) => [s.value, ...s.seeds, ...(s.comparable ? [] : [s.low, s.high]), ...(Number.isNaN(s.spread) ? [] : [s.value - s.spread, s.value + s.spread])].filter(Number.isFinite);
   const xs = points.flatMap((p) => ends(p.x)).filter((v) => v > 0);
   const log = xs.length > 0 && points.every((p) => p.x.value > 0) && Math.max(...xs) / Math.min(...xs) > 5;
   const [x0, x1] = axis(log ? xs : points.flatMap((p) => ends(p.x)), log);
@@ -64,31 +75,38 @@ function drawPlot() {
   }
   root.append(svg("text", { class: "axis", x: (left + right) / 2, y: height - 10, "text-anchor": "middle" }, `${measure(kx).label}${log ? " (logarithmic)" : ""}`),
     svg("text", { class: "axis", transform: `translate(14 ${(top + bottom) / 2}) rotate(-90)`, "text-anchor": "middle" }, measure(ky).label));
-  const front = pareto(points.filter((p) => !isOracle(p.group)), kx, ky);
+  // Of every entry, shown or not, whose numbers can be ranked.
+  const kept = (key, side) => rankable(every.map((p) => p.group), every.map((p) => p[side]), key).map((v) => !Number.isNaN(v));
+  const [openX, openY] = [kept(kx, "x"), kept(ky, "y")];
+  const front = pareto(every.filter((_, i) => openX[i] && openY[i]), kx, ky);
   if (front.length > 1) {
     const path = front.map((p, i) => (i ? `H${px(p.x.value)}V${py(p.y.value)}` : `M${px(p.x.value)} ${py(p.y.value)}`)).join("");
     root.append(svg("path", { class: "front", d: path }));
   }
   const taken = points.map((p) => ({ x: px(p.x.value) - 9, y: py(p.y.value) - 9, w: 18, h: 18 }));
-  points.forEach((p, i) => root.append(mark(p, i, px, py)));
-  points.forEach((p, i) => root.append(label(p, px(p.x.value), py(p.y.value), taken, [left, right, top, bottom])));
+  points.forEach((p) => root.append(mark(p, px, py)));
+  points.forEach((p) => root.append(label(p, px(p.x.value), py(p.y.value), taken, [left, right, top, bottom])));
   $("plot").replaceChildren(root);
   const many = points.some((p) => p.y.seeds.length > 1);
-  $("plot-said").textContent = `${measure(ky).label} against ${measure(kx).label}. Pareto-optimal: ${front.map((p) => p.group.method).join(", ")}${front.length > 1 ? " (dashed)" : ""}.`
+  const ranged = [[kx, "x"], [ky, "y"]].filter(([, side]) => every.some((p) => !p[side].comparable)).map(([key]) => measure(key).label);
+  $("plot-said").textContent = `${measure(ky).label} against ${measure(kx).label}. `
+    + (front.length ? `Pareto-optimal: ${front.map((p) => p.group.method).join(", ")}${front.length > 1 ? " (dashed)" : ""}.` : "No Pareto front: no two entries can be ranked in both.")
+    + (ranged.length ? ` ${ranged.join(", ")}: the bars are ranges over runs, because not every run had the machine alone.` : "")
     + (many ? " Bars: sample deviation over seeds; faint dots: the seeds." : "");
 }
 
 const brief = (v) => (Math.abs(v) >= 10000 ? `${Number((v / 1000).toPrecision(4))}k` : String(Number(v.toPrecision(5))));
 
-function mark(p, i, px, py) {
-  const colour = COLOURS[i % COLOURS.length];
+function mark(p, px, py) {
+  const { colour, shape: draw } = look(p.group);
   const [x, y] = [px(p.x.value), py(p.y.value)];
   const of = svg("g", { stroke: colour, fill: colour }, svg("title", {}, `${p.group.method} (${p.group.about}): ${p.y.value.toPrecision(5)} at ${p.x.value.toPrecision(5)}`));
   p.y.seeds.forEach((v, s) => Number.isFinite(v) && Number.isFinite(p.x.seeds[s]) && p.y.seeds.length > 1
     && of.append(svg("circle", { class: "seed", cx: px(p.x.seeds[s]), cy: py(v), r: 2.5, stroke: "none" })));
   if (p.y.spread > 0) of.append(svg("line", { class: "bar", x1: x, x2: x, y1: py(p.y.value - p.y.spread), y2: py(p.y.value + p.y.spread) }));
-  if (p.x.spread > 0) of.append(svg("line", { class: "bar", y1: y, y2: y, x1: px(p.x.value - p.x.spread), x2: px(p.x.value + p.x.spread) }));
-  const shape = SHAPES[(i + Math.floor(i / COLOURS.length)) % SHAPES.length](x, y);
+  const [low, high] = p.x.comparable ? [p.x.value - p.x.spread, p.x.value + p.x.spread] : [p.x.low, p.x.high];
+  if (high > low) of.append(svg("line", { class: p.x.comparable ? "bar" : "bar range", y1: y, y2: y, x1: px(low), x2: px(high) }));
+  const shape = draw(x, y);
   shape.setAttribute("class", "point");
   of.append(shape);
   return of;
@@ -108,7 +126,7 @@ function label(p, x, y, taken, [left, right, top, bottom]) {
   return svg("text", { class: "name", x: bx + 2, y: by + 12 }, name);
 }
 
-/** Points that no other beats in both, from cheap to dear. */
+/** Pareto-optimal points, from cheap to dear. */
 function pareto(points, kx, ky) {
   const sx = measure(kx).better === "higher" ? -1 : 1;
   const sy = measure(ky).better === "lower" ? -1 : 1;

@@ -1,4 +1,4 @@
-// Tables: headers that sort, dots for seeds, a row that opens to its runs.
+// The overview: headers that sort, dots for seeds, a row that opens to its runs.
 
 /** Sorted rows: what is missing goes last whichever way, ties go by name. */
 function sorted(rows, columns, name, fallback) {
@@ -22,10 +22,12 @@ function head(columns, name, fallback, redraw) {
       document.querySelector(`#${name} thead button[data-key="${CSS.escape(c.key)}"]`)?.focus();
     };
     const button = h("button", { type: "button", "data-key": c.key, onclick: press, title: c.title ?? `Sort by ${c.label}` },
-      h("span", { class: "way", "data-way": c.arrow ?? "" }, c.label), c.small ? h("small", {}, c.small) : null);
+      c.picture ?? null, h("span", { class: "way", "data-way": c.arrow ?? "" }, c.label), c.small ? h("small", {}, c.small) : null);
     return h("th", { scope: "col", class: c.name ? "name" : null, "aria-sort": active ? (down ? "descending" : "ascending") : "none" }, button);
   })));
 }
+
+const arrow = (key) => ({ higher: " ↑", lower: " ↓" })[measure(key).better] ?? "";
 
 /** Seeds as dots between the least and the greatest of the column. */
 function dots(seeds, low, high) {
@@ -35,166 +37,138 @@ function dots(seeds, low, high) {
     svg("line", { x1: 3, x2: 53, y1: 4, y2: 4 }), ...marks);
 }
 
-function cell(s, key, rank, low, high, many) {
+/** What a cell holds: value or range, rank, deviation and seeds. */
+function inside(s, key, rank, low, high) {
   const { digits } = measure(key);
-  if (Number.isNaN(s.value)) return h("td", { class: "none" }, "–");
   const quality = !COSTS.includes(key);
-  const title = s.seeds.length > 1 ? `seeds: ${s.seeds.map((v) => shown(v, digits)).join(", ")}` : null;
   const deviation = quality && !Number.isNaN(s.spread) ? h("small", {}, `±${shown(s.spread, digits)}`) : null;
   const place = rank ? h("sup", { "aria-label": `, rank ${rank}` }, String(rank)) : null;
-  const marks = quality && many && s.seeds.length > 1 ? dots(s.seeds, low, high) : null;
+  const marks = quality && s.seeds.length > 1 ? dots(s.seeds, low, high) : null;
   const below = deviation || marks ? h("div", { class: "spread" }, deviation, marks) : null;
-  return h("td", { title, "data-rank": rank }, shown(s.value, digits), place, below);
+  return [cellText(s, key), place, below].filter(Boolean);
+}
+
+function cell(s, key, rank, low, high) {
+  if (Number.isNaN(s.value)) return h("td", { class: "none" }, "–");
+  const { digits } = measure(key);
+  const title = !s.comparable ? "a range, not ranked: see the notes" : s.seeds.length > 1 ? `seeds: ${s.seeds.map((v) => shown(v, digits)).join(", ")}` : null;
+  return h("td", { title, "data-rank": rank, class: s.comparable ? null : "range" }, ...inside(s, key, rank, low, high));
 }
 
 function measuredColumns(runs, scenes) {
-  const arrow = (key) => ({ higher: " ↑", lower: " ↓" })[measure(key).better] ?? "";
-  const column = (key, label, of, small) => ({
-    key: small ? `${key}:${small}` : key, metric: key, label, small, arrow: arrow(key), down: measure(key).better === "higher", of,
-  });
   const present = (key) => runs.some((r) => !Number.isNaN(valueOf(r, key)));
-  const cost = COSTS.filter(present).map((k) => column(k, measure(k).label, scenes));
-  if (state.metric) {
-    const label = measure(state.metric).label;
-    const each = scenes.length > 1 ? scenes.map((s) => column(state.metric, label, [s], s)) : [];
-    return [column(state.metric, label, scenes, each.length ? "mean" : ""), ...each, ...cost];
-  }
-  const quality = DATA.order.filter((k) => runs.some((r) => Object.hasOwn(r.quality, k)));
-  return [...quality.map((k) => column(k, measure(k).label, scenes)), ...cost];
+  const keys = [...DATA.order.filter((k) => runs.some((r) => Object.hasOwn(r.quality, k))), ...COSTS.filter(present)];
+  return keys.map((key) => {
+    const over = definedScenes(key, scenes).length;
+    return { key, label: measure(key).label, arrow: arrow(key), down: measure(key).better === "higher", small: over && over < scenes.length ? `${over} of ${scenes.length} scenes` : "" };
+  });
+}
+
+/** The groups with runs on the ticked scenes, their summaries and ranks by column; the search takes nothing away. */
+function overview() {
+  const scenes = chosenScenes();
+  const runs = runsOf(state.dataset).filter((r) => scenes.includes(r.scene));
+  const found = groups(state.dataset).map((g) => ({ ...g, runs: g.runs.filter((r) => scenes.includes(r.scene)) })).filter((g) => g.runs.length);
+  const every = measuredColumns(runs, scenes);
+  const filled = (c) => found.some((g) => !Number.isNaN(summary(g, c.key, scenes).value));
+  const columns = every.some(filled) ? every.filter(filled) : every;
+  const rows = found.map((g) => ({ group: g, title: `${g.method} ${g.about}`, cells: columns.map((c) => summary(g, c.key, scenes)) }));
+  const ranked = columns.map((c, i) => ranks(rankable(found, rows.map((row) => row.cells[i]), c.key), c.key));
+  rows.forEach((row, at) => { row.ranks = ranked.map((r) => r[at]); });
+  return { scenes, runs, found, columns, rows, empty: every.filter((c) => !columns.includes(c)) };
 }
 
 function drawMeasured() {
-  const runs = runsOf(state.dataset).filter((r) => !state.scene || r.scene === state.scene);
-  const scenes = state.scene ? [state.scene] : scenesOf(state.dataset);
-  const found = groups(state.dataset).map((g) => ({ ...g, runs: g.runs.filter((r) => scenes.includes(r.scene)) })).filter((g) => g.runs.length);
-  const every = measuredColumns(runs, scenes);
-  // a mean over scenes of which one lacks the metric is missing for everybody: a note says so, not an empty column
-  const filled = (c) => found.some((g) => !Number.isNaN(summary(g, c.metric, c.of).value));
-  const measuredOnes = every.some(filled) ? every.filter((c) => c.small || filled(c)) : every;
-  const empty = every.filter((c) => !measuredOnes.includes(c));
-  const rows = found.map((g) => ({ group: g, title: `${g.method} ${g.about}`, cells: measuredOnes.map((c) => summary(g, c.metric, c.of)) }));
+  const { scenes, runs, found, columns: measuredOnes, rows: all, empty } = overview();
+  const rows = all.filter((row) => asked(row.group.method));
   const seeds = (row) => unique(row.group.runs.map((r) => r.seed)).length;
   const columns = [
     { key: "method", label: "Method", name: true, sort: (row) => row.title },
     ...measuredOnes.map((c, i) => ({ ...c, sort: (row) => row.cells[i].value })),
     { key: "seeds", label: "Seeds", down: true, sort: seeds },
   ];
-  const first = columns[1];
-  const fallback = { key: first.key, down: Boolean(first.down) };
-  const ranked = measuredOnes.map((c, i) => ranks(rows.map((row) => (isOracle(row.group) ? NaN : row.cells[i].value)), c.metric));
-  const ends = measuredOnes.map((_, i) => rows.flatMap((row) => row.cells[i].seeds).filter(Number.isFinite));
+  const best = columns.find((c) => c.key === state.metric) ?? columns[1];
+  const fallback = { key: best.key, down: Boolean(best.down) };
+  const ends = measuredOnes.map((_, i) => all.flatMap((row) => row.cells[i].seeds).filter(Number.isFinite));
   const limits = ends.map((v) => [Math.min(...v), Math.max(...v)]);
   const body = h("tbody");
   for (const row of sorted(rows, columns, "table", fallback)) {
-    const at = rows.indexOf(row);
-    const cells = row.cells.map((s, i) => cell(s, measuredOnes[i].metric, ranked[i][at], ...limits[i], true));
+    const cells = row.cells.map((s, i) => cell(s, measuredOnes[i].key, row.ranks[i], ...limits[i]));
     const covered = unique(row.group.runs.map((r) => r.scene)).length;
-    const part = covered < scenes.length ? h("small", {}, ` of ${covered}/${scenes.length} scenes`) : null;
-    const line = h("tr", {}, nameCell(row.group, columns.length), ...cells, h("td", {}, String(seeds(row)), part));
-    body.append(line);
+    const part = covered < scenes.length ? h("small", {}, ` on ${covered} of ${scenes.length} scenes`) : null;
+    body.append(h("tr", { "data-group": row.group.key }, nameCell(row.group), ...cells, h("td", {}, String(seeds(row)), part)));
+    if (state.open.has(row.group.key)) body.append(opened(row.group.runs, columns.length));
   }
+  const focus = focusOf($("table"));
   $("table").replaceChildren(head(columns, "table", fallback, drawMeasured), body);
-  const where = state.scene || (scenes.length === 1 ? scenes[0] : `the mean over ${scenes.length} scenes`);
-  $("said").textContent = rows.length ? `${rows.length} of ${unique(runsOf(state.dataset).map(groupKey)).length} entries, ${where}` : "Nothing measured fits this choice.";
+  focus();
+  const where = scenes.length === 1 ? scenes[0] : `mean over ${scenes.length} scenes`;
+  $("said").textContent = rows.length ? `${rows.length} of ${all.length} entries, ${where}` : scenes.length ? "Nothing measured fits this choice." : "No scene is ticked.";
   $("table").parentElement.hidden = !rows.length;
-  drawNotes(runs, found, scenes, empty);
+  $("table-csv").hidden = !rows.length;
+  $("table-csv").onclick = () => saveCsv(fileName("overview"), csvRows(sorted(rows, columns, "table", fallback), measuredOnes, scenes));
+  drawNotes(runs, found, scenes, empty, measuredOnes);
   remember();
 }
 
-function nameCell(group, width) {
-  const open = h("button", { type: "button", class: "open", "aria-expanded": "false", title: "Runs, hashes, commands" }, group.method);
-  open.addEventListener("click", () => {
-    const line = open.closest("tr");
-    const isOpen = open.getAttribute("aria-expanded") === "true";
-    open.setAttribute("aria-expanded", String(!isOpen));
-    if (isOpen) line.nextElementSibling.remove();
-    else line.after(h("tr", { class: "more" }, h("td", { colspan: width }, h("div", { class: "runs" }, ...group.runs.map(oneRun)))));
-  });
-  const oracle = isOracle(group) ? h("span", { class: "badge", title: "shown exact masks or clean photos" }, "oracle (not ranked)") : null;
-  return h("th", { scope: "row", class: "name" }, open, oracle, h("small", {}, group.about));
+/** Puts the focus back on what had it in a table that is drawn again. */
+function focusOf(table) {
+  const had = document.activeElement;
+  if (!table.contains(had)) return () => {};
+  const row = had.closest("[data-group]")?.dataset.group, key = had.dataset.key ?? had.dataset.cell;
+  return () => [...table.querySelectorAll("button")].find((b) => (b.dataset.key ?? b.dataset.cell) === key && b.closest("[data-group]")?.dataset.group === row)?.focus();
 }
 
-function oneRun(run) {
-  const values = DATA.order.filter((k) => Object.hasOwn(run.quality, k)).map((k) => `${measure(k).label} ${shown(valueOf(run, k), measure(k).digits)}`);
-  const checked = run.checked === "photos" ? "metrics computed again from its renders" : run.checked === "psnr" ? "PSNR computed again from its renders" : "files and hashes checked, the scene was not at hand";
-  const code = h("code", {}, run.reproduce);
-  return h("div", { class: "run" },
-    h("p", {}, h("strong", {}, `${run.scene}, seed ${run.seed}`), `: ${values.join(", ")}`),
-    h("p", { class: "small" }, `${run.images} test images; ${checked}; ${run.device}, ${run.hardware}; version ${run.version}; configuration ${run.config_hash.slice(0, 12)}, scene ${run.scene_hash.slice(0, 12)}, result ${run.result_hash.slice(0, 12)}${run.source ? `, its file ${run.source.slice(0, 12)}` : ""}${run.code_hash ? `, code ${run.code_hash.slice(0, 12)}` : ""}`),
-    run.view ? h("p", {}, h("a", { href: run.view }, "Fly through the model")) : null,
-    h("div", { class: "row" }, code, h("button", { type: "button", class: "copy", "aria-label": "Copy the command", onclick: (e) => copy(code, e.currentTarget) }, "Copy")));
+function csvRows(rows, columns, scenes) {
+  const head = ["dataset", "scenes", "method", "setting", "options", "oracle", "seeds"];
+  for (const c of columns) head.push(c.key, ...(isTime(c.key) ? [`${c.key}_low`, `${c.key}_high`, `${c.key}_comparable`] : [`${c.key}_std`]), `${c.key}_rank`);
+  return [head, ...rows.map((row) => {
+    const g = row.group;
+    const line = [state.dataset, scenes.join(" "), g.method, g.setting, g.options, isOracle(g) ? "yes" : "", unique(g.runs.map((r) => r.seed)).length];
+    row.cells.forEach((s, i) => line.push(plainNumber(s.value), ...(isTime(columns[i].key) ? [plainNumber(s.low), plainNumber(s.high), s.comparable ? "yes" : "no"] : [plainNumber(s.spread)]), row.ranks[i] ?? ""));
+    return line;
+  })];
 }
 
-async function copy(code, button) {
-  try {
-    await navigator.clipboard.writeText(code.textContent);
-  } catch {
-    // No clipboard from a file in some browsers: the old way.
-    getSelection().selectAllChildren(code);
-    document.execCommand("copy");
-  }
-  button.textContent = "Copied";
-  setTimeout(() => { button.textContent = "Copy"; }, 1500);
+function oracleBadge(group) {
+  return isOracle(group) ? h("span", { class: "badge", title: "given exact masks or clean photos" }, "oracle (not ranked)") : null;
 }
 
-function drawNotes(runs, found, scenes, empty) {
+function nameCell(group) {
+  const isOpen = state.open.has(group.key);
+  const press = () => {
+    if (isOpen) state.open.delete(group.key);
+    else state.open.add(group.key);
+    drawMeasured();
+  };
+  const open = h("button", { type: "button", class: "open", "data-key": "open", "aria-expanded": String(isOpen), title: "Runs, hashes, commands", onclick: press }, group.method);
+  return h("th", { scope: "row", class: "name" }, open, oracleBadge(group), h("small", {}, group.about));
+}
+
+function drawNotes(runs, found, scenes, empty, columns) {
   const notes = [];
-  const missing = unique(runs.flatMap((r) => r.missing)).filter((k) => !runs.some((r) => Object.hasOwn(r.quality, k)));
+  const missing = unique(runs.flatMap((r) => r.missing)).filter((k) => !DATA.partial.includes(k) && !runs.some((r) => Object.hasOwn(r.quality, k)));
   if (missing.length) notes.push(`Not measured in any of these runs: ${missing.map((k) => measure(k).label).join(", ")}.`);
-  if (empty.length) notes.push(`No mean over all scenes, because some have nothing to measure it on: ${empty.map((c) => c.label).join(", ")}. Choose a scene, or the metric, to see it.`);
+  if (empty.length) notes.push(`No mean is shown where a value is missing: ${empty.map((c) => c.label).join(", ")}.`);
+  const left = new Map();
+  for (const c of columns) {
+    const out = scenes.filter((s) => !definedScenes(c.key, scenes).includes(s)).join(", ");
+    if (out) left.set(out, [...(left.get(out) ?? []), c.label]);
+  }
+  for (const [out, labels] of left) notes.push(`Undefined for ${out} and left out of the mean: ${labels.join(", ")}.`);
   for (const g of found) {
     const lacking = scenes.filter((s) => !g.runs.some((r) => r.scene === s));
     if (lacking.length) notes.push(`${g.method} (${g.about}) has no run on ${lacking.join(", ")}: no mean.`);
   }
+  const timed = columns.filter((c) => isTime(c.key)).map((c) => c.label).join(", ");
+  const shared = runs.filter((r) => r.alone === false).length, unknown = runs.filter((r) => r.alone === null).length;
+  if (timed && (shared || unknown)) {
+    const why = [shared ? `${shared} of ${runs.length} runs shared the machine with other work` : "", unknown ? `the load during ${unknown} of ${runs.length} runs was not recorded` : ""].filter(Boolean).join("; ");
+    notes.push(`Shown as ranges over runs and not ranked: ${timed}, because ${why}.`);
+  }
   const machines = unique(runs.map((r) => r.hardware)).sort(byName);
-  if (machines.length > 1) notes.push(`Times are of different machines (${machines.join("; ")}) and do not compare across them.`);
+  if (machines.length > 1) notes.push(`Times are of different machines (${machines.join("; ")}) and are not ranked.`);
   const files = runs.filter((r) => r.checked === "files").length;
   if (files) notes.push(`${files} of ${runs.length} runs were taken in without their scene at hand: their metrics were not computed again.`);
   $("notes").replaceChildren(...notes.map((n) => h("li", {}, n)));
-}
-
-function nothingReported() {
-  const datasets = unique(DATA.reported.map((n) => n.dataset)).sort(byName);
-  if (datasets.includes(state.dataset)) return "Nothing reported fits this choice.";
-  return `No number of ${state.dataset} is printed anywhere we know of. Choose as dataset, to see what is: ${datasets.join(", ")}.`;
-}
-
-/** What papers print, one row a method, scene and table: its own table, so that nothing is ranked together. */
-function drawReported() {
-  const section = $("others");
-  section.hidden = !DATA.reported.length || !state.reported;
-  if (section.hidden) return;
-  const asked = state.method.trim().toLowerCase();
-  const metricOf = (n) => JSON.stringify([n.metric, n.variant]);
-  const fits = DATA.reported.filter((n) => n.dataset === state.dataset && (!state.scene || n.scene === state.scene)
-    && `${n.method} ${n.setting}`.toLowerCase().includes(asked) && (!state.metric || [state.metric, state.metric.split("_")[0]].includes(n.metric)));
-  const lines = new Map();
-  for (const n of fits) {
-    const key = JSON.stringify([n.method, n.setting, n.scene, n.table]);
-    if (!lines.has(key)) lines.set(key, { title: `${n.method} ${n.setting} ${n.scene}`, first: n, cells: {} });
-    lines.get(key).cells[metricOf(n)] = n;
-  }
-  const usual = ["psnr", "ssim", "lpips"];
-  const rank = (key) => (usual.includes(JSON.parse(key)[0]) ? usual.indexOf(JSON.parse(key)[0]) : usual.length);
-  const metrics = unique(fits.map(metricOf)).sort((a, b) => rank(a) - rank(b) || byName(a, b));
-  const columns = [
-    { key: "method", label: "Method", name: true, sort: (row) => `${row.first.method} ${row.first.setting}` },
-    { key: "scene", label: "Scene", sort: (row) => row.first.scene },
-    ...metrics.map((key) => {
-      const [metric, variant] = JSON.parse(key);
-      const better = measure(metric === "lpips" ? "lpips_alex" : metric).better;
-      return { key, label: measure(metric).label.split(" ")[0], small: variant === "unknown" ? "variant unknown" : variant, down: better === "higher",
-        arrow: { higher: " ↑", lower: " ↓" }[better] ?? "", sort: (row) => number(row.cells[key]?.value) };
-    }),
-    { key: "table", label: "Where", sort: (row) => row.first.table },
-  ];
-  const fallback = { key: columns.length > 3 ? columns[2].key : "method", down: Boolean(columns[2].down) };
-  const body = h("tbody", {}, ...sorted([...lines.values()], columns, "others-table", fallback).map((row) => h("tr", {},
-    h("th", { scope: "row", class: "name" }, row.first.method, " ", h("span", { class: "badge" }, "reported"), row.first.setting ? h("small", {}, row.first.setting) : null),
-    h("td", {}, row.first.scene),
-    ...metrics.map((key) => h("td", { class: row.cells[key] ? null : "none" }, row.cells[key]?.printed ?? "–")),
-    h("td", {}, h("small", {}, row.first.table)))));
-  $("others-table").replaceChildren(head(columns, "others-table", fallback, drawReported), body);
-  $("others-table").parentElement.hidden = !lines.size;
-  $("others-said").textContent = lines.size ? `${lines.size} rows` : nothingReported();
 }

@@ -6,37 +6,35 @@ import base64
 import hashlib
 import html
 import json
-import math
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.audit.table import REPORTED
 from ambiguous_wild.harness.leaderboard import pictures
 from ambiguous_wild.harness.leaderboard.board import files_of, read_board
-from ambiguous_wild.harness.leaderboard.entry import Entry, in_order
+from ambiguous_wild.harness.leaderboard.entry import Entry
 from ambiguous_wild.harness.leaderboard.models import ModelPages, write_model_pages
-from ambiguous_wild.harness.leaderboard.reported import SOURCE, Printed, read_reported, reported_csv
-from ambiguous_wild.harness.leaderboard.sheet import to_number
-from ambiguous_wild.harness.measures import measure
+from ambiguous_wild.harness.leaderboard.page_facts import facts
+from ambiguous_wild.harness.leaderboard.reported import SOURCE, Printed, Reported, read_reported, reported_csv
 from ambiguous_wild.io.atomic import atomic_dir, check_output, sweep_siblings, write_json
 from ambiguous_wild.io.foreign_files import list_names
 from ambiguous_wild.io.foreign_files import refuse_foreign_files as refuse_strangers
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.lock import folder_lock
-from ambiguous_wild.methods.registry import knows_truth
 
 GENERATOR = '<meta name="generator" content="aw leaderboard publish">'
 OURS = {"index.html", "data", "images", "models"}
 MANIFEST = "data/files.json"  # every other file of the page
-SCRIPTS = ("page_data.js", "page_table.js", "page_plot.js", "page_main.js")
-COSTS = ("train_s", "model_mb", "fps", "gaussians", "peak_rss_mb")
-PRINTED_LABELS = {"lpips": "LPIPS", "memory": "memory", "gpu_hours": "GPU h", "fps": "FPS"}
-LABELS = {"train_s": "training s", "model_mb": "model MB", "peak_rss_mb": "peak memory MB"}
+SCRIPTS = (
+    "page_data.js", "page_table.js", "page_matrix.js", "page_runs.js", "page_plot.js", "page_compare.js",
+    "page_reported.js", "page_main.js",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -66,7 +64,7 @@ def publish(
     Args:
         board: folder of the leaderboard.
         out: for index.html, data/*.csv and images/.
-        reported: show what papers print, too: BOARD/reported/*.csv.
+        reported: show what papers print, too: BOARD/reported/*.csv, else the tables of this package.
         reported_from: show what papers print, too, from this folder.
         title: of the page.
         models: run folders, or folders of them; their models go into pages of `aw view`, OUT/models/*.html.
@@ -81,7 +79,9 @@ def publish(
         raise AwError(
             f"no folder of reported numbers {reported_from}: give one with *.csv, see docs/audit.md"
         )
-    source = board / SOURCE if reported and reported_from is None else reported_from
+    source = reported_from
+    if reported and source is None:
+        source = board / SOURCE if (board / SOURCE).is_dir() else REPORTED
     check_output(out)
     out = Path(os.path.realpath(out))
     with folder_lock(out, "aw leaderboard publish"):
@@ -89,22 +89,22 @@ def publish(
         _check_folder(out)
         sweep_siblings(out)
         entries, index = read_board(board), pictures.read_index(board)
-        printed = read_reported(source) if source is not None else []
+        printed = read_reported(source) if source is not None else Reported()
         with atomic_dir(out) as folder:
-            names = _write_data(board, folder / "data", entries, printed)
+            names = _write_data(board, folder / "data", entries, printed.numbers)
             for row in index:
                 _copy_picture(
                     pictures.folder_of(board) / row["file"], folder / "images" / row["file"], row["sha256"]
                 )
             pages = write_model_pages(entries, models, folder, say) if models else ModelPages({}, 0)
-            text = page(title, _facts(entries, index, printed, names, pages.links))
+            text = page(title, facts(entries, index, printed, names, pages.links))
             (folder / "index.html").write_text(text, encoding="utf-8")
             write_json(folder / MANIFEST, list_names(folder))
     return Published(
         runs=len(entries),
         datasets=len({e.dataset for e in entries}),
         images=len(index),
-        reported=len(printed),
+        reported=len(printed.numbers),
         reported_from=None if source is None else str(source),
         model_pages=pages.pages,
     )
@@ -167,69 +167,13 @@ def _copy_picture(source: Path, target: Path, digest: str) -> None:
     shutil.copyfile(source, target)
 
 
-def _facts(
-    entries: Sequence[Entry],
-    index: Iterable[Mapping[str, str]],
-    printed: Sequence[Printed],
-    files: list[str],
-    views: Mapping[str, str],  # page of the model by result hash
-) -> dict[str, Any]:
-    """What the page's script reads."""
-    order = in_order({k for e in entries for k in e.quality})
-    missing = {k for e in entries for k in e.missing}
-    measures = {
-        k: {"label": LABELS.get(k, m.label), "better": m.better, "digits": m.digits}
-        for k in (*order, *sorted(missing), *COSTS, "lpips_alex")
-        for m in (measure(k),)
-    }
-    for n in printed:
-        label = PRINTED_LABELS.get(n.metric, measure(n.metric).label)
-        measures.setdefault(n.metric, {"label": label, "better": measure(n.metric).better, "digits": 3})
-    columns = (
-        "dataset", "scene", "method", "setting", "options", "seed", "images", "missing", "device", "hardware",
-        "version", "source", "code_hash", "config_hash", "scene_hash", "result_hash", "checked", "reproduce",
-    )  # fmt: skip
-    return {
-        "order": order,
-        "oracles": sorted({e.method for e in entries if knows_truth(e.method)}),
-        "measures": measures,
-        "runs": [
-            {k: getattr(e, k) for k in columns}
-            | {
-                "quality": _numbers(e.quality),
-                "cost": _numbers({k: v for k, v in e.cost.items() if k in COSTS}),
-            }
-            | ({"view": views[e.result_hash]} if e.result_hash in views else {})
-            for e in entries
-        ],
-        "images": [
-            {k: v for k, v in row.items() if k not in ("sha256", "psnr")}
-            | {"psnr": _number(to_number(row["psnr"], "psnr"))}
-            for row in index
-        ],
-        "reported": [n.plain() for n in printed],
-        "files": files,
-    }
-
-
-def _numbers(values: Mapping[str, float]) -> dict[str, Any]:
-    return {k: _number(v) for k, v in values.items()}
-
-
-def _number(value: float) -> float | str | None:
-    """As JSON has it: no NaN, no infinity."""
-    if math.isfinite(value):
-        return value
-    return None if math.isnan(value) else str(value)
-
-
-def page(title: str, facts: Mapping[str, Any]) -> str:
+def page(title: str, known: Mapping[str, Any]) -> str:
     """The page; data and title can be anything and stay text."""
     here = Path(__file__).resolve().parent
     template = (here / "page.html").read_text(encoding="utf-8")
     style = (here / "page.css").read_text(encoding="utf-8")
     script = "\n".join((here / name).read_text(encoding="utf-8") for name in SCRIPTS)
-    data = json.dumps(facts, ensure_ascii=False, allow_nan=False, separators=(",", ":"), sort_keys=True)
+    data = json.dumps(known, ensure_ascii=False, allow_nan=False, separators=(",", ":"), sort_keys=True)
     for char in "<>&\u2028\u2029":  # no text in it can end the element it stands in
         data = data.replace(char, f"\\u{ord(char):04x}")
     # A picture beside a file:// page is not 'self' in every browser.

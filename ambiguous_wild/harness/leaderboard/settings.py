@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -47,11 +47,15 @@ def options_hash(config: Mapping[str, Any]) -> str:
     return config_hash(config["options"])[:8] if config["options"] else ""
 
 
-def command(config: Mapping[str, Any]) -> str:
+def command(config: Mapping[str, Any], before: Sequence[str] = ()) -> str:
     """The command that makes the run again, the scene by its name.
 
     From the hashed configuration alone: what a result file calls a command is a stranger's text, and whoever
     reads a board pastes this one into a shell.
+
+    Args:
+        config: of the run.
+        before: commands that make its scene, see `reproduce.preparation`.
 
     Raises:
         AwError: it would hold what is not seen: control characters, line breaks, text-direction marks.
@@ -85,7 +89,7 @@ def command(config: Mapping[str, Any]) -> str:
     for key, value in _changed(config).items():
         words += ["--set", f"{method.split('@')[0]}.{key}={value}"]
     words += ["--device", config.get("device", "cpu"), "-o", "runs"]
-    text = shlex.join(str(w) for w in words)
+    text = " && ".join([*before, shlex.join(str(w) for w in words)])
     hidden = next((c for c in text if unicodedata.category(c) in HIDDEN), None)
     if hidden is not None:
         raise AwError(f"config.yaml holds {hidden!a}, which no command can show: run it again without")

@@ -11,8 +11,9 @@ from typing import Any, cast
 
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.errors import shortlist
-from ambiguous_wild.harness.leaderboard.entry import COST, FIRST, LAST, Entry
+from ambiguous_wild.harness.leaderboard.entry import ALONE, COST, FIRST, LAST, Entry
 from ambiguous_wild.harness.leaderboard.photos import check_photos
+from ambiguous_wild.harness.leaderboard.reproduce import preparation
 from ambiguous_wild.harness.leaderboard.scenes import Scenes
 from ambiguous_wild.harness.leaderboard.settings import command, hardware, options_hash, setting
 from ambiguous_wild.harness.leaderboard.sheet import check_text
@@ -22,6 +23,7 @@ from ambiguous_wild.harness.running.identity import config_identity
 from ambiguous_wild.harness.running.records import RunConfig, RunResult, metrics_of
 from ambiguous_wild.harness.running.result_file import FAILED, RESULT, read_result
 from ambiguous_wild.harness.running.store import MASK_SCORES, read_config
+from ambiguous_wild.harness.running.timing import timing_of
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.metrics import stats
@@ -69,7 +71,8 @@ def verify(run: Path, scenes: Scenes, *, quick: bool = False) -> Verified:
     dataset = scenes.dataset(run, scene, result["scene_hash"])
     quality, missing = _qualities(run, result)
     cost = {k: float(v) for k, v in result["cost"].items() if isinstance(v, (int, float)) and v == v}
-    words, again = _words(run, config)
+    cost |= _load(result)
+    words, again = _words(run, config, preparation(scene))
     entry = Entry(
         dataset=check_text("dataset", dataset),
         scene=check_text(f"scene name of {run}", result["scene"]),
@@ -94,6 +97,12 @@ def verify(run: Path, scenes: Scenes, *, quick: bool = False) -> Verified:
     )
     psnr = {row["name"]: _known(row.get("psnr")) for row in result["per_image"]}
     return Verified(entry, run, tuple(sorted(renders)), psnr, scene)
+
+
+def _load(result: RunResult) -> dict[str, float]:
+    """Whether the run had the machine alone, as a number: 1 or 0; nothing where the load was not recorded."""
+    verdict = timing_of(result["cost"]).verdict
+    return {} if verdict == "unknown" else {ALONE: float(verdict == "alone")}
 
 
 def _result(run: Path) -> RunResult:
@@ -125,10 +134,10 @@ def _config(run: Path) -> RunConfig:
     return cast(RunConfig, config)
 
 
-def _words(run: Path, config: RunConfig) -> tuple[str, str]:
-    """(setting, command) of a configuration that a stranger wrote."""
+def _words(run: Path, config: RunConfig, before: list[str]) -> tuple[str, str]:
+    """(setting, commands) of a configuration that a stranger wrote."""
     try:
-        return check_text(f"setting of {run}", setting(config)), command(config)
+        return check_text(f"setting of {run}", setting(config)), command(config, before)
     except AwError as error:
         raise AwError(f"{run}: {error}") from None
     except (TypeError, ValueError, AttributeError, KeyError) as error:

@@ -4,24 +4,29 @@ from __future__ import annotations
 
 import os
 import shutil
+import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import torch
 
 from ambiguous_wild.core import AwError, Camera, Scene, View
-from ambiguous_wild.harness.running import evaluate
+from ambiguous_wild.harness.running import evaluate, machine
 from ambiguous_wild.harness.running.cell import Cell
+from ambiguous_wild.harness.running.meter import Meter
 from ambiguous_wild.harness.running.records import Cost, MaskScores, RunResult
 from ambiguous_wild.harness.running.result import finished_result
 from ambiguous_wild.io.atomic import atomic_path
 from ambiguous_wild.io.images import image_size, read_gray, read_png_rgb
-from ambiguous_wild.io.ply import splat_count
-from ambiguous_wild.methods.external.program import LOGS, WORK, Produced, Task
+from ambiguous_wild.io.ply import read_splat_ply, splat_count
+from ambiguous_wild.methods.external.program import LOGS, WORK, Produced, Program, Task
+from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.render import render
+from ambiguous_wild.splat.rendered import Rendered
 from ambiguous_wild.splat.trainer import Trainer
 
 
@@ -37,21 +42,22 @@ def run_program(cell: Cell, folder: Path) -> RunResult:
     if cell.chosen.effects:
         raise AwError(f"{cell.method.name} is an external program and takes no effects: use --effects none")
     (folder / WORK).mkdir(exist_ok=True)
-    produced = program.run(
-        Task(
-            scene=cell.scene,
-            options=cell.options,
-            seed=cell.train.seed,
-            iterations=cell.train.iterations,
-            budget_s=cell.train.budget_s,
-            device=cell.device,
-            folder=folder,
-            work=folder / WORK,
-            logs=folder / LOGS,
-        )
+    task = Task(
+        scene=cell.scene,
+        options=cell.options,
+        seed=cell.train.seed,
+        iterations=cell.train.iterations,
+        budget_s=cell.train.budget_s,
+        device=cell.device,
+        folder=folder,
+        work=folder / WORK,
+        logs=folder / LOGS,
     )
+    produced, time_cost = _timed(program, task)
     truth = evaluate.load_test_photos(cell.scene)
-    drawn = _Drawn(truth, produced.renders)
+    drawn: _Drawn | _Splats = _Drawn(truth, produced.renders)
+    if produced.drawn_by_us:
+        drawn = _Splats(produced, cell.device)
     per_image, missing = evaluate.render_and_measure(
         cast(Trainer, drawn),
         truth,
@@ -64,9 +70,34 @@ def run_program(cell: Cell, folder: Path) -> RunResult:
         per_image=per_image,
         missing=missing,
         masks=_masks(cell.scene, produced.masks, folder / "masks"),
-        facts=dict(produced.facts) | ({} if cell.protocol == "full" else {"protocol": cell.protocol}),
-        cost=cast(Cost, {"device": cell.device, **produced.cost, **_model(produced, folder)}),
+        facts=dict(produced.facts)
+        | ({"drawn_by": "ambiguous_wild"} if produced.drawn_by_us else {})
+        | ({} if cell.protocol == "full" else {"protocol": cell.protocol}),
+        cost=cast(Cost, {"device": cell.device, **produced.cost, **time_cost, **_model(produced, folder)}),
     )
+
+
+def _timed(program: Program, task: Task) -> tuple[Produced, Cost]:
+    """Run the program between two calibrations; its output, and what is known of its time.
+
+    Nothing is known where its training ended before this call, or where the kernel cannot run here: a program
+    has packages of its own.
+    """
+    meter, begin, before = Meter(task.device, machine.cores()), time.perf_counter(), machine.own_s()
+    try:
+        meter.begin(0.0)
+    except AwError:
+        meter.end(0.0)
+        return program.run(task), {}
+    try:
+        produced = program.run(task)
+        trained, spent = produced.cost.get("train_s"), time.perf_counter() - begin
+        if trained is None or trained > spent:
+            return produced, {}
+        meter.look(trained)
+    finally:
+        meter.end(0.0)
+    return produced, {**meter.cost(trained), "cpu_s": machine.own_s() - before}
 
 
 @dataclass(frozen=True)
@@ -92,6 +123,30 @@ class _Drawn:
 
     def render_fitted(self, camera: Camera, photo: torch.Tensor, keep: torch.Tensor) -> torch.Tensor:
         """The plain render: effects of a program cannot be fitted here."""
+        return self.render(camera).image
+
+
+class _Splats:
+    """Stands in for a trained model: the program's splats, drawn by our renderer on a black background."""
+
+    def __init__(self, produced: Produced, device: str) -> None:
+        """
+        Raises:
+            AwError: the file of splats cannot be read.
+        """
+        assert produced.ply is not None
+        known: dict[str, Any] = {
+            name: torch.from_numpy(values) for name, values in read_splat_ply(produced.ply).items()
+        }
+        self.gaussians = Gaussians(**known).to(device)
+        self.data = SimpleNamespace(device=torch.device(device))
+
+    @torch.no_grad()
+    def render(self, camera: Camera) -> Rendered:
+        return render(self.gaussians, camera, sh_degree=self.gaussians.sh_degree)
+
+    def render_fitted(self, camera: Camera, photo: torch.Tensor, keep: torch.Tensor) -> torch.Tensor:
+        """The plain render: splats have no colours of a photo."""
         return self.render(camera).image
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import math
 import re
-import resource
 import sys
 from pathlib import Path
 
@@ -28,7 +28,8 @@ def reset_peak(device: str = "cpu") -> None:
 
 def peak_memory(device: str = "cpu") -> Cost:
     """peak_rss_mb, and on a GPU peak_cuda_mb: the most its tensors held at once since `reset_peak`."""
-    peaks: Cost = {"peak_rss_mb": peak_rss_mb()}
+    rss = peak_rss_mb()
+    peaks: Cost = {"peak_rss_mb": rss} if math.isfinite(rss) else {}
     if device.startswith("cuda"):
         import torch
 
@@ -37,13 +38,20 @@ def peak_memory(device: str = "cpu") -> Cost:
 
 
 def peak_rss_mb() -> float:
-    """Largest resident memory since `reset_peak` (elsewhere than on Linux: since the process began), MB."""
+    """Largest resident memory since `reset_peak` in MB.
+
+    Elsewhere than on Linux since the process began; NaN on Windows.
+    """
     try:
         for line in (_PROC / "status").read_text().splitlines():
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) * 1024 / 1e6
     except OSError:
         pass
+    try:
+        import resource
+    except ImportError:  # Windows
+        return math.nan
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6  # bytes there, KiB elsewhere
 

@@ -45,12 +45,31 @@ class MaskScores(TypedDict):
     images: int
 
 
+class TimeRecord(TypedDict, total=False):
+    """How far the time of a run can be trusted, see `timing.py`."""
+
+    verdict: Required[Literal["alone", "contended", "unknown"]]
+    reason: Required[str]  # empty for "alone"
+    kernel: str  # of the calibration
+    kernel_reference_s: float  # its seconds on the reference machine
+    samples: list[list[float]]  # (seconds of training so far, seconds of the kernel)
+    runs: int  # most runs of ours at once on this machine or GPU, this one included
+    others: float  # processors that other programs used, mean over the run
+    load: float  # load average of one minute, mean over the samples
+    clock_mhz: list[float]  # of the GPU, lowest and highest at the samples
+
+
 class Cost(TypedDict, total=False):
     """What a run took. What is unknown is absent: an external program may know little."""
 
-    train_s: float
+    train_s: float  # wall seconds
+    cpu_s: float  # processor seconds of training, child processes included
+    reference_s: float  # training in seconds of the reference machine, see `timing.py`
+    timing: TimeRecord
     setup_s: float  # features, masks and compilation before the first step
     iterations: int
+    passes: int  # trainings that all of this counts, where there was more than one
+    first_pass_s: float  # of train_s, that of the first
     ms_per_iteration: float
     ms_parts: dict[str, float]  # by part of an iteration
     gaussians: int
@@ -87,6 +106,14 @@ class Provenance(TypedDict):
     reproduce: str
 
 
+class Rescore(TypedDict):
+    """Metrics that `aw rescore` added to a result, and by which code."""
+
+    metrics: list[str]
+    version: str
+    code_hash: str
+
+
 class RunResult(TypedDict):
     """A result file: metrics.json, or failed.json of a run that failed."""
 
@@ -109,6 +136,7 @@ class RunResult(TypedDict):
     environment: NotRequired[Environment]
     code_hash: NotRequired[str]
     reproduce: NotRequired[str]
+    rescored: NotRequired[list[Rescore]]
 
 
 class SceneConfig(TypedDict):

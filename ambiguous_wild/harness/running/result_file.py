@@ -17,6 +17,7 @@ import numpy as np
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.running.records import RunResult
+from ambiguous_wild.harness.running.timing import VERDICTS
 from ambiguous_wild.io.atomic import write_json
 
 SCHEMA = 1
@@ -40,7 +41,9 @@ FIELDS: dict[str, type | tuple[type, ...]] = {
     "version": str,
 }
 # Fields that results of earlier versions lack.
-OPTIONAL: dict[str, type | tuple[type, ...]] = {"environment": dict, "code_hash": str, "reproduce": str}
+OPTIONAL: dict[str, type | tuple[type, ...]] = {
+    "environment": dict, "code_hash": str, "reproduce": str, "rescored": list,
+}  # fmt: skip
 
 
 def write_result(path: Path | str, result: Mapping[str, Any]) -> None:
@@ -111,8 +114,28 @@ def _check(data: Any, where: str) -> None:
     for name, value in (data["masks"] or {}).items():
         _check_number(value, f"masks.{name}", where)
     for name, value in data["cost"].items():
-        if name not in ("device", "ms_parts"):
+        if name == "timing":
+            _check_timing(value, where)
+        elif name not in ("device", "ms_parts"):
             _check_number(value, f"cost.{name}", where)
+
+
+def _check_timing(value: Any, where: str) -> None:
+    if not isinstance(value, dict) or value.get("verdict") not in VERDICTS:
+        _wrong(where, f"cost.timing has no verdict of {', '.join(VERDICTS)}: {_short(value)}")
+    if not isinstance(value.get("reason"), str) or not isinstance(value.get("kernel", ""), str):
+        _wrong(where, f"cost.timing has no reason or kernel in words: {_short(value)}")
+    samples = value.get("samples", [])
+    if not isinstance(samples, list) or not all(isinstance(s, list) and len(s) == 2 for s in samples):
+        _wrong(where, f"cost.timing.samples are no pairs of numbers: {_short(samples)}")
+    numbers = [n for pair in samples for n in pair]
+    numbers += [value[name] for name in ("kernel_reference_s", "runs", "others", "load") if name in value]
+    for number in numbers:
+        _check_number(number, "a number of cost.timing", where)
+        if not isinstance(number, (int, float)) or not number >= 0.0:
+            _wrong(where, f"cost.timing holds {_short(number)}, which is no time")
+    if any(not pair[1] > 0.0 for pair in samples):
+        _wrong(where, "cost.timing.samples hold a kernel that took no time")
 
 
 def _check_images(rows: list[Any], where: str) -> None:

@@ -15,10 +15,16 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.measures import PARTIAL
 from ambiguous_wild.harness.running.records import RunResult, metrics_of
 from ambiguous_wild.harness.running.result_file import FAILED, RESULT, read_result
+from ambiguous_wild.harness.running.timing import timing_of
 from ambiguous_wild.io import plain_yaml
 
 CONFIG = "config.yaml"
 MASK_SCORES = ("iou", "precision", "recall")
+# Columns of `Runs.runs` that hold words, beside scene and method.
+TEXT_OF_RUNS = (
+    "status", "error", "folder", "device", "version", "config_hash", "scene_hash", "timing", "timing_reason",
+    "timing_kernel", "hardware",
+)  # fmt: skip
 FoundResult = tuple[Path, RunResult]  # of this run folder
 
 
@@ -38,7 +44,9 @@ class Runs:
 
     images: one row per run, image and metric: scene, method, seed, image, metric, value (NaN = missing).
     runs: one row per run: scene, method, seed, status, error, folder, images, config_hash, scene_hash,
-        version, device, the numbers of "cost", and mask_iou, mask_precision, mask_recall.
+        version, fit (what was done with test photos, see tables/notes.py), device, the numbers of "cost",
+        timing ("alone", "contended", "unknown"), timing_reason, timing_kernel, hardware, and mask_iou,
+        mask_precision, mask_recall.
     missing: one row per run and missing metric: scene, method, seed, metric, reason.
     """
 
@@ -155,6 +163,7 @@ def _image_rows(results: list[FoundResult]) -> Iterator[dict[str, Any]]:
 def _run_row(run: Path, result: RunResult) -> dict[str, Any]:
     masks: Mapping[str, Any] = result["masks"] or {}
     cost = {k: v for k, v in result["cost"].items() if not isinstance(v, (dict, list))}
+    timing = timing_of(result["cost"])
     return (
         _key(result)
         | {
@@ -163,11 +172,33 @@ def _run_row(run: Path, result: RunResult) -> dict[str, Any]:
             "config_hash": result["config_hash"],
             "scene_hash": result["scene_hash"],
             "version": result["version"],
+            "fit": _fit(result["facts"]),
         }
         | {"folder": str(run), "images": len(result["per_image"])}
         | cost
+        | {"timing": timing.verdict, "timing_reason": timing.reason, "timing_kernel": timing.kernel}
+        | {"hardware": _hardware(result)}
         | {f"mask_{k}": math.nan if masks.get(k) is None else masks[k] for k in MASK_SCORES}
     )
+
+
+def _hardware(result: RunResult) -> str:
+    """What times depend on: the GPU, or the processor and the threads; empty where it is not known."""
+    known: Mapping[str, Any] = result.get("environment") or {}
+    if known.get("gpu"):
+        return str(known["gpu"])
+    threads = result["cost"].get("threads")
+    return f"{known['cpu']}, {threads} threads" if known.get("cpu") and threads else ""
+
+
+def _fit(facts: Mapping[str, Any]) -> str:
+    """What the method did with test photos, a key of `notes.FITTED`."""
+    if facts.get("protocol", "full") != "half":
+        return "full"
+    fitted = facts.get("fitted")
+    if not isinstance(fitted, dict):
+        return "unknown"
+    return "fitted" if fitted.get("steps") else "read" if fitted.get("read_by") else "plain"
 
 
 def _missing_rows(results: list[FoundResult]) -> Iterator[dict[str, Any]]:

@@ -1,15 +1,16 @@
 """From runs to a comparison: rows are methods, columns are measures, one block a scene.
 
-The mean is taken over images, then over seeds, then over scenes, in that order. A mean over missing cells
-is missing; a failed run makes its cell "failed", so that no method gains by failing where it is hard, and
-a method with an unfinished run shows what it has but is not ranked.
-`render_tables.py` writes a `Table` as text, Markdown, CSV or LaTeX.
+The mean is taken over images, then over seeds, then over scenes, in that order. No mean is shown where a
+value is missing. A scene that cannot have a value, such as a mask score without distractors, is left out of
+the mean, for every method. A failed run makes its cell "failed", so that no method gains by failing where
+it is hard, and a method with an unfinished run shows what it has but is not ranked.
+`render.py` writes a `Table` as text, Markdown, CSV or LaTeX.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -18,12 +19,15 @@ import pandas as pd
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist, unknown
-from ambiguous_wild.harness.measures import ALWAYS, COST, MEASURES, Measure, measure
-from ambiguous_wild.harness.running.store import Runs
+from ambiguous_wild.harness.measures import ALWAYS, COST, MEASURES, PARTIAL, Measure, measure
+from ambiguous_wild.harness.running.store import TEXT_OF_RUNS, Runs
 from ambiguous_wild.harness.tables.notes import notes
+from ambiguous_wild.harness.tables.times import incomparable, untimed
 from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.metrics import stats
 
+MASK_COLUMNS = ("mask_iou", "mask_precision")
+UNDEFINED_ON_SOME = (*PARTIAL, *MASK_COLUMNS, "mask_recall")
 State = Literal["ok", "missing", "failed", "absent"]
 
 
@@ -36,6 +40,7 @@ class TableCell:
     low: float = math.nan  # 95 % bootstrap interval over the images of one scene
     high: float = math.nan
     rank: int | None = None  # 1, 2, 3 or None
+    ranged: bool = False  # a time that cannot be compared: shown from `low` to `high`, its least and its most
     state: State = "ok"
 
 
@@ -69,7 +74,9 @@ class Table:
         return replace(self, notes=(*self.notes, note))
 
 
-def comparison(runs: Runs, *, metrics: Sequence[str] = (), scenes: Sequence[str] = ()) -> Table:
+def comparison(
+    runs: Runs, *, metrics: Sequence[str] = (), scenes: Sequence[str] = (), drop_empty: bool | None = None
+) -> Table:
     """The comparison of every method over the scenes.
 
     Args:
@@ -77,6 +84,8 @@ def comparison(runs: Runs, *, metrics: Sequence[str] = (), scenes: Sequence[str]
         metrics: columns by key, in this order; empty: PSNR, SSIM, LPIPS, whatever else was measured, mask
             IoU and cost.
         scenes: only these, in this order; empty: all, by name.
+        drop_empty: leave out columns without any value; a note says why they are empty. None: unless
+            `metrics` names them.
 
     Raises:
         AwError: a metric or scene that no run has, or no finished run.
@@ -96,19 +105,54 @@ def comparison(runs: Runs, *, metrics: Sequence[str] = (), scenes: Sequence[str]
         images=runs.images[runs.images["scene"].isin(chosen)],
         missing=runs.missing[runs.missing["scene"].isin(chosen)],
     )
-    columns = _columns(runs, metrics)
     methods = sorted(runs.runs["method"].unique())
     index = _Index(runs)
+    columns = _columns(runs, metrics)
+    defined = {c.key: [s for s in chosen if index.can_have(s, c, methods)] for c in columns}
+    unranked = incomparable(runs.runs, columns)
     blocks = [Block(scene, tuple(_scene_row(index, m, scene, columns) for m in methods)) for scene in chosen]
     if len(chosen) > 1:
-        mean = tuple(_mean_row(index, m, chosen, columns, blocks) for m in methods)
+        mean = tuple(_mean_row(index, m, chosen, columns, blocks, defined) for m in methods)
         blocks.insert(0, Block(None, mean))
-    return Table(
-        columns,
-        tuple(_ranked(b, columns) for b in blocks),
-        chosen,
-        notes(runs, columns, methods, chosen),
-    )
+    told = (*notes(runs, columns, methods, chosen), *_undefined(columns, chosen, defined))
+    if drop_empty if drop_empty is not None else not metrics:
+        columns, blocks = _without_empty(columns, blocks)
+    return Table(columns, tuple(_ranked(b, columns, unranked) for b in blocks), chosen, told)
+
+
+def _without_empty(
+    columns: tuple[Measure, ...], blocks: list[Block]
+) -> tuple[tuple[Measure, ...], list[Block]]:
+    """Without the columns that have no value anywhere; where none has any, everything stays."""
+    kept = [
+        i
+        for i in range(len(columns))
+        if any(row.cells[i].state == "ok" for block in blocks for row in block.rows)
+    ]
+    return (columns, blocks) if not kept else selected(columns, blocks, kept)
+
+
+def selected(
+    columns: tuple[Measure, ...], blocks: Sequence[Block], kept: Sequence[int]
+) -> tuple[tuple[Measure, ...], list[Block]]:
+    """Columns and blocks with the columns of these numbers alone."""
+    chosen = [
+        replace(b, rows=tuple(replace(r, cells=tuple(r.cells[i] for i in kept)) for r in b.rows))
+        for b in blocks
+    ]
+    return tuple(columns[i] for i in kept), chosen
+
+
+def _undefined(
+    columns: tuple[Measure, ...], scenes: tuple[str, ...], defined: Mapping[str, Sequence[str]]
+) -> list[str]:
+    """A line for the columns whose mean leaves the same scenes out."""
+    lines: dict[str, list[str]] = {}
+    for column in columns:
+        out = [s for s in scenes if s not in defined[column.key]]
+        if out and len(out) < len(scenes):
+            lines.setdefault(shortlist(out), []).append(column.label)
+    return [f"undefined on {out}, left out of the mean: {', '.join(c)}" for out, c in lines.items()]
 
 
 class _Index:
@@ -118,17 +162,30 @@ class _Index:
         self.runs = dict(iter(runs.runs.groupby(["method", "scene"])))
         self.images = dict(iter(runs.images.groupby(["method", "scene", "metric"])))
         self.unfinished = {(i.method, i.scene) for i in runs.incomplete}
+        self.untimed = set(untimed(runs.runs))
 
     def seeds(self, method: str, scene: str, column: Measure) -> pd.Series:
         """The run's value by seed, NaN where missing."""
         rows = self.runs[method, scene].set_index("seed")
         if not column.per_image:
             values = rows[column.key] if column.key in rows else pd.Series(math.nan, index=rows.index)
-            return values.astype(float).sort_index()
+            values = values.astype(float)
+            if column.key in MASK_COLUMNS and "mask_recall" in rows:
+                # Without a distractor recall is undefined, and an IoU of 0 says nothing.
+                values = values.where(rows["mask_recall"].notna())
+            return values.sort_index()
         images = self.images.get((method, scene, column.key))
         found = {} if images is None else {seed: g["value"].to_numpy() for seed, g in images.groupby("seed")}
         means = {seed: stats.mean(found.get(seed, np.empty(0))) for seed in sorted(rows.index)}
         return pd.Series(means, dtype=float)
+
+    def can_have(self, scene: str, column: Measure, methods: Sequence[str]) -> bool:
+        """Whether the measure is defined on the scene: some method has a value, or it always is."""
+        if column.key not in UNDEFINED_ON_SOME:
+            return True
+        return any(
+            (m, scene) in self.runs and bool(self.seeds(m, scene, column).notna().any()) for m in methods
+        )
 
     def state(self, method: str, scene: str) -> State:
         if (method, scene) not in self.runs:
@@ -139,8 +196,7 @@ class _Index:
 def _columns(runs: Runs, metrics: Sequence[str]) -> tuple[Measure, ...]:
     images = runs.images.dropna(subset=["value"])
     measured = list(dict.fromkeys([*MEASURES, *sorted(images["metric"].unique())]))
-    text = {"scene", "method", "status", "error", "folder", "device", "version", "config_hash", "scene_hash"}
-    of_runs = set(runs.runs.columns) - text
+    of_runs = set(runs.runs.columns) - {"scene", "method", *TEXT_OF_RUNS}
     if metrics:
         choices = set(MEASURES) | set(runs.images["metric"]) | of_runs
         for name in metrics:
@@ -168,6 +224,9 @@ def _scene_row(index: _Index, method: str, scene: str, columns: tuple[Measure, .
             cells.append(TableCell(state="missing"))
             continue
         low = high = math.nan
+        if column.timed and (method, scene) in index.untimed:
+            cells.append(TableCell(value, math.nan, float(values.min()), float(values.max()), ranged=True))
+            continue
         if column.per_image:
             images = index.images[method, scene, column.key].pivot_table(
                 index="image", columns="seed", values="value", aggfunc="mean", dropna=False
@@ -180,34 +239,47 @@ def _scene_row(index: _Index, method: str, scene: str, columns: tuple[Measure, .
 
 
 def _mean_row(
-    index: _Index, method: str, scenes: tuple[str, ...], columns: tuple[Measure, ...], blocks: list[Block]
+    index: _Index,
+    method: str,
+    scenes: tuple[str, ...],
+    columns: tuple[Measure, ...],
+    blocks: list[Block],
+    defined: Mapping[str, Sequence[str]],  # column -> scenes that can have a value
 ) -> Row:
     rows = [next(r for r in block.rows if r.method == method) for block in blocks]
     states = [index.state(method, scene) for scene in scenes]
     cells = []
     for i, column in enumerate(columns):
-        value = stats.mean([row.cells[i].value for row in rows])
+        over = defined[column.key]
+        value = stats.mean([row.cells[i].value for row, s in zip(rows, scenes) if s in over])
         if "failed" in states:
             cells.append(TableCell(state="failed"))
         elif math.isnan(value):
             cells.append(TableCell(state="missing"))
+        elif any(row.cells[i].ranged for row in rows):
+            own = [(c.low, c.high) if c.ranged else (c.value, c.value) for c in (r.cells[i] for r in rows)]
+            low, high = (float(np.mean(ends)) for ends in zip(*own))
+            cells.append(TableCell(value, math.nan, low, high, ranged=True))
         else:
             # Seed by seed, so that the spread is that of the number shown; needs the same seeds everywhere.
-            by_seed = pd.concat([index.seeds(method, s, column) for s in scenes], axis=1).to_numpy()
+            by_seed = pd.concat([index.seeds(method, s, column) for s in over], axis=1).to_numpy()
             cells.append(TableCell(value, stats.spread(by_seed.mean(axis=1))))
     return Row(method, tuple(cells), sum(row.runs for row in rows), ranked=all(row.ranked for row in rows))
 
 
-def _ranked(block: Block, columns: tuple[Measure, ...]) -> Block:
-    """The block with the first, second and third of every column marked; equal in print = equal rank."""
+def _ranked(block: Block, columns: tuple[Measure, ...], unranked: frozenset[str]) -> Block:
+    """The block with the first, second and third of every column marked; equal in print = equal rank.
+
+    `unranked`: columns of times that were measured on machines that differ.
+    """
     rows = [list(row.cells) for row in block.rows]
     for i, column in enumerate(columns):
         values = {
             k: round(row.cells[i].value, column.digits)
             for k, row in enumerate(block.rows)
-            if row.ranked and row.cells[i].state == "ok"
+            if row.ranked and row.cells[i].state == "ok" and not row.cells[i].ranged
         }
-        if column.better is None or len(set(values.values())) < 2:
+        if column.better is None or column.key in unranked or len(set(values.values())) < 2:
             continue
         for k, value in values.items():
             ahead = sum(v > value if column.better == "higher" else v < value for v in values.values())

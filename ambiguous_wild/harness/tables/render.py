@@ -14,6 +14,7 @@ import unicodedata
 from collections.abc import Callable, Sequence
 
 from ambiguous_wild.harness.measures import Measure
+from ambiguous_wild.harness.running.timing import seconds_range
 from ambiguous_wild.harness.tables.comparison import Block, Row, Table, TableCell
 
 STATES = {"missing": "—", "failed": "failed", "absent": "no run"}
@@ -36,6 +37,8 @@ def number(column: Measure, cell: TableCell, *, mark: bool = True) -> str:
     """What the cell shows: value, deviation over seeds, rank; or its state."""
     if cell.state != "ok":
         return STATES[cell.state]
+    if cell.ranged:
+        return seconds_range([cell.low, cell.high], column.digits)
     text = f"{cell.value:.{column.digits}f}"
     if not math.isnan(cell.spread) and column.quality:
         text += f" ± {cell.spread:.{column.digits}f}"

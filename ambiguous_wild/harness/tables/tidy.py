@@ -9,12 +9,12 @@ import pandas as pd
 
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.harness.measures import measure
-from ambiguous_wild.harness.running.store import Runs
+from ambiguous_wild.harness.running.store import TEXT_OF_RUNS, Runs
 from ambiguous_wild.harness.tables.render import csv_text
 
 COLUMNS = ("scene", "method", "seed", "image", "metric", "value", "better", "reason", "config_hash")
 _KEYS = ["scene", "method", "seed"]
-_NO_NUMBER = {*_KEYS, "status", "error", "folder", "images", "device", "version", "config_hash", "scene_hash"}
+_NO_NUMBER = {*_KEYS, "images", *TEXT_OF_RUNS}
 _TEXT = ("scene", "method", "image", "metric", "better", "reason", "config_hash")
 
 

@@ -33,11 +33,13 @@ def kernel_cache() -> Path:
 
 def _private_temporary() -> Path:
     """A temporary folder of this user alone: compiled code is loaded from it."""
-    folder = Path(tempfile.gettempdir()) / f"ambiguous_wild-{os.getuid()}"
+    user = os.getuid() if hasattr(os, "getuid") else None  # Windows: its temporary folder is the user's own
+    folder = Path(tempfile.gettempdir()) / f"ambiguous_wild-{'user' if user is None else user}"
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
         status = folder.lstat()
     except OSError:
         return Path(tempfile.mkdtemp(prefix="ambiguous_wild-"))
-    mine = stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & 0o022
+    mine = user is None or (status.st_uid == user and not status.st_mode & 0o022)
+    mine = mine and stat.S_ISDIR(status.st_mode)
     return folder if mine else Path(tempfile.mkdtemp(prefix="ambiguous_wild-"))

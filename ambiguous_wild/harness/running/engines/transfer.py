@@ -38,9 +38,10 @@ def send_scene(scene: Path, limit_mb: float) -> tuple[str, bytes]:
 
 def run_sent(job: Job, scene_key: str, scene: bytes, limit_mb: float) -> Sent:
     """On a node: unpack the scene unless it is there, run the job in a folder there, pack that."""
-    cache = Path(tempfile.gettempdir()) / f"ambiguous_wild-{os.getuid()}"
+    user = os.getuid() if hasattr(os, "getuid") else "user"
+    cache = Path(tempfile.gettempdir()) / f"ambiguous_wild-{user}"
     cache.mkdir(mode=0o700, exist_ok=True)
-    if cache.is_symlink() or cache.stat().st_uid != os.getuid():
+    if cache.is_symlink() or (hasattr(os, "getuid") and cache.stat().st_uid != os.getuid()):
         raise AwError(f"{cache} belongs to somebody else: remove it, or set TMPDIR on the nodes")
     # The folder's own name: a plain COLMAP scene is called after it.
     place = cache / "scenes" / scene_key / Path(job.scene).name

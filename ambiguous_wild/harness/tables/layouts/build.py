@@ -43,7 +43,9 @@ def paper(
     """
     ties, layouts, begin = Ties(runs), [], f"{subject}, " if subject else ""
     for name, members in divided(runs, scenes, datasets or {}).items():
-        table = comparison(runs, metrics=metrics or quality_columns(runs), scenes=members)
+        table = comparison(
+            runs, metrics=metrics or quality_columns(runs), scenes=members, drop_empty=not metrics
+        )
         blocks = [b for b in table.blocks if b.scene is not None]
         mean = [b for b in table.blocks if b.scene is None]
         chunks = [blocks[i : i + per_table] for i in range(0, len(blocks), per_table)]
@@ -66,7 +68,9 @@ def means(
     parts: list[Layout] = []
     notes: dict[str, None] = {}
     for name, members in divided(runs, scenes, datasets or {}).items():
-        table = comparison(runs, metrics=metrics or quality_columns(runs), scenes=members)
+        table = comparison(
+            runs, metrics=metrics or quality_columns(runs), scenes=members, drop_empty=not metrics
+        )
         heading = f"{name or ('other scenes' if parts else 'all scenes')} ({len(members)})"
         parts.append(_layout("", table, table.blocks[:1], ties, heading=heading, dataset=name))
         notes |= dict.fromkeys(table.notes)

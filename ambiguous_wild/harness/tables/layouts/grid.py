@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from ambiguous_wild.harness.measures import Measure
+from ambiguous_wild.harness.running.timing import seconds_range
 from ambiguous_wild.harness.tables.comparison import TableCell
 
 Kind = Literal["measured", "reported"]
@@ -40,11 +41,12 @@ class LayoutCell:
     tie: bool = False  # not the best, and not significantly different from it
     state: State = "ok"
     printed: str = ""  # as a paper prints it; empty for what was measured
+    ranged: tuple[float, float] | None = None  # least and most of a time that cannot be compared
 
     @staticmethod
     def of(cell: TableCell, *, tie: bool = False) -> LayoutCell:
         """The entry of a measured cell."""
-        return LayoutCell(cell.value, cell.spread, cell.rank, tie, cell.state)
+        return LayoutCell(cell.value, cell.spread, cell.rank, tie, cell.state, ranged=_ends(cell))
 
     def text(self, measure: Measure) -> str:
         """The number with its spread, or its state; neither rank nor tie."""
@@ -52,9 +54,15 @@ class LayoutCell:
             return self.printed
         if self.state != "ok":
             return SHOWN[self.state]
+        if self.ranged is not None:
+            return seconds_range(self.ranged, measure.digits)
         text = f"{self.value:.{measure.digits}f}"
         spread = measure.quality and not math.isnan(self.spread)
         return f"{text} ± {self.spread:.{measure.digits}f}" if spread else text
+
+
+def _ends(cell: TableCell) -> tuple[float, float] | None:
+    return (cell.low, cell.high) if cell.ranged else None
 
 
 @dataclass(frozen=True)

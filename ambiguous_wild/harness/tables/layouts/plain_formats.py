@@ -24,7 +24,7 @@ def to_text(layouts: Sequence[Layout], *, color: bool = False) -> str:
 def _aligned(layout: Layout, color: bool) -> list[str]:
     head = ["method", *(column.label for column in layout.columns)]
     body = [
-        [_name(line), *(marked(e, c.measure) for c, e in zip(layout.columns, line.entries))]
+        [row_name(line), *(marked(e, c.measure) for c, e in zip(layout.columns, line.entries))]
         for line in layout.lines
     ]
     widths = [max(display_width(line[i]) for line in [head, *body]) for i in range(len(head))]
@@ -64,7 +64,8 @@ def marked(entry: LayoutCell, measure: object) -> str:
     return text + (f" ({entry.rank})" if entry.rank else "") + (f" {TIE}" if entry.tie else "")
 
 
-def _name(line: Line) -> str:
+def row_name(line: Line) -> str:
+    """What stands in front of a row of text."""
     return plain(f"  {line.name}" if line.kind == "reported" else line.name)
 
 

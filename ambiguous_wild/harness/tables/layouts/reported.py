@@ -7,10 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.audit.table import MEAN, Number, read_tables
+from ambiguous_wild.harness.audit.table import MEAN, REPORTED, Number, read_tables
 from ambiguous_wild.harness.tables.layouts.grid import Column, Layout, LayoutCell, Line
 
-FOLDER = Path(__file__).resolve().parents[4] / "leaderboard" / "reported"
 FAMILIES = ("psnr", "ssim", "lpips")
 NAMES = {"model_mb": "memory"}  # a measure -> how papers call it
 
@@ -21,7 +20,7 @@ def read_reported(folder: Path | None = None) -> list[Number]:
     Raises:
         AwError: there are none, or one cannot be read.
     """
-    folder = folder or FOLDER
+    folder = folder or REPORTED
     if not folder.exists():
         raise AwError(f"no reported numbers in {folder}: say where they are with --reported-from")
     return read_tables([folder])

@@ -1,0 +1,190 @@
+"""Measures how busy the machine is while a run trains, and what its time is worth elsewhere.
+
+The trainer calls the meter with its clock stopped: before the first step, now and then, after the last one.
+Each time a calibration kernel is timed. Its work and the record's are no part of the training time.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import Any
+
+import torch
+
+from ambiguous_wild.harness.running import machine
+from ambiguous_wild.harness.running.records import Cost, TimeRecord
+from ambiguous_wild.harness.running.timing import Verdict, in_reference_seconds
+from ambiguous_wild.splat.calibration import KERNELS, calibration
+
+EVERY_S = 15.0  # of training between two calibrations, which take about a fortieth of that
+SHARES = 4  # a shorter run has one at each quarter, where a quarter takes
+LEAST_S = 2.0  # at least so long
+OTHERS = 0.1  # a run is contended where others use more than this share of the processors that it needs
+VARIED = 1.3  # or where the slowest calibration takes this many times the fastest
+COVERED = 0.9  # of the training must lie between the first and the last calibration
+
+
+class Meter:
+    """Of one run; its state lies in the run's checkpoint, so that a resumed run is judged as a whole."""
+
+    def __init__(
+        self,
+        device: str,
+        threads: int,
+        *,
+        kernel_s: Callable[[], float] | None = None,
+        presence: machine.Presence | None = None,
+    ) -> None:
+        """
+        Args:
+            device: "cpu" or "cuda".
+            threads: that the training uses.
+            kernel_s: times the calibration kernel once; None = the kernel of the device.
+            presence: counts runs; None = those of this machine or GPU.
+        """
+        self.device, self.threads = device, threads
+        self.kernel = KERNELS["cuda" if device.startswith("cuda") else "cpu"]
+        self._kernel_s = kernel_s or (lambda: calibration(torch.device(device)).seconds())
+        self.presence = presence or machine.Presence(machine.unit(device))
+        self._stack = ExitStack()
+        self.samples: list[list[float]] = []
+        self.clocks: list[float] = []
+        self.loads: list[float] = []
+        self.runs = 1
+        self.wall_s = self.others_s = 0.0  # of the intervals so far; others' processor seconds in them
+        self.blind = False  # others' work could not be measured
+        self._since: tuple[float, float | None, float] | None = None
+
+    @classmethod
+    def of(cls, device: str) -> Meter:
+        """Of a training in this process, with the threads that it was given."""
+        import numba
+
+        return cls(device, int(numba.get_num_threads()) if device == "cpu" else 1)
+
+    # -- called by the trainer ---------------------------------------------------------------------
+
+    def begin(self, trained_s: float) -> None:
+        """Before the first step of this process."""
+        self._stack.enter_context(self.presence.here())
+        self._sample(trained_s)
+        self._since = self._now()
+
+    def due(self, trained_s: float, progress: float) -> bool:
+        """Whether a calibration is due after an iteration; `progress` in [0, 1]."""
+        ago = trained_s - self.samples[-1][0]
+        if progress >= 1.0:
+            return ago > 0.0
+        return ago >= EVERY_S or (ago >= LEAST_S and ago >= trained_s / max(progress, 1e-9) / SHARES)
+
+    def look(self, trained_s: float) -> None:
+        """Calibrate, and note what others did since the last time."""
+        self._close()
+        self._sample(trained_s)
+        self._since = self._now()
+
+    def end(self, trained_s: float) -> None:
+        """After the last step, or where the training stops with an error."""
+        if self._since is not None:
+            self._close()
+        self._since = None
+        self._stack.close()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Plain values for a checkpoint, the open interval included."""
+        wall, others, blind = self._interval()
+        return {
+            "samples": [list(sample) for sample in self.samples],
+            "clocks": list(self.clocks),
+            "loads": list(self.loads),
+            "runs": self.runs,
+            "wall_s": self.wall_s + wall,
+            "others_s": self.others_s + others,
+            "blind": self.blind or blind,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.samples = [list(map(float, sample)) for sample in state["samples"]]
+        self.clocks, self.loads = list(state["clocks"]), list(state["loads"])
+        self.runs, self.blind = int(state["runs"]), bool(state["blind"])
+        self.wall_s, self.others_s = float(state["wall_s"]), float(state["others_s"])
+        if self._since is not None:  # a rollback: the interval so far is in the state's past or undone
+            self._since = self._now()
+
+    # -- what it found -----------------------------------------------------------------------------
+
+    def cost(self, trained_s: float) -> Cost:
+        """reference_s and the record of the time, for the cost of a run."""
+        verdict, reason = self.verdict(trained_s)
+        record: TimeRecord = {
+            "verdict": verdict,
+            "reason": reason,
+            "kernel": self.kernel.name,
+            "kernel_reference_s": self.kernel.reference_s,
+            "samples": self.samples,
+            "runs": self.runs,
+        }
+        if self.wall_s > 0.0 and not self.blind:
+            record["others"] = self.others_s / self.wall_s
+        if self.loads:
+            record["load"] = sum(self.loads) / len(self.loads)
+        if self.clocks:
+            record["clock_mhz"] = [min(self.clocks), max(self.clocks)]
+        cost: Cost = {"timing": record}
+        if self.samples:
+            found = in_reference_seconds(self.samples, self.kernel.reference_s, [trained_s])
+            cost["reference_s"] = float(found[0])
+        return cost
+
+    def verdict(self, trained_s: float) -> tuple[Verdict, str]:
+        """Whether the run was alone, and why not."""
+        if self.runs > 1:
+            where = "this GPU" if self.device.startswith("cuda") else "the machine"
+            return "contended", f"{self.runs} runs shared {where}"
+        others = self.others_s / self.wall_s if self.wall_s > 0.0 else 0.0
+        total = machine.cores()
+        needed = min(self.threads, total)
+        if others - (total - needed) > OTHERS * needed:
+            return "contended", f"other programs used {others:.1f} of {total} processors"
+        seconds = [kernel for _, kernel in self.samples]
+        if seconds and max(seconds) > VARIED * min(seconds):
+            ratio = max(seconds) / min(seconds)
+            return "contended", f"the machine's speed varied {ratio:.1f} times between calibrations"
+        span = self.samples[-1][0] - self.samples[0][0] if self.samples else 0.0
+        if span < COVERED * trained_s:
+            share = 100.0 * span / trained_s if trained_s > 0.0 else 0.0
+            return "unknown", f"calibrations cover {share:.0f} % of the training"
+        if self.blind and len(self.samples) < 3:
+            return "unknown", "this system does not tell what other programs used, and the run was short"
+        return "alone", ""
+
+    # -- inside ------------------------------------------------------------------------------------
+
+    def _sample(self, trained_s: float) -> None:
+        self.samples.append([trained_s, self._kernel_s()])
+        self.runs = max(self.runs, self.presence.count())
+        for found, into in ((machine.load(), self.loads), (machine.gpu_clock_mhz(self.device), self.clocks)):
+            if found is not None:
+                into.append(found)
+
+    def _now(self) -> tuple[float, float | None, float]:
+        return time.monotonic(), machine.busy_s(), machine.own_s()
+
+    def _interval(self) -> tuple[float, float, bool]:
+        """(wall seconds, others' processor seconds, whether those are unknown) since the last calibration."""
+        if self._since is None:
+            return 0.0, 0.0, False
+        (begin, busy, own), (now, busy_now, own_now) = self._since, self._now()
+        if busy is None or busy_now is None:
+            return now - begin, 0.0, True
+        return now - begin, max(busy_now - busy - (own_now - own), 0.0), False
+
+    def _close(self) -> None:
+        wall, others, blind = self._interval()
+        self.wall_s, self.others_s, self.blind = (
+            self.wall_s + wall,
+            self.others_s + others,
+            self.blind or blind,
+        )

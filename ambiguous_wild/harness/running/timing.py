@@ -1,0 +1,106 @@
+"""Whether the times of runs can be compared, and in which seconds. Reads records; measures nothing.
+
+    timing = timing_of(result["cost"])       # verdict and reason of one run
+    why = why_not_ranked(costs)              # "" = rank these runs by cost["reference_s"]
+    text = seconds_range([c["train_s"] for c in costs])     # shown instead, unranked
+
+A run is *alone* where nothing else used its processors, and *contended* otherwise. `reference_s` is the
+training time in seconds of a stated machine: how often the calibration kernel (`splat/calibration.py`) would
+have run in that time, times the kernel's seconds on that machine. It corrects for load and for the machine's
+speed; a contended run keeps it, but is not ranked.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+Verdict = Literal["alone", "contended", "unknown"]
+VERDICTS: tuple[Verdict, ...] = ("alone", "contended", "unknown")
+UNTIMED = "its time was not calibrated (an earlier version, several GPUs, or an external program)"
+# Keys of "cost" that a busy machine changes; whatever ranks one of them asks `why_not_ranked` first.
+TIMED = ("train_s", "reference_s", "setup_s", "ms_per_iteration", "fps", "fps_low", "fps_high")
+
+
+@dataclass(frozen=True)
+class Timing:
+    """What is known about the time of one run."""
+
+    verdict: Verdict
+    reason: str  # why it is contended or unknown; empty for a run that was alone
+    kernel: str  # calibration that `reference_s` rests on, e.g. "cpu-1"; empty without one
+    reference_s: float  # training in seconds of the reference machine; NaN without calibration
+
+    @property
+    def ranked(self) -> bool:
+        """Whether this time may take part in a ranking."""
+        return self.verdict == "alone" and math.isfinite(self.reference_s)
+
+
+def timing_of(cost: Mapping[str, Any]) -> Timing:
+    """The timing in the "cost" of a result; "unknown" where it holds none."""
+    record = cost.get("timing")
+    if not isinstance(record, Mapping) or record.get("verdict") not in VERDICTS:
+        return Timing("unknown", UNTIMED, "", math.nan)
+    seconds = cost.get("reference_s")
+    return Timing(
+        record["verdict"],
+        str(record.get("reason", "")),
+        str(record.get("kernel", "")),
+        math.nan if seconds is None else float(seconds),
+    )
+
+
+def why_not_ranked(costs: Iterable[Mapping[str, Any]]) -> str:
+    """Why the times of these runs cannot be ranked against each other; empty where they can.
+
+    Args:
+        costs: "cost" of each result.
+    """
+    timings = [timing_of(cost) for cost in costs]
+    for verdict in ("contended", "unknown"):
+        reasons = [t.reason for t in timings if t.verdict == verdict]
+        if reasons:
+            return f"{len(reasons)} of {len(timings)} runs {verdict}: {reasons[0]}"
+    if any(not t.ranked for t in timings):
+        return UNTIMED
+    kernels = sorted({t.kernel for t in timings})
+    return f"calibrated by different kernels: {', '.join(kernels)}" if len(kernels) > 1 else ""
+
+
+def seconds_range(values: Sequence[float], digits: int = 0) -> str:
+    """Times that are not ranked: "129 to 230", or one number where they print alike; empty without any."""
+    known = [v for v in values if math.isfinite(v)]
+    if not known:
+        return ""
+    low, high = (f"{v:.{digits}f}" for v in (min(known), max(known)))
+    return low if low == high else f"{low} to {high}"
+
+
+def in_reference_seconds(
+    samples: Sequence[Sequence[float]],  # (seconds of training so far, seconds of the kernel), in order
+    reference_s: float,  # of the kernel on the reference machine
+    at: Sequence[float],  # seconds of training
+) -> np.ndarray:
+    """Seconds of training as seconds of the reference machine.
+
+    Between two samples the machine's speed is their mean (kernels a second); before the first and after the
+    last it is theirs.
+
+    Returns:
+        [n] float64, increasing with `at`; NaN without samples.
+    """
+    times = np.asarray(at, np.float64)
+    if not len(samples):
+        return np.full(times.shape, math.nan)
+    begin, kernel = np.asarray(samples, np.float64).reshape(-1, 2).T
+    speed = reference_s / kernel  # reference seconds a second
+    steps = np.diff(begin) * 0.5 * (speed[1:] + speed[:-1])
+    there = np.concatenate([[begin[0] * speed[0]], begin[0] * speed[0] + np.cumsum(steps)])
+    inside = np.interp(times, begin, there)
+    early, late = np.minimum(times - begin[0], 0.0) * speed[0], np.maximum(times - begin[-1], 0.0) * speed[-1]
+    return inside + early + late

@@ -1,0 +1,94 @@
+"""A fixed piece of training whose seconds say how fast the machine is now: blending and Adam.
+
+It runs the trainer's own code with the trainer's threads, so that other programs slow it down as they slow a
+training down. The scene never changes: learning rates are 0. A change of the work needs a new name in
+`KERNELS`, because seconds of different kernels cannot be compared.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import torch
+
+from ambiguous_wild.core import Camera
+from ambiguous_wild.splat import device as devices
+from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.losses import photometric
+from ambiguous_wild.splat.optim import SplatAdam
+from ambiguous_wild.splat.render import render
+
+
+@dataclass(frozen=True)
+class Size:
+    """Work of a kernel."""
+
+    name: str  # in the record of a run
+    reference_s: float  # seconds on the reference machine
+    gaussians: int
+    width: int
+    height: int
+    steps: int
+
+
+# Reference machine of the CPU: 2 threads of an AMD EPYC virtual machine, nothing else running. That of a GPU
+# is nominal: the kernel takes a tenth of a second there.
+KERNELS = {
+    "cpu": Size("cpu-1", 0.25, 12_000, 240, 136, 12),
+    "cuda": Size("gpu-1", 0.10, 100_000, 960, 544, 24),
+}
+
+
+class Calibration:
+    """The kernel on one device."""
+
+    def __init__(self, device: torch.device, size: Size) -> None:
+        self.device, self.size = device, size
+        rng = np.random.default_rng(7)
+        xyz = rng.uniform([-4.0, -2.4, 4.0], [4.0, 2.4, 8.0], (size.gaussians, 3))
+        colours = rng.integers(0, 255, (size.gaussians, 3)).astype(np.uint8)
+        self.gaussians = Gaussians.from_points(xyz, colours).to(device)
+        focal = 0.9 * size.width
+        lens = (size.width, size.height, focal, focal, size.width / 2, size.height / 2)
+        self.cameras = [Camera(*lens, _moved(shift)) for shift in (-0.4, 0.0, 0.4)]
+        self.photo = torch.full((size.height, size.width, 3), 0.5, device=device)
+        self.optimiser = SplatAdam(self.gaussians, {name: 0.0 for name, _ in self.gaussians.items()})
+        self._steps(1)  # first use allocates
+
+    def seconds(self) -> float:
+        """Run the kernel once; returns its wall seconds, on a GPU those between two of its events."""
+        if self.device.type != "cuda":
+            begin = time.perf_counter()
+            self._steps(self.size.steps)
+            devices.wait(self.device)
+            return time.perf_counter() - begin
+        first, last = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+        first.record()
+        self._steps(self.size.steps)
+        last.record()
+        last.synchronize()
+        return first.elapsed_time(last) / 1e3
+
+    def _steps(self, count: int) -> None:
+        for k in range(count):
+            rendered = render(self.gaussians, self.cameras[k % len(self.cameras)])
+            if devices.accelerated(self.device):  # the loss there is compiled for one size of photo
+                cotangent = rendered.image - self.photo
+            else:
+                cotangent = photometric(rendered.image, self.photo).d_image
+            self.optimiser.step(rendered.backward(cotangent), rendered.visible)
+
+
+@lru_cache(maxsize=1)
+def calibration(device: torch.device) -> Calibration:
+    """The kernel of a device; made once a process."""
+    return Calibration(device, KERNELS["cuda" if device.type == "cuda" else "cpu"])
+
+
+def _moved(shift: float) -> np.ndarray:
+    pose = np.eye(4)
+    pose[0, 3] = shift
+    return pose

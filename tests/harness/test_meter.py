@@ -1,0 +1,231 @@
+"""What a run notes about the machine: alone or contended, reference seconds, state."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from ambiguous_wild.harness.running import machine
+from ambiguous_wild.harness.running.grid import plan_cells, run_cells
+from ambiguous_wild.harness.running.machine import Presence
+from ambiguous_wild.harness.running.meter import Meter
+from ambiguous_wild.harness.running.timing import in_reference_seconds
+from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.splat.calibration import KERNELS, Calibration, Size
+from ambiguous_wild.splat.data import load_train_data
+from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.trainer import Trainer
+from tests.tiny_scene import write_tiny_scene
+
+CORES = 4
+
+
+class Machine:
+    """Clocks that a test moves: `others` processors are busy with other work."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.wall = self.others = self.own = 0.0
+        monkeypatch.setattr(time, "monotonic", lambda: self.wall)
+        monkeypatch.setattr(machine, "busy_s", lambda: 1000.0 + self.others + self.own)
+        monkeypatch.setattr(machine, "own_s", lambda: 5.0 + self.own)
+        monkeypatch.setattr(machine, "cores", lambda: CORES)
+        monkeypatch.setattr(machine, "load", lambda: 1.0)
+
+    def work(self, seconds: float, *, threads: int = CORES, others: float = 0.0) -> None:
+        self.wall, self.own = self.wall + seconds, self.own + threads * seconds
+        self.others += others * seconds
+
+
+def meter(tmp_path: Path, *, kernel: list[float] | None = None, threads: int = CORES) -> Meter:
+    seconds = iter(kernel or [0.5] * 100)
+    return Meter("cpu", threads, kernel_s=lambda: next(seconds), presence=Presence("cpu", tmp_path))
+
+
+def measured(m: Meter, m_work, seconds: float = 40.0, **how: float) -> tuple[str, str]:
+    m.begin(0.0)
+    m_work(seconds, **how)
+    m.look(seconds)
+    m.end(seconds)
+    return m.verdict(seconds)
+
+
+def test_a_run_that_has_its_processors_is_alone(tmp_path, monkeypatch):
+    assert measured(meter(tmp_path), Machine(monkeypatch).work) == ("alone", "")
+    # others may use what this run does not need
+    here = Machine(monkeypatch)
+    assert measured(meter(tmp_path, threads=1), here.work, threads=1, others=2.9) == ("alone", "")
+
+
+@pytest.mark.parametrize(("threads", "others"), [(4, 0.5), (4, 2.0), (1, 3.2)])
+def test_other_programs_make_a_run_contended(tmp_path, monkeypatch, threads, others):
+    m = meter(tmp_path, threads=threads)
+    verdict, reason = measured(m, Machine(monkeypatch).work, threads=threads, others=others)
+    assert verdict == "contended"
+    assert reason == f"other programs used {others:.1f} of 4 processors"
+    assert m.cost(40.0)["timing"]["others"] == pytest.approx(others)
+
+
+def test_a_load_that_others_brought_once_is_not_forgotten(tmp_path, monkeypatch):
+    here, m = Machine(monkeypatch), meter(tmp_path)
+    m.begin(0.0)
+    for k in range(4):
+        here.work(10.0, others=2.0 if k == 0 else 0.0)
+        m.look(10.0 * (k + 1))
+    m.end(40.0)
+    assert m.verdict(40.0) == ("contended", "other programs used 0.5 of 4 processors")
+
+
+def test_a_speed_that_varies_is_contention(tmp_path, monkeypatch):
+    verdict, reason = measured(meter(tmp_path, kernel=[0.5, 0.8]), Machine(monkeypatch).work)
+    assert (verdict, reason) == ("contended", "the machine's speed varied 1.6 times between calibrations")
+
+
+def test_a_run_that_was_calibrated_late_is_unknown(tmp_path, monkeypatch):
+    here, m = Machine(monkeypatch), meter(tmp_path)
+    m.begin(30.0)
+    here.work(10.0)
+    m.look(40.0)
+    assert m.verdict(40.0) == ("unknown", "calibrations cover 25 % of the training")
+
+
+def test_reference_seconds_are_of_the_reference_machine(tmp_path, monkeypatch):
+    twice = KERNELS["cpu"].reference_s * 2
+    m = meter(tmp_path, kernel=[twice] * 9)
+    measured(m, Machine(monkeypatch).work, 40.0)
+    cost = m.cost(40.0)
+    assert cost["reference_s"] == pytest.approx(20.0)
+    record = cost["timing"]
+    again = in_reference_seconds(record["samples"], record["kernel_reference_s"], [40.0])
+    assert again[0] == cost["reference_s"]
+
+
+def test_calibrations_come_at_quarters_and_every_fifteen_seconds(tmp_path, monkeypatch):
+    Machine(monkeypatch)
+    for total, step, expected in ((1.0, 0.01, 2), (20.0, 0.5, 5), (300.0, 1.0, 21)):
+        m = meter(tmp_path)
+        m.begin(0.0)
+        for k in range(1, round(total / step) + 1):
+            if m.due(k * step, k * step / total):
+                m.look(k * step)
+        m.end(total)
+        assert len(m.samples) == expected
+        assert m.samples[0][0] == 0.0 and m.samples[-1][0] == pytest.approx(total)
+
+
+def test_the_state_of_a_meter_goes_on_after_a_kill(tmp_path, monkeypatch):
+    here, m = Machine(monkeypatch), meter(tmp_path)
+    m.begin(0.0)
+    here.work(20.0, others=2.0)
+    m.look(20.0)
+    here.work(10.0, others=2.0)
+    state = m.state_dict()
+    m.end(30.0)
+    other = meter(tmp_path)
+    other.load_state_dict(state)
+    other.begin(30.0)
+    here.work(10.0)
+    other.look(40.0)
+    other.end(40.0)
+    assert other.verdict(40.0) == ("contended", "other programs used 1.5 of 4 processors")
+    assert [at for at, _ in other.samples] == [0.0, 20.0, 30.0, 40.0]
+
+
+def test_runs_count_each_other_and_forget_the_dead(tmp_path):
+    one, two = Presence("cpu", tmp_path), Presence("cpu", tmp_path)
+    other_gpu = Presence("GPU-1234", tmp_path)
+    with one.here():
+        assert one.count() == 1
+        with two.here(), other_gpu.here():
+            assert one.count() == two.count() == 2
+            assert other_gpu.count() == 1
+        assert one.count() == 1
+    code = (
+        "import os, sys\nfrom pathlib import Path\n"
+        "from ambiguous_wild.harness.running.machine import Presence\n"
+        "p = Presence('cpu', Path(sys.argv[1]))\np.here().__enter__()\nprint(p.count(), flush=True)\n"
+        "os.kill(os.getpid(), 9)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True)
+    assert done.stdout == "1\n"
+    with one.here():
+        assert one.count() == 1
+    assert not list(tmp_path.rglob("*.lock"))
+
+
+def test_two_runs_at_once_are_contended(tmp_path, monkeypatch):
+    here, m = Machine(monkeypatch), meter(tmp_path)
+    with Presence("cpu", tmp_path).here():
+        assert measured(m, here.work) == ("contended", "2 runs shared the machine")
+
+
+def test_busy_seconds_count_the_work_of_others():
+    if machine.busy_s() is None:
+        pytest.skip("this system does not tell")
+    busy, own = machine.busy_s(), machine.own_s()
+    subprocess.run([sys.executable, "-c", "sum(range(8_000_000))"], check=True)
+    grown, spent = machine.busy_s() - busy, machine.own_s() - own
+    assert spent > 0.05  # a child that has ended is ours
+    assert grown > spent - 0.05  # ticks of a hundredth
+
+
+def test_what_the_system_does_not_tell_is_unknown(tmp_path, monkeypatch):
+    here = Machine(monkeypatch)
+    monkeypatch.setattr(machine, "busy_s", lambda: None)
+    m = meter(tmp_path)
+    assert measured(m, here.work)[0] == "unknown" and "others" not in m.cost(40.0)["timing"]
+    monkeypatch.setattr(machine, "_STAT", tmp_path / "absent")
+    monkeypatch.undo()
+    monkeypatch.setattr(machine, "_STAT", tmp_path / "absent")
+    assert machine.busy_s() is None
+    monkeypatch.delattr(os, "getloadavg", raising=False)
+    assert machine.load() is None
+
+
+def test_the_kernel_does_the_same_work_every_time():
+    kernel = Calibration(torch.device("cpu"), Size("test", 1.0, 200, 48, 32, 3))
+    before = {name: tensor.clone() for name, tensor in kernel.gaussians.items()}
+    assert kernel.seconds() > 0.0
+    assert kernel.seconds() > 0.0
+    assert all(torch.equal(before[name], tensor) for name, tensor in kernel.gaussians.items())
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return load_scene(write_tiny_scene(tmp_path_factory.mktemp("data") / "scene"))
+
+
+def test_a_meter_changes_no_bit_of_a_run(scene, tmp_path):
+    found = []
+    for name in ("with", "without"):
+        data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=tmp_path)
+        trainer = Trainer(data, Parts(), TrainConfig(iterations=60, probes=2), folder=tmp_path / name)
+        if name == "with":
+            trainer.meter = meter(tmp_path, kernel=[1.0] * 100)
+            monitored = trainer.meter
+            monitored.due = lambda trained_s, progress: True  # after every iteration
+            kernel = Calibration(torch.device("cpu"), Size("test", 1.0, 200, 48, 32, 1))
+            monitored._kernel_s = kernel.seconds
+        trainer.train()
+        found.append({k: v.numpy().tobytes() for k, v in trainer.gaussians.items()})
+    assert len(monitored.samples) == 61
+    assert found[0] == found[1]
+
+
+def test_every_run_records_its_time(scene, tmp_path):
+    (report,) = run_cells(
+        plan_cells(["3dgs"], [scene.root], [0], TrainConfig(iterations=30)), tmp_path / "runs"
+    )
+    cost = report.result["cost"]
+    record = cost["timing"]
+    assert record["kernel"] == "cpu-1" and record["runs"] >= 1
+    assert [at for at, _ in record["samples"]] == [0.0, pytest.approx(cost["train_s"])]
+    again = in_reference_seconds(record["samples"], record["kernel_reference_s"], [cost["train_s"]])
+    assert cost["reference_s"] == pytest.approx(again[0])
+    assert 0.0 < cost["cpu_s"] <= 1.5 * machine.cores() * cost["train_s"]

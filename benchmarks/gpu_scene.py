@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import shutil
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -25,12 +26,33 @@ from ambiguous_wild.simulate.capture import simulate
 from ambiguous_wild.simulate.presets import preset
 
 SAMPLES = 2  # rays a pixel; it is the time of training that is measured
+EVERY_PX_SMALL = 48  # of a scene to be carried
 EVERY_PX = 24  # a point for so many px along rows and columns of every train photo
 SAME_DEPTH = 0.02  # relative: another photo shows a point whose depth there is its own
 
 
-def make_scene(out: Path, *, name: str, train: int, test: int, width: int, seed: int = 0) -> Path:
-    """Write a scene folder with photos, model, lists and truth; returns it. An existing one is kept."""
+def make_scene(
+    out: Path,
+    *,
+    name: str,
+    train: int,
+    test: int,
+    width: int,
+    seed: int = 0,
+    to_train_on: bool = False,
+    every: int | None = None,
+) -> Path:
+    """Write a scene folder with photos, model, lists and truth; returns it. An existing one is kept.
+
+    Args:
+        out: the folder.
+        name: of the simulator's preset.
+        train, test: number of photos.
+        width: of a photo in px.
+        seed: of the simulation.
+        to_train_on: small, to be carried elsewhere: photos as the simulator's JPEG, no truth, fewer points.
+        every: a point for so many px along rows and columns of every train photo; None = EVERY_PX.
+    """
     if (out / "sparse" / "0" / "points3D.bin").is_file():
         return out
     spec = preset(name)
@@ -41,33 +63,43 @@ def make_scene(out: Path, *, name: str, train: int, test: int, width: int, seed:
         raw = Path(raw_name) / "raw"
         simulate(spec, raw, seed=seed, depth=True)
         cameras = json.loads((raw / "truth" / "cameras.json").read_text())
-        for part in ("images", "sparse/0", "truth/distractor", "truth/clean"):
+        for part in ("images", "sparse/0", *(() if to_train_on else ("truth/distractor", "truth/clean"))):
             (folder / part).mkdir(parents=True)
         lists: dict[str, list[str]] = {"train": [], "test": []}
         for split, found in lists.items():
             for photo in sorted((raw / split).iterdir()):
                 png = photo.with_suffix(".png").name
+                if to_train_on:
+                    shutil.copyfile(photo, folder / "images" / photo.name)
+                    found.append(photo.name)
+                    continue
                 pixels = cv2.imread(str(photo), cv2.IMREAD_COLOR)
                 write_png(folder / "images" / png, np.ascontiguousarray(pixels[:, :, ::-1]))
                 found.append(png)
-        for kind in ("distractor", "clean"):
+        for kind in () if to_train_on else ("distractor", "clean"):
             for path in (raw / "truth" / kind).iterdir():
                 (folder / "truth" / kind / path.name).write_bytes(path.read_bytes())
         for split, found in lists.items():
             write_text(folder / f"{split}_list.txt", "\n".join(found) + "\n")
-        _write_model(folder, raw, cameras, lists["train"])
+        if every is None:
+            every = EVERY_PX_SMALL if to_train_on else EVERY_PX
+        _write_model(folder, raw, cameras, lists, every)
     return out
 
 
-def _write_model(folder: Path, raw: Path, cameras: dict[str, Any], train: list[str]) -> None:
+def _write_model(
+    folder: Path, raw: Path, cameras: dict[str, Any], lists: dict[str, list[str]], every: int
+) -> None:
     """Every photo's pose; points on a grid of every train photo, with the train photos that show them."""
     order = sorted(cameras)
     first = cameras[order[0]]
     poses = {name: np.array(cameras[name]["cam_from_world"]) for name in order}
     stems = [Path(name).stem for name in order]
-    views = [k for k, stem in enumerate(stems) if f"{stem}.png" in set(train)]
+    names = {Path(name).stem: name for found in lists.values() for name in found}
+    train = {Path(name).stem for name in lists["train"]}
+    views = [k for k, stem in enumerate(stems) if stem in train]
     depths = {k: _depth_m(raw, stems[k]) for k in views}
-    xyz, rgb = _points(raw, cameras, order, views, depths)
+    xyz, rgb = _points(raw, cameras, order, views, depths, every)
     observed: dict[int, tuple[np.ndarray, np.ndarray]] = {}
     for k in views:
         c = cameras[order[k]]
@@ -84,8 +116,7 @@ def _write_model(folder: Path, raw: Path, cameras: dict[str, Any], train: list[s
         rows, uv = observed.get(k, (np.zeros(0, np.int64), np.zeros((0, 2))))
         pose = poses[name]
         q = _quaternion(pose[:3, :3])
-        png = f"{stems[k]}.png"
-        images.append(ModelImage(k + 1, q, pose[:3, 3], 1, png, uv, rows.astype(np.int64) + 1))
+        images.append(ModelImage(k + 1, q, pose[:3, 3], 1, names[stems[k]], uv, rows.astype(np.int64) + 1))
     size = (first["width"], first["height"], tuple(first[key] for key in ("fx", "fy", "cx", "cy")))
     sparse = folder / "sparse" / "0"
     write_cameras(sparse / "cameras.bin", [ModelCamera(1, "PINHOLE", *size)])
@@ -94,15 +125,18 @@ def _write_model(folder: Path, raw: Path, cameras: dict[str, Any], train: list[s
 
 
 def _points(
-    raw: Path, cameras: dict[str, Any], order: list[str], views: list[int], depths: dict[int, np.ndarray]
+    raw: Path,
+    cameras: dict[str, Any],
+    order: list[str],
+    views: list[int],
+    depths: dict[int, np.ndarray],
+    every: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """World points [M, 3] on a grid of every train photo, and their colours [M, 3] uint8."""
     xyz, rgb = [], []
     for k in views:
         c = cameras[order[k]]
-        rows, columns = np.mgrid[
-            EVERY_PX // 2 : c["height"] : EVERY_PX, EVERY_PX // 2 : c["width"] : EVERY_PX
-        ]
+        rows, columns = np.mgrid[every // 2 : c["height"] : every, every // 2 : c["width"] : every]
         z = depths[k][rows, columns]
         known = z > 0
         rows, columns, z = rows[known], columns[known], z[known]

@@ -1,7 +1,8 @@
 """Refresh intervals of RefineSplat's masks and entropy terms: quality against time.
 
     python benchmarks/refresh.py --scene SCENE [--scene ...] [--seed 0 --seed 1] [--iterations 3000]
-        [--set KEY=VALUE] [--interval KEY=1,2,4,8] [-o RUNS] [--json PATH]
+        [--method refinesplat-paper] [--set KEY=VALUE] [--interval KEY=1,2,4,8] [--gaussians 20000]
+        [-o RUNS] [--json PATH]
 
 Each interval is varied alone, with the others at their defaults. Runs are ordinary cells under -o: finished
 ones are kept, stopped ones resume. Writes benchmarks/results/refresh.json and refresh.png: PSNR and mask IoU
@@ -32,7 +33,6 @@ from ambiguous_wild.metrics import stats
 from ambiguous_wild.splat.pace import TrainConfig
 
 RESULTS = Path(__file__).parent / "results" / "refresh.json"
-METHOD = "refinesplat"
 INTERVALS = {"mask_every": (1, 2, 4, 8, 16), "entropy_every": (1, 2, 4, 8, 16)}
 KNEE_DB = 0.1  # a step to a cheaper interval that costs less than this is worth it
 
@@ -48,9 +48,9 @@ class Point:
 
 def plan(args: argparse.Namespace) -> list[Point]:
     """Every value of every interval on every scene with every seed; each setting's runs have a name."""
-    train = TrainConfig(iterations=args.iterations, probes=0)
-    settings = [f"{METHOD}.{text}" for text in args.settings]
-    default = plan_cells([METHOD], args.scenes, args.seeds or [0], train, settings=settings)
+    train = TrainConfig(iterations=args.iterations, probes=0, max_gaussians=args.gaussians)
+    settings = [f"{args.method}.{text}" for text in args.settings]
+    default = plan_cells([args.method], args.scenes, args.seeds or [0], train, settings=settings)
     points = []
     for key, values in list(args.intervals.items()):
         if key == "entropy_every" and not (default[0].options.lambda_id or default[0].options.lambda_cr):
@@ -61,7 +61,7 @@ def plan(args: argparse.Namespace) -> list[Point]:
             options = with_options(default[0].options, {key: str(value)})
             same = options == default[0].options
             method = default[0].method
-            entry = method if same else dataclasses.replace(method, name=f"{METHOD}@{key}-{value}")
+            entry = method if same else dataclasses.replace(method, name=f"{args.method}@{key}-{value}")
             cells = tuple(dataclasses.replace(c, method=entry, options=options) for c in default)
             points.append(Point(key, value, cells))
     return points
@@ -119,7 +119,7 @@ def draw(data: dict[str, Any], path: Path) -> None:
             panel.set_xlabel("ms per iteration")
             panel.set_ylabel(label)
             panel.grid(alpha=0.25)
-        axes[0, column].set_title(f"{METHOD}.{key}", fontsize=10)
+        axes[0, column].set_title(f"{data['method']}.{key}", fontsize=10)
     with atomic_path(path) as temporary:
         figure.savefig(temporary, metadata={"Software": None})
 
@@ -136,7 +136,9 @@ def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--scene", dest="scenes", action="append", type=Path, required=True)
     parser.add_argument("--seed", dest="seeds", action="append", type=int, help="default: 0")
+    parser.add_argument("--method", default="refinesplat")
     parser.add_argument("--iterations", type=int, default=3000)
+    parser.add_argument("--gaussians", type=int, help="most Gaussians; default: as in training")
     parser.add_argument("--set", dest="settings", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument(
         "--interval", dest="intervals", action="append", type=_interval, metavar="KEY=1,2,4",
@@ -169,6 +171,7 @@ def main() -> None:
     knees = {key: knee([r for r in rows if r["interval"] == key]) for key in args.intervals}
     data = {
         "machine": machine(),
+        "method": args.method,
         "scenes": [str(p.name) for p in args.scenes],
         "seeds": args.seeds or [0],
         "iterations": args.iterations,

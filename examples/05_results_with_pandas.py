@@ -1,6 +1,7 @@
 """Results of runs as pandas tables: means, differences between methods, the hardest images.
 
-    python examples/05_results_with_pandas.py                    trains two methods on a small scene first
+    python examples/01_photos_to_table.py                        trains two methods on a small capture
+    python examples/05_results_with_pandas.py                    reads its runs
     python examples/05_results_with_pandas.py --runs runs        reads a folder that 'aw bench' wrote
 
 Every number comes from the metrics.json of a run. `docs/metrics.md` says what each metric is.
@@ -9,29 +10,24 @@ Every number comes from the metrics.json of a run. `docs/metrics.md` says what e
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 import pandas as pd
 
-from ambiguous_wild import bench
-from ambiguous_wild.builder.pipeline import build_scene
-from ambiguous_wild.harness.bench import Lines
+from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.running.store import read_runs
 from ambiguous_wild.harness.tables.tidy import tidy
-from ambiguous_wild.simulate.capture import simulate
-from ambiguous_wild.simulate.presets import preset
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--runs", type=Path, help="folder of runs; without it two methods are trained")
+    parser.add_argument("--runs", type=Path, default=Path("example_photos_to_table/runs"))
     parser.add_argument("-o", "--output", type=Path, default=Path("example_results"))
-    parser.add_argument("--iterations", type=int, default=100)
     wanted = parser.parse_args()
-    folder = wanted.runs or train_two_methods(wanted.output, wanted.iterations)
 
     # One row for each method, scene, seed, image and metric. A missing value is NaN, and `reason` says why.
-    results = tidy(read_runs(folder))
+    results = tidy(read_runs(wanted.runs))
     print(results.head(), "\n")
 
     # Numbers of an image have its name; those of a whole run (cost, masks) have an empty one.
@@ -66,15 +62,8 @@ def main() -> None:
     print(f"wrote {path}")
 
 
-def train_two_methods(output: Path, iterations: int) -> Path:
-    """A simulated capture, built and benched; returns the folder of the runs."""
-    simulate(preset("tiny"), output / "raw")
-    scene = build_scene(output / "raw", output / "scene").scene
-    methods = ["3dgs", "refinesplat"]
-    return bench(
-        methods, scene, output=output / "runs", iterations=iterations, pictures=False, callbacks=Lines()
-    ).output
-
-
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except AwError as error:
+        sys.exit(f"error: {error}")

@@ -1,4 +1,4 @@
-"""Transcribe the tables of the RefineSplat paper from its LaTeX source to ambiguous_wild/harness/audit/reported/*.csv.
+"""Transcribe the tables of the RefineSplat paper from its LaTeX source to CSV.
 
     python leaderboard/transcribe.py paper.tex -o ambiguous_wild/harness/audit/reported
 

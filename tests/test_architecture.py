@@ -17,20 +17,22 @@ from ambiguous_wild.cli.main import COMMANDS
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "ambiguous_wild"
-BELOW_HARNESS = {"core", "io", "builder", "simulate", "vision", "metrics", "splat", "methods"}
+BELOW_HARNESS = {"core", "io", "builder", "datasets", "simulate", "vision", "metrics", "splat", "methods"}
 ALLOWED: dict[str, set[str]] = {
     "core": set(),
     "io": {"core"},
     "builder": {"core", "io"},
+    "datasets": {"core", "io", "builder"},
     "simulate": {"core", "io"},
     "vision": {"core", "io"},
     "metrics": {"core"},
     "splat": {"core", "io"},
     "methods": {"core", "io", "splat", "vision"},
-    "harness": BELOW_HARNESS,
+    "viewing": {"core", "io", "metrics", "splat"},
+    "harness": BELOW_HARNESS | {"viewing"},
     "study": {"core", "io", "metrics", "harness"},
     "stress": {"core", "metrics", "splat", "methods"},
-    "cli": BELOW_HARNESS | {"harness", "study", "stress"},
+    "cli": BELOW_HARNESS | {"viewing", "harness", "study", "stress"},
 }
 HEAVY = ("torch", "numba", "pycolmap", "cv2", "matplotlib", "transformers", "scipy", "pandas", "skimage")
 FILES = sorted(PACKAGE.rglob("*.py"))

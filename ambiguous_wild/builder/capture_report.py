@@ -10,6 +10,7 @@ import numpy as np
 
 from ambiguous_wild.builder.checks import Check, run_checks
 from ambiguous_wild.builder.collect import Source, collect
+from ambiguous_wild.builder.phone_photos import format_twins
 from ambiguous_wild.builder.photo_comparison import (
     PhotoFeatures,
     candidate_pairs,
@@ -64,11 +65,15 @@ def check_capture(raw: Path | str, *, jobs: int = 1, bar: Bar | None = None) -> 
     bar.finish()
     unreadable = [r for r in rows if not isinstance(r, tuple)]
     good = [r for r in rows if isinstance(r, tuple)]
+    if not capture.has_sides:
+        twins = format_twins([r for r, _, _ in good], np.stack([t for _, t, _ in good]) if good else None)
+        good = [row for row in good if row[0]["source"] not in twins]
+        copies = copies | twins
     refuse_bad(capture, unreadable, copies, len(good), False)
     skipped = [*unreadable, *copy_rows(copies)]
     features = [f for _, _, f in good]
     bar.start("comparing photos", len(candidate_pairs(features)))
-    compared = compare_photos(features, bar.step)
+    compared = compare_photos(features, bar.step, jobs)
     bar.finish()
     checks = run_checks([record for record, _, _ in good], np.stack([t for _, t, _ in good]), compared)
     if skipped:

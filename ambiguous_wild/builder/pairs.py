@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+PAIRS = "pairs.txt"  # in the stage's folder: what was matched
 OVERLAP = 10  # neighbours on each side
 EXHAUSTIVE_LIMIT = 200  # photos; 19 900 pairs, about nine minutes on two cores at 3000 features
 
 
 def sequential_pairs(names: list[str], test_names: set[str]) -> list[tuple[str, str]]:
-    """Neighbours in the given order, photos 2^k further on, and every test photo against all.
+    """Neighbours in the given order, and photos 2^k further on.
 
-    Test photos are not part of the walk: neighbours of a test photo by name are other test photos.
+    Photos of a separate test set are not part of the walk: their neighbours by name are other test photos.
+    `retrieval.pairs_of_tests` finds their partners.
 
     Args:
         names: in the order of capture.
@@ -20,8 +22,4 @@ def sequential_pairs(names: list[str], test_names: set[str]) -> list[tuple[str, 
     """
     walk = [n for n in names if n not in test_names]
     steps = sorted({*range(1, OVERLAP + 1), *(2**k for k in range(4, 10))})
-    pairs = [(walk[i], walk[i + s]) for i in range(len(walk)) for s in steps if i + s < len(walk)]
-    tests = [n for n in names if n in test_names]
-    pairs += [(a, b) for a in tests for b in walk]
-    pairs += [(a, b) for i, a in enumerate(tests) for b in tests[i + 1 :]]
-    return pairs
+    return [(walk[i], walk[i + s]) for i in range(len(walk)) for s in steps if i + s < len(walk)]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -93,6 +94,7 @@ def _coarse_colours(small: np.ndarray) -> np.ndarray:
 def compare_photos(
     features: Sequence[PhotoFeatures],  # in the order of capture, where known
     step: Callable[[], None] = lambda: None,
+    jobs: int = 1,  # threads; the result does not depend on it
 ) -> PhotoComparison:
     """Match each photo with the next and the most similar ones; solve for one offset a photo."""
     count = len(features)
@@ -100,8 +102,12 @@ def compare_photos(
     rows: list[tuple[int, int, np.ndarray, float]] = []
     forward: list[bool] = []
 
-    def try_pair(i: int, j: int) -> None:
-        found = _match(features[i], features[j])
+    def matched(pair: tuple[int, int]) -> tuple[np.ndarray, np.ndarray] | None:
+        found = _match(features[pair[0]], features[pair[1]])
+        step()
+        return found
+
+    def enter(i: int, j: int, found: tuple[np.ndarray, np.ndarray] | None) -> None:
         if found is None:
             return
         graph[i, j] = graph[j, i] = True
@@ -112,16 +118,18 @@ def compare_photos(
             rows.append((i, j, np.median(difference[good], axis=0), float(np.sqrt(good.sum()))))
 
     tried = set(candidate_pairs(features))
-    for i, j in sorted(tried):
-        try_pair(i, j)
-        step()
+    ordered = sorted(tried)
+    # OpenCV's random numbers are a thread's own, and each match seeds them.
+    with ThreadPoolExecutor(jobs) as pool:
+        for (i, j), found in zip(ordered, pool.map(matched, ordered)):
+            enter(i, j, found)
     # A photo that overlaps with few is tried against more candidates before it counts as isolated.
     groups = _groups(graph)
     for i in np.flatnonzero((groups != 0) | (graph.sum(axis=1) < 2)).tolist():
         for j in most_similar(features, i, EXTRA_CANDIDATES):
             if (pair := (min(i, j), max(i, j))) not in tried:
                 tried.add(pair)
-                try_pair(*pair)
+                enter(*pair, _match(features[pair[0]], features[pair[1]]))
     share = float(np.mean(forward)) if forward else math.nan
     return PhotoComparison(_solve(count, rows), graph.sum(axis=1), _groups(graph), share)
 
@@ -174,20 +182,33 @@ def _match(a: PhotoFeatures, b: PhotoFeatures) -> tuple[np.ndarray, np.ndarray] 
     """Indices of matching features in both photos; None where the photos do not overlap."""
     if min(len(a.xy), len(b.xy)) < MIN_INLIERS:
         return None
-    nearest = cv2.BFMatcher(cv2.NORM_L2).knnMatch(
-        a.descriptors.astype(np.float32), b.descriptors.astype(np.float32), k=2
-    )
-    good = [m[0] for m in nearest if len(m) == 2 and m[0].distance < RATIO * m[1].distance]
-    if len(good) < MIN_INLIERS:
+    one, two = _ratio_matches(a.descriptors, b.descriptors)
+    if len(one) < MIN_INLIERS:
         return None
-    one = np.array([m.queryIdx for m in good])
-    two = np.array([m.trainIdx for m in good])
     cv2.setRNGSeed(0)
     _, inlier = cv2.findFundamentalMat(a.xy[one], b.xy[two], cv2.FM_RANSAC, 2.0, 0.99, 500)
     if inlier is None or int(inlier.sum()) < MIN_INLIERS:
         return None
     keep = inlier.ravel() > 0
     return one[keep], two[keep]
+
+
+def _ratio_matches(
+    a: np.ndarray,  # [F, 128] uint8
+    b: np.ndarray,  # [G, 128] uint8
+) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of matches by Lowe's ratio test.
+
+    By a matrix product: sums of squares of bytes are exact in float32, and it takes a third of the time of
+    OpenCV's matcher (1000 features).
+    """
+    x, y = a.astype(np.float32), b.astype(np.float32)
+    squared = (x * x).sum(axis=1)[:, None] + (y * y).sum(axis=1)[None] - 2 * (x @ y.T)
+    rows, nearest = np.arange(len(x)), np.argmin(squared, axis=1)
+    first = np.sqrt(squared[rows, nearest])
+    squared[rows, nearest] = np.inf
+    good = first < RATIO * np.sqrt(squared.min(axis=1))
+    return rows[good], nearest[good]
 
 
 def _solve(count: int, rows: list[tuple[int, int, np.ndarray, float]]) -> np.ndarray:

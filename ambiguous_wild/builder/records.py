@@ -81,14 +81,14 @@ class MaskResult(TypedDict):
 class FeatureResult(TypedDict):
     """Of the stage `features`."""
 
-    camera: str  # "single" or "per-image"
+    camera: str  # "single", "per-device" or "per-image"
     features: dict[str, int]  # work name -> number
 
 
 class MatchResult(TypedDict):
     """Of the stage `matches`."""
 
-    matcher: str  # "exhaustive" or "sequential"
+    matcher: str  # "exhaustive", "sequential" or "retrieval"
     pairs: int  # tried
     verified: int
 

@@ -114,7 +114,7 @@ def point_checks(model: Model, names: dict[str, str], test: set[str]) -> tuple[i
     in_train = ~np.isin(points.track_image_ids, tests)
     owner = np.repeat(np.arange(len(lengths)), lengths)
     trained = np.bincount(owner, weights=in_train, minlength=len(lengths))
-    return int((trained == 0).sum()), int((lengths == 2).sum())
+    return int(((trained == 0) & (lengths > 0)).sum()), int((lengths == 2).sum())
 
 
 def parallax_deg(model: Model) -> float:

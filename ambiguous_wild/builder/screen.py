@@ -9,13 +9,14 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import cast
 
 import cv2
 import numpy as np
 
 from ambiguous_wild.builder.collect import MIN_PHOTOS, Capture, Source, identical
+from ambiguous_wild.builder.phone_photos import burst_warnings, format_twins, live_photo_warnings
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import (
     ExifRecord,
@@ -66,6 +67,10 @@ def screen(capture: Capture, folder: Path, *, strict: bool, jobs: int, bar: Bar)
     bar.finish()
     unreadable = [r for r in rows if not isinstance(r, tuple)]
     good = [r for r in rows if isinstance(r, tuple)]
+    twins = format_twins([record for record, _ in good], np.stack([t for _, t in good]) if good else None)
+    if not capture.has_sides:
+        good = _without_twins(good, twins, photos)
+        copies = copies | twins
     refuse_bad(capture, unreadable, copies, len(good), strict)
     facts = [record for record, _ in good]
     skipped = [*unreadable, *copy_rows(copies)]
@@ -74,6 +79,8 @@ def screen(capture: Capture, folder: Path, *, strict: bool, jobs: int, bar: Bar)
         *(f"{p['source']}: {n}" for p in facts for n in p["notes"]),
         *(_identical_warning(group) for group in identical(capture) if capture.has_sides),
         *_near_duplicates(facts, np.stack([t for _, t in good])),
+        *burst_warnings(facts, np.stack([t for _, t in good])),
+        *live_photo_warnings(capture),
         *drift_warnings(facts),
     ]
     return {"photos": facts, "skipped": skipped, "warnings": warnings}
@@ -170,6 +177,20 @@ def exposure_stops(exif: ExifRecord) -> float | None:
     return math.log2(exif["exposure_s"] * exif.get("iso", 100.0) / exif.get("f_number", 1.0) ** 2)
 
 
+def _without_twins(
+    good: list[tuple[ScreenedPhoto, np.ndarray]], twins: dict[str, str], folder: Path
+) -> list[tuple[ScreenedPhoto, np.ndarray]]:
+    """Leave out photos that are there in another format too; they become copies of those."""
+    kept = []
+    for record, small in good:
+        if record["source"] in twins:
+            (folder / record["work_name"]).unlink()
+            continue
+        record["copies"] += [copy for copy, source in twins.items() if source == record["source"]]
+        kept.append((record, small))
+    return kept
+
+
 def _near_duplicates(facts: Sequence[PhotoRecord], thumbnails: np.ndarray) -> list[str]:
     close = np.triu(thumbnails @ thumbnails.T > NEAR_DUPLICATE, k=1)
     pairs = [
@@ -193,20 +214,36 @@ def _lay_out(source: Source, photo: Photo, pixels: np.ndarray, folder: Path) -> 
 
     # OpenImageIO copies the EXIF focal length, from which COLMAP starts.
     name = source.stem + ".png"
-    original = oiio.ImageBuf(str(photo.path)).spec()
     spec = oiio.ImageSpec(photo.width, photo.height, 3, "uint8")
-    for attribute in original.extra_attribs:
-        known = attribute.name.startswith("Exif:") or attribute.name in ("Make", "Model")
-        if known and isinstance(attribute.value, (str, int, float)):
-            spec.attribute(
-                attribute.name, attribute.value
-            )  # passed with its uint16 type, it would be dropped
+    for key, value in _attributes(photo).items():
+        spec.attribute(key, value)  # passed with its uint16 type, it would be dropped
     output = oiio.ImageOutput.create(str(folder / name))
     if output is None or not output.open(str(folder / name), spec) or not output.write_image(pixels):
         reason = oiio.geterror() if output is None else output.geterror()
         raise AwError(f"cannot convert {source.relative} to PNG: {' '.join(reason.split())}")
     output.close()
     return name
+
+
+def _attributes(photo: Photo) -> dict[str, str | int | float]:
+    """EXIF under OpenImageIO's names."""
+    if photo.format == "heic":
+        exif = photo.exif
+        known = {
+            "Make": exif.make,
+            "Model": exif.model,
+            "Exif:FocalLength": exif.focal_mm,
+            "Exif:FocalLengthIn35mmFilm": None if exif.focal_35mm is None else int(exif.focal_35mm),
+        }
+        return {key: value for key, value in known.items() if value is not None}
+    import OpenImageIO as oiio
+
+    return {
+        a.name: a.value
+        for a in oiio.ImageBuf(str(photo.path)).spec().extra_attribs
+        if (a.name.startswith("Exif:") or a.name in ("Make", "Model"))
+        and isinstance(a.value, (str, int, float))
+    }
 
 
 def _identical_warning(group: list[str]) -> str:
@@ -217,7 +254,12 @@ def _identical_warning(group: list[str]) -> str:
 
 def copy_rows(copies: dict[str, str]) -> list[SkippedPhoto]:
     """The copies as photos that are left out."""
-    return [{"source": copy, "skipped": f"the same file as {kept}"} for copy, kept in copies.items()]
+    return [{"source": copy, "skipped": f"{_sameness(copy, kept)} {kept}"} for copy, kept in copies.items()]
+
+
+def _sameness(copy: str, kept: str) -> str:
+    other_format = PurePosixPath(copy).suffix.lower() != PurePosixPath(kept).suffix.lower()
+    return "the same photo in another format as" if other_format else "the same file as"
 
 
 def refuse_bad(

@@ -7,8 +7,8 @@ from typing import Literal
 
 from ambiguous_wild.core.errors import AwError
 
-CameraMode = Literal["auto", "single", "per-image"]
-Matcher = Literal["auto", "exhaustive", "sequential"]
+CameraMode = Literal["auto", "single", "per-device", "per-image"]
+Matcher = Literal["auto", "exhaustive", "sequential", "retrieval"]
 Mapper = Literal["incremental", "global"]
 
 
@@ -20,8 +20,8 @@ class BuildSettings:
     """Settings of `build_scene`; none depends on the machine."""
 
     factor: int | None = None  # downsampling; None: of 1, 2, 4, 8 the largest that leaves 480 px
-    camera: CameraMode = "auto"  # auto: one camera if EXIF and size agree, else one per photo
-    matcher: Matcher = "auto"  # auto: exhaustive up to 200 photos, then sequential
+    camera: CameraMode = "auto"  # auto: one camera if EXIF and size agree, else one a device or a photo
+    matcher: Matcher = "auto"  # auto: exhaustive up to 200 photos, then retrieval
     mapper: Mapper = "incremental"  # global is faster on many photos, weaker on few
     max_features: int = 3000  # SIFT features a photo
     max_side: int = 1600  # px; photos are reduced to this for SIFT only

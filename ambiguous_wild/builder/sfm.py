@@ -11,8 +11,9 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
-from ambiguous_wild.builder.pairs import EXHAUSTIVE_LIMIT, sequential_pairs
+from ambiguous_wild.builder.pairs import EXHAUSTIVE_LIMIT, PAIRS
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import (
     FeatureResult,
@@ -36,25 +37,38 @@ class SfmCrash(AwError):
 
 
 def choose_camera(photos: Sequence[PhotoRecord], wanted: str) -> str:
-    """ "single" or "per-image".
+    """ "single", "per-device" or "per-image".
 
     "single" where size, camera model and focal length are the same in all photos. Photos of one size without
-    EXIF count as frames of one camera: internet photos differ in size.
+    EXIF count as frames of one camera: internet photos differ in size. "per-device" where EXIF tells two or
+    more photos of one camera from the others.
     """
     if wanted != "auto":
         return wanted
-    kinds = {
-        (p["width"], p["height"], p["camera"], p["exif"].get("focal_mm"), p["exif"].get("focal_35mm"))
-        for p in photos
-    }
-    return "single" if len(kinds) == 1 else "per-image"
+    if len({_device(p) for p in photos}) == 1:
+        return "single"
+    return "per-device" if any(len(group) > 1 for group in camera_groups(photos)) else "per-image"
+
+
+def _device(photo: PhotoRecord) -> tuple[Any, ...]:
+    exif = photo["exif"]
+    return (photo["width"], photo["height"], photo["camera"], exif.get("focal_mm"), exif.get("focal_35mm"))
+
+
+def camera_groups(photos: Sequence[PhotoRecord]) -> list[list[int]]:
+    """Indices of photos that share a camera by EXIF; a photo without make and focal length stands alone."""
+    groups: dict[tuple[Any, ...], list[int]] = {}
+    for index, photo in enumerate(photos):
+        known = photo["camera"] and ("focal_mm" in photo["exif"] or "focal_35mm" in photo["exif"])
+        groups.setdefault(_device(photo) if known else (index,), []).append(index)
+    return list(groups.values())
 
 
 def choose_matcher(count: int, wanted: str) -> str:
-    """ "exhaustive" or "sequential"."""
+    """ "exhaustive", "retrieval" or "sequential"."""
     if wanted != "auto":
         return wanted
-    return "exhaustive" if count <= EXHAUSTIVE_LIMIT else "sequential"
+    return "exhaustive" if count <= EXHAUSTIVE_LIMIT else "retrieval"
 
 
 def extract_features(
@@ -76,13 +90,16 @@ def extract_features(
         "photos": str(photos),
         "names": [f["work_name"] for f in facts],
         "camera": camera,
+        "groups": [[facts[i]["work_name"] for i in g] for g in camera_groups(facts)]
+        if camera == "per-device"
+        else [],
         "masks": str(masks) if masks else None,
         "max_features": settings.max_features,
         "max_side": settings.max_side,
         "seed": settings.seed,
         "jobs": jobs,
     }
-    _run(job, folder, lambda: bar.at(_count(database, "keypoints")))
+    run_job(job, folder, lambda: bar.at(_count(database, "keypoints")))
     bar.finish()
     with closing(sqlite3.connect(database)) as db:
         rows = db.execute(
@@ -112,11 +129,10 @@ def match(
     shutil.copyfile(features / DATABASE, database)
     names = [f["work_name"] for f in facts]
     test_names = [f["work_name"] for f in facts if f["side"] == "test"]
-    if matcher == "exhaustive":
-        pairs = len(names) * (len(names) - 1) // 2
-    else:
-        pairs = len(sequential_pairs(names, set(test_names)))
-    bar.start("matching pairs", pairs)
+    listed = folder / PAIRS
+    every = len(names) * (len(names) - 1) // 2
+    # How many pairs retrieval finds is known once it has.
+    bar.start("matching pairs", every if matcher == "exhaustive" else None)
     job: MatchJob = {
         "task": "matches",
         "database": str(database),
@@ -126,8 +142,9 @@ def match(
         "seed": settings.seed,
         "jobs": jobs,
     }
-    _run(job, folder, lambda: bar.at(_count(database, "two_view_geometries")))
+    run_job(job, folder, lambda: bar.at(_count(database, "two_view_geometries")))
     bar.finish()
+    pairs = every if matcher == "exhaustive" else len(listed.read_text(encoding="utf-8").splitlines())
     with closing(sqlite3.connect(database)) as db:
         inliers = [r[0] for r in db.execute("SELECT rows FROM two_view_geometries WHERE rows > 0")]
     return {"matcher": matcher, "pairs": pairs, "verified": len(inliers)}
@@ -150,7 +167,7 @@ def map_scene(
         "mapper": settings.mapper,
         "seed": settings.seed,
     }
-    _run(job, folder, lambda: bar.at(_number(progress)))
+    run_job(job, folder, lambda: bar.at(_number(progress)))
     bar.finish()
     database.unlink()
     progress.unlink(missing_ok=True)
@@ -158,7 +175,7 @@ def map_scene(
     return {"models": listing}
 
 
-def _run(job: SfmJob, folder: Path, watch: Callable[[], None]) -> None:
+def run_job(job: SfmJob, folder: Path, watch: Callable[[], None]) -> None:
     """Run one task of the worker; `watch` is called while it runs."""
     write_json(folder / "job.json", {**job, "parent": os.getpid()})
     log = folder / LOG

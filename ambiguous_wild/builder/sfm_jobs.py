@@ -13,6 +13,7 @@ class FeatureJob(TypedDict):
     photos: str  # folder
     names: list[str]
     camera: str
+    groups: list[list[str]]  # names that share a camera, where the camera is "per-device"
     masks: str | None  # folder
     max_features: int
     max_side: int  # px
@@ -47,4 +48,16 @@ class MappingJob(TypedDict):
     parent: NotRequired[int]
 
 
-SfmJob = FeatureJob | MatchJob | MappingJob
+class TriangulationJob(TypedDict):
+    """Triangulate points with known poses."""
+
+    task: Literal["triangulation"]
+    database: str
+    photos: str  # folder
+    model: str  # folder; cameras and poses, numbered as in the database
+    output: str  # folder
+    seed: int
+    parent: NotRequired[int]
+
+
+SfmJob = FeatureJob | MatchJob | MappingJob | TriangulationJob

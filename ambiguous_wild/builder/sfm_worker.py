@@ -16,9 +16,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from ambiguous_wild.builder.pairs import sequential_pairs
+import numpy as np
+
+from ambiguous_wild.builder.pairs import PAIRS, sequential_pairs
 from ambiguous_wild.builder.records import ModelSummary
-from ambiguous_wild.builder.sfm_jobs import FeatureJob, MappingJob, MatchJob, SfmJob
+from ambiguous_wild.builder.retrieval import embed, pairs_of_tests, retrieval_pairs
+from ambiguous_wild.builder.sfm_jobs import FeatureJob, MappingJob, MatchJob, SfmJob, TriangulationJob
 from ambiguous_wild.io.atomic import write_json
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
@@ -37,25 +40,26 @@ def run_features(job: FeatureJob) -> None:
     reader.camera_model = "SIMPLE_RADIAL"
     if job["masks"]:
         reader.mask_path = job["masks"]
-    mode = pycolmap.CameraMode.SINGLE if job["camera"] == "single" else pycolmap.CameraMode.PER_IMAGE
+    mode = pycolmap.CameraMode.PER_IMAGE if job["camera"] == "per-image" else pycolmap.CameraMode.SINGLE
     # Photos are imported first, ordered by name: extraction numbers them in the order its threads finish,
     # and later random choices depend on these numbers.
     pycolmap.Database.open(job["database"]).close()
-    pycolmap.import_images(
-        job["database"], job["photos"], camera_mode=mode, image_names=job["names"], options=reader
-    )
+    for names in job["groups"] or [job["names"]]:
+        pycolmap.import_images(
+            job["database"], job["photos"], camera_mode=mode, image_names=names, options=reader
+        )
     pycolmap.extract_features(
         job["database"],
         job["photos"],
         image_names=job["names"],
-        camera_mode=mode,
+        camera_mode=pycolmap.CameraMode.PER_IMAGE if job["groups"] else mode,
         reader_options=reader,
         extraction_options=options,
     )
 
 
 def run_matches(job: MatchJob) -> None:
-    """Match and verify pairs: all of them, or those of `sequential_pairs`."""
+    """Match and verify pairs: all of them, or those that are likely to overlap."""
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu = False
     options.num_threads = job["jobs"]
@@ -64,14 +68,36 @@ def run_matches(job: MatchJob) -> None:
     if job["matcher"] == "exhaustive":
         pycolmap.match_exhaustive(job["database"], matching_options=options, verification_options=verify)
         return
-    listed = Path(job["database"]).with_name("pairs.txt")
-    pairs = sequential_pairs(job["names"], set(job["test_names"]))
+    listed = Path(job["database"]).with_name(PAIRS)
+    pairs = _likely_pairs(job)
     listed.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="utf-8")
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = str(listed)
     pycolmap.match_image_pairs(
         job["database"], matching_options=options, pairing_options=pairing, verification_options=verify
     )
+
+
+def _likely_pairs(job: MatchJob) -> list[tuple[str, str]]:
+    """By the order of capture, by similar features, or both."""
+    tests = set(job["test_names"])
+    sequential = job["matcher"] == "sequential"
+    if sequential and not tests:
+        return sequential_pairs(job["names"], tests)
+    database = pycolmap.Database.open(job["database"])
+    try:
+        numbers = {image.name: image.image_id for image in database.read_all_images()}
+
+        def read(name: str) -> np.ndarray:
+            return np.asarray(database.read_descriptors(numbers[name]).data)
+
+        vectors = embed(read, job["names"], job["seed"])
+    finally:
+        database.close()
+    if sequential:
+        found = {*sequential_pairs(job["names"], tests), *pairs_of_tests(vectors, job["names"], tests)}
+        return sorted(found)
+    return retrieval_pairs(vectors, job["names"], tests)
 
 
 def run_mapping(job: MappingJob) -> None:
@@ -96,6 +122,19 @@ def run_mapping(job: MappingJob) -> None:
             }
         )
     write_json(output / "models.json", listing)
+
+
+def run_triangulation(job: TriangulationJob) -> None:
+    """Points from the matches; poses and intrinsics stay as they are."""
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = 1
+    options.ba_min_num_residuals_for_cpu_multi_threading = 10**9
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = job["seed"]
+    known = pycolmap.Reconstruction(job["model"])
+    found = pycolmap.triangulate_points(
+        known, job["database"], job["photos"], job["output"], options=options, refine_intrinsics=False
+    )
+    found.write_binary(job["output"])
 
 
 def _map_incrementally(job: MappingJob, output: Path) -> dict[int, Any]:
@@ -154,8 +193,10 @@ def main() -> None:
         run_features(job)
     elif job["task"] == "matches":
         run_matches(job)
-    else:
+    elif job["task"] == "mapping":
         run_mapping(job)
+    else:
+        run_triangulation(job)
 
 
 if __name__ == "__main__":

@@ -4,18 +4,24 @@ from __future__ import annotations
 
 import math
 import re
+import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from ambiguous_wild.cli.engines import engine_options
 from ambiguous_wild.cli.options import training_options
 from ambiguous_wild.cli.paths import PathName
-from ambiguous_wild.cli.progress import Progress, finish
+from ambiguous_wild.cli.progress import Progress, finish, say
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.harness.bench import Engine, bench
 
+if TYPE_CHECKING:
+    from ambiguous_wild.harness.suite import PreparedSuite
+
+SUITES = ("ambiguous-wild", "on-the-go", "robustnerf", "photo-tourism", "drone")
 LONGEST_S = 366 * 24 * 3600.0
 _UNITS = {"s": 1, "m": 60, "min": 60, "h": 3600}
 
@@ -40,16 +46,23 @@ def parse_budget(text: str) -> float:
     "--method",
     "methods",
     multiple=True,
-    required=True,
     help="A name of 'aw methods', FILE.py:RECIPE, external:FILE.yaml or nerfbaselines:METHOD; repeatable.",
 )
 @click.option(
     "--scene",
     "scenes",
     multiple=True,
-    required=True,
     type=PathName(),
     help="A scene folder; repeatable.",
+)
+@click.option(
+    "--suite",
+    "suite_name",
+    type=click.Choice(SUITES),
+    help="All scenes of a published table instead of --scene; prints the table beside the reported numbers.",
+)
+@click.option(
+    "--root", type=PathName(), help="Folder with a folder a scene of the suite, in any layout of 'aw import'."
 )
 @training_options
 @click.option(
@@ -68,6 +81,8 @@ def parse_budget(text: str) -> float:
 @click.option("--mask", metavar="METHOD", help="Masks of another method, none, or truth (exact ones).")
 @click.option("--density", metavar="METHOD", help="Density control of another method.")
 @click.option("--regulariser", metavar="METHOD", help="Loss on the render of another method.")
+@click.option("--passes", type=click.IntRange(1, 2), default=1, show_default=True,
+              help="2: train again from the start with the final masks; both trainings count as its cost.")  # fmt: skip
 @click.option(
     "--set", "settings", multiple=True, metavar="METHOD.KEY=VALUE", help="An option of a method; repeatable."
 )
@@ -87,9 +102,7 @@ def parse_budget(text: str) -> float:
 @click.option(
     "--protocol",
     type=click.Choice(["full", "half"]),
-    default="full",
-    show_default=True,
-    help="half: colour effects see the left half of a test photo, the right one is measured (NeRF-W).",
+    help="half: colour effects see the left half of a test photo, the right one is measured (NeRF-W).  [default: as scene.json says, else full]",
 )
 @click.option("-o", "--output", type=PathName(), default=Path("runs"), show_default=True)
 @click.option(
@@ -132,6 +145,8 @@ def command(
     engine: Engine,
     methods: tuple[str, ...],
     scenes: tuple[Path, ...],
+    suite_name: str | None,
+    root: Path | None,
     seeds: tuple[int, ...],
     iterations: int | None,
     budgets: tuple[str, ...],
@@ -143,11 +158,12 @@ def command(
     mask: str | None,
     density: str | None,
     regulariser: str | None,
+    passes: int,
     settings: tuple[str, ...],
     plugins: tuple[Path, ...],
     effects: tuple[str, ...],
     plan_file: Path | None,
-    protocol: str,
+    protocol: str | None,
     output: Path,
     probes: int,
     overwrite: str,
@@ -165,6 +181,7 @@ def command(
     aw bench --method refinesplat --scene scene --budget 10m --set refinesplat.lambda_cr=0.1
     aw bench --method 3dgs --method refinesplat --scene scene --budget 1m --budget 3m --budget 10m -o runs
     aw bench --method 3dgs --method robustsplat --mask refinesplat --scene scene -o runs
+    aw bench --suite on-the-go --root datasets/on-the-go -o runs
 
     With --jobs 4 four cells run at a time, with --engine ray as many as a cluster has room for.
     --mask, --density and --regulariser plug parts of one method into every METHOD: the runs are called
@@ -177,6 +194,15 @@ def command(
     if iterations is not None and budgets:
         raise AwError("--iterations and --budget exclude each other: a run is as long as one of them says")
     seconds = [parse_budget(budget) for budget in budgets]
+    prepared = None
+    if suite_name is not None:
+        prepared, methods, iterations = _suite(suite_name, root, scenes, output, methods, iterations, seconds)
+        scenes, protocol = tuple(prepared.scenes.values()), protocol or prepared.suite.protocol
+    elif root is not None:
+        raise AwError("--root goes with --suite: name the suite whose scenes it holds")
+    for flag, given in (("--method", methods), ("--scene", scenes)):
+        if not given:
+            raise AwError(f"{flag} is missing: 'aw bench --help' shows examples")
     if math.isnan(checkpoint_every):
         raise AwError("--checkpoint-every nan: give a number of seconds")
     parts = {"mask": mask, "density": density, "regulariser": regulariser}
@@ -198,6 +224,7 @@ def command(
         plan=plan_file,
         settings=settings,
         parts={place: donor for place, donor in parts.items() if donor},  # type: ignore[misc]
+        passes=passes,
         train=train,  # type: ignore[arg-type]
         plugins=plugins,
         device=device,  # type: ignore[arg-type]
@@ -211,4 +238,38 @@ def command(
         pictures=pictures,
         callbacks=Progress(),
     )
+    if prepared is not None and not as_json:
+        for folder in report.folders:
+            _print_tables(prepared, folder)
     finish(report, as_json)
+
+
+def _suite(
+    name: str,
+    root: Path | None,
+    scenes: Sequence[Path],
+    output: Path,
+    methods: Sequence[str],
+    iterations: int | None,
+    budgets_s: Sequence[float],
+) -> tuple[PreparedSuite, tuple[str, ...], int | None]:
+    """The suite's scenes, its methods and length unless others are asked for."""
+    from ambiguous_wild.datasets.suites import get_suite
+    from ambiguous_wild.harness.suite import prepare_suite, suite_methods
+
+    if root is None or scenes:
+        raise AwError(f"--suite {name} takes its scenes from --root DIR; leave --scene out")
+    suite = get_suite(name)
+    prepared = prepare_suite(suite, root, output, say=say)
+    length = iterations if iterations is not None or budgets_s else suite.iterations
+    return prepared, tuple(methods or suite_methods(suite)), length
+
+
+def _print_tables(prepared: PreparedSuite, folder: Path) -> None:
+    from ambiguous_wild.harness.suite import suite_layouts
+    from ambiguous_wild.harness.tables.layouts.plain_formats import to_text
+
+    try:
+        click.echo(to_text(suite_layouts(prepared, folder), color=sys.stdout.isatty()), nl=False)
+    except AwError as error:  # every run failed, which `finish` tells
+        say(str(error))

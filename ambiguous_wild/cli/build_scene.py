@@ -21,10 +21,17 @@ if TYPE_CHECKING:
     "--factor", type=int, help="Downsampling; default: of 1, 2, 4, 8 the largest that leaves 480 px."
 )
 @click.option(
-    "--camera", type=click.Choice(["auto", "single", "per-image"]), default="auto", show_default=True
+    "--camera",
+    type=click.Choice(["auto", "single", "per-device", "per-image"]),
+    default="auto",
+    show_default=True,
 )
 @click.option(
-    "--matcher", type=click.Choice(["auto", "exhaustive", "sequential"]), default="auto", show_default=True
+    "--matcher",
+    type=click.Choice(["auto", "exhaustive", "sequential", "retrieval"]),
+    default="auto",
+    show_default=True,
+    help="Pairs of photos: all, neighbours in order, or similar ones; auto: all up to 200 photos, else similar ones.",
 )
 @click.option(
     "--mapper", type=click.Choice(["incremental", "global"]), default="incremental", show_default=True

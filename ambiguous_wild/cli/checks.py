@@ -254,6 +254,7 @@ def _extras() -> list[Check]:
 
     packages = {
         "ray": ("ray", "aw bench --engine ray"),
+        "pi-heif": ("heic", "HEIC photos of phones"),
         "choix": ("study", "aw study score: ranking"),
         "nltk": ("study", "aw study score: agreement"),
     }
@@ -292,11 +293,13 @@ def _vision() -> list[Check]:
     detail = f"{version or 'not installed'} (DINO features, SAM masks)"
     fix = "" if version else install_command("masks")
     checks = [Check("optional", "transformers", version is not None, detail, fix)]
-    hub = {w.name: w.used_for for w in weights.KNOWN if w.kind == "hub"}
+    # those of LPIPS are listed by metric
+    listed = {w.name: w for w in weights.KNOWN if "LPIPS" not in w.used_for}
     checks += [
-        Check("optional", line.name, line.present, f"{hub[line.name]}: {line.where}", line.command)
-        for line in weights.status()
-        if line.name in hub
+        Check(
+            "optional", line.name, line.present, f"{listed[line.name].used_for}: {line.where}", line.command
+        )
+        for line in weights.status(listed.values())
     ]
     return checks
 
@@ -320,7 +323,7 @@ def _metrics() -> list[Check]:
     for metric in lpips.VARIANTS:
         missing = lpips.missing_weights(metric)
         detail = f"weights missing: {', '.join(missing)}" if missing else "weights found"
-        fix = weights.download_command(*map(weights.named, missing)) if missing else ""
+        fix = weights.get_command(*missing) if missing else ""
         checks.append(Check("optional", metric, not missing, detail, fix))
     return checks
 

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import shlex
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from ambiguous_wild.cli.paths import PathName
 from ambiguous_wild.core.errors import AwError
+
+if TYPE_CHECKING:
+    from ambiguous_wild.harness.cost.read import Found
 
 
 @click.command(name="cost")
@@ -29,6 +34,11 @@ from ambiguous_wild.core.errors import AwError
     is_flag=True,
     help="Count features and masks made before the first step as time too; a cache makes them short.",
 )
+@click.option(
+    "--recommend", "recommended", type=PathName(file_okay=False), metavar="SCENE",
+    help="Say which measured setting to train this scene with, for the time that --budget gives.",
+)  # fmt: skip
+@click.option("--budget", metavar="TIME", help="For --recommend: training time here, e.g. 90s, 5m.")
 @click.option("--plots/--no-plots", default=True, show_default=True, help="Draw SVG and PNG.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
 def command(
@@ -37,6 +47,8 @@ def command(
     targets: tuple[float, ...],
     scenes: tuple[str, ...],
     with_setup: bool,
+    recommended: Path | None,
+    budget: str | None,
     plots: bool,
     as_json: bool,
 ) -> None:
@@ -48,6 +60,7 @@ def command(
     \b
     aw bench --method 3dgs --method refinesplat --scene scene --budget 1m --budget 3m --budget 10m -o runs
     aw cost runs --target 25 -o cost
+    aw cost runs --recommend my-scene --budget 5m
     """
     if any(not math.isfinite(t) for t in targets):
         raise AwError("--target must be a number of dB, e.g. 25")
@@ -56,7 +69,14 @@ def command(
     from ambiguous_wild.harness.cost.text import to_text
     from ambiguous_wild.io.atomic import check_output
 
+    if (recommended is None) != (budget is None):
+        raise AwError(
+            "--recommend SCENE and --budget TIME belong together, e.g. --recommend scene --budget 5m"
+        )
     found = read_cost_runs(runs, scenes=scenes)
+    if recommended is not None and budget is not None:
+        _recommend(found, recommended, budget, as_json)
+        return
     made_by = command_line(runs, output, targets, scenes, with_setup)
     report = cost_report(found, targets=targets, setup=with_setup, made_by=made_by)
     check_output(output / "cost.json")  # not before: it makes the folder, and there may be nothing to write
@@ -67,6 +87,27 @@ def command(
         written += draw_all(report, output)
     click.echo(json.dumps(plain_data(report), indent=2) if as_json else to_text(report), nl=as_json)
     click.echo(f"wrote {', '.join(p.name for p in written)} in {output}", err=True)
+
+
+def _recommend(found: Found, scene: Path, budget: str, as_json: bool) -> None:
+    from ambiguous_wild.cli.bench import parse_budget
+    from ambiguous_wild.harness.cost.here import speed_here
+    from ambiguous_wild.harness.cost.recommend import in_words, recommend
+    from ambiguous_wild.harness.cost.report import finite
+    from ambiguous_wild.harness.running.identity import scene_identity
+    from ambiguous_wild.io.scene_folder import load_scene
+
+    seconds = parse_budget(budget)
+    opened = load_scene(scene, verify="quick")
+    speed = speed_here(found) if found.reference else 1.0
+    advice = recommend(found.runs, opened.name, seconds, speed=speed, scene_hash=scene_identity(opened))
+    if not found.reference:
+        click.echo("the runs have wall seconds alone: this machine is taken for theirs", err=True)
+    if as_json:
+        told = dataclasses.asdict(advice) | {"command": advice.command(str(scene))}
+        click.echo(json.dumps(finite(told), indent=2))
+    else:
+        click.echo(in_words(advice, str(scene)), nl=False)
 
 
 def command_line(

@@ -1,27 +1,49 @@
-"""`aw methods`: the available methods and their requirements."""
+"""`aw methods`: the available methods, one of them in full, or what they consist of."""
 
 from __future__ import annotations
 
 import json
 import textwrap
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from ambiguous_wild.cli.paths import PathName
 
+if TYPE_CHECKING:
+    from ambiguous_wild.methods.entry import MethodEntry
+
+WIDTH = 100
+
 
 @click.command(name="methods")
+@click.argument("names", nargs=-1, metavar="[NAME]...")
+@click.option("--table", is_flag=True, help="What each method consists of: masks, appearance, density, ...")
 @click.option("--plugin", "plugins", multiple=True, type=PathName(),
               help="A Python file that registers your methods; repeatable.")  # fmt: skip
-@click.option("--json", "as_json", is_flag=True, help="Print the list as JSON.")
-def command(plugins: tuple[Path, ...], as_json: bool) -> None:
-    """List the methods: name, summary, paper, requirements beyond the core."""
-    from ambiguous_wild.methods.registry import all_methods, load_plugin
+@click.option("--json", "as_json", is_flag=True, help="Print the same as JSON.")
+def command(names: tuple[str, ...], table: bool, plugins: tuple[Path, ...], as_json: bool) -> None:
+    """List the methods: name, summary, paper, requirements beyond the core.
+
+    With NAME: what differs from its release and why, with what features it was published and runs here, its
+    options with their defaults, and its ablations.
+    """
+    from ambiguous_wild.methods.registry import all_methods, get_method, load_plugin
 
     for plugin in plugins:
         load_plugin(plugin)
-    entries = [entry for _, entry in sorted(all_methods().items())]
+    entries = [get_method(name) for name in names] or [entry for _, entry in sorted(all_methods().items())]
+    if table:
+        _table(entries, as_json)
+    elif names:
+        _in_full(entries, as_json)
+    else:
+        _list(entries, as_json)
+
+
+def _list(entries: Sequence[MethodEntry], as_json: bool) -> None:
     if as_json:
         rows = [{"name": e.name, "summary": e.summary, "paper": e.paper, "needs": e.needs} for e in entries]
         click.echo(json.dumps(rows, indent=2, ensure_ascii=False))
@@ -34,6 +56,68 @@ def command(plugins: tuple[Path, ...], as_json: bool) -> None:
         for i, line in enumerate(lines):
             name = click.style(entry.name.ljust(width), bold=True) if i == 0 else " " * width
             click.echo(
-                textwrap.fill(line, 100, initial_indent=f"{name}  ", subsequent_indent=" " * (width + 2))
+                textwrap.fill(line, WIDTH, initial_indent=f"{name}  ", subsequent_indent=" " * (width + 2))
             )
-    click.echo(f"\n{len(entries)} methods; 'aw bench --method NAME --scene SCENE' runs one")
+    click.echo(
+        f"\n{len(entries)} methods; 'aw methods NAME' shows one in full, 'aw methods --table' their parts"
+    )
+
+
+def _table(entries: Sequence[MethodEntry], as_json: bool) -> None:
+    from ambiguous_wild.methods.describe import COLUMNS, table_row
+
+    rows = [table_row(entry) for entry in entries]
+    if as_json:
+        click.echo(json.dumps([dict(zip(COLUMNS, row)) for row in rows], indent=2, ensure_ascii=False))
+        return
+    widths = [max(len(row[i]) for row in (COLUMNS, *rows)) for i in range(len(COLUMNS))]
+    for row in (COLUMNS, *rows):
+        line = "  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip()
+        click.echo(click.style(line, bold=row is COLUMNS))
+    click.echo("\n- as in 3DGS, or none; CPU: a statistic is needed that gsplat does not offer")
+
+
+def _in_full(entries: Sequence[MethodEntry], as_json: bool) -> None:
+    from ambiguous_wild.methods.describe import details
+
+    found = [details(entry) for entry in entries]
+    if as_json:
+        click.echo(json.dumps(found, indent=2, ensure_ascii=False))
+        return
+    for number, one in enumerate(found):
+        click.echo("\n" * bool(number), nl=False)
+        _show(one)
+
+
+def _show(one: dict[str, Any]) -> None:
+    click.echo(click.style(one["name"], bold=True) + "\n")
+    click.echo(one["about"] or one["summary"])
+    click.echo()
+    facts = {
+        "paper": one["paper"],
+        "needs": one["needs"] or "nothing beyond the core",
+        **one["parts"],
+        "published with": one["published_with"],
+        "runs with": ", ".join(f"{k}={v}" for k, v in one["runs_with"].items()),
+        "trainings": "2, the second with the final masks" if one["passes"] > 1 else "",
+        "recipe": one["recipe"],
+    }
+    width = max(map(len, facts))
+    for key, value in facts.items():
+        if value:
+            head = f"{key.ljust(width)}  "
+            click.echo(textwrap.fill(value, WIDTH, initial_indent=head, subsequent_indent=" " * len(head)))
+    if one["options"]:
+        click.echo(click.style("\noptions", bold=True) + f" (--set {one['name']}.KEY=VALUE)")
+        keys = max(len(o["key"]) + len(o["default"]) + 1 for o in one["options"])
+        keys = min(keys, 44)
+        for option in one["options"]:
+            head = f"  {option['key']}={option['default']}".ljust(keys + 4)
+            indent = " " * (keys + 4)
+            click.echo(textwrap.fill(option["comment"], WIDTH, initial_indent=head, subsequent_indent=indent)
+                       if option["comment"] else head.rstrip())  # fmt: skip
+    if one["ablations"]:
+        click.echo(click.style("\nablations", bold=True) + f" (aw ablate --method {one['name']})")
+        for group in one["ablations"]:
+            click.echo(textwrap.fill(f"{group['name']}: {group['title']} ({', '.join(group['variants'])})", WIDTH,
+                                     initial_indent="  ", subsequent_indent="    "))  # fmt: skip

@@ -180,7 +180,7 @@ def _layouts(
         return build.blocks(found, metrics=metrics, scenes=scenes)
     numbers = read_reported(reported_from) if reported or reported_from else []
     if not datasets:
-        datasets = datasets_of(numbers or _known(), sorted(set(found.runs["scene"])))
+        datasets = datasets_of(numbers or read_reported(), sorted(set(found.runs["scene"])))
     if layout == "memory":
         metrics = metrics or build.MEMORY
     if layout == "means":
@@ -189,13 +189,6 @@ def _layouts(
         subject = "memory" if layout == "memory" else ""
         made = build.paper(found, metrics=metrics, scenes=scenes, datasets=datasets, subject=subject)
     return [with_reported(one, numbers) for one in made] if numbers else made
-
-
-def _known() -> list:
-    """What the checkout's reported tables tell of datasets; nothing where there are none."""
-    from ambiguous_wild.harness.tables.layouts.reported import FOLDER, read_reported
-
-    return read_reported() if FOLDER.is_dir() else []
 
 
 def _laid_out(made: list[Layout], style: str, made_by: str, color: bool, everything: bool) -> tuple[str, str]:

@@ -29,7 +29,8 @@ class SceneInfo(TypedDict, total=False):
     factor: int  # downsampling that the scene was built for
     images: str  # folder of that factor
     license: str
-    dataset: str
+    dataset: str  # as result tables call it
+    evaluation: dict[str, Any]  # how the dataset's papers measure: protocol, effects
     build_key: str
     inputs: dict[str, Any]  # what it was built from
     files: dict[str, FileEntry]  # by path relative to the scene

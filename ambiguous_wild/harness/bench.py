@@ -12,6 +12,7 @@ Imports nothing heavy until names and options are checked.
 from __future__ import annotations
 
 import dataclasses
+import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from ambiguous_wild.harness.running.cell import Cell, CellReport, Outcome, Overwrite, Protocol
     from ambiguous_wild.harness.running.records import RunResult
     from ambiguous_wild.harness.running.store import Runs
+    from ambiguous_wild.harness.showing.page import Viewer
 
 Place = Literal["mask", "density", "regulariser"]
 Words = str | Path
@@ -67,6 +69,19 @@ class RunReport:
         known = [value for value in values if value is not None]
         return sum(known) / len(known) if known and len(known) == len(values) else None
 
+    def show(self, height: int = 640) -> Viewer:
+        """The page of `aw view` for this run; as the last value of a notebook's cell it is shown there.
+
+        Args:
+            height: of the frame, px.
+
+        Raises:
+            AwError: the run has no model, or its scene is not where it was.
+        """
+        from ambiguous_wild.harness.showing.page import Viewer
+
+        return Viewer([self.folder], height=height)
+
 
 @dataclass(frozen=True)
 class BenchReport:
@@ -99,6 +114,12 @@ class BenchReport:
 
         return read_runs(self.folders[0] if folder is None else folder)
 
+    def show(self, height: int = 640) -> Viewer:
+        """The page of `aw view` with every model side by side, for a notebook; see `RunReport.show`."""
+        from ambiguous_wild.harness.showing.page import Viewer
+
+        return Viewer([run.folder for run in self.runs if run.outcome != "failed"], height=height)
+
 
 def bench(
     methods: str | Sequence[str],
@@ -112,6 +133,7 @@ def bench(
     plan: Plan | Words | None = None,
     settings: Sequence[str] = (),
     parts: Mapping[Place, str] | None = None,
+    passes: int = 1,
     train: TrainSettings | None = None,
     plugins: Sequence[Words] = (),
     device: Literal["auto", "cpu", "cuda"] = "auto",
@@ -120,7 +142,7 @@ def bench(
     engine: Engine | None = None,
     gpus: int = 1,
     factor: int | None = None,
-    protocol: Protocol = "full",
+    protocol: Protocol | None = None,
     overwrite: Overwrite = "missing",
     cache: Words | None = None,
     pictures: bool = True,
@@ -140,6 +162,7 @@ def bench(
         plan: of `aw plan`, or its file, for the one scene; None = made where one is needed.
         settings: options of methods, "METHOD.KEY=VALUE".
         parts: parts of other methods that every method takes, e.g. {"mask": "refinesplat"}.
+        passes: 2 = train again from the start with the final masks; the runs are called METHOD+2passes.
         train: other settings of training.
         plugins: Python files that register methods.
         device: where to train; "auto" = the GPU where it can be used.
@@ -148,7 +171,8 @@ def bench(
         engine: where cells run; None = this machine.
         gpus: that share one model, for a scene too large for one.
         factor: which images_N; None = what the scene was built for.
-        protocol: "full" measures whole test photos, "half" the right half (NeRF-W).
+        protocol: "full" measures whole test photos, "half" the right half (NeRF-W); None = what the scene's
+            scene.json says, else "full".
         overwrite: "missing" keeps what is finished and resumes what stopped, "always" starts anew, "never"
             leaves folders that exist as they are.
         cache: for features and instance masks; None = OUTPUT/.cache.
@@ -166,7 +190,7 @@ def bench(
     where = Engine() if engine is None else engine
     where = where if jobs is None else dataclasses.replace(where, jobs=jobs)
     where.check()
-    names = _check_methods([methods] if isinstance(methods, str) else methods, plugins, parts or {})
+    names = _check_methods([methods] if isinstance(methods, str) else methods, plugins, parts or {}, passes)
     folders = [Path(scenes)] if isinstance(scenes, str | Path) else [Path(scene) for scene in scenes]
     choices = [effects] if isinstance(effects, str) else list(effects)
     _check_effects(choices, plan, folders)
@@ -176,6 +200,7 @@ def bench(
     with Session(where, threads, told) as session:
         from ambiguous_wild.harness.running.grid import plan_cells, run_cells
         from ambiguous_wild.harness.running.groups import grouped
+        from ambiguous_wild.harness.running.passes import check_passes
         from ambiguous_wild.harness.running.prepare import prepare_cpu
         from ambiguous_wild.io.atomic import check_output
         from ambiguous_wild.splat.pace import TrainConfig
@@ -205,6 +230,8 @@ def bench(
         cells = grouped(planned, budgets_s)
         if gpus > 1:
             cells = _on_several_gpus(cells, gpus, where)
+        for cell in {cell.method.name: cell for cell in cells}.values():
+            check_passes(cell)
         for line in _remarks(cells):
             told.say(line)
         check_output(out / "run")  # before half a minute of compiling
@@ -227,18 +254,27 @@ def bench(
         else:
             files = [Path(plugin) for plugin in plugins]
             reports = session.run(Grid(cells, out, overwrite, place, pictures, files, names))
-    return BenchReport(out, tuple(_run_report(cell, report) for cell, report in zip(cells, reports)))
+    made = BenchReport(out, tuple(_run_report(cell, report) for cell, report in zip(cells, reports)))
+    if said := _rescorable(made):
+        told.say(said)
+    return made
 
 
-def _check_methods(methods: Sequence[str], plugins: Sequence[Words], parts: Mapping[Place, str]) -> list[str]:
+def _check_methods(
+    methods: Sequence[str], plugins: Sequence[Words], parts: Mapping[Place, str], passes: int
+) -> list[str]:
     """The methods' names with the parts they take; a misspelt one is answered before torch is imported."""
     from ambiguous_wild.methods.graft import graft_name
     from ambiguous_wild.methods.registry import get_method, load_plugin
+    from ambiguous_wild.methods.second_pass import second_pass_name, trained_once
 
     for plugin in plugins:
         load_plugin(Path(plugin))
     donors: dict[str, str | None] = dict(parts.items())
-    names = [graft_name(name, donors) for name in methods]
+    names = []
+    for name in methods:
+        once = trained_once(name)
+        names.append(second_pass_name(graft_name(once, donors), passes if once == name else 2))
     for name in names:
         get_method(name)
     return names
@@ -299,6 +335,20 @@ def _remarks(cells: Sequence[Cell]) -> list[str]:
                 f"switch it on with --set {idle}.KEY=VALUE, or leave the regulariser out"
             )
     return lines
+
+
+def _rescorable(made: BenchReport) -> str:
+    """What `aw rescore` could add to runs that were kept; empty where it could add nothing."""
+    kept = [run.result for run in made.runs if run.outcome in ("kept", "skipped") and run.result is not None]
+    if not any(result["missing"] for result in kept):
+        return ""
+    from ambiguous_wild.harness.rescore import could_be_measured
+
+    names = could_be_measured(kept)
+    command = f"aw rescore {shlex.quote(str(made.output))}"
+    return (
+        f"runs that were kept lack {', '.join(names)}, which can be measured now: {command}" if names else ""
+    )
 
 
 def _run_report(cell: Cell, report: CellReport) -> RunReport:

@@ -13,9 +13,12 @@ import numpy as np
 
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.exif import Exif, exif_from_spec
+from ambiguous_wild.io.heif import UnreadableHeif, is_heif, read_heif
 from ambiguous_wild.io.image_header import MAX_PIXELS
 
-PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".jp2", ".heic", ".heif")
+PHOTO_SUFFIXES = (
+    ".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".jp2", ".heic", ".heif", ".dng",
+)  # fmt: skip
 MIN_SIDE = 16  # px; smaller photos have no features
 
 _FORMAT_OF_SUFFIX = {".jpg": "jpeg", ".jpeg": "jpeg", ".tif": "tiff", ".jp2": "jpeg2000", ".heif": "heic"}
@@ -54,6 +57,8 @@ def read_photo(
 
     source = Path(path)
     form = _sniff(source)
+    if form == "heic":
+        return _read_heic(source)
     _check_whole(source, form)
     reader = oiio.ImageInput.open(str(source))
     if reader is None:
@@ -72,12 +77,33 @@ def read_photo(
     if exif.orientation != 1:
         notes.append(f"turned upright (EXIF orientation {exif.orientation})")
         rgb = _upright(rgb, exif.orientation)
-    expected = _FORMAT_OF_SUFFIX.get(source.suffix.lower(), source.suffix.lower().lstrip("."))
-    if expected != form:
-        notes.append(f"{form} data under the name {source.suffix or 'without a suffix'}")
+    notes += _misnamed(source, form)
     height, width = rgb.shape[:2]
     plain = not notes and form in ("jpeg", "png")
     return Photo(source, form, width, height, exif, plain, tuple(notes)), np.ascontiguousarray(rgb)
+
+
+def _read_heic(source: Path) -> tuple[Photo, np.ndarray]:
+    try:
+        rgb, exif, notes = read_heif(source)
+    except UnreadableHeif as error:
+        raise UnreadablePhoto(source, str(error)) from error
+    height, width = rgb.shape[:2]
+    if min(width, height) < MIN_SIDE:
+        raise UnreadablePhoto(source, _too_small(width, height))
+    notes += _misnamed(source, "heic")
+    return Photo(source, "heic", width, height, exif, False, tuple(notes)), np.ascontiguousarray(rgb)
+
+
+def _misnamed(source: Path, form: str) -> list[str]:
+    suffix = source.suffix.lower()
+    if _FORMAT_OF_SUFFIX.get(suffix, suffix.lstrip(".")) == form:
+        return []
+    return [f"{form} data under the name {source.suffix or 'without a suffix'}"]
+
+
+def _too_small(width: int, height: int) -> str:
+    return f"{width}x{height} px is too small to match (at least {MIN_SIDE} a side)"
 
 
 def _sniff(path: Path) -> str:
@@ -98,12 +124,23 @@ def _sniff(path: Path) -> str:
     }
     for signature, form in signatures.items():
         if head.startswith(signature):
-            return form
+            return _raw(path) if path.suffix.lower() == ".dng" else form
     if head[:4] == b"RIFF" and head[8:12] == b"WEBP":
         return "webp"
-    if head[4:12] in (b"ftypheic", b"ftypheix", b"ftypmif1", b"ftypheim", b"ftypmsf1"):
-        raise UnreadablePhoto(path, "HEIC photos are not supported; export them as JPEG")
+    if is_heif(head):
+        return "heic"
     raise UnreadablePhoto(path, "no image (the content is of no photo format)")
+
+
+def _raw(path: Path) -> str:
+    """DNG is read where OpenImageIO was built with LibRaw; its TIFF reader would return the small preview."""
+    import OpenImageIO as oiio
+
+    if "raw" not in str(oiio.get_string_attribute("format_list")).split(","):
+        raise UnreadablePhoto(
+            path, "this OpenImageIO reads no raw photos (it has no LibRaw); export it as JPEG or 16-bit TIFF"
+        )
+    return "dng"
 
 
 def _check_whole(path: Path, form: str) -> None:
@@ -146,7 +183,7 @@ def _check_size(path: Path, spec: Any) -> None:
             f"limit of {MAX_PIXELS // 1_000_000}; reduce it",
         )
     if min(width, height) < MIN_SIDE:
-        raise UnreadablePhoto(path, f"{width}x{height} px is too small to match (at least {MIN_SIDE} a side)")
+        raise UnreadablePhoto(path, _too_small(width, height))
     if str(spec.format) not in ("uint8", "uint16"):
         raise UnreadablePhoto(path, f"pixels of type {spec.format} are not supported; export 8 or 16 bits")
 

@@ -55,13 +55,13 @@ def load_scene(
     if read is not None and verify:
         verify_files(root, read, quick=verify == "quick")
     # The model first: a folder of photos alone is told that it has none.
-    model_folder = _model_folder(root)
+    sparse = model_folder(root)
     chosen = _default_factor(root, read) if factor is None else factor
     folder = _image_folder(root, chosen)
     info: SceneInfo = {} if read is None else read.copy()
     # Runs are written to a folder of this name, and the scene may be somebody else's.
     name = check_name(f"scene name in {root}", info.get("name", root.resolve().name))
-    model = read_model(model_folder)
+    model = read_model(sparse)
     info["loaded_factor"] = chosen
     split, missing = _split(root, [image.name for image in model.images.values()])
     info["missing"] = missing
@@ -182,7 +182,12 @@ def _inside(name: str, root: Path) -> str:
     return name
 
 
-def _model_folder(root: Path) -> Path:
+def model_folder(root: Path) -> Path:
+    """Where the scene's COLMAP model lies.
+
+    Raises:
+        AwError: there is none.
+    """
     for folder in (root / "sparse" / "0", root / "sparse", root / "colmap" / "sparse" / "0"):
         if (folder / "cameras.bin").is_file() or (folder / "cameras.txt").is_file():
             return folder

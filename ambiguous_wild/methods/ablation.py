@@ -25,7 +25,9 @@ class Variant:
     features: str = (
         ""  # a features back end it needs, see vision/backends.py; without its weights the row is missing
     )
-    method: str = ""  # another method at its defaults, if the paper compares with one
+    # another method, if the paper compares with one; `settings` are then of the study's method as its donor,
+    # or of the graft where the study's method is its host
+    method: str = ""
 
 
 @dataclass(frozen=True)

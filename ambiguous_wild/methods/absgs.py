@@ -1,7 +1,8 @@
 """AbsGS: large Gaussians are split by the absolute screen gradient, where the signed one cancels out.
 
-Source: the defaults of the released code, TY424/AbsGS; what its paper's tables used is unverified. The clamp
-of opacity ends with growth (ours). Pruning by screen size and by blending weight (off there) are left out.
+Source: the defaults of the released code, TY424/AbsGS; what its paper's tables used is unverified. The
+clamp of opacity ends with growth (ours). Pruning by screen size and by blending weight (off there) are
+left out.
 """
 
 from __future__ import annotations
@@ -75,13 +76,20 @@ class AbsDensity(DensityControl):
     @torch.no_grad()
     def refine(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> tuple[Gaussians, list[str]]:
         gaussians, events = super().refine(step, gaussians, optimiser)
-        config, since = self.config, step.iteration - self.last_clamp
-        due = since >= config.min_clamp_every and since * step.nominal / step.iteration >= config.clamp_every
-        if due and step.nominal <= config.stop and config.clamp_opacity < 1:
-            gaussians.opacity_logits.clamp_(max=torch.logit(torch.tensor(config.clamp_opacity)).item())
+        if self._clamp_due(step):
+            limit = torch.logit(torch.tensor(self.config.clamp_opacity)).item()
+            gaussians.opacity_logits.clamp_(max=limit)
             optimiser.reset_moments(["opacity_logits"])
             self.last_clamp = step.iteration
         return gaussians, events
+
+    def due(self, step: Step) -> bool:
+        return super().due(step) or self._clamp_due(step)
+
+    def _clamp_due(self, step: Step) -> bool:
+        config, since = self.config, step.iteration - self.last_clamp
+        due = since >= config.min_clamp_every and since * step.nominal / step.iteration >= config.clamp_every
+        return due and step.nominal <= config.stop and config.clamp_opacity < 1
 
     def state_dict(self) -> dict[str, Any]:
         return super().state_dict() | {"last_clamp": self.last_clamp}

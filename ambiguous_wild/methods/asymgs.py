@@ -1,8 +1,8 @@
 """AsymGS in its EMA-GS form: the model agrees with a slow average of itself, under two masks in turn.
 
-Source: arXiv 2506.03538 and its released code. Ours: features (Lab and HOG for DINOv2's patch embedding) and
-instances (graph segments for Semantic-SAM's) without weights, both options; masks weigh SSIM's map, not its
-gradient; the base is 3DGS without Mip-Splatting's filters and growth.
+Source: arXiv 2506.03538 and its released code. Ours: features (Lab and HOG for DINOv2's patch embedding)
+and instances (graph segments for Semantic-SAM's) without weights, both options; masks weigh SSIM's map,
+not its gradient; the base is 3DGS without Mip-Splatting's filters and growth.
 """
 
 from __future__ import annotations

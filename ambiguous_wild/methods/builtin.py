@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from ambiguous_wild.methods.entry import MethodEntry
 
+PAPER_NETWORKS = "the paper's networks, DINOv2 and SAM 2; without their weights labhog and graph, hand-made"
+
 BUILTIN = (
     MethodEntry(
         name="3dgs",
@@ -13,12 +15,36 @@ BUILTIN = (
     ),
     MethodEntry(
         name="refinesplat",
-        summary="entropy-aware masks, density control and merging for ambiguous distractors",
+        summary="for ambiguous distractors, without pretrained weights: RefineSplat's parts, and ours where "
+        "the paper's measure worse (structure and other views instead of entropy)",
         recipe="ambiguous_wild.methods.refinesplat.recipe:build",
         config="ambiguous_wild.methods.refinesplat.recipe:Config",
         paper="Rectifying Mask via Entropy for Distractor-Free 3DGS in Ambiguous Scenarios",
         ablations="ambiguous_wild.methods.refinesplat.ablations:ABLATIONS",
         auto_effects=("exposure", "appearance", "antialias", "poses"),
+        note="weight-free; ours where the paper's parts measure worse (docs/fidelity.md)",
+    ),
+    MethodEntry(
+        name="refinesplat-paper",
+        summary="RefineSplat with all parts of its paper: identities, entropy masks, L_id and L_cr, "
+        "entropy-aware density, merging; repaired only where the print degenerates",
+        recipe="ambiguous_wild.methods.refinesplat.recipe:build",
+        config="ambiguous_wild.methods.refinesplat.paper:PaperConfig",
+        paper="Rectifying Mask via Entropy for Distractor-Free 3DGS in Ambiguous Scenarios",
+        needs=PAPER_NETWORKS,
+        ablations="ambiguous_wild.methods.refinesplat.paper_ablations:ABLATIONS",
+        note="all parts of the paper, repaired where the print degenerates (docs/fidelity.md); features "
+        "{features}, instances {instances}",
+    ),
+    MethodEntry(
+        name="refinesplat-printed",
+        summary="RefineSplat to the letter of its paper, degenerate forms included",
+        recipe="ambiguous_wild.methods.refinesplat.recipe:build",
+        config="ambiguous_wild.methods.refinesplat.paper:PrintedConfig",
+        paper="Rectifying Mask via Entropy for Distractor-Free 3DGS in Ambiguous Scenarios",
+        needs=PAPER_NETWORKS,
+        note="to the letter of the paper, degenerate forms included (docs/fidelity.md); features {features}, "
+        "instances {instances}",
     ),
     MethodEntry(
         name="robustsplat",
@@ -40,6 +66,7 @@ BUILTIN = (
         summary="appearance of every photo: an embedding per Gaussian and per photo changes colours",
         recipe="ambiguous_wild.methods.wildgaussians:build",
         config="ambiguous_wild.methods.wildgaussians:Config",
+        ablations="ambiguous_wild.methods.plug_in:WILDGAUSSIANS",
         paper="Kulhanek et al., NeurIPS 2024 (arXiv 2407.08447); its appearance only",
     ),
     MethodEntry(
@@ -76,6 +103,84 @@ BUILTIN = (
         recipe="ambiguous_wild.methods.asymgs:build",
         config="ambiguous_wild.methods.asymgs:AsymGsConfig",
         paper="AsymGS, NeurIPS 2025 (arXiv 2506.03538), its EMA-GS form",
+    ),
+    MethodEntry(
+        name="spotlesssplats",
+        summary="a small net on frozen features, held between two bounds of the residual, finds outliers",
+        recipe="ambiguous_wild.methods.spotlesssplats.recipe:build",
+        config="ambiguous_wild.methods.spotlesssplats.recipe:SpotLessSplatsConfig",
+        paper="SpotLessSplats (arXiv 2406.20055), its MLP form",
+    ),
+    MethodEntry(
+        name="spotlesssplats-cluster",
+        summary="clusters of frozen features are static where most of their residuals are inliers",
+        recipe="ambiguous_wild.methods.spotlesssplats.recipe:build",
+        config="ambiguous_wild.methods.spotlesssplats.recipe:ClusterConfig",
+        paper="SpotLessSplats (arXiv 2406.20055), its clustered form",
+    ),
+    MethodEntry(
+        name="mip-splatting",
+        summary="no Gaussian smaller than any photo resolves, and a screen filter that keeps the brightness",
+        recipe="ambiguous_wild.methods.mip:build",
+        config="ambiguous_wild.methods.mip:MipConfig",
+        paper="Mip-Splatting, CVPR 2024",
+    ),
+    MethodEntry(
+        name="gs-w",
+        summary="colours by a net, from what each Gaussian is and what it samples in maps of its photo",
+        recipe="ambiguous_wild.methods.gsw.recipe:build",
+        config="ambiguous_wild.methods.gsw.recipe:GswConfig",
+        ablations="ambiguous_wild.methods.plug_in:GSW",
+        paper="Gaussian in the Wild, from its code",
+    ),
+    MethodEntry(
+        name="splatfacto-w",
+        summary="harmonics by a net of each Gaussian's feature and each photo's embedding, and a background",
+        recipe="ambiguous_wild.methods.splatfactow:build",
+        config="ambiguous_wild.methods.splatfactow:SplatfactoWConfig",
+        paper="Splatfacto-W, from its code",
+    ),
+    MethodEntry(
+        name="swag",
+        summary="a net of each photo's embedding and each Gaussian's place colours it, and may switch it off",
+        recipe="ambiguous_wild.methods.swag:build",
+        config="ambiguous_wild.methods.swag:SwagConfig",
+        paper="SWAG (arXiv 2403.10427), its mechanism; sizes and rates are unverified",
+    ),
+    MethodEntry(
+        name="nexussplats",
+        summary="uncertainty of Gaussians, drawn like a colour, masks; light is a code beside each of them",
+        recipe="ambiguous_wild.methods.nexussplats:build",
+        config="ambiguous_wild.methods.nexussplats:NexusSplatsConfig",
+        paper="NexusSplats (arXiv 2411.14514), without anchors",
+    ),
+    MethodEntry(
+        name="hybridgs",
+        summary="every photo has 2D Gaussians on its plane for what only it shows, added up, not blended",
+        recipe="ambiguous_wild.methods.hybridgs:build",
+        config="ambiguous_wild.methods.hybridgs:HybridGsConfig",
+        paper="HybridGS, CVPR 2025 (arXiv 2412.03844); its training is unverified",
+    ),
+    MethodEntry(
+        name="t-3dgs",
+        summary="masks pixels whose photo and render lead a head to different distributions of their errors",
+        recipe="ambiguous_wild.methods.t3dgs:build",
+        config="ambiguous_wild.methods.t3dgs:T3dgsConfig",
+        paper="T-3DGS (arXiv 2412.00155), its first stage",
+    ),
+    MethodEntry(
+        name="forestsplats",
+        summary="one small transient field, bent for each photo by a net, shows where a net masks it",
+        recipe="ambiguous_wild.methods.forestsplats.recipe:build",
+        config="ambiguous_wild.methods.forestsplats.nets:ForestSplatsConfig",
+        paper="ForestSplats, WACV 2026 (arXiv 2503.06179)",
+    ),
+    MethodEntry(
+        name="uad",
+        summary="growth by views that show a Gaussian large and unmasked; its formula is unverified",
+        recipe="ambiguous_wild.methods.uad:build",
+        config="ambiguous_wild.methods.uad:UadConfig",
+        paper="density control of ForestSplats (arXiv 2503.06179)",
     ),
     MethodEntry(
         name="3dgs+truth",

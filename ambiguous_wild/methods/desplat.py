@@ -1,8 +1,9 @@
 """DeSplat: every photo has a few Gaussians of its own in front of its camera; test views do not show them.
 
-Source: DeSplat (CVPR 2025, arXiv 2411.19756) and its released code. Ours: the layer covers the photo's frame
-(the released box spans 53 degrees), lies at 0.02 of the scene's extent, and keeps its number of Gaussians.
-Growth of the layers, the background model and the embeddings are left out; static rules are those of 3DGS.
+Source: DeSplat (CVPR 2025, arXiv 2411.19756) and its released code. Ours: the layer covers the photo's
+frame (the released box spans 53 degrees), lies at 0.02 of the scene's extent, and keeps its number of
+Gaussians. Growth of the layers, the background model and the embeddings are left out; static rules are
+those of 3DGS.
 """
 
 from __future__ import annotations

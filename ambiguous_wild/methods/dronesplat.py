@@ -79,16 +79,21 @@ def heat_map(
     count: int | None = None,  # above every label; None: looked up, for which the host waits
 ) -> Tensor:
     """Each pixel its instance's mean residual, 0 where unlabelled, over its own range; float64 [H, W]."""
-    flat, values = labels.reshape(-1), residual.reshape(-1).double()
-    count = int(flat.max()) + 1 if count is None else count
-    if device.accelerated(flat.device):
-        sums, sizes = _label_sums(values, flat, count), _label_sums(torch.ones_like(values), flat, count)
-    else:
-        sums = torch.bincount(flat, weights=values, minlength=count)
-        sizes = torch.bincount(flat, minlength=count)
-    means = sums / sizes.clamp(min=1)
+    count = int(labels.max()) + 1 if count is None else count
+    means = label_means(residual, labels, count)
     means[0] = 0.0
-    return unit_range(means[flat].reshape(labels.shape))
+    return unit_range(means[labels])
+
+
+def label_means(values: Tensor, labels: Tensor, count: int) -> Tensor:
+    """[count] float64: mean of `values` [H, W] over the pixels of each label [H, W]; 0 where it has none."""
+    flat, given = labels.reshape(-1), values.reshape(-1).double()
+    if device.accelerated(flat.device):
+        sums, sizes = _label_sums(given, flat, count), _label_sums(torch.ones_like(given), flat, count)
+    else:
+        sums = torch.bincount(flat, weights=given, minlength=count)
+        sizes = torch.bincount(flat, minlength=count)
+    return sums / sizes.clamp(min=1)
 
 
 def _label_sums(values: Tensor, flat: Tensor, count: int) -> Tensor:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from string import Formatter
 from typing import TYPE_CHECKING, Any
 
 from ambiguous_wild.core.errors import AwError
@@ -40,8 +41,12 @@ class MethodEntry:
     auto_effects: tuple[str, ...] = ()
     # an external program, run instead of parts on our trainer, see methods/external/
     program: Program | None = None
+    base: str = ""  # of a method that trains twice: its name without that, which options are given by
+    passes: int = 1  # trainings, of which the second has the final masks of the first, see second_pass.py
     # of a method named by its file: what --method was given, with the absolute path, see references.py
     given_as: str = ""
+    # what every table of its runs says below; {features} stands for the option of that name
+    note: str = ""
 
     def options(self) -> Any:
         """The method's options at their defaults (a frozen dataclass instance).
@@ -62,9 +67,23 @@ class MethodEntry:
             )
         return cls()
 
+    def about(self, options: Iterable[Mapping[str, Any]]) -> str:
+        """`note` with the values of the options that it names in braces.
+
+        Args:
+            options: flat, of each run that the note is about.
+        """
+        every = list(options)
+        keys = [key for _, key, _, _ in Formatter().parse(self.note) if key]
+        values = {
+            key: "/".join(dict.fromkeys(str(o[key]) for o in every if key in o)) or "not recorded"
+            for key in keys
+        }
+        return self.note.format_map(values)
+
     def option_keys(self, method: str, key: str) -> list[str]:
         """The keys of this method's options that a setting METHOD.KEY sets; may be none."""
-        if method == self.name:
+        if method in (self.name, self.base):
             return [key]
         return [f"{place}.{key}" for place, name in self.places if name == method]
 

@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any
 from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.methods.entry import MethodEntry, NoOptions, resolve
 from ambiguous_wild.methods.references import is_reference
+from ambiguous_wild.methods.second_pass import trained_once
 
 if TYPE_CHECKING:
     from ambiguous_wild.splat.parts import Parts
@@ -66,9 +67,16 @@ def knows_truth(name: str) -> bool:
     Such a row is an upper bound; tables do not rank it. A graft has its host's photos and, unless a donor
     replaces them, its host's masks. Any other name, such as an ablation variant's, is accepted too.
     """
+    name = trained_once(name)
     host, _, rest = name.rpartition("@") if "@" in name else (name, "", "")
     masks = [ALIASES.get(donor, donor) for place, donor in _written(rest) if place == "mask"] or [host]
     return host == "3dgs-clean" or masks[-1] == "3dgs+truth"
+
+
+def members(name: str) -> list[str]:
+    """The host and the donors in a method's name; of an ablation's variant, its method."""
+    host, _, rest = name.rpartition("@") if "@" in name else (name, "", "")
+    return list(dict.fromkeys([host, *(ALIASES.get(donor, donor) for _, donor in _written(rest) if donor)]))
 
 
 def grafted(name: str, host: MethodEntry, methods: Mapping[str, MethodEntry]) -> MethodEntry:
@@ -82,6 +90,8 @@ def grafted(name: str, host: MethodEntry, methods: Mapping[str, MethodEntry]) ->
     Raises:
         AwError: unknown place or donor, or a place filled twice.
     """
+    if host.passes > 1:
+        raise AwError(f"{name}: the end of the name says that it trains twice: {host.base}@...+2passes")
     pairs = _pairs(name)
     donors = {place: _donor(place, donor, methods) for place, donor in pairs}
     entries = {"host": host} | donors
@@ -144,6 +154,8 @@ def build(name: str, entries: Mapping[str, MethodEntry], options: Any) -> Parts:
     if "density" in entries:
         density = parts_of("density")
         changed |= {"density": density.density, "density_config": density.density_config}
+        if density.start is not None:  # MCMC's fixed number starts from Gaussians of its own
+            changed["start"] = density.start
     if "effects" not in entries:
         _warn_of_effects(name, host, [(donor, parts) for donor, _, parts in built])
         return dataclasses.replace(host, **changed)

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from typing import Protocol
 
+import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from ambiguous_wild.methods.deferred import deferred
+from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.parts import MaskPolicy
 from ambiguous_wild.splat.step import Step
+
+_WORD = 1 << 32
 
 
 class WarmUp(Protocol):
@@ -82,9 +87,55 @@ class MaskedShares(dict[int, float | Tensor]):
         return cls({int(view): float(share) for view, share in state.items()})
 
 
+def d_keep(render: Tensor, photo: Tensor, keep: Tensor) -> Tensor:
+    """dL/dkeep [H, W] of 0.8 |k R - k I| + 0.2 D-SSIM(k R, k I), for nets that learn what they mask by it.
+
+    Both pictures depend on k; the loss is symmetric in them, so each call gives the share of one of them.
+    """
+    one, other = keep[..., None] * render, keep[..., None] * photo
+    mine, theirs = photometric(one, other).d_image, photometric(other, one).d_image
+    return (mine * render + theirs * photo).sum(dim=2)
+
+
 def upsampled(image: Tensor, height: int, width: int) -> Tensor:
     """A render [h, w, 3] at [height, width, 3], bilinear; the render itself where it has that size."""
     if image.shape[:2] == (height, width):
         return image
     chw = image.permute(2, 0, 1)[None]
     return F.interpolate(chw, size=(height, width), mode="bilinear", align_corners=False)[0].permute(1, 2, 0)
+
+
+def hashed_uniform(count: int, key: tuple[int, ...], place: torch.device) -> Tensor:
+    """[count] float32 in (0, 1), a function of the numbers in `key` alone: the same on every device.
+
+    A generator would have a state to save, and its numbers would come from the host. Mixing: the finaliser
+    of MurmurHash3 (public domain), once for each number of the key.
+    """
+    x = torch.arange(count, device=place, dtype=torch.int64)
+    for number in key:
+        x = (x + (number % _WORD) * 0x9E3779B1 % _WORD) % _WORD
+        x = ((x ^ (x >> 16)) * 0x85EBCA6B) & (_WORD - 1)
+        x = ((x ^ (x >> 13)) * 0xC2B2AE35) & (_WORD - 1)
+        x = x ^ (x >> 16)
+    return ((x >> 8).to(torch.float32) + 0.5) * 2.0**-24
+
+
+def sampled(keep: Tensor, probability: float, key: tuple[int, ...]) -> Tensor:
+    """Bernoulli draw [H, W] with probability p + (1 - p) keep: 1 for certain where keep is 1.
+
+    Args:
+        keep: [H, W] in [0, 1].
+        probability: with which a masked pixel is kept nevertheless.
+        key: seed and iteration, for instance.
+    """
+    chance = probability + (1.0 - probability) * keep
+    return (hashed_uniform(keep.numel(), key, keep.device).reshape(keep.shape) < chance).float()
+
+
+def annealed(step: Step, rate: float) -> float:
+    """exp(-rate floor((1 + s) / 1.5)), with s in iterations of the run or nominal ones, whichever are fewer.
+
+    Source: SpotLessSplats and T-3DGS. A short run's renders are no better for its nominal count.
+    """
+    s = min(float(step.iteration), step.nominal)
+    return math.exp(-rate * math.floor((1.0 + s) / 1.5))

@@ -76,6 +76,9 @@ class McmcDensity(DensityControl):
         g.means += (half @ (half.mT @ pushed[:, :, None])).squeeze(2)
         return g, events
 
+    def due(self, step: Step) -> bool:
+        return True  # noise in every step
+
     def _grow(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> Gaussians:
         dead = torch.sigmoid(gaussians.opacity_logits) <= self.config.dead_opacity
         if 0 < (count := int(dead.sum())) < len(gaussians):

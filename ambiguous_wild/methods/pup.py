@@ -1,7 +1,10 @@
 """PUP 3D-GS: removes Gaussians that can move or change size without changing a picture, then refines.
 Source: PUP 3D-GS (CVPR 2025) and its code: the score is log det of the 6x6 Gauss-Newton block of mean and log
 scale over all train views. Ours: the block from random signs (Hutchinson; rank correlation not measured),
-growth ends after a third of the run, 80 % go in equal rounds (that code: 80 %, then 50 %)."""
+growth ends after a third of the run, 80 % go in equal rounds (that code: 80 %, then 50 %).
+
+
+"""
 
 from __future__ import annotations
 
@@ -66,8 +69,8 @@ class PupDensity(DensityControl):
     @torch.no_grad()
     def refine(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> tuple[Gaussians, list[str]]:
         gaussians, events = super().refine(step, gaussians, optimiser)
-        config, due = self.config, self.config.prune_at + self.done * self.config.between
-        if self.done == config.rounds or step.nominal < due or events:  # rows that changed cannot be drawn
+        config = self.config
+        if events or not self._round_due(step):  # rows that changed cannot be drawn
             return gaussians, events
         self.done += 1
         share = 1.0 - (1.0 - config.share) ** (1.0 / config.rounds)
@@ -79,6 +82,13 @@ class PupDensity(DensityControl):
         self.log.begin(step.iteration)
         self.log.now.pruned, self.log.now.count = int(drop.sum()), int((~drop).sum())
         return self.keep_rows(gaussians, optimiser, ~drop), ["prune"]
+
+    def due(self, step: Step) -> bool:
+        return super().due(step) or self._round_due(step)
+
+    def _round_due(self, step: Step) -> bool:
+        config = self.config
+        return self.done < config.rounds and step.nominal >= config.prune_at + self.done * config.between
 
     def blocks(self, step: Step, gaussians: Gaussians) -> Tensor:
         """[N, 6, 6] float64: sum over views of the mean g g^T, g = d(sum(signs picture))/d(mean, log s)."""

@@ -18,6 +18,7 @@ from ambiguous_wild.methods.entry import MethodEntry
 from ambiguous_wild.methods.graft import grafted, knows_truth, split_graft
 from ambiguous_wild.methods.plugin_file import import_file
 from ambiguous_wild.methods.references import is_reference, read_reference
+from ambiguous_wild.methods.second_pass import second_pass, trained_once
 
 __all__ = [
     "BUILTIN",
@@ -53,11 +54,15 @@ def all_methods() -> dict[str, MethodEntry]:
 
 def get_method(name: str) -> MethodEntry:
     """The method of that name; "host@mask=donor" is a graft, see graft.py, and "recipe.py:my_recipe",
-    "external:FILE" and "nerfbaselines:METHOD" are references, see references.py.
+    "external:FILE" and "nerfbaselines:METHOD" are references, see references.py; "NAME+2passes" trains twice,
+    see second_pass.py.
 
     Raises:
         AwError: there is none; names the nearest.
     """
+    once = trained_once(name)
+    if once != name:
+        return second_pass(get_method(once))
     if is_reference(name):
         return load_reference(name)
     methods = all_methods()

@@ -1,10 +1,11 @@
 """WildGaussians' appearance on the shared trainer: an embedding per Gaussian and one per photo.
 
-Source: "WildGaussians: 3D Gaussian Splatting in the Wild", Kulhanek et al., NeurIPS 2024 (arXiv 2407.08447),
-and its code. An MLP of (colour, embedding of the Gaussian, embedding of the photo) gives (o, m); the colour
-becomes m colour + o. Different from the release: the MLP reads the colour in the view's direction, not the
-constant harmonic; m is 1 + its output, so that training starts from unchanged colours; D-SSIM is of the toned
-picture (one render a step); the MLP runs on visible Gaussians only. Masks, sky and growth are not part of it.
+Source: "WildGaussians: 3D Gaussian Splatting in the Wild", Kulhanek et al., NeurIPS 2024 (arXiv
+2407.08447), and its code. An MLP of (colour, embedding of the Gaussian, embedding of the photo) gives (o,
+m); the colour becomes m colour + o. Different from the release: the MLP reads the colour in the view's
+direction, not the constant harmonic; m is 1 + its output, so that training starts from unchanged colours;
+D-SSIM is of the toned picture (one render a step); the MLP runs on visible Gaussians only. Masks, sky and
+growth are not part of it.
 """
 
 from __future__ import annotations

@@ -1,15 +1,14 @@
 """LPIPS v0.1 from weights on disk, without the lpips package, torchvision or downloads.
 
-Each variant needs two files: torchvision's backbone and the linear heads of the LPIPS repository. If one is
-absent, the metric is *missing*, with the reason; it is never 0 or another variant's value. torch is imported
-only when a network is loaded.
+Each variant needs two files: torchvision's backbone and the linear heads of the LPIPS repository, as published
+(.pth) or as `aw weights get lpips` stores them (.safetensors). If one is absent, the metric is *missing*, with
+the reason; it is never 0 or another variant's value. torch is imported only when a network is loaded.
 
 Source: Zhang et al., CVPR 2018; layout of the layers and of the files: richzhang/PerceptualSimilarity.
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -20,6 +19,8 @@ import numpy as np
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import unknown
+from ambiguous_wild.core.tensor_files import read_tensors
+from ambiguous_wild.core.weight_places import find_file
 from ambiguous_wild.metrics.image import checked_pair
 
 if TYPE_CHECKING:
@@ -37,10 +38,9 @@ class _Backbone:
     """A convolutional stack; numbers in `layers` are output channels, see `_stack`."""
 
     name: str  # folder below AW_WEIGHTS, and name in 'aw doctor'
-    file: str  # as torchvision names it
+    files: tuple[str, str]  # either will do; the second is torchvision's name
     head_name: str
-    head_file: str
-    head_source: str
+    head_files: tuple[str, str]  # either will do
     layers: tuple[Any, ...]  # (channels, kernel, stride, padding), or "M" for a max pool
     pool: tuple[int, int]  # kernel, stride
     taps: tuple[int, ...]  # indices of the ReLU layers whose outputs are used
@@ -50,10 +50,9 @@ class _Backbone:
 
 ALEX = _Backbone(
     name="alexnet",
-    file="alexnet-owt-7be5be79.pth",
+    files=("alexnet.safetensors", "alexnet-owt-7be5be79.pth"),
     head_name="lpips-alex",
-    head_file="lpips_alex.pth",
-    head_source="lpips/weights/v0.1/alex.pth",
+    head_files=("lpips_alex.safetensors", "lpips_alex.pth"),
     layers=((64, 11, 4, 2), "M", (192, 5, 1, 2), "M", (384, 3, 1, 1), (256, 3, 1, 1), (256, 3, 1, 1)),
     pool=(3, 2),
     taps=(1, 4, 7, 9, 11),
@@ -62,10 +61,9 @@ ALEX = _Backbone(
 )
 VGG = _Backbone(
     name="vgg16",
-    file="vgg16-397923af.pth",
+    files=("vgg16.safetensors", "vgg16-397923af.pth"),
     head_name="lpips-vgg",
-    head_file="lpips_vgg.pth",
-    head_source="lpips/weights/v0.1/vgg.pth",
+    head_files=("lpips_vgg.safetensors", "lpips_vgg.pth"),
     layers=tuple(
         "M" if c == "M" else (c, 3, 1, 1)
         for c in (64, 64, "M", 128, 128, "M", 256, 256, 256, "M", 512, 512, 512, "M", 512, 512, 512)
@@ -90,7 +88,7 @@ def available() -> dict[str, str | None]:
 
 def missing_weights(name: str) -> list[str]:
     """Names of the weights (see `vision.weights`) that a variant of `VARIANTS` lacks."""
-    return [weight for weight, file in _files(VARIANTS[name][0]) if _find(weight, file) is None]
+    return [weight for weight, files in _files(VARIANTS[name][0]) if find_file(weight, files) is None]
 
 
 def load(name: str) -> Metric:
@@ -111,7 +109,7 @@ def load(name: str) -> Metric:
     reason = _reason(backbone)
     if reason is not None:
         raise AwError(f"{name}: {reason}")
-    paths = [_find(*pair) for pair in _files(backbone)]
+    paths = [find_file(*pair) for pair in _files(backbone)]
     stamps = tuple((str(p), p.stat().st_mtime_ns) for p in paths if p is not None)
     stack, heads = _network(backbone, stamps)
     return lambda a, b: _distance(backbone, stack, heads, a, b, centred)
@@ -192,19 +190,24 @@ def _network(backbone: _Backbone, stamps: tuple[tuple[str, int], ...]) -> tuple[
     file is read again."""
     trunk, head = (Path(path) for path, _ in stamps)
     stack = _stack(backbone)
-    weights = {k.removeprefix("features."): v for k, v in _read(trunk).items() if k.startswith("features.")}
+    weights = {
+        k.removeprefix("features."): v for k, v in read_tensors(trunk).items() if k.startswith("features.")
+    }
     try:
         stack.load_state_dict(weights, strict=True)
     except RuntimeError as error:
-        raise AwError(f"{trunk} is not {backbone.name}: {error}; download it again") from None
+        line = " ".join(str(error).split())
+        raise AwError(
+            f"{trunk} is not {backbone.name}: {line}; delete it and run: aw weights get {backbone.name}"
+        ) from None
     stack.eval().requires_grad_(False)
     expected = {f"lin{i}.model.1.weight": (1, c, 1, 1) for i, c in enumerate(backbone.channels)}
-    linear = _read(head)
+    linear = read_tensors(head)
     found = {key: tuple(value.shape) for key, value in linear.items()}
     if found != expected:
         raise AwError(
             f"{head} does not hold the LPIPS heads of {backbone.name} (five of [1, C, 1, 1]); "
-            f"replace it with {backbone.head_source} of the LPIPS repository"
+            f"delete it and run: aw weights get {backbone.head_name}"
         )
     return stack, [linear[key][0].float() for key in expected]
 
@@ -225,46 +228,13 @@ def _stack(backbone: _Backbone) -> nn.Sequential:
     return nn.Sequential(*layers)
 
 
-def _read(path: Path) -> dict[str, Tensor]:
-    import torch
-
-    try:
-        data = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch raises many undocumented types for a damaged file
-        line = (str(error).splitlines() or [type(error).__name__])[0]
-        raise AwError(f"{path} cannot be read as weights ({line}); download it again") from None
-    if not isinstance(data, dict) or not all(isinstance(v, torch.Tensor) for v in data.values()):
-        raise AwError(f"{path} holds no dictionary of tensors; download it again")
-    return data
-
-
-def _files(backbone: _Backbone) -> tuple[tuple[str, str], tuple[str, str]]:
-    return (backbone.name, backbone.file), (backbone.head_name, backbone.head_file)
-
-
-def _find(name: str, file: str) -> Path | None:
-    return next((folder / file for folder in _folders(name) if (folder / file).is_file()), None)
-
-
-def _folders(name: str) -> list[Path]:
-    """$AW_WEIGHTS/<name>, $AW_WEIGHTS and torch hub's checkpoints, as in `vision/weights.py`."""
-    own = os.environ.get("AW_WEIGHTS", "").strip()
-    folders = [Path(own).expanduser() / name, Path(own).expanduser()] if own else []
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
-    home = Path(os.environ.get("TORCH_HOME") or cache / "torch").expanduser()
-    return [*folders, home / "hub" / "checkpoints"]
+def _files(backbone: _Backbone) -> tuple[tuple[str, tuple[str, str]], tuple[str, tuple[str, str]]]:
+    return (backbone.name, backbone.files), (backbone.head_name, backbone.head_files)
 
 
 def _reason(backbone: _Backbone) -> str | None:
-    """None if both files exist, else which files to put where."""
-    (name, file), (head_name, head_file) = _files(backbone)
-    need = []
-    if _find(name, file) is None:
-        need.append(f"{file} (torchvision's {name})")
-    if _find(head_name, head_file) is None:
-        need.append(f"{head_file} ({backbone.head_source} of the LPIPS repository, renamed)")
+    """None if both files exist, else the command that downloads them."""
+    need = [name for name, files in _files(backbone) if find_file(name, files) is None]
     if not need:
         return None
-    own = os.environ.get("AW_WEIGHTS", "").strip()
-    target = str(Path(own).expanduser()) if own else "a folder, and set AW_WEIGHTS to it"
-    return f"weights missing: put {' and '.join(need)} into {target}"
+    return f"weights missing: {', '.join(need)}; run: aw weights get {' '.join(need)}"

@@ -8,11 +8,11 @@ import numpy as np
 
 from ambiguous_wild.core.camera import Camera
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.simulate.ground_plan import BACK_M, HALF_WIDTH_M
 from ambiguous_wild.simulate.spec import FULL_FRAME_DIAGONAL_MM, CaptureSpec
 from ambiguous_wild.simulate.world import World
 
 _NEAREST_WALL_M = 0.1
+_AHEAD_M = 4.0  # to what an outward camera looks at
 
 
 def focal_px(spec: CaptureSpec) -> float:
@@ -38,30 +38,43 @@ def plan_cameras(
 ) -> tuple[list[Camera], list[Camera]]:
     """Train cameras along an arc with varying distance and height; test cameras within their range.
 
-    Test viewpoints have other angles than the train photos, and distances and heights between theirs.
+    Test viewpoints have other angles than the train photos, and distances and heights between theirs. An
+    outward walk goes around the hub and looks away from it.
 
     Raises:
         AwError: the walk leads into a wall.
     """
     half = np.deg2rad(spec.arc_deg / 2)
     phase = rng.uniform(0, 2 * np.pi, 2)
+    outward = spec.walk == "outward"
+    plan = world.plan
 
     def camera(azimuth: float, sway: float, rise: float, shake: float) -> Camera:
         radius = np.interp(sway, (-1, 1), spec.radius_m)
         height = np.interp(rise, (-1, 1), spec.eye_m)
-        center = np.array([world.statue[0], world.statue[1] - 0.3])
-        eye = np.array([*(center + radius * np.array([np.sin(azimuth), -np.cos(azimuth)])), height])
-        if abs(eye[0]) > HALF_WIDTH_M - _NEAREST_WALL_M or eye[1] > BACK_M - _NEAREST_WALL_M:
+        center = np.array([world.hub[0], world.hub[1] - (0.0 if outward else 0.3)])
+        direction = np.array([np.sin(azimuth), -np.cos(azimuth)])
+        eye = np.array([*(center + radius * direction), height])
+        behind = "wall_front" in plan.walls and eye[1] < plan.y_m[0] + _NEAREST_WALL_M
+        if (
+            not plan.x_m[0] + _NEAREST_WALL_M <= eye[0] <= plan.x_m[1] - _NEAREST_WALL_M
+            or eye[1] > plan.y_m[1] - _NEAREST_WALL_M
+            or behind
+        ):
             raise AwError(
                 f"arc_deg {spec.arc_deg:g} and radius_m {spec.radius_m[0]:g} to {spec.radius_m[1]:g} lead "
-                "the camera into a wall of the courtyard; lower one of them"
+                f"the camera into a wall of the {spec.world.place}; lower one of them"
             )
-        target = np.array([*center, 1.25]) + rng.normal(0, 0.16, 3) * shake
+        target = np.array([*center, 1.25])
+        if outward:  # straight away from the hub
+            target = np.array([*(eye[:2] + _AHEAD_M * direction), height + 0.1])
+        target = target + rng.normal(0, 0.16, 3) * shake
         f = focal_px(spec)
         pose = look_at(eye, target, float(rng.normal(0, 1.2)) * shake)
         return Camera(spec.width, spec.height, f, f, spec.width / 2, spec.height / 2, pose)
 
-    step = 2 * half / (spec.train_views - 1)
+    turn_round = spec.arc_deg >= 360  # the last photo stands beside the first one
+    step = 2 * half / (spec.train_views - (0 if turn_round else 1))
     train = []
     for k in range(spec.train_views):
         azimuth = -half + step * (k + (rng.uniform(-0.25, 0.25) if 0 < k < spec.train_views - 1 else 0))

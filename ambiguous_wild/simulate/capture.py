@@ -36,6 +36,7 @@ from ambiguous_wild.simulate.camera_path import plan_cameras
 from ambiguous_wild.simulate.distractors import lay_out
 from ambiguous_wild.simulate.image_effects.photo_random import PhotoRandom
 from ambiguous_wild.simulate.photo_files import write_photo, write_png
+from ambiguous_wild.simulate.places import build_world
 from ambiguous_wild.simulate.records import (
     CameraRecord,
     CaptureTruth,
@@ -55,7 +56,7 @@ from ambiguous_wild.simulate.render import (
 from ambiguous_wild.simulate.spec import CaptureSpec
 from ambiguous_wild.simulate.spec_file import plain_spec
 from ambiguous_wild.simulate.tracer import TracedPhoto
-from ambiguous_wild.simulate.world import World, courtyard
+from ambiguous_wild.simulate.world import World
 
 PhotoProgress = Callable[[list[PlannedPhoto]], Iterable[PlannedPhoto]]
 
@@ -63,7 +64,7 @@ PhotoProgress = Callable[[list[PlannedPhoto]], Iterable[PlannedPhoto]]
 def plan(spec: CaptureSpec, seed: int) -> tuple[World, list[PlannedPhoto]]:
     """The world and every photo to render; world, walk and layout have independent random streams."""
     paint, walk, layout = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(3))
-    world = courtyard(paint, spec.detail_px_per_m, spec.samples, spec.world)
+    world = build_world(paint, spec.detail_px_per_m, spec.samples, spec.world)
     train, test = plan_cameras(spec, world, walk)
     layouts = lay_out(spec, train, world, layout)
     first_test = 100 * (spec.train_views // 100 + 1) + 1

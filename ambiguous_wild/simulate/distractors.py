@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ambiguous_wild.core.camera import Camera
-from ambiguous_wild.simulate.ground_plan import BACK_M, FRONT_M, HALF_WIDTH_M
+from ambiguous_wild.simulate.ground_plan import GroundPlan
 from ambiguous_wild.simulate.image_effects import specular
 from ambiguous_wild.simulate.kernels import BOX, ELLIPSOID
 from ambiguous_wild.simulate.shapes import Shape, banner, barrier, figure, placed, pole, shape_table
 from ambiguous_wild.simulate.spec import STATUES, CaptureSpec, Distractor
-from ambiguous_wild.simulate.things import placard, statue
+from ambiguous_wild.simulate.things import car, placard, statue
 from ambiguous_wild.simulate.tracer import ShapeTable, trace
 from ambiguous_wild.simulate.world import World
 
@@ -24,6 +24,7 @@ _TRIES = 80  # layouts drawn for a photo, of which the best is taken
 _SAME_PLACE_M = 0.6  # closer than this is the same place
 _SAME_PLACE_SHARE = 0.15  # of the photos: the most with one distractor at the same place
 _APART_M = 0.75
+_CLEARANCE_M = {"car": 1.2}  # from what stands; others keep 0.3 m
 _PREVIEW_PX = 96
 
 
@@ -38,15 +39,15 @@ class Placement:
     pose: float  # 0 to 1: stride and arm of a figure
 
 
-def shapes_of(distractor: Distractor, placement: Placement) -> list[Shape]:
+def shapes_of(distractor: Distractor, placement: Placement, plan: GroundPlan) -> list[Shape]:
     """The distractor's shapes in the world, owned by ``placement.which + 1``."""
     at = (placement.x_m, placement.y_m, distractor.lift_m * placement.pose)
-    parts = [_tinted(s, distractor) for s in _parts(distractor, placement.pose)]
+    parts = [_tinted(s, distractor) for s in _parts(distractor, placement.pose, plan)]
     moved = placed(parts, at, placement.yaw_deg, distractor.size)
     return [replace(s, owner=placement.which + 1) for s in moved]
 
 
-def _parts(distractor: Distractor, pose: float) -> list[Shape]:
+def _parts(distractor: Distractor, pose: float, plan: GroundPlan) -> list[Shape]:
     """The distractor at its natural size, standing at the origin."""
     texture = distractor.texture
     match distractor.kind:
@@ -66,7 +67,9 @@ def _parts(distractor: Distractor, pose: float) -> list[Shape]:
         case "banner":
             return banner(texture)
         case "placard":
-            return placard(texture)
+            return placard(texture, plan)
+        case "car":
+            return car(texture)
     if distractor.kind in STATUES:
         return [statue(distractor.kind, texture, 1.6)]
     return [Shape(ELLIPSOID, (0, 0, 0.4), (0.4, 0.4, 0.4), texture)]
@@ -82,7 +85,7 @@ def _tinted(shape: Shape, distractor: Distractor) -> Shape:
 
 def movers(spec: CaptureSpec, placements: tuple[Placement, ...], world: World) -> ShapeTable:
     """All distractors of one photo as a table for the ray caster."""
-    shapes = [s for p in placements for s in shapes_of(spec.distractors[p.which], p)]
+    shapes = [s for p in placements for s in shapes_of(spec.distractors[p.which], p, world.plan)]
     gloss = spec.effects.specular
     if gloss is not None:
         shapes = specular.specular(shapes, gloss.textures, gloss.strength, gloss.sharpness)
@@ -145,12 +148,12 @@ def _draw(
         if distractor.path == "walk":
             place = _walker_placement(which, distractor, len(earlier) / max(spec.train_views - 1, 1))
             away = np.hypot(*(camera.center[:2] - (place.x_m, place.y_m)))
-            if away >= distractor.distance_m[0] and _is_free(place, world, []):
+            if away >= distractor.distance_m[0] and _is_free(place, world, [], distractor):
                 layout.append(place)
             continue
         for _ in range(12):
             place = _random_placement(which, distractor, camera, rng)
-            if _is_free(place, world, layout) and _is_fresh(place, earlier, spec.train_views):
+            if _is_free(place, world, layout, distractor) and _is_fresh(place, earlier, spec.train_views):
                 layout.append(place)
                 break
     return tuple(layout)
@@ -183,13 +186,14 @@ def _walker_placement(which: int, distractor: Distractor, progress: float) -> Pl
     return Placement(which, float(x), float(y), float(yaw), float(stride))
 
 
-def _is_free(place: Placement, world: World, others: list[Placement]) -> bool:
-    if abs(place.x_m) > HALF_WIDTH_M - 0.6 or not FRONT_M + 0.6 < place.y_m < BACK_M - 0.6:
+def _is_free(place: Placement, world: World, others: list[Placement], distractor: Distractor) -> bool:
+    clearance = _CLEARANCE_M.get(distractor.kind, 0.3)
+    if world.plan.gap(place.x_m, place.y_m) < 0.3 + clearance:
         return False
     away = np.hypot(world.keep_out[:, 0] - place.x_m, world.keep_out[:, 1] - place.y_m) - world.keep_out[:, 2]
-    if away.min(initial=np.inf) < 0.3:
+    if away.min(initial=np.inf) < clearance:
         return False
-    return all(np.hypot(o.x_m - place.x_m, o.y_m - place.y_m) > _APART_M for o in others)
+    return all(np.hypot(o.x_m - place.x_m, o.y_m - place.y_m) > _APART_M + clearance - 0.3 for o in others)
 
 
 def _is_fresh(place: Placement, earlier: list[tuple[Placement, ...]], photos: int) -> bool:

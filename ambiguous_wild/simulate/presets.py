@@ -20,6 +20,7 @@ from ambiguous_wild.simulate.preset_distractors import (
     thin,
 )
 from ambiguous_wild.simulate.preset_gallery import GALLERY
+from ambiguous_wild.simulate.preset_places import PLACES
 from ambiguous_wild.simulate.spec import CaptureSpec
 from ambiguous_wild.simulate.spec_check import check_spec
 
@@ -106,6 +107,7 @@ PRESETS = {
             designed=designed("both"),
         ),
         *GALLERY,
+        *PLACES,
     )
 }
 

@@ -20,8 +20,10 @@ Kind = Literal[
     "knot",
     "hound",
     "spire",
+    "car",
 ]
-ThingKind = Literal["box", "ball", "column", "board", "figure", "bust", "knot", "hound", "spire"]
+ThingKind = Literal["box", "ball", "column", "board", "figure", "bust", "knot", "hound", "spire", "car"]
+Place = Literal["courtyard", "room", "yard"]
 Ambiguity = Literal["colour", "semantic", "none"]
 Colour = tuple[float, float, float]  # linear light
 FULL_FRAME_DIAGONAL_MM = 43.2666  # of 36 x 24 mm, what `focal_35mm` is an equivalent on
@@ -51,7 +53,9 @@ class Distractor:
     # layouts drawn, from which `occlusion` chooses
     presence: float = 0.85
     distance_m: tuple[float, float] = (1.9, 4.5)  # from the camera; for a walker only the minimum counts
-    size: float = 1.0  # factor on the natural size: figures 1.75 m, ball 0.8 m, pole 2 m, statues 1.6 m
+    size: float = (
+        1.0  # factor on the natural size: figures 1.75 m, ball 0.8 m, pole 2 m, statues 1.6 m, car 4.1 m
+    )
     lift_m: float = 0.0  # greatest height above the ground
     tint: Colour = (1.0, 1.0, 1.0)  # factor on the texture, in linear light
     path: Literal["elsewhere", "walk"] = (
@@ -63,22 +67,26 @@ class Distractor:
 
 @dataclass(frozen=True)
 class Thing:
-    """A static object that the spec adds to the courtyard."""
+    """A static object that the spec adds to the place."""
 
     kind: ThingKind
     texture: str
     at_m: tuple[float, float, float]  # middle of its foot: x to the right, y away from the walk, z up
-    size_m: tuple[float, float, float] = (1.0, 1.0, 1.0)  # width, depth, height; statues take the height
+    # width, depth, height; statues take the height, a car the width as its length
+    size_m: tuple[float, float, float] = (1.0, 1.0, 1.0)
     yaw_deg: float = 0.0
     tint: Colour = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
 class WorldSpec:
-    """The courtyard: ground, three walls with posters, a sky, and these objects."""
+    """A place: its ground and walls, and these objects."""
 
-    furniture: bool = True  # planters, crates, bench, stone ball
-    statue: bool = True  # the figure on its plinth
+    place: Place = "courtyard"
+    furniture: bool = (
+        True  # courtyard: planters, crates, bench, ball; room: all that stands; yard: cars, trees
+    )
+    statue: bool = True  # on its plinth
     things: tuple[Thing, ...] = ()
 
 
@@ -97,8 +105,9 @@ class CaptureSpec:
     samples: int = 4  # rays a pixel, a square number
     detail_px_per_m: float = 110.0  # resolution of the textures
     focal_35mm: float = 26.0  # mm, the equivalent that phones state (CIPA: same diagonal angle)
-    arc_deg: float = 104.0  # arc around the statue that the cameras cover
-    radius_m: tuple[float, float] = (4.2, 5.3)  # distance from the statue during the walk
+    walk: Literal["around", "outward"] = "around"  # look at the hub, or stand around it and look away
+    arc_deg: float = 104.0  # arc around the hub that the cameras cover
+    radius_m: tuple[float, float] = (4.2, 5.3)  # distance from the hub during the walk
     eye_m: tuple[float, float] = (1.3, 1.8)  # height of the phone
     zoom: tuple[float, float] = (1.0, 1.0)  # range of factors on `focal_35mm`
     world: WorldSpec = field(default_factory=WorldSpec)

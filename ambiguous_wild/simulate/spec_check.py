@@ -9,12 +9,25 @@ from dataclasses import fields
 import numpy as np
 
 from ambiguous_wild.core.errors import AwError, unknown
-from ambiguous_wild.simulate.ground_plan import SURFACES
+from ambiguous_wild.simulate.ground_plan import PLANS, GroundPlan
 from ambiguous_wild.simulate.image_effects.settings import Effects, LensDistortion
 from ambiguous_wild.simulate.spec import FULL_FRAME_DIAGONAL_MM, CaptureSpec, Distractor, Thing
 
 # Textures that `world.py` bakes (a test compares the two lists).
-SHEET_NAMES = ("stone", "foliage", "timber", "clay", "skin", "brick", "gravel", "vivid", "cloth")
+SHEET_NAMES = (
+    "stone",
+    "foliage",
+    "timber",
+    "clay",
+    "skin",
+    "brick",
+    "gravel",
+    "vivid",
+    "cloth",
+    "plaster",
+    "asphalt",
+    "enamel",
+)
 PICTURES = tuple(
     f"poster_{name}" for name in ("coffee", "rocket", "chelsea", "hubble", "coins", "camera", "retina")
 )
@@ -28,6 +41,7 @@ def check_spec(spec: CaptureSpec) -> CaptureSpec:
     Raises:
         AwError: the first wrong value: where it is, what it is, what is allowed.
     """
+    plan = PLANS[spec.world.place]
     if not spec.name or not all(c.isalnum() or c in "-_" for c in spec.name):
         raise AwError(f"name: letters, digits, - and _ only, got {spec.name!r}")
     _between("train_views", spec.train_views, 3, 2000)
@@ -38,9 +52,10 @@ def check_spec(spec: CaptureSpec) -> CaptureSpec:
         raise AwError(f"samples: a square number from 1 to 64, got {spec.samples}")
     _between("detail_px_per_m", spec.detail_px_per_m, 2, 300)
     _between("focal_35mm", spec.focal_35mm, 10, 200)
-    _between("arc_deg", spec.arc_deg, 5, 150)
+    around = spec.walk == "around"
+    _between("arc_deg", spec.arc_deg, 5, 150 if around else 360)
     _range("occlusion", spec.occlusion, 0, 0.9)
-    _range("radius_m", spec.radius_m, 1.5, 7)
+    _range("radius_m", spec.radius_m, 1.5 if around else 0.2, 7)
     _range("eye_m", spec.eye_m, 0.2, 3.3)
     _range("zoom", spec.zoom, 0.5, 4)
     if len(spec.distractors) > MOST:
@@ -52,10 +67,10 @@ def check_spec(spec: CaptureSpec) -> CaptureSpec:
             raise AwError(f"distractors[{k}].name: {distractor.name!a} is there twice; give each its own")
         if distractor.head and distractor.kind != "visitor":
             raise AwError(f"distractors[{k}].head: only a visitor has one, not a {distractor.kind}")
-        _distractor(f"distractors[{k}]", distractor)
+        _distractor(f"distractors[{k}]", distractor, plan)
     for k, thing in enumerate(spec.world.things):
-        _thing(f"world.things[{k}]", thing)
-    _effects(spec.effects)
+        _thing(f"world.things[{k}]", thing, plan)
+    _effects(spec.effects, plan)
     if spec.effects.lens_distortion is not None:
         _lens(spec, spec.effects.lens_distortion)
     return spec
@@ -74,8 +89,8 @@ def _lens(spec: CaptureSpec, lens: LensDistortion) -> None:
         )
 
 
-def _distractor(where: str, d: Distractor) -> None:
-    known = (*SHEET_NAMES, *PICTURES, *SURFACES) if d.kind == "placard" else SHEET_NAMES
+def _distractor(where: str, d: Distractor, plan: GroundPlan) -> None:
+    known = (*SHEET_NAMES, *PICTURES, *plan.surfaces) if d.kind == "placard" else SHEET_NAMES
     _texture(f"{where}.texture", d.texture, known)
     if d.head:
         _texture(f"{where}.head", d.head, SHEET_NAMES)
@@ -92,22 +107,22 @@ def _distractor(where: str, d: Distractor) -> None:
     if d.path == "elsewhere" and d.laps != Distractor.laps:
         raise AwError(f"{where}.laps: only read with 'path: walk'; add that or leave it out")
     for x, y in d.waypoints:
-        _between(f"{where}.waypoints x", x, -5, 5)
-        _between(f"{where}.waypoints y", y, -6, 4)
+        _between(f"{where}.waypoints x", x, plan.x_m[0] + 0.6, plan.x_m[1] - 0.6)
+        _between(f"{where}.waypoints y", y, plan.y_m[0], plan.y_m[1] - 0.2)
 
 
-def _thing(where: str, thing: Thing) -> None:
-    known = (*SHEET_NAMES, *PICTURES, *SURFACES) if thing.kind == "board" else SHEET_NAMES
+def _thing(where: str, thing: Thing, plan: GroundPlan) -> None:
+    known = (*SHEET_NAMES, *PICTURES, *plan.surfaces) if thing.kind == "board" else SHEET_NAMES
     _texture(f"{where}.texture", thing.texture, known)
     for value in thing.size_m:
         _between(f"{where}.size_m", value, 0.01, 12)
-    for axis, value, low, high in zip("xyz", thing.at_m, (-5.5, -6, 0), (5.5, 4.2, 4)):
-        _between(f"{where}.at_m {axis}", value, low, high)
+    for axis, value, limits in zip("xyz", thing.at_m, (plan.x_m, plan.y_m, (0.0, 4.0))):
+        _between(f"{where}.at_m {axis}", value, *limits)
     _between(f"{where}.yaw_deg", thing.yaw_deg, -360, 360)
     _colour(f"{where}.tint", thing.tint)
 
 
-def _effects(effects: Effects) -> None:
+def _effects(effects: Effects, plan: GroundPlan) -> None:
     limits: dict[str, dict[str, tuple[float, float]]] = {
         "exposure_drift": {"stops": (0, 3)},
         "white_balance": {"warmth": (0, 2), "tint": (0, 1)},
@@ -136,7 +151,7 @@ def _effects(effects: Effects) -> None:
         if not effects.specular.textures:
             raise AwError("effects.specular.textures: name at least one, or leave the effect out")
         for name in effects.specular.textures:
-            _texture("effects.specular.textures", name, (*SHEET_NAMES, *SURFACES))
+            _texture("effects.specular.textures", name, (*SHEET_NAMES, *plan.surfaces))
 
 
 def _between(where: str, value: float, low: float, high: float) -> None:

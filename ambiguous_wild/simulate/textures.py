@@ -6,7 +6,7 @@ metre different.
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, lru_cache
 from importlib.metadata import version
 from pathlib import Path
 
@@ -77,20 +77,25 @@ def octaves(rng: np.random.Generator, height: int, width: int, cell_px: float, c
     return np.asarray(total / weight, dtype=np.float32)
 
 
-def _step(low: float, high: float, x: np.ndarray) -> np.ndarray:
+def step(low: float, high: float, x: np.ndarray) -> np.ndarray:
     t = np.clip((x - low) / (high - low), 0.0, 1.0)
     return (t * t * (3 - 2 * t))[..., None]
 
 
-def _laid(
+@lru_cache(maxsize=32)
+def _brightness(name: str, scale: float) -> np.ndarray:
+    """Brightness of a shipped photograph, mean 1, blurred for a surface `scale` times as coarse, [H, W]."""
+    grey = photograph(name).mean(axis=2)
+    grey = np.ascontiguousarray(grey / grey.mean())
+    return cv2.GaussianBlur(grey, (0, 0), 0.5 * scale) if scale > 1 else grey
+
+
+def laid(
     name: str, height: int, width: int, px_per_m: float, tile_m: float, angle_deg: float, shift: np.ndarray
 ) -> np.ndarray:
     """The photograph's brightness laid over a surface, mirrored at its seams: [H, W, 1], mean 1."""
-    grey = photograph(name).mean(axis=2)
-    grey = np.ascontiguousarray(grey / grey.mean())
-    scale = grey.shape[1] / (tile_m * px_per_m)
-    if scale > 1:  # the surface is coarser than the photograph: blur against aliasing
-        grey = cv2.GaussianBlur(grey, (0, 0), 0.5 * scale)
+    scale = photograph(name).shape[1] / (tile_m * px_per_m)
+    grey = _brightness(name, max(scale, 1.0))
     v, u = np.mgrid[0:height, 0:width].astype(np.float32)
     c, s = np.cos(np.deg2rad(angle_deg)), np.sin(np.deg2rad(angle_deg))
     x = (c * u - s * v) * scale + float(shift[0]) * grey.shape[1]
@@ -105,16 +110,16 @@ def _mirrored(x: np.ndarray, size: int) -> np.ndarray:
     return np.where(folded > size - 1, period - folded, folded).astype(np.float32)
 
 
-def _scattered(
+def scattered(
     name: str, rng: np.random.Generator, height: int, width: int, px_per_m: float, tile_m: float
 ) -> np.ndarray:
     """Three layers of one photograph at different angles and sizes, blended along noise: no repetition."""
     layers = [
-        _laid(name, height, width, px_per_m, tile_m * size, angle + 40 * rng.random(), rng.random(2))
+        laid(name, height, width, px_per_m, tile_m * size, angle + 40 * rng.random(), rng.random(2))
         for size, angle in ((1.0, 0), (1.27, 70), (0.85, 150))
     ]
-    first = _step(0.45, 0.55, octaves(rng, height, width, 0.9 * px_per_m))
-    second = _step(0.45, 0.55, octaves(rng, height, width, 0.7 * px_per_m))
+    first = step(0.45, 0.55, octaves(rng, height, width, 0.9 * px_per_m))
+    second = step(0.45, 0.55, octaves(rng, height, width, 0.7 * px_per_m))
     return layers[0] * (1 - first) + first * (layers[1] * (1 - second) + layers[2] * second)
 
 
@@ -122,18 +127,18 @@ def gravel_ground(rng: np.random.Generator, width_m: float, height_m: float, px_
     """Gravel with worn grass and a paved way through the middle, [H, W, 3] linear light."""
     h, w = round(height_m * px_per_m), round(width_m * px_per_m)
     stones = gravel(rng, width_m, height_m, px_per_m)
-    lawn = _scattered("grass", rng, h, w, px_per_m, 1.8) * _tint(rng, h, w, px_per_m, (0.13, 0.2, 0.06), 0.5)
-    paving = _laid("brick", h, w, px_per_m, 2.6, 8.0, rng.random(2))
-    paving = paving * _tint(rng, h, w, px_per_m, (0.3, 0.27, 0.25), 0.5)
+    lawn = scattered("grass", rng, h, w, px_per_m, 1.8) * tint(rng, h, w, px_per_m, (0.13, 0.2, 0.06), 0.5)
+    paving = laid("brick", h, w, px_per_m, 2.6, 8.0, rng.random(2))
+    paving = paving * tint(rng, h, w, px_per_m, (0.3, 0.27, 0.25), 0.5)
     patches = octaves(rng, h, w, 1.6 * px_per_m, 6)
-    ground = stones + (lawn - stones) * _step(0.52, 0.6, patches)
+    ground = stones + (lawn - stones) * step(0.52, 0.6, patches)
     x = (np.arange(w, dtype=np.float32) / px_per_m - width_m / 2)[None]
     bend, ragged = octaves(rng, h, w, 1.6 * px_per_m) - 0.5, octaves(rng, h, w, 0.2 * px_per_m, 3) - 0.5
     edge = np.abs(x + 0.3 + 1.6 * bend) + 0.35 * ragged
-    return np.asarray(ground + (paving - ground) * (1 - _step(0.75, 0.85, edge)), dtype=np.float32)
+    return np.asarray(ground + (paving - ground) * (1 - step(0.75, 0.85, edge)), dtype=np.float32)
 
 
-def _tint(
+def tint(
     rng: np.random.Generator, h: int, w: int, px_per_m: float, colour: Colour, strength: float
 ) -> np.ndarray:
     """A colour that drifts over metres and centimetres, [H, W, 3] linear light."""
@@ -158,16 +163,16 @@ def brick_wall(
     Without `foot` it is the middle of a wall: hardly any moss or plaster.
     """
     h, w = round(height_m * px_per_m), round(width_m * px_per_m)
-    courses = _laid("brick", h, w, px_per_m, 1.9, 90.0, rng.random(2)) ** 1.2
-    wall = courses * _tint(rng, h, w, px_per_m, colour, 0.55)
+    courses = laid("brick", h, w, px_per_m, 1.9, 90.0, rng.random(2)) ** 1.2
+    wall = courses * tint(rng, h, w, px_per_m, colour, 0.55)
     height = (np.arange(h, dtype=np.float32) / px_per_m)[:, None]
     fallen = octaves(rng, h, w, 1.1 * px_per_m, 6) - (0.0 if foot else 0.2)
-    plaster = _scattered("gravel", rng, h, w, px_per_m, 5.0) ** 0.35
-    plaster = plaster * _tint(rng, h, w, px_per_m, (0.46, 0.4, 0.3), 0.25)
-    wall = wall + (plaster - wall) * _step(0.585, 0.605, fallen)
-    moss = _scattered("grass", rng, h, w, px_per_m, 1.2) * np.array([0.09, 0.13, 0.04], np.float32)
+    plaster = scattered("gravel", rng, h, w, px_per_m, 5.0) ** 0.35
+    plaster = plaster * tint(rng, h, w, px_per_m, (0.46, 0.4, 0.3), 0.25)
+    wall = wall + (plaster - wall) * step(0.585, 0.605, fallen)
+    moss = scattered("grass", rng, h, w, px_per_m, 1.2) * np.array([0.09, 0.13, 0.04], np.float32)
     damp = octaves(rng, h, w, 0.6 * px_per_m, 5) + (0.35 * np.exp(-height / 0.4) - 0.05 if foot else -0.2)
-    wall = wall + 0.85 * (moss - wall) * _step(0.58, 0.68, damp)
+    wall = wall + 0.85 * (moss - wall) * step(0.58, 0.68, damp)
     streaks = cv2.GaussianBlur(rng.random((h, w), dtype=np.float32), (0, 0), 2.0, sigmaY=0.5 * px_per_m) - 0.5
     soot = 1 + 6.0 * streaks * np.clip(height / height_m, 0, 1)
     return np.asarray(wall * np.clip(soot, 0.5, 1.4)[..., None], dtype=np.float32)
@@ -176,21 +181,21 @@ def brick_wall(
 def stone(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: float) -> np.ndarray:
     """Weathered sandstone with some lichen, [H, W, 3] linear light."""
     h, w = round(height_m * px_per_m), round(width_m * px_per_m)
-    grain = _scattered("gravel", rng, h, w, px_per_m, 0.9) ** 0.7
-    body = grain * _tint(rng, h, w, px_per_m * 0.3, (0.40, 0.36, 0.28), 0.4)
+    grain = scattered("gravel", rng, h, w, px_per_m, 0.9) ** 0.7
+    body = grain * tint(rng, h, w, px_per_m * 0.3, (0.40, 0.36, 0.28), 0.4)
     lichen = grain * np.array([0.26, 0.26, 0.15], np.float32)
-    body = body + 0.7 * (lichen - body) * _step(0.6, 0.7, octaves(rng, h, w, 0.2 * px_per_m, 6))
+    body = body + 0.7 * (lichen - body) * step(0.6, 0.7, octaves(rng, h, w, 0.2 * px_per_m, 6))
     runs = cv2.GaussianBlur(rng.random((h, w), dtype=np.float32), (0, 0), 1.5, sigmaY=0.1 * px_per_m) - 0.5
-    dark = _step(0.52, 0.75, octaves(rng, h, w, 0.25 * px_per_m, 6) + 1.5 * runs)
+    dark = step(0.52, 0.75, octaves(rng, h, w, 0.25 * px_per_m, 6) + 1.5 * runs)
     return np.asarray(body * (1 - 0.55 * dark), dtype=np.float32)
 
 
 def foliage(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: float) -> np.ndarray:
     """Leaves, [H, W, 3] linear light."""
     h, w = round(height_m * px_per_m), round(width_m * px_per_m)
-    leaves = _scattered("grass", rng, h, w, px_per_m, 0.9) ** 1.5
-    clumps = 0.5 + 1.1 * _step(0.35, 0.65, octaves(rng, h, w, 0.2 * px_per_m, 4))
-    green = _tint(rng, h, w, px_per_m * 0.5, (0.12, 0.19, 0.05), 0.6)
+    leaves = scattered("grass", rng, h, w, px_per_m, 0.9) ** 1.5
+    clumps = 0.5 + 1.1 * step(0.35, 0.65, octaves(rng, h, w, 0.2 * px_per_m, 4))
+    green = tint(rng, h, w, px_per_m * 0.5, (0.12, 0.19, 0.05), 0.6)
     return np.asarray(leaves * clumps * green, dtype=np.float32)
 
 
@@ -202,8 +207,8 @@ def timber(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: 
     grain = cv2.GaussianBlur(rng.random((h, w), dtype=np.float32), (0, 0), 0.12 * px_per_m, sigmaY=0.8) - 0.5
     joint = np.abs((np.arange(h) / (0.14 * px_per_m)) % 1.0 - 0.5)[:, None] > 0.46
     value = tone * (1 + 4.0 * grain) * np.where(joint, 0.25, 1.0)
-    rough = _scattered("gravel", rng, h, w, px_per_m, 2.0) ** 0.5
-    brown = _tint(rng, h, w, px_per_m, (0.3, 0.19, 0.1), 0.3)
+    rough = scattered("gravel", rng, h, w, px_per_m, 2.0) ** 0.5
+    brown = tint(rng, h, w, px_per_m, (0.3, 0.19, 0.1), 0.3)
     return np.asarray(np.clip(value, 0.1, 2)[..., None] * rough * brown, dtype=np.float32)
 
 
@@ -225,8 +230,8 @@ def brick(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: f
 def gravel(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: float) -> np.ndarray:
     """The ground's gravel, for objects, [H, W, 3] linear light."""
     h, w = round(height_m * px_per_m), round(width_m * px_per_m)
-    stones = _scattered("gravel", rng, h, w, px_per_m, 2.2)
-    return np.asarray(stones * _tint(rng, h, w, px_per_m, (0.36, 0.32, 0.26), 0.35), dtype=np.float32)
+    stones = scattered("gravel", rng, h, w, px_per_m, 2.2)
+    return np.asarray(stones * tint(rng, h, w, px_per_m, (0.36, 0.32, 0.26), 0.35), dtype=np.float32)
 
 
 def vivid(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: float) -> np.ndarray:
@@ -235,7 +240,7 @@ def vivid(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: f
     colours = np.array([[0.75, 0.03, 0.4], [0.02, 0.45, 0.75], [0.85, 0.6, 0.02]], np.float32)
     wave = np.arange(w, dtype=np.float32)[None] / px_per_m + 0.4 * octaves(rng, h, w, 0.3 * px_per_m, 3)
     band = (wave / 0.16).astype(int) % 3
-    grain = _scattered("gravel", rng, h, w, px_per_m, 1.5) ** 0.25
+    grain = scattered("gravel", rng, h, w, px_per_m, 1.5) ** 0.25
     return np.asarray(colours[band] * grain, dtype=np.float32)
 
 
@@ -243,7 +248,7 @@ def cloth(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: f
     """White cloth with folds and a weave, to be tinted, [H, W, 3] linear light."""
     h, w = round(height_m * px_per_m), round(width_m * px_per_m)
     folds = np.clip(0.05 + 1.3 * octaves(rng, h, w, 0.35 * px_per_m, 3), 0.1, 1.2)
-    weave = _scattered("gravel", rng, h, w, px_per_m, 1.5) ** 0.6
+    weave = scattered("gravel", rng, h, w, px_per_m, 1.5) ** 0.6
     return np.asarray(np.repeat((folds[..., None] * weave).mean(2, keepdims=True), 3, 2), dtype=np.float32)
 
 
@@ -253,7 +258,7 @@ def sky(rng: np.random.Generator, height: int = 512, width: int = 2048) -> np.nd
     blue = np.array([0.20, 0.36, 0.66], np.float32) * (1 - 0.35 * elevation[..., None])
     haze = np.array([0.52, 0.56, 0.62], np.float32)
     image = blue + (haze - blue) * np.exp(-elevation / 0.25)[..., None]
-    image = image + (np.array([0.74, 0.73, 0.71], np.float32) - image) * _step(
+    image = image + (np.array([0.74, 0.73, 0.71], np.float32) - image) * step(
         0.42, 0.7, _round(octaves(rng, height, width // 2, 110.0, 7))
     )
     image = image * (0.8 + 0.4 * _round(octaves(rng, height, width // 2, 60.0, 5)))[..., None]
@@ -262,7 +267,7 @@ def sky(rng: np.random.Generator, height: int = 512, width: int = 2048) -> np.nd
     line = 0.12 + 0.9 * (crowns - 0.25) + 0.16 * (ragged - 0.5)
     light = (0.2 + 1.6 * _round(octaves(rng, height, width // 2, 30.0, 5)) ** 2)[..., None]
     leaves = light * np.array([0.10, 0.15, 0.05], np.float32)
-    trees = 1 - _step(-0.004, 0.004, elevation - line)
+    trees = 1 - step(-0.004, 0.004, elevation - line)
     return np.asarray(image + (leaves - image) * trees, dtype=np.float32)
 
 

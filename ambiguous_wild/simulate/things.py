@@ -1,10 +1,11 @@
-"""Static objects that a spec adds to the courtyard: boxes, balls, columns, boards, statues."""
+"""Objects that a spec adds to a place: boxes, balls, columns, boards, statues, cars."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
-from ambiguous_wild.simulate.ground_plan import SURFACES
+from ambiguous_wild.simulate.ground_plan import GroundPlan
 from ambiguous_wild.simulate.kernels import BOX, BY_FACE, CYLINDER, ELLIPSOID, VOLUME
 from ambiguous_wild.simulate.shapes import SHEET_M, Shape, between, figure, placed
 from ambiguous_wild.simulate.spec import STATUES, Thing
@@ -16,7 +17,9 @@ def statue(name: str, texture: str, height_m: float) -> Shape:
     return Shape(VOLUME, (0, 0, 0.9 * half), (half, half, half), texture, mapping=BY_FACE, volume=name)
 
 
-def board(texture: str, width_m: float, height_m: float, thick_m: float, lift_m: float = 0.0) -> Shape:
+def board(
+    texture: str, width_m: float, height_m: float, thick_m: float, plan: GroundPlan, lift_m: float = 0.0
+) -> Shape:
     """An upright board that faces -y. A poster covers it once; of another texture it shows a part.
 
     Of a wall it shows the part at its own height, so it looks like the wall behind it.
@@ -25,18 +28,49 @@ def board(texture: str, width_m: float, height_m: float, thick_m: float, lift_m:
     middle = (0.0, 0.0, lift_m + height_m / 2)
     if texture.startswith("poster_"):
         return Shape(BOX, middle, half, texture, scale=(1.0 / width_m, 1.0 / height_m))
-    across, up = SURFACES.get(texture, (SHEET_M, SHEET_M))
+    across, up = plan.surfaces.get(texture, (SHEET_M, SHEET_M))
     level = middle[2] / up if texture.startswith("wall_") else 0.5
     return Shape(BOX, middle, half, texture, scale=(1.0 / across, 1.0 / up), offset=(0.5, level))
 
 
-def placard(texture: str) -> list[Shape]:
+def placard(texture: str, plan: GroundPlan) -> list[Shape]:
     """A board of 1.1 x 0.85 m on two sticks, 0.75 m above the ground."""
     sticks = [between((x, 0.03, 0.02), (x, 0.03, 1.5), 0.018, "timber") for x in (-0.45, 0.45)]
-    return [board(texture, 1.1, 0.85, 0.03, 0.75), *sticks]
+    return [board(texture, 1.1, 0.85, 0.03, plan, 0.75), *sticks]
 
 
-def shapes_of_thing(thing: Thing) -> list[Shape]:
+def car(texture: str, length_m: float = 4.1) -> list[Shape]:
+    """A small car at the origin that faces +x: body, glass, wheels, lamps."""
+    body: dict[str, Any] = {"gloss": (0.5, 60.0)}
+    dark = (0.12, 0.13, 0.15)
+    shapes = [
+        Shape(BOX, (0, 0, 0.56), (1.78, 0.8, 0.25), texture, **body),
+        Shape(ELLIPSOID, (1.35, 0, 0.6), (0.72, 0.8, 0.3), texture, offset=(0.2, 0.6), **body),
+        Shape(ELLIPSOID, (-1.4, 0, 0.62), (0.66, 0.8, 0.34), texture, offset=(0.8, 0.4), **body),
+        Shape(ELLIPSOID, (-0.2, 0, 0.86), (1.3, 0.72, 0.56), "enamel", tint=dark, gloss=(0.9, 120.0)),
+        Shape(ELLIPSOID, (-0.25, 0, 1.22), (0.95, 0.6, 0.22), texture, offset=(0.4, 0.8), **body),
+        Shape(BOX, (0, 0, 0.33), (1.75, 0.76, 0.07), "asphalt", tint=(0.5, 0.5, 0.5)),
+    ]
+    for x in (-1.2, 1.2):
+        for side in (-1.0, 1.0):
+            shapes += [
+                between(
+                    (x, side * 0.62, 0.32), (x, side * 0.84, 0.32), 0.32, "asphalt", CYLINDER, tint=(0.4,) * 3
+                ),
+                between((x, side * 0.8, 0.32), (x, side * 0.855, 0.32), 0.19, "enamel", CYLINDER),
+            ]
+    for side in (-1.0, 1.0):
+        shapes += [
+            Shape(ELLIPSOID, (1.86, side * 0.56, 0.64), (0.14, 0.18, 0.09), "enamel", gloss=(0.9, 80.0)),
+            Shape(ELLIPSOID, (-1.9, side * 0.6, 0.68), (0.1, 0.15, 0.1), "enamel", tint=(0.6, 0.03, 0.02)),
+        ]
+    shapes += [
+        Shape(BOX, (x, 0, 0.44), (0.02, 0.26, 0.06), "enamel", offset=(0.3, 0.2)) for x in (-2.0, 2.02)
+    ]
+    return placed(shapes, (0, 0, 0), 0.0, length_m / 4.1)
+
+
+def shapes_of_thing(thing: Thing, plan: GroundPlan) -> list[Shape]:
     """The thing's shapes in the world."""
     width, depth, height = thing.size_m
     half = (width / 2, depth / 2, height / 2)
@@ -46,7 +80,9 @@ def shapes_of_thing(thing: Thing) -> list[Shape]:
     elif thing.kind == "figure":
         parts = placed(figure(thing.texture, thing.texture, 0.07, 0.8), (0, 0, 0), 0.0, height / 1.75)
     elif thing.kind == "board":
-        parts = [board(thing.texture, width, height, depth)]
+        parts = [board(thing.texture, width, height, depth, plan)]
+    elif thing.kind == "car":
+        parts = car(thing.texture, width)
     elif thing.kind == "column":
         parts = [between((0, 0, 0), (0, 0, height), width / 2, thing.texture, CYLINDER)]
     else:
@@ -57,7 +93,9 @@ def shapes_of_thing(thing: Thing) -> list[Shape]:
     parts = [
         replace(
             s,
-            tint=(s.tint[0] * tint[0], s.tint[1] * tint[1], s.tint[2] * tint[2]),
+            tint=(s.tint[0] * tint[0], s.tint[1] * tint[1], s.tint[2] * tint[2])
+            if s.texture == thing.texture
+            else s.tint,  # glass and tyres of a car
             offset=s.offset if thing.kind == "board" else (s.offset[0] + shift[0], s.offset[1] + shift[1]),
         )
         for s in parts

@@ -130,11 +130,7 @@ class DensityControl:
             The Gaussians to go on with and what happened: any of "grow", "reset".
         """
         events: list[str] = []
-        config = self.config
-        due = step.iteration - self.last_growth >= config.min_every
-        due = due and step.nominal >= config.start and step.nominal <= config.stop
-        due = due and self._crossed(step, config.every)
-        if due:
+        if self._growth_due(step):
             self._match(gaussians)
             # Lazily stepped rows are brought up to date first: growth copies parameters.
             optimiser.flush()
@@ -147,11 +143,30 @@ class DensityControl:
             self.last_growth = step.iteration
             events.append("grow")
         if self._reset_due(step):
-            gaussians.opacity_logits.clamp_(max=_logit(config.reset_opacity))
+            self.reset_opacity(gaussians)
             optimiser.reset_moments(["opacity_logits"])
             self.last_reset = step.iteration
             events.append("reset")
         return gaussians, events
+
+    def reset_opacity(self, gaussians: Gaussians) -> None:
+        """Hook: lower the opacities, in place."""
+        gaussians.opacity_logits.clamp_(max=_logit(self.config.reset_opacity))
+
+    def due(self, step: Step) -> bool:
+        """Whether `refine` may change something now; whoever overrides `refine` extends this.
+
+        On an accelerator the host asks then, and only then, whether the photo was all masked.
+        """
+        config = self.config
+        resets = self.resets_done < len(config.resets) and step.nominal >= config.resets[self.resets_done]
+        return self._growth_due(step) or resets
+
+    def _growth_due(self, step: Step) -> bool:
+        config = self.config
+        due = step.iteration - self.last_growth >= config.min_every
+        due = due and step.nominal >= config.start and step.nominal <= config.stop
+        return due and self._crossed(step, config.every)
 
     def after_growth(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> Gaussians:
         """Hook: change the set once more after growth and pruning (merging, for one)."""

@@ -22,9 +22,11 @@ from ambiguous_wild.splat.rendered import (
     Cotangents,
     Frame,
     Gradients,
+    Pull,
     Rendered,
     as_cotangents,
     frame_of,
+    sum_own,
 )
 from ambiguous_wild.splat.step import Shot, Step, TrainData
 
@@ -60,6 +62,10 @@ class Fields(ABC):
         """Fields that take part in this picture beside the static one; only asked for train photos."""
         return ()
 
+    def bend(self, name: str, gaussians: Gaussians, shot: Shot) -> tuple[Gaussians, Pull]:
+        """A field's Gaussians as they are drawn for this picture, and the pull to those that learn."""
+        return gaussians, lambda gradients: gradients
+
     def compose(self, frames: Mapping[str, Frame], shot: Shot) -> tuple[Frame, ComposePull]:
         """One picture of the frames of `STATIC` and of those that `drawn` names, and the pull."""
         return frames[STATIC], lambda cotangents: {STATIC: cotangents}
@@ -81,7 +87,12 @@ class Composite:
     """A `Rendered` made of the pictures of several fields; gradients of the others lie in `fields`."""
 
     def __init__(
-        self, fields: Fields, drawn: Mapping[str, Rendered], needs: Mapping[str, frozenset[str]], shot: Shot
+        self,
+        fields: Fields,
+        drawn: Mapping[str, Rendered],
+        needs: Mapping[str, frozenset[str]],
+        shot: Shot,
+        bent: Mapping[str, Pull],
     ) -> None:
         """
         Args:
@@ -89,7 +100,9 @@ class Composite:
             drawn: renders of `STATIC` and of the others.
             needs: statistics of the backward pass that each other field asks for.
             shot: of the picture.
+            bent: pulls of `Fields.bend`, by field.
         """
+        self._bent = bent
         frames = {name: frame_of(rendered) for name, rendered in drawn.items()}
         frame, self._pull = fields.compose(frames, shot)
         self._own = fields.regularise(frames, shot)
@@ -116,7 +129,13 @@ class Composite:
             for name, rendered in self._drawn.items()
             if name in given or name == STATIC
         }
-        return replace(found.pop(STATIC), fields=found)
+        static = found.pop(STATIC)
+        found = {name: self._bent[name](gradients) if name in self._bent else gradients
+                 for name, gradients in found.items()}  # fmt: skip
+        own = static.own
+        for gradients in found.values():
+            own = sum_own(own, gradients.own)
+        return replace(static, fields=found, own=own)
 
 
 def frames_of(rendered: Rendered) -> Mapping[str, Frame]:

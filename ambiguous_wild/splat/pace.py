@@ -71,6 +71,11 @@ class Pace:
         """Photos are trained at their size over this."""
         return divisor_at(self.levels, progress)
 
+    @property
+    def divisors(self) -> tuple[int, ...]:
+        """All that the run trains at."""
+        return tuple(sorted({level.divisor for level in self.levels}))
+
     def ceiling(self, divisor: int, progress: float) -> int:
         """Growth stops at this many Gaussians now."""
         return ceiling_at(self.start, self.most, divisor, progress, COARSE_UNTIL)

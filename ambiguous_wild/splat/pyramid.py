@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from torch import Tensor
 
 from ambiguous_wild.core import Camera
@@ -18,6 +20,11 @@ class Pyramid:
         self._cameras: dict[tuple[int, int], Camera] = {}
         # where photos do not fit on the device: copies the next one there while a step runs
         self.prefetch = getattr(data.photos, "prefetch", None)
+
+    def sizes(self, divisors: Iterable[int]) -> frozenset[tuple[int, int]]:
+        """Heights and widths of all photos at these divisors."""
+        full = {(camera.height, camera.width) for camera in self._data.cameras}
+        return frozenset((h // d, w // d) for h, w in full for d in divisors)
 
     def photo(self, view: int, divisor: int) -> Tensor:
         """[H // divisor, W // divisor, 3] of a train photo."""

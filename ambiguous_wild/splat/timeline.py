@@ -25,6 +25,7 @@ class Timeline:
         self.rows: list[dict[str, Any]] = []
         self.loss_sum: float | Tensor = 0.0  # since the last row
         self.loss_count = 0
+        self.before_s = 0.0  # seconds of earlier trainings that belong to this one
 
     def loss(self, value: float | Tensor) -> None:
         """Take the loss of one iteration; NaN (a photo left out) does not count.
@@ -37,7 +38,7 @@ class Timeline:
     def add(self, iteration: int, gaussians: int, clock: Clock) -> dict[str, Any]:
         """A new row; returns it, with room for the PSNR of the test views."""
         row: dict[str, Any] = {
-            "wall_s": round(clock.now(), 3),
+            "wall_s": round(self.before_s + clock.now(), 3),
             "iteration": iteration,
             "loss": float(self.loss_sum) / max(self.loss_count, 1),
             "gaussians": gaussians,

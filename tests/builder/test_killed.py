@@ -22,11 +22,11 @@ KILLS = {
     "inside screening": f"S._lay_out = lambda *a: {_DIE}",
     "between features and matches": f"T.match = lambda *a: {_DIE}",
     "while COLMAP matches": (
-        "real = F._run\n"
+        "real = F.run_job\n"
         "def run(job, folder, watch):\n"
         f"    real(job, folder, (lambda: {_DIE}) if job['task'] == 'matches' else watch)\n"
         "F._POLL_S = 0.05\n"
-        "F._run = run"
+        "F.run_job = run"
     ),
     "inside undistortion": (
         "import ambiguous_wild.builder.undistort as U\n"

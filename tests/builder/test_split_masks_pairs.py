@@ -3,7 +3,7 @@ import pytest
 
 from ambiguous_wild.builder.masks import find_masks, lay_out_masks, mask_warnings
 from ambiguous_wild.builder.pairs import sequential_pairs
-from ambiguous_wild.builder.sfm import choose_camera, choose_matcher
+from ambiguous_wild.builder.sfm import camera_groups, choose_camera, choose_matcher
 from ambiguous_wild.builder.split import read_test_list, split_photos
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.images import read_gray, write_png
@@ -108,8 +108,8 @@ def test_a_test_photo_meets_every_training_photo():
     pairs = sequential_pairs(names, {"t0", "t1"})
     assert len(pairs) == len({frozenset(p) for p in pairs})
     joined = {frozenset(p) for p in pairs}
-    assert all(frozenset(("t0", f"w{i}")) in joined for i in range(60))
-    assert frozenset(("t0", "t1")) in joined
+    # photos of the test set are no part of the walk: their partners come from retrieval
+    assert not any("t0" in pair or "t1" in pair for pair in joined)
     assert frozenset(("w0", "w10")) in joined
     assert frozenset(("w0", "w32")) in joined
     assert frozenset(("w0", "w11")) not in joined
@@ -122,13 +122,26 @@ def test_one_camera_only_where_everything_agrees():
     for change in ({"width": 13}, {"camera": "D"}, {"exif": {"focal_mm": 6.0}}):
         mixed = facts(3)
         mixed[1].update(change)
-        assert choose_camera(mixed, "auto") == "per-image"
+        assert choose_camera(mixed, "auto") == "per-device"
+        assert camera_groups(mixed) == [[0, 2], [1]]
         assert choose_camera(mixed, "single") == "single"
+
+
+def test_photos_without_exif_never_share_a_camera_with_others():
+    internet = facts(4)
+    for i, fact in enumerate(internet):
+        fact.update(width=100 + i % 2, camera=None, exif={})
+    assert choose_camera(internet, "auto") == "per-image"
+    assert camera_groups(internet) == [[0], [1], [2], [3]]
+    internet[1].update(camera="C", exif={"focal_mm": 5.0})
+    internet[3].update(camera="C", exif={"focal_mm": 5.0})
+    assert choose_camera(internet, "auto") == "per-device"
+    assert camera_groups(internet) == [[0], [1, 3], [2]]
 
 
 def test_matcher_by_count():
     assert choose_matcher(200, "auto") == "exhaustive"
-    assert choose_matcher(201, "auto") == "sequential"
+    assert choose_matcher(201, "auto") == "retrieval"
     assert choose_matcher(500, "exhaustive") == "exhaustive"
 
 

@@ -89,29 +89,25 @@ def test_what_one_command_needs_comes_with_its_extra(
     assert fixes["nerfbaselines"].startswith("python3 -m venv")
 
 
-def test_weights_of_foundation_models_come_with_the_command_that_brings_them(report: list[Check]) -> None:
+def test_weights_come_with_the_command_that_downloads_them(report: list[Check]) -> None:
     optional = {c.name: c for c in report if c.group == "optional"}
     assert optional["transformers"].ok
-    assert optional["dinov2-small"].ok or "hf download facebook/dinov2-small" in optional["dinov2-small"].fix
+    for name in ("dinov2-small", "dino-vits16", "efficientnet-lite0"):
+        assert optional[name].ok or optional[name].fix == f"aw weights get {name}"
 
 
-def test_the_way_to_lpips_can_be_pasted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    for name in ("AW_WEIGHTS", "TORCH_HOME", "XDG_CACHE_HOME"):
+def test_lpips_comes_with_the_command_for_the_files_it_lacks(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    for name in ("TORCH_HOME", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("HOME", str(tmp_path))
-    fake_curl = tmp_path / "bin" / "curl"  # writes an empty file in place of a download
-    fake_curl.parent.mkdir()
-    fake_curl.write_text('#!/bin/sh\n[ "$1 $2" = "-fL -o" ] && : > "$3"\n')
-    fake_curl.chmod(0o755)
-    monkeypatch.setenv("PATH", f"{fake_curl.parent}:/usr/bin:/bin")
-    fix = checks._metrics()[0].fix
-    assert "alexnet" in fix and "lpips_alex.pth" in fix
-    assert subprocess.run(["bash", "-c", fix]).returncode == 0
-    monkeypatch.setenv("AW_WEIGHTS", str(tmp_path / ".cache/ambiguous_wild/weights"))
-    assert checks._metrics()[0].ok
     monkeypatch.setenv("AW_WEIGHTS", str(tmp_path / "my weights"))
-    assert not checks._metrics()[0].ok
-    assert subprocess.run(["bash", "-c", checks._metrics()[0].fix]).returncode == 0
+    assert checks._metrics()[0].fix == "aw weights get alexnet lpips-alex"
+    (tmp_path / "my weights").mkdir()
+    (tmp_path / "my weights" / "alexnet.safetensors").touch()
+    assert checks._metrics()[0].fix == "aw weights get lpips-alex"
+    (tmp_path / "my weights" / "lpips_alex.pth").touch()
     assert checks._metrics()[0].ok
 
 

@@ -46,3 +46,63 @@ def test_a_plugin_is_listed(tmp_path: Path) -> None:
     assert "mine" in out and "needs: a GPU" in out
     error = CliRunner().invoke(command, ["--plugin", str(tmp_path / "no.py")]).exception
     assert isinstance(error, AwError)
+
+
+# -- one in full, and the table --------------------------------------------------------------------
+
+
+def shown(*args: str) -> str:
+    return CliRunner().invoke(command, list(args), catch_exceptions=False).output
+
+
+def test_a_method_in_full_says_what_differs_and_its_options() -> None:
+    out = shown("spotlesssplats")
+    assert "Ours:" in out and "arXiv 2406.20055" in out and "Stable Diffusion" in out
+    assert "features=labhog" in out and "upper=0.9" in out and "density.free_colour=8002" in out
+    line = next(row for row in out.splitlines() if "upper=0.9" in row)
+    assert "published also 0.8" in line
+
+
+def test_every_builtin_method_is_described_in_full() -> None:
+    for name, entry in registry.all_methods().items():
+        (one,) = json.loads(shown(name, "--json"))
+        assert one["name"] == name and one["about"], name
+        assert {o["key"].split(".")[0] for o in one["options"]} == set(vars(entry.options())), name
+    assert "masks-local" not in shown("refinesplat") and "ablations" in shown("refinesplat")
+    assert "trainings" in shown("t-3dgs+2passes")
+
+
+def test_the_table_agrees_with_what_recipes_build() -> None:
+    from ambiguous_wild.methods.traits import BUILTIN_TRAITS
+    from ambiguous_wild.splat.density import DensityControl
+    from ambiguous_wild.splat.parts import MaskPolicy
+    from ambiguous_wild.splat.rendered import check_needs
+
+    assert set(BUILTIN_TRAITS) == {entry.name for entry in registry.BUILTIN}
+    for entry in registry.BUILTIN:
+        traits, parts = BUILTIN_TRAITS[entry.name], entry.build(entry.options())
+        own = type(parts.mask)
+        masks = own.keep is not MaskPolicy.keep or own.predict is not MaskPolicy.predict
+        assert bool(traits.masks) == masks, entry.name
+        colours = any(effect.acts("shade") for effect in parts.effects)
+        assert bool(traits.appearance) == colours, entry.name
+        assert bool(traits.density) >= (parts.density is not DensityControl), entry.name
+        try:
+            check_needs(parts.density.needs, accelerated=True)
+            offered = True
+        except AwError:
+            offered = False
+        assert traits.cpu_only != offered, entry.name
+
+
+def test_the_table_has_a_line_a_method_and_says_unknown_of_others(tmp_path: Path) -> None:
+    out = shown("--table")
+    for name in registry.all_methods():
+        assert any(line.startswith(name + " ") for line in out.splitlines()), name
+    plugin = tmp_path / "mine.py"
+    plugin.write_text(
+        "from ambiguous_wild.methods import MethodEntry, register\n"
+        "register(MethodEntry('mine', 'my own', 'ambiguous_wild.methods.threedgs:build'))\n"
+    )
+    rows = json.loads(shown("--table", "--json", "--plugin", str(plugin)))
+    assert next(row for row in rows if row["method"] == "mine")["masks"] == "?"

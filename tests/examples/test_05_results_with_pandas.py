@@ -31,7 +31,7 @@ def test_means_and_differences_of_runs_that_exist(tmp_path):
     assert len(table[(table["metric"] == "psnr") & table["value"].notna()]) == 4
 
 
-def test_without_runs_it_trains_some(tmp_path):
-    said = run("-o", tmp_path, "--iterations", "5")
-    assert "refinesplat - 3dgs" in said
-    assert len(list(tmp_path.glob("runs/scene/*/seed0/metrics.json"))) == 2
+def test_without_runs_it_says_so(tmp_path):
+    done = subprocess.run([sys.executable, EXAMPLE], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 1 and len(done.stderr.splitlines()) == 1, done.stderr
+    assert "example_photos_to_table" in done.stderr

@@ -15,6 +15,7 @@ import pytest
 import torch
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.core.tensor_files import read_tensors
 from ambiguous_wild.harness.planning.decide import SCHEMA
 from ambiguous_wild.harness.planning.file import read_plan
 from ambiguous_wild.harness.running.result_file import read_result
@@ -23,7 +24,6 @@ from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.image_header import header_size
 from ambiguous_wild.io.images import read_png_rgb, write_png
 from ambiguous_wild.io.scene_folder import load_scene, read_scene_json
-from ambiguous_wild.metrics import lpips
 from ambiguous_wild.simulate.spec_file import parse_spec
 from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.study.answers import read_answers
@@ -191,7 +191,11 @@ def test_code_in_a_file_is_never_run(tmp_path, kind):
         np.save(out, np.array([harmful], dtype=object), allow_pickle=True)
         path.write_bytes(out.getvalue())
     path.with_suffix(".npy").write_bytes(path.read_bytes())
-    for read, name in ((checkpoint.load, path), (lpips._read, path), (read_labels, path.with_suffix(".npy"))):
+    for read, name in (
+        (checkpoint.load, path),
+        (read_tensors, path),
+        (read_labels, path.with_suffix(".npy")),
+    ):
         with pytest.raises(AwError):
             read(name)
     assert not victim.exists()
@@ -203,7 +207,7 @@ def test_an_interrupted_download_of_weights_is_never_taken_for_whole(tmp_path, s
     data = (tmp_path / "whole.pth").read_bytes()
     (tmp_path / "part.pth").write_bytes(data[: int(len(data) * share)])
     with pytest.raises(AwError, match=r"part\.pth cannot be read as weights.*download it again"):
-        lpips._read(tmp_path / "part.pth")
+        read_tensors(tmp_path / "part.pth")
     checkpoint.save(tmp_path / "a.safetensors", {"means": torch.zeros(40, 40)})
     data = (tmp_path / "a.safetensors").read_bytes()
     (tmp_path / "a.safetensors").write_bytes(data[: int(len(data) * share)])

@@ -12,6 +12,8 @@ import yaml
 from ambiguous_wild.harness.running.result_file import write_result
 from tests.harness.fake_runs import fake_result
 
+ALONE: dict[str, Any] = {"verdict": "alone", "reason": "", "kernel": "cpu-1"}
+
 
 def cost_run(
     root: Path,
@@ -27,17 +29,28 @@ def cost_run(
     probes: list[tuple[float, float]] | None = None,
     ms: float = 100.0,
     model_mb: float = 1.0,
+    reference_s: float | None = None,
+    timing: dict[str, Any] | None = ALONE,
+    train: dict[str, Any] | None = None,
     **changes: Any,
 ) -> Path:
-    """A finished run with a timeline of (seconds, dB); returns its folder."""
+    """A finished run with a timeline of (seconds, dB); returns its folder.
+
+    Its reference seconds are its wall seconds unless given; a `timing` of None is that of an earlier version.
+    """
     folder = root / scene / "".join(c if c.isalnum() else "_" for c in method) / f"seed{seed}"
     result = fake_result(method, scene, seed, psnr, options=options or {}, **changes)
     if result["cost"]:
         result["cost"] |= {"train_s": train_s, "setup_s": 5.0, "ms_per_iteration": ms, "model_mb": model_mb}
+        for key in ("timing", "reference_s"):
+            result["cost"].pop(key, None)
+        if timing is not None:
+            seconds = train_s if reference_s is None else reference_s
+            result["cost"] |= {"timing": timing, "reference_s": seconds}
     write_result(folder / ("failed.json" if result["status"] == "failed" else "metrics.json"), result)
     config = {
         "method": method,
-        "train": {"iterations": 100, "budget_s": budget_s, "seed": seed, "probes": 8},
+        "train": {"iterations": 100, "budget_s": budget_s, "seed": seed, "probes": 8} | (train or {}),
         "scene": {"name": scene, "factor": 1},
         "device": "cpu",
     } | ({"effects": list(effects)} if effects else {})

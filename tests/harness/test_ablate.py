@@ -12,6 +12,7 @@ from ambiguous_wild.core.config import with_options
 from ambiguous_wild.harness.ablation.plan import plan_study, read_outcomes
 from ambiguous_wild.harness.ablation.report import report, to_markdown, write_report
 from ambiguous_wild.harness.running.grid import cell_folder, run_cells
+from ambiguous_wild.harness.running.provenance import reproduce
 from ambiguous_wild.harness.running.result_file import write_result
 from ambiguous_wild.harness.running.store import read_runs
 from ambiguous_wild.methods import MethodEntry, get_method, register, registry
@@ -182,12 +183,15 @@ def test_names_that_cannot_be_folders_are_refused():
         check_groups("m", [replace(GROUPS[0], name="g"), replace(GROUPS[1], name="g")])
 
 
-def test_refinesplats_ablations_name_options_it_has():
-    entry = get_method("refinesplat")
-    groups = choose_groups("refinesplat", entry.ablation_groups(), [])
-    assert [g.name for g in groups][:4] == ["modules", "masks", "thresholds", "density"]
+@pytest.mark.parametrize("name", ["refinesplat", "refinesplat-paper"])
+def test_refinesplats_ablations_name_options_it_has(name):
+    entry = get_method(name)
+    groups = choose_groups(name, entry.ablation_groups(), [])
+    assert [g.name for g in groups][:3] == ["modules", "masks", "thresholds"]
     for variant in (v for g in groups for v in g.variants):
         pairs = dict(setting.split("=") for setting in variant.settings)
+        if variant.method and pairs:
+            assert f"={name}" in variant.method, f"{variant.name} sets options of a method that is not in it"
         assert len(pairs) == len(variant.settings), f"{variant.name} sets an option twice"
         options = with_options(entry.options(), pairs)
         for key, text in pairs.items():
@@ -197,6 +201,42 @@ def test_refinesplats_ablations_name_options_it_has():
             )
             # 0.10 and 0.1 are one number
             assert shown == text or value == float(text), key
+
+
+def test_the_printed_threshold_is_ablated_without_what_would_hide_it():
+    groups = {g.name: g for g in get_method("refinesplat").ablation_groups()}
+    for group in ("thresholds", "printed"):
+        (variant,) = [v for v in groups[group].variants if v.name == "t-ent-literal"]
+        options = with_options(
+            get_method("refinesplat").options(), dict(s.split("=") for s in variant.settings)
+        )
+        mask = options.mask
+        assert (mask.threshold, mask.gate, mask.floor, mask.ceiling) == ("literal", 0.0, 0.0, 0.0)
+
+
+def test_a_graft_of_the_method_is_a_row_with_settings(scene, tmp_path):
+    """The method's masks or density in another method: the study's settings and the variant's reach them."""
+    rows = (
+        Variant("plain", method="3dgs"),
+        Variant("with", ("grow_grad=0.1",), method="3dgs@density=mine"),
+        Variant("without", method="3dgs@density=mine"),
+    )
+    register(replace(get_method("mine"), ablations=(Group("plug-in", "in others", rows),)))
+    plan = plan_study("mine", [scene], [0], SHORT, settings=["grow_scale=0.5"])
+    names = {row.variant.name: row.cells[0] for row in plan.rows if not row.is_default}
+    assert names["plain"].method.name == "3dgs"
+    for name, grow in (("with", 0.1), ("without", 0.0002)):
+        cell = names[name]
+        assert cell.method.name == f"mine@plug-in-{name}"
+        assert (cell.options.density.grow_scale, cell.options.density.grow_grad) == (0.5, grow)
+    command = reproduce(names["with"])
+    assert "--method 3dgs@density=mine" in command
+    assert "--set mine.grow_grad=0.1" in command and "--set mine.grow_scale=0.5" in command
+    # without settings it is an ordinary graft, whose runs others share
+    plain = plan_study("mine", [scene], [0], SHORT)
+    assert {row.cells[0].method.name for row in plain.rows if row.variant.name == "without"} == {
+        "3dgs@density=mine"
+    }
 
 
 def _at(options, key):

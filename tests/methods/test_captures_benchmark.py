@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from ambiguous_wild.core import AwError
 from tests.tiny_scene import write_tiny_scene
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
@@ -26,6 +27,11 @@ def report():
         yield importlib.import_module("captures_report")
     finally:
         sys.path.remove(str(BENCHMARKS))
+
+
+@pytest.fixture(scope="module")
+def script(report):
+    return importlib.import_module("captures")
 
 
 def row(capture, method, psnr, iou=None, gaussians=100.0, masked=0.0):
@@ -104,22 +110,25 @@ def test_the_masked_share_is_counted_in_the_written_masks(report, tmp_path):
     assert report.masked_share(tmp_path) == pytest.approx((2 / 8 + 4 / 8) / 2)
 
 
-def test_the_script_trains_what_is_missing_and_tabulates(tmp_path):
+def test_the_script_trains_what_is_missing_and_tabulates(script, report, tmp_path, capsys):
     write_tiny_scene(tmp_path / "captures" / "with")
     (tmp_path / "captures" / "with" / "nested").mkdir()
-    words = [sys.executable, BENCHMARKS / "captures.py", "--captures", tmp_path / "captures" / "with"]
-    words += ["--out", tmp_path / "runs", "--results", tmp_path / "out", "--iterations", "10"]
-    words += ["--methods", "3dgs", "3dgs@mask=truth", "--seeds", "0", "1", "--set", "truth.dilation=1"]
-    words = [str(word) for word in words]
-    first = subprocess.run(words, capture_output=True, text=True, check=True)
-    assert "4 runs: 0 finished before, 4 to go" in first.stdout
+    words = ["--captures", tmp_path / "captures" / "with", "--out", tmp_path / "runs"]
+    words += ["--results", tmp_path / "out", "--iterations", "10", "--methods", "3dgs@mask=truth"]
+    words = [str(word) for word in [*words, "--seeds", "0", "1", "--set", "truth.dilation=1"]]
+
+    def said(*more: str) -> str:
+        assert script.main([*words, *more]) == 0
+        return capsys.readouterr().out
+
+    assert "2 runs: 0 finished before, 2 to go" in said()
     data = json.loads((tmp_path / "out.json").read_text())
     (capture,) = data["captures"]
     assert len(capture.pop("sha256")) == 64
     share = pytest.approx(144 / (64 * 48))
     assert capture == {"name": "with", "train": 6, "test": 2, "distractor_share": share}
     assert data["threads"] == [1]
-    truth = {r["method"]: r for r in data["rows"]}["3dgs@mask=truth"]
+    (truth,) = data["rows"]
     assert truth["masked_share"] == pytest.approx(100 * 14 * 14 / (64 * 48), abs=1e-4)
     values = []
     for seed in (0, 1):
@@ -129,33 +138,32 @@ def test_the_script_trains_what_is_missing_and_tabulates(tmp_path):
     assert truth["psnr"] == pytest.approx(sum(values) / 2, abs=1e-5)
     assert truth["psnr_sd"] == pytest.approx(abs(values[0] - values[1]) / 2**0.5, abs=1e-5)
     rows = list(csv.DictReader((tmp_path / "out.csv").open()))
-    assert [r["method"] for r in rows] == ["3dgs", "3dgs@mask=truth"]
+    assert [r["method"] for r in rows] == ["3dgs@mask=truth"]
     assert "| 3dgs@mask=truth |" in (tmp_path / "out.md").read_text()
 
-    again = subprocess.run(words, capture_output=True, text=True, check=True)
-    assert "4 finished before, 0 to go" in again.stdout
+    assert "2 finished before, 0 to go" in said()
     for name in ("out.json", "out.csv", "out.md"):
         assert str(tmp_path) not in (tmp_path / name).read_text()
 
-    report = [*words, "--report-only"]
-    with_third = subprocess.run([*report, "--seeds", "0", "2"], capture_output=True, text=True, check=True)
-    assert "to go" not in with_third.stdout
-    assert "- 3dgs on with, seed 2 (not finished)" in with_third.stdout
+    third = said("--report-only", "--seeds", "0", "2")
+    assert "to go" not in third
+    assert "- 3dgs@mask=truth on with, seed 2 (not finished)" in third
     data = json.loads((tmp_path / "out.json").read_text())
-    assert [m["seed"] for m in data["missing"]] == [2, 2]
+    assert [m["seed"] for m in data["missing"]] == [2]
     assert data["rows"][0]["psnr"] is None  # one seed of two is no mean
 
     shutil.rmtree(tmp_path / "runs")  # another machine: the book is enough
-    lost = subprocess.run(words, capture_output=True, text=True, check=True)
-    assert "4 finished before, 0 to go" in lost.stdout
-    assert {r["method"]: r for r in json.loads((tmp_path / "out.json").read_text())["rows"]}[
-        "3dgs@mask=truth"
-    ]["psnr"] == pytest.approx(truth["psnr"], abs=1e-5)
-    changed = subprocess.run([*words, "--iterations", "12"], capture_output=True, text=True, check=True)
-    assert "0 finished before, 4 to go" in changed.stdout  # what was configured otherwise is no result
+    assert "2 finished before, 0 to go" in said()
+    (kept,) = json.loads((tmp_path / "out.json").read_text())["rows"]
+    assert kept["psnr"] == pytest.approx(truth["psnr"], abs=1e-5)
+    changed = said("--iterations", "12", "--seeds", "0")
+    assert "0 finished before, 1 to go" in changed  # what was configured otherwise is no result
 
-    other = subprocess.run([*report, "--iterations", "14"], capture_output=True, text=True)
-    assert other.returncode == 1
-    assert "another configuration (train.iterations was 12, is 14)" in other.stderr
-    empty = subprocess.run([*words, "--captures", str(tmp_path / "runs")], capture_output=True, text=True)
-    assert "is no scene folder" in empty.stderr
+    with pytest.raises(AwError, match=r"another configuration \(train.iterations was 12, is 14\)"):
+        script.main([*words, "--report-only", "--iterations", "14"])
+
+
+def test_the_script_as_it_is_typed(tmp_path):
+    words = [sys.executable, BENCHMARKS / "captures.py", "--captures", tmp_path, "--out", tmp_path / "runs"]
+    done = subprocess.run([str(word) for word in words], capture_output=True, text=True)
+    assert done.returncode == 1 and "is no scene folder" in done.stderr

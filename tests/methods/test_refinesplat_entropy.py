@@ -9,7 +9,7 @@ import torch
 from ambiguous_wild.core import AwError
 from ambiguous_wild.methods.refinesplat import masking
 from ambiguous_wild.methods.refinesplat.entropy import contrast, entropy, surprise
-from ambiguous_wild.methods.refinesplat.threshold import LearntWeight, objective, t_ent
+from ambiguous_wild.methods.refinesplat.threshold import LearntWeight, objective, soft_threshold, t_ent
 
 
 @pytest.mark.parametrize("variant", ["sigmoid", "softmax"])
@@ -81,14 +81,18 @@ def test_the_cut_equals_brute_force(form, w2):
             continue
         if form == "kapur" and best == values.min():
             continue  # not a cut: the default wants two sides
-        assert cut.threshold < best
-        assert np.array_equal(cut.flagged, values >= best)
+        if form == "literal":  # printed: the subset is H >= t, the mask H > T
+            assert cut.threshold == best
+            assert np.array_equal(cut.flagged, values > best)
+        else:
+            assert cut.threshold < best
+            assert np.array_equal(cut.flagged, values >= best)
 
 
 def test_the_printed_objective_degenerates():
     values = np.r_[np.full(20, 0.05), 0.25, 0.3] + np.arange(22) * 1e-4
-    assert t_ent(values, 0.4, "literal").flagged.all()  # w2 < 1/2: everything is transient
-    assert t_ent(values, 0.6, "literal").flagged.sum() == 1  # w2 > 1/2: only the largest value is
+    assert t_ent(values, 0.4, "literal").flagged.sum() == 21  # w2 < 1/2: all but the smallest value
+    assert t_ent(values, 0.6, "literal").flagged.sum() == 0  # w2 > 1/2: nothing
     order = np.sort(values)
     scores = objective(order, np.arange(22), 0.5, "literal")
     assert np.ptp(scores) < 1e-12  # w2 = 1/2: any threshold is as good as any other
@@ -148,6 +152,35 @@ def test_learnt_weight_follows_the_residuals():
     assert dear.value < 0.5 < cheap.value
 
 
+def test_the_printed_weight_learns_through_the_printed_form():
+    """The gradient written out by hand: dT/dw2 = sum p (t - T) (Ent below t - Ent from t) / tau."""
+    values = np.array([0.05, 0.1, 0.12, 0.3])
+    starts, w2, tau = np.arange(4), 0.45, 0.1
+    ent = np.array([-(v * np.log(v)) for v in values])
+    upper = np.array([ent[k:].sum() for k in starts])
+    lower = np.array([ent[:k].sum() for k in starts])
+    scores = ((1 - w2) * upper + w2 * lower) / tau
+    p = np.exp(scores - scores.max()) / np.exp(scores - scores.max()).sum()
+    soft = (p * values).sum()
+    weight = torch.tensor(w2, dtype=torch.float64, requires_grad=True)
+    found = soft_threshold(torch.from_numpy(values), torch.from_numpy(starts), weight, tau, "literal")
+    (slope,) = torch.autograd.grad(found, weight)
+    assert float(found.detach()) == pytest.approx(soft)
+    assert float(slope) == pytest.approx((p * (values - soft) * (lower - upper)).sum() / tau)
+
+
+def test_the_printed_weight_falls_to_all_and_rises_to_nothing():
+    """Additive, the printed threshold knows only these two ends; what masking is worth picks one."""
+    values = np.linspace(0.02, 0.3, 30)
+    dear, cheap = LearntWeight(), LearntWeight()
+    for _ in range(50):
+        dear.learn(values, np.full(30, 5.0), np.ones(30), -math.inf, "literal")
+        cheap.learn(values, np.zeros(30), np.ones(30), -math.inf, "literal")
+    assert dear.value < 0.5 < cheap.value
+    assert t_ent(values, dear.value, "literal").flagged.sum() == 29
+    assert t_ent(values, cheap.value, "literal").flagged.sum() == 0
+
+
 # -- masks --------------------------------------------------------------------------------------------
 
 
@@ -201,7 +234,8 @@ def test_a_planted_region_is_found_although_h_is_zero_over_half_the_photo():
     planted[9:17, 7:17] = True
     assert not (found & ~planted).any()
     # as printed, with a small perturbation in the denominator, the variance swallows the region
-    printed = masking.uncertainty(cosine) / (h + 1e-6)
+    printed = masking.ratio(masking.uncertainty(cosine), h, perturbation=1e-6)
+    assert np.allclose(printed, 2.0 / (np.maximum(cosine, -0.999) + 1.0) / (h + 1e-6))
     assert not masking.global_mask(printed, spread="var").any()
 
 
@@ -209,6 +243,15 @@ def test_a_photo_that_agrees_with_its_render_has_no_global_mask():
     rng = np.random.default_rng(1)
     r = masking.ratio(masking.uncertainty(rng.uniform(0.9, 1.0, (34, 60))), rng.uniform(0.4, 0.6, (34, 60)))
     assert masking.global_mask(r, spread="std", gate=6.0).mean() < 0.02
+
+
+def test_a_fixed_global_threshold_and_the_adaptive_one_by_hand():
+    r = np.array([[1.0, 2.0], [3.0, 10.0]])
+    assert np.array_equal(masking.global_mask(r, 1, "hard", hard=2.5), [[False, False], [True, True]])
+    assert np.array_equal(masking.global_mask(r, 1, "hard", hard=10.0), np.zeros((2, 2), bool))
+    # mean 4, variance 12.5, deviation 3.54
+    assert not masking.global_mask(r, 1, "var").any()
+    assert np.array_equal(masking.global_mask(r, 1, "std"), [[False, False], [False, True]])
 
 
 def test_the_mask_is_bounded_and_the_surest_pixels_go():

@@ -9,11 +9,13 @@ import torch
 from scipy import ndimage
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.methods.refinesplat.inputs import train_tracks
 from ambiguous_wild.methods.robustsplat import supervision
 from ambiguous_wild.methods.robustsplat.config import RobustSplatConfig
 from ambiguous_wild.methods.robustsplat.net import MaskNet
-from ambiguous_wild.methods.robustsplat.policy import RobustSplatMask, coarse_spec
+from ambiguous_wild.methods.robustsplat.policy import RobustSplatMask, _fit, coarse_spec
 from ambiguous_wild.methods.robustsplat.recipe import build
+from ambiguous_wild.vision.labhog import LabHog
 from tests.methods.baselines import data_of, parts_of, resumed_equals_whole, step_of, trained
 from tests.tiny_scene import SQUARE, TRAIN, wall_colour, write_tiny_scene
 
@@ -215,13 +217,36 @@ def test_smaller_steps_get_masks_of_their_size(scene, tmp_path):
 
 def test_the_coarse_stage_has_features_of_its_own():
     assert coarse_spec(RobustSplatConfig()) == "labhog"
+    for spec, coarse in (
+        ("sceneconv", "sceneconv"),
+        ("efficientnet-lite0", "efficientnet-lite0"),  # follows the size of the picture
+        ("efficientnet-lite0@270,layer=stride4", "efficientnet-lite0@120,layer=stride4"),
+        ("vgg16", "vgg16@112"),
+        ("vgg16@0", "vgg16@0"),
+    ):
+        config = RobustSplatConfig(features=spec)
+        assert coarse_spec(config) == coarse and config.local and config.net_context == (5, 15)
     published = RobustSplatConfig(features="dinov2-small-registers@504,normalise=raw")
     assert coarse_spec(published) == "dinov2-small-registers@224,normalise=raw"
 
 
+def test_features_trained_on_the_scene_get_tracks_in_px_of_their_pictures(scene, tmp_path):
+    class Recorded(LabHog):
+        def fit_scene(self, photos, tracks, folder=None):
+            self.given = tracks
+
+    data = policy_on(scene, tmp_path).data
+    point, photo, xy = train_tracks(data.scene)
+    whole, half = Recorded(), Recorded()
+    _fit(whole, data.photos, data)
+    _fit(half, [p[::2, ::2] for p in data.photos], data)
+    assert np.array_equal(whole.given[2], xy) and np.array_equal(half.given[2], xy / 2)
+    assert np.array_equal(half.given[0], point) and np.array_equal(half.given[1], photo)
+
+
 def test_with_a_nets_features_everything_is_published():
     config = RobustSplatConfig(features="dinov2-small-registers@504,normalise=raw", context=(5,))
-    assert (config.net_context, config.net_hidden, config.net_lr, config.hand_made) == ((), 16, 1e-3, False)
+    assert (config.net_context, config.net_hidden, config.net_lr, config.local) == ((), 16, 1e-3, False)
     config = RobustSplatConfig(hidden=16, lr=1e-3, context=())
     assert (config.net_context, config.net_hidden, config.net_lr) == ((), 16, 1e-3)
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.lib.stride_tricks import sliding_window_view
+from safetensors.torch import save_file
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.metrics import lpips
@@ -58,7 +59,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(autouse=True)
 def no_weights_of_the_machine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
-    monkeypatch.delenv("AW_WEIGHTS", raising=False)
+    monkeypatch.setenv("AW_WEIGHTS", str(tmp_path / "none"))
 
 
 def pictures(height: int, width: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -159,13 +160,17 @@ def test_smallest_pictures(weights: Path, monkeypatch: pytest.MonkeyPatch) -> No
             metric(*pictures(side - 1, 40))
 
 
-def test_without_weights_every_variant_says_what_goes_where() -> None:
+def test_without_weights_every_variant_says_which_command_downloads_them() -> None:
     reasons = lpips.available()
     assert list(reasons) == ["lpips_alex", "lpips_vgg", "lpips_vgg_01"]
+    assert (
+        reasons["lpips_alex"]
+        == "weights missing: alexnet, lpips-alex; run: aw weights get alexnet lpips-alex"
+    )
     for name, reason in reasons.items():
-        assert reason is not None and "AW_WEIGHTS" in reason and ".pth" in reason
-        with pytest.raises(AwError, match=r"weights missing: put"):
+        with pytest.raises(AwError) as error:
             lpips.load(name)
+        assert str(error.value) == f"{name}: {reason}"
     with pytest.raises(AwError, match="lpips_alex"):
         lpips.load("lpips_alexnet")
 
@@ -175,13 +180,28 @@ def test_one_of_two_files_is_not_enough(
 ) -> None:
     monkeypatch.setenv("AW_WEIGHTS", str(tmp_path))
     (tmp_path / "lpips_alex.pth").write_bytes((weights / "lpips_alex.pth").read_bytes())
-    reason = lpips.available()["lpips_alex"]
-    assert reason is not None and "alexnet-owt-7be5be79.pth" in reason and "lpips_alex.pth" not in reason
+    assert lpips.available()["lpips_alex"] == "weights missing: alexnet; run: aw weights get alexnet"
     hub = tmp_path / "torch" / "hub" / "checkpoints"
     hub.mkdir(parents=True)
     (hub / "alexnet-owt-7be5be79.pth").write_bytes((weights / "alexnet-owt-7be5be79.pth").read_bytes())
     assert lpips.available()["lpips_alex"] is None
     assert lpips.available()["lpips_vgg"] is not None
+
+
+def test_safetensors_give_what_the_published_files_give(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, weights: Path
+) -> None:
+    a, b = pictures(33, 40)
+    monkeypatch.setenv("AW_WEIGHTS", str(weights))
+    expected = lpips.lpips_alex(a, b)
+    monkeypatch.setenv("AW_WEIGHTS", str(tmp_path))
+    for name, file, made in (
+        ("alexnet", "alexnet-owt-7be5be79.pth", "alexnet.safetensors"),
+        ("lpips-alex", "lpips_alex.pth", "lpips_alex.safetensors"),
+    ):
+        (tmp_path / name).mkdir()
+        save_file(torch.load(weights / file, weights_only=True), tmp_path / name / made)
+    assert lpips.lpips_alex(a, b) == expected
 
 
 @pytest.mark.parametrize("damage", ["cut", "other", "heads", "pickle"])

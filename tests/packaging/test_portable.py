@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-# gsplat's own imports, Ray, viser and transformers are extras; a module of ours that needs one imports it late.
+# gsplat, Ray, viser and transformers are extras; a module of ours that needs one imports it late.
 CODE = """
 import importlib, json, pkgutil, sys
 absent = json.loads(sys.argv[1])

@@ -40,7 +40,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The `aw` of an environment of its own that has the wheel, and sees this one's dependencies behind it."""
+    """The Python of a new environment that has the wheel, and this one's dependencies behind it."""
     home = tmp_path_factory.mktemp("installed")
     venv.create(home / "venv", with_pip=False, symlinks=os.name != "nt")
     python = home / "venv" / ("Scripts/python.exe" if os.name == "nt" else "bin/python")

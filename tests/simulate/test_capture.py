@@ -17,7 +17,7 @@ from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.simulate import capture
 from ambiguous_wild.simulate import world as world_module
 from ambiguous_wild.simulate.distractors import Placement, movers, shapes_of
-from ambiguous_wild.simulate.ground_plan import SURFACES
+from ambiguous_wild.simulate.ground_plan import PLANS, SURFACE_NAMES
 from ambiguous_wild.simulate.presets import PRESETS, TWIN, preset, resized
 from ambiguous_wild.simulate.spec_check import PICTURES
 from ambiguous_wild.simulate.tracer import trace
@@ -147,7 +147,7 @@ def test_exif_states_the_true_focal_length(raw: Path) -> None:
 def test_test_viewpoints_are_new_and_inside_the_walk() -> None:
     for seed in range(5):
         world, shots = capture.plan(replace(SMALL, distractors=(), detail_px_per_m=COARSE), seed)
-        hub = np.array([world.statue[0], world.statue[1] - 0.3])
+        hub = np.array([world.hub[0], world.hub[1] - 0.3])
         around = {"train": [], "test": []}
         for shot in shots:
             rotation = shot.camera.cam_from_world[:3, :3]
@@ -219,7 +219,7 @@ def test_presets_name_what_they_use() -> None:
     from ambiguous_wild.simulate.world import SHEETS
 
     for spec in PRESETS.values():
-        flat = (*SURFACES, *PICTURES)
+        flat = (*SURFACE_NAMES, *PICTURES)
         for d in spec.distractors:
             assert d.texture in SHEETS or (d.kind == "placard" and d.texture in flat)
             assert not d.head or d.head in SHEETS
@@ -255,7 +255,7 @@ def test_thin_distractors_are_a_few_pixels_wide() -> None:
 
 def test_a_tint_colours_its_own_sheet_and_leaves_the_head() -> None:
     red = next(d for d in PRESETS["courtyard-plain"].distractors if d.kind == "visitor")
-    shapes = shapes_of(red, Placement(0, 0.0, 0.0, 0.0, 0.5))
+    shapes = shapes_of(red, Placement(0, 0.0, 0.0, 0.0, 0.5), PLANS["courtyard"])
     assert all(s.tint[1] < 0.1 * s.tint[0] for s in shapes if s.texture == red.texture)
     heads = [s.tint for s in shapes if s.texture == "skin"]
     assert heads and all(t == (1.0, 1.0, 1.0) for t in heads)
@@ -263,7 +263,7 @@ def test_a_tint_colours_its_own_sheet_and_leaves_the_head() -> None:
 
 def test_size_and_lift_move_a_ball_off_the_ground() -> None:
     ball = replace(PRESETS["courtyard-plain"].distractors[1], size=0.25, lift_m=2.0)
-    (shape,) = shapes_of(ball, Placement(1, 0.5, -1.0, 0.0, 0.5))
+    (shape,) = shapes_of(ball, Placement(1, 0.5, -1.0, 0.0, 0.5), PLANS["courtyard"])
     assert shape.center == pytest.approx((0.5, -1.0, 1.0 + 0.1)) and shape.half == pytest.approx((0.1,) * 3)
     assert shape.owner == 2
 

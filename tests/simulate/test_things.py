@@ -13,6 +13,7 @@ from ambiguous_wild.simulate import capture, volumes
 from ambiguous_wild.simulate.atlas import build_atlas
 from ambiguous_wild.simulate.camera_path import look_at
 from ambiguous_wild.simulate.distractors import lay_out
+from ambiguous_wild.simulate.ground_plan import PLANS
 from ambiguous_wild.simulate.kernels import QUAD, VOLUME
 from ambiguous_wild.simulate.presets import preset, resized
 from ambiguous_wild.simulate.shapes import UNSEEN, Shape, shape_table
@@ -82,7 +83,7 @@ def test_a_thing_stands_on_the_ground_at_its_place(kind: str) -> None:
     camera = Camera(
         90, 150, 150.0, 150.0, 45.0, 75.0, look_at(np.array([0.5, -7.0, 0.8]), np.array([0.5, -1, 0.8]), 0.0)
     )
-    things = shape_table([replace(s, owner=1) for s in shapes_of_thing(thing)], ATLAS)
+    things = shape_table([replace(s, owner=1) for s in shapes_of_thing(thing, PLANS["courtyard"])], ATLAS)
     rows, columns = np.nonzero(trace(camera, shape_table([], ATLAS), things, ATLAS, LIGHT).owner)
     scale = 150.0 / 6.0
     top, foot = (75 - rows.min()) / scale + 0.8, (74 - rows.max()) / scale + 0.8

@@ -1,4 +1,4 @@
-"""gsplat's five calls in plain torch: every pixel against every Gaussian, gradients by autograd.
+"""gsplat's calls in plain torch: every pixel against every Gaussian, gradients by autograd.
 
 Stands in for the package where there is no GPU: the code around it runs with real numbers on the CPU, and
 without any on torch's `meta` device. Signatures, shapes and conventions are those of the release named.
@@ -23,6 +23,7 @@ def fully_fused_projection(
     opacities=None,
 ):  # fmt: skip
     assert covars is None and not packed and len(viewmats) == len(Ks) == 1
+    assert opacities is None or opacities.shape == means.shape[:-1]
     assert len(means), "gsplat divides by their number, in C++"
     pose, k = viewmats[0].to(means), Ks[0].to(means)
     local = means @ pose[:3, :3].T + pose[:3, 3]
@@ -66,6 +67,14 @@ def spherical_harmonics(degrees_to_use, dirs, coeffs, masks=None):
     return 0.28209479177387814 * coeffs[:, 0] + torch.einsum("nk,nkc->nc", bands, used)
 
 
+def spherical_harmonics_later(degrees_to_use, means, viewmats, coeffs, masks=None):
+    """After 1.5.3: directions are made of means and cameras, and the colours have a dimension of cameras."""
+    assert means.shape == (len(coeffs), 3) and viewmats.shape == (1, 4, 4), (means.shape, viewmats.shape)
+    assert (degrees_to_use + 1) ** 2 <= coeffs.shape[1] and masks is None
+    centre = -viewmats[0, :3, :3].T @ viewmats[0, :3, 3]
+    return spherical_harmonics(degrees_to_use, means - centre, coeffs)[None]
+
+
 def isect_tiles(means2d, radii, depths, tile_size, tile_width, tile_height, sort=True, segmented=False,
                 packed=False, n_images=None, image_ids=None, gaussian_ids=None):  # fmt: skip
     assert not depths.requires_grad and depths.shape == radii.shape[:-1] == means2d.shape[:-1]
@@ -82,7 +91,8 @@ def isect_offset_encode(isect_ids, n_images, tile_width, tile_height):
 def rasterize_to_pixels(means2d, conics, colors, opacities, image_width, image_height, tile_size,
                         isect_offsets, flatten_ids, backgrounds=None, masks=None, packed=False,
                         absgrad=False):  # fmt: skip
-    assert isect_offsets.shape == (1, -(-image_height // tile_size), -(-image_width // tile_size))
+    tall, wide = -(-image_height // tile_size), -(-image_width // tile_size)
+    assert isect_offsets.shape[0] == 1 and isect_offsets.shape[2] == wide and isect_offsets.shape[1] >= tall
     ids = flatten_ids.long()
     rows = torch.arange(image_height, device=means2d.device).to(means2d) + 0.5
     columns = torch.arange(image_width, device=means2d.device).to(means2d) + 0.5
@@ -94,7 +104,11 @@ def rasterize_to_pixels(means2d, conics, colors, opacities, image_width, image_h
         everywhere = means2d.new_zeros(means2d.shape)
 
         def keep(gradient):
-            means2d.absgrad = everywhere.index_add(1, ids, gradient.abs().sum(0)[None])
+            found = everywhere.index_add(1, ids, gradient.abs().sum(0)[None])
+            if rasterize_to_pixels.in_place and getattr(means2d, "absgrad", None) is not None:
+                means2d.absgrad.copy_(found)
+            else:
+                means2d.absgrad = found
 
         centres.register_hook(keep)
     dx, dy = centres[..., 0] - x, centres[..., 1] - y
@@ -103,6 +117,13 @@ def rasterize_to_pixels(means2d, conics, colors, opacities, image_width, image_h
     alpha = opacities[0, ids] * torch.exp(-sigma)
     alpha = torch.where(alpha > rasterize_to_pixels.max_alpha, rasterize_to_pixels.max_alpha, alpha)
     alpha = torch.where((alpha < 1 / 255) | (sigma < 0), torch.zeros_like(alpha), alpha)
+    if isect_offsets.shape[1] > tall:  # not of `isect_tiles` above: a list for every tile
+        here = (y[:, 0] // tile_size).long() * wide + (x[:, 0] // tile_size).long()
+        starts = isect_offsets.flatten().long()
+        ends = torch.cat([starts[1:], starts.new_full((1,), len(ids))])
+        index = torch.arange(len(ids), device=ids.device)[None]
+        listed = (index >= starts[here][:, None]) & (index < ends[here][:, None])
+        alpha = torch.where(listed, alpha, torch.zeros_like(alpha))
     after = torch.cumprod((1 - alpha).double(), 1).to(alpha)
     drawn = after > 1e-4
     alpha = torch.where(drawn, alpha, torch.zeros_like(alpha))
@@ -121,7 +142,7 @@ def rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, 
     radii, means2d, depths, conics, _ = fully_fused_projection(
         means, None, quats, scales, viewmats, Ks, width, height, opacities=opacities
     )
-    centre = -viewmats[0, :3, :3].T @ viewmats[0, :3, 3]
+    centre = torch.inverse(viewmats)[0, :3, 3]  # as gsplat does; the host waits for it
     shade = spherical_harmonics(sh_degree, means - centre, colors).add(0.5).clamp(min=0.0)
     columns, rows = -(-width // 16), -(-height // 16)
     _, ids, flat = isect_tiles(means2d.detach(), radii, depths.detach(), 16, columns, rows)
@@ -142,7 +163,9 @@ def module(version="1.6.0"):
     """The package of that version."""
     fake = types.ModuleType("gsplat")
     fake.__version__ = version
-    rasterize_to_pixels.max_alpha = 0.999 if version.startswith("1.5") else 0.99
+    old = version.startswith("1.5")
+    rasterize_to_pixels.max_alpha = 0.999 if old else 0.99
+    rasterize_to_pixels.in_place = not old
     calls = (
         fully_fused_projection,
         spherical_harmonics,
@@ -153,8 +176,9 @@ def module(version="1.6.0"):
     )
     for call in calls:
         setattr(fake, call.__name__, call)
-    if not version.startswith("1.5"):
+    if not old:
         fake.isect_tiles = isect_tiles_later
+        fake.spherical_harmonics = spherical_harmonics_later
     return fake
 
 
@@ -176,5 +200,6 @@ def _forget():
         gsplat_seam.ready,
         gsplat_seam.max_alpha,
         gsplat_seam._tests_tiles_by_ellipse,
+        gsplat_seam._takes_cameras,
     ):
         what.cache_clear()

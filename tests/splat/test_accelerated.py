@@ -9,7 +9,9 @@ import torch
 
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat import clock
+from ambiguous_wild.splat.gpu import compiled as compiled_module
 from ambiguous_wild.splat.gpu import fused_loss
+from ambiguous_wild.splat.gpu.compiled import Compiled
 from ambiguous_wild.splat.gpu.sentinel import Sentinel
 from ambiguous_wild.splat.losses import photometric, ssim_map
 from ambiguous_wild.splat.parts import MaskPolicy, Parts
@@ -270,13 +272,13 @@ def test_the_fused_loss_reads_nothing_and_is_one_graph_for_a_compiler():
 def test_the_loss_is_compiled_once_for_all_sizes(monkeypatch):
     """Photos of several sizes, smaller ones, and strides of any kind: a run meets them in the middle."""
     compiled = []
-    monkeypatch.setattr(fused_loss, "_compiles", lambda device: True)
+    monkeypatch.setattr(compiled_module, "compiles", lambda device: True)
 
     def counting(graph, inputs):
         compiled.append(graph)
         return graph.forward
 
-    loss = fused_loss._Compiled(fused_loss._loss, backend=counting)
+    loss = Compiled(fused_loss._loss, backend=counting)
     for height, width, masked in (
         (16, 16, True),  # a square one first: its sides must not be taken for one number
         (17, 23, True),
@@ -302,7 +304,7 @@ def test_without_a_compiler_the_loss_runs_as_it_stands_and_says_so():
     def broken(*arguments):
         raise RuntimeError("no triton\nand more")
 
-    call = fused_loss._Compiled(lambda x: x + 1)
+    call = Compiled(lambda x: x + 1)
     call.compiled[torch.Tensor,] = broken
     argument = torch.zeros(2).as_subclass(Cuda)
     with pytest.warns(UserWarning, match="not compiled and slower for it: no triton$"):

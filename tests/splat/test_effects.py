@@ -94,6 +94,13 @@ def test_an_effect_that_the_method_brings_is_applied_once():
     assert [e.name for e in with_effects(parts, ("exposure", "poses")).effects] == ["exposure", "poses"]
 
 
+def test_two_effects_of_one_name_are_refused(scene, tmp_path):
+    """A checkpoint holds effects by name: one would replace the other."""
+    data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=tmp_path)
+    with pytest.raises(AwError, match="effect exposure is there twice"):
+        Chain((AffineExposure(), AffineExposure()), data)
+
+
 def test_names():
     assert check_effects(["poses", "exposure", "poses"]) == ("exposure", "poses")
     with pytest.raises(AwError, match="did you mean 'exposure'"):
@@ -130,7 +137,7 @@ def test_a_resumed_run_equals_an_undisturbed_one(scene, tmp_path, names):
 def test_a_render_between_steps_changes_nothing(scene, tmp_path):
     plain, probed = (trainer_for(scene, tmp_path / n, ALL, iterations=140) for n in ("plain", "probed"))
     plain.train()
-    probed.train(tick=lambda t: (t._probe_image(t.data.cameras[0]), t.make_step(t.iteration, 1)))
+    probed.train(tick=lambda t: (t.picture(t.data.cameras[0]), t.make_step(t.iteration, 1)))
     assert bits(probed) == bits(plain)
 
 

@@ -12,6 +12,7 @@ from ambiguous_wild.methods import get_method
 from ambiguous_wild.splat.cpu.render import render_cpu
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.gpu import fused_loss, gsplat_seam
+from ambiguous_wild.splat.gpu.compiled import Compiled
 from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.render import render
@@ -86,7 +87,7 @@ def test_the_compiled_loss_is_that_of_the_cpu(weighting):
 
 
 def test_the_loss_is_compiled_once_for_all_sizes():
-    call = fused_loss._Compiled(fused_loss._loss)
+    call = Compiled(fused_loss._loss)
     torch._dynamo.utils.counters.clear()
     for size in ((64, 64), (378, 504), (252, 189), (126, 94)):
         a, b, keep = (t.to(GPU) for t in pictures(*size))

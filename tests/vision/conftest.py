@@ -160,6 +160,14 @@ def offline(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
+def own(offline: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """An empty weights folder."""
+    monkeypatch.delenv("TORCH_HOME", raising=False)
+    monkeypatch.setenv("AW_WEIGHTS", str(tmp_path / "own"))
+    return tmp_path / "own"
+
+
+@pytest.fixture
 def photo() -> Callable[..., torch.Tensor]:
     def make(seed: int, height: int = 96, width: int = 130) -> torch.Tensor:
         small = np.random.default_rng(seed).random((6, 8, 3)).astype(np.float32)

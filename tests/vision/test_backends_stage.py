@@ -73,6 +73,10 @@ def test_instances_by_name(checkpoint, tmp_path):
 @pytest.mark.parametrize(
     "spec, message",
     [
+        ("vgg16,layer=relu3", "unknown layer of vgg16 'relu3': did you mean 'relu3_3'"),
+        ("vgg16@2", "at least one cell of 4 px"),
+        ("efficientnet-lite0,fit_photos=0", "fit_photos at least 1"),
+        ("efficientnet-lite0:x", "nothing after a colon"),
         ("dinov2-smal", "did you mean 'dinov2-small'"),
         ("labhog,blocks=3", "takes no options"),
         ("dinov2-small:x", "nothing after a colon"),
@@ -87,6 +91,8 @@ def test_features_that_do_not_exist(spec, message):
 @pytest.mark.parametrize(
     "spec, message",
     [
+        ("efficientnet-lite0,alike=2", "alike"),
+        ("vgg16,similar=0.5", "unknown option of vgg16"),
         ("sam2video", "did you mean 'sam2-video'"),
         ("graph,kk=3", "unknown option of graph"),
         ("graph@7", "graph takes no size"),
@@ -105,10 +111,12 @@ def test_instances_that_do_not_exist(spec, message):
 def test_without_weights_a_name_answers_with_the_command(offline):
     for make, spec in (
         (make_features, "dinov2-small-registers"),
+        (make_features, "vgg16"),
         (make_instances, "sam2-video"),
         (make_instances, "grounded:car"),
+        (make_instances, "efficientnet-lite0"),
     ):
-        with pytest.raises(AwError, match=r"download them with: .*hf download"):
+        with pytest.raises(AwError, match=r"download them with: aw weights get [a-z0-9.-]+$"):
             make(spec)
 
 

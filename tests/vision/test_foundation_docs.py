@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 from ambiguous_wild.vision.backends import FEATURES, INSTANCES, parse
-from ambiguous_wild.vision.weights import KNOWN, OTHER_SIZES
+from ambiguous_wild.vision.weights import KNOWN, OTHER_SIZES, get_command
 
 TEXT = (Path(__file__).resolve().parents[2] / "docs" / "foundation-models.md").read_text(encoding="utf-8")
 
@@ -33,5 +33,4 @@ def test_the_weights_it_names_exist() -> None:
 
 
 def test_the_command_it_shows_is_the_one_the_program_gives() -> None:
-    weight = next(w for w in KNOWN if w.name == "dinov2-small")
-    assert f"hf download {weight.hub_id} {' '.join(weight.files)} --local-dir" in TEXT
+    assert f"{get_command('lpips', 'efficientnet-lite0')}\n" in TEXT

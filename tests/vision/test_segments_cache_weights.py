@@ -1,6 +1,4 @@
 import os
-import subprocess
-import sys
 
 import cv2
 import numpy as np
@@ -8,7 +6,6 @@ import pytest
 import torch
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.vision import weights
 from ambiguous_wild.vision.cache import cache_key, cached
 from ambiguous_wild.vision.segments import GraphSegments, SegmentConfig
 
@@ -99,43 +96,6 @@ def test_cache_key_depends_on_everything():
     assert len(keys) == 7
 
 
-def test_weights_are_found_where_they_lie(tmp_path, monkeypatch):
-    for name in ("AW_WEIGHTS", "HF_HUB_CACHE", "HF_HOME", "TORCH_HOME", "XDG_CACHE_HOME"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    assert not any(line.present for line in weights.status())
-    assert all(line.command for line in weights.status())
-
-    own = tmp_path / "own"
-    monkeypatch.setenv("AW_WEIGHTS", str(own))
-    (own / "dinov2-small").mkdir(parents=True)
-    (own / "dinov2-small" / "config.json").write_text("{}")
-    line = next(x for x in weights.status() if x.name == "dinov2-small")
-    assert not line.present
-    assert "lacks model.safetensors" in line.where
-    (own / "dinov2-small" / "model.safetensors").write_bytes(b"")
-    line = next(x for x in weights.status() if x.name == "dinov2-small")
-    assert line == ("dinov2-small", True, str(own / "dinov2-small"), "")
-
-    hub = tmp_path / "home/.cache/huggingface/hub/models--facebook--dino-vits16"
-    (hub / "refs").mkdir(parents=True)
-    (hub / "refs" / "main").write_text("../../outside")
-    assert not next(x for x in weights.status() if x.name == "dino-vits16").present
-    (hub / "refs" / "main").write_text("abc123")
-    (hub / "snapshots" / "abc123").mkdir(parents=True)
-    for name in ("config.json", "model.safetensors"):
-        (hub / "snapshots" / "abc123" / name).write_bytes(b"")
-    assert next(x for x in weights.status() if x.name == "dino-vits16").present
-
-
-def test_weight_status_imports_neither_torch_nor_transformers():
-    code = (
-        "import sys; from ambiguous_wild.vision import weights; weights.status();"
-        "sys.exit(any(m in sys.modules for m in ('torch', 'transformers', 'numpy')))"
-    )
-    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
-
-
 def test_old_leftovers_of_killed_writes_are_removed_from_the_cache(tmp_path):
     old, young = tmp_path / ".a.x1.tmp.npz", tmp_path / ".b.x2.tmp.npz"
     other = tmp_path / "segments.npz"
@@ -145,22 +105,3 @@ def test_old_leftovers_of_killed_writes_are_removed_from_the_cache(tmp_path):
         os.utime(path, (1e9, 1e9))
     cached(tmp_path, "k", {"x": np.int32}, lambda: {"x": np.zeros(1, np.int32)})
     assert sorted(p.name for p in tmp_path.iterdir()) == [young.name, "k.npz", other.name]
-
-
-def test_the_download_command_can_be_pasted_with_and_without_a_folder(monkeypatch, tmp_path):
-    fake_curl = tmp_path / "bin" / "curl"  # writes what it was asked to download
-    fake_curl.parent.mkdir()
-    fake_curl.write_text('#!/bin/sh\n[ "$1 $2" = "-fL -o" ] && printf %s "$4" > "$3"\n')
-    fake_curl.chmod(0o755)
-    monkeypatch.setenv("PATH", f"{fake_curl.parent}{os.pathsep}{os.environ['PATH']}")
-    monkeypatch.setenv("HOME", str(tmp_path))
-    monkeypatch.delenv("AW_WEIGHTS", raising=False)
-    for line in weights.status():
-        assert line.command.startswith("export AW_WEIGHTS=~/.cache/ambiguous_wild/weights && ")
-    file = next(w for w in weights.KNOWN if w.kind == "file")
-    command = next(s.command for s in weights.status() if s.name == file.name)
-    assert subprocess.run(["bash", "-c", command], cwd=tmp_path).returncode == 0
-    monkeypatch.setenv("AW_WEIGHTS", str(tmp_path / ".cache/ambiguous_wild/weights"))
-    folder, _ = weights.find(file)
-    assert folder is not None and (folder / file.files[0]).read_text() == file.url
-    assert not any("export" in s.command for s in weights.status())

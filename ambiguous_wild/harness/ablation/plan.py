@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.core.config import config_hash, to_plain, with_options
+from ambiguous_wild.core.config import config_hash, flatten, to_plain, with_options
 from ambiguous_wild.harness.ablation.records import StudyFacts
 from ambiguous_wild.harness.running.cell import Cell
 from ambiguous_wild.harness.running.grid import cell_folder, plan_cells
@@ -48,6 +48,11 @@ class Study:
     default: tuple[Cell, ...]
     rows: tuple[Planned, ...]  # in the order of the groups; each group begins with the default
 
+    @property
+    def note(self) -> str:
+        """What the method says about itself, with the options of the default rows."""
+        return get_method(self.method).about([flatten(to_plain(self.default[0].options))])
+
     def facts(self) -> StudyFacts:
         """Facts that two studies must share before one report can hold both."""
         return {
@@ -81,8 +86,7 @@ def plan_study(
     """Every variant on every scene with every seed; nothing is trained.
 
     A variant whose method, option or weights are missing becomes a row with the reason. Variants of equal
-    settings
-    share their runs, whatever groups are chosen.
+    settings share their runs, whatever groups are chosen.
 
     Args:
         method: a name of `aw methods` that declares ablations.
@@ -109,7 +113,15 @@ def plan_study(
         for variant in group.variants:
             try:
                 if variant.method:
-                    cells = plan_cells([variant.method], scenes, seeds, train, device=device, factor=factor)
+                    _check_features(variant)
+                    host = variant.method.partition("@")[0] == method
+                    given = own if host else _settings_of(variant, method, own)
+                    cells = plan_cells(
+                        [variant.method], scenes, seeds, train, settings=given, device=device, factor=factor
+                    )
+                    if given or variant.settings:  # at its defaults the run has the method's own name
+                        of_graft = variant.settings if host else ()
+                        cells = _renamed(cells, variant.method, of_graft, folder_name(method, group, variant))
                     rows.append(Planned(group.name, variant, tuple(cells)))
                     continue
                 options = names.options(variant)
@@ -126,6 +138,14 @@ def plan_study(
     return Study(method, chosen, tuple(settings), default, tuple(rows))
 
 
+def _settings_of(variant: Variant, method: str, own: Sequence[str]) -> list[str]:
+    """Settings of a variant that is another method: the study's where its method is the donor of the graft, and
+    the variant's own."""
+    peer = get_method(variant.method)
+    shared = own if peer.option_keys(method, "key") else []
+    return [*shared, *(f"{method}.{text}" for text in variant.settings)]
+
+
 def earlier_groups(study: Study, output: Path) -> list[str]:
     """Groups that an earlier report in the folder holds and this study does not; all else is equal.
 
@@ -139,6 +159,14 @@ def earlier_groups(study: Study, output: Path) -> list[str]:
         return []
     there = {group.name for group in get_method(study.method).ablation_groups()}
     return [n for n in names if n in there and n not in {group.name for group in study.groups}]
+
+
+def _renamed(cells: Sequence[Cell], method: str, settings: Sequence[str], name: str) -> list[Cell]:
+    """Cells of another method with these options on top, under a name of their own."""
+    given = {key: value for key, _, value in (setting.partition("=") for setting in settings)}
+    options = with_options(cells[0].options, given, f"option of {method}")
+    entry = dataclasses.replace(cells[0].method, name=name)
+    return [dataclasses.replace(cell, method=entry, options=options) for cell in cells]
 
 
 class _Names:

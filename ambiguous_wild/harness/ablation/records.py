@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, TypedDict
+from typing import Any, Literal, NotRequired, TypedDict
 
 
 class StudyFacts(TypedDict):
@@ -50,5 +50,6 @@ class StudyReport(StudyFacts):
 
     schema: int
     made_by: str  # the command
+    note: NotRequired[str]  # what the method says about itself
     groups: list[GroupFacts]
     rows: list[VariantRow]

@@ -32,6 +32,7 @@ def report(study: Study, output: Path, made_by: str = "") -> StudyReport:
     return {
         "schema": 1,
         "made_by": made_by,
+        "note": study.note,
         **study.facts(),
         "groups": [{"name": g.name, "title": g.title, "source": g.source} for g in study.groups],
         "rows": rows,
@@ -116,6 +117,8 @@ def to_markdown(data: StudyReport, picture: str = "") -> str:
     """One table a group: quality and cost of each variant."""
     shown = [m for m in METRICS if any(r["values"][m[0]]["mean"] is not None for r in data["rows"])]
     lines = [f"# Ablations of {data['method']}", "", _subtitle(data), ""]
+    if data.get("note"):
+        lines += [f"{data['method']}: {data['note']}", ""]
     if picture:
         lines += [f"![quality against cost]({picture})", ""]
     for group in data["groups"]:

@@ -1,7 +1,7 @@
 """What accuracy costs on a scene, in one line: most of the best PSNR, and the last dB.
 
-The time of a PSNR is that of whichever method is there first, on the mean over its seeds; an oracle is not asked,
-nor a run that was not alone while others were.
+The time of a PSNR is that of whichever method is there first, on the mean over its seeds. Oracles do not
+count, nor do runs that were not alone where others were.
 """
 
 from __future__ import annotations

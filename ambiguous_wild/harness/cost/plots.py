@@ -92,10 +92,10 @@ def _end(axes: Any, name: str, x: Summary, y: Summary, look: dict[str, Any]) -> 
     return name, x.mean, y.mean, look["color"]
 
 
-def _dot(axes: Any, x: Summary, y: Summary, colour: Any) -> None:
+def _dot(axes: Any, x: Summary, y: Summary, colour: Any, *, hollow: bool = False) -> None:
     xerr, yerr = (e if finite(e) else None for e in (x.spread, y.spread))
     axes.errorbar(x.mean, y.mean, xerr=xerr, yerr=yerr, fmt="o", color=colour, markersize=5.5, elinewidth=1.2,
-                  capsize=2.5, zorder=3)  # fmt: skip
+                  capsize=2.5, zorder=3, markerfacecolor="white" if hollow else colour)  # fmt: skip
 
 
 def draw_budgets(report: CostReport) -> Any | None:
@@ -152,7 +152,8 @@ def draw_front(report: CostReport) -> Any | None:
     if not panels:
         return None
     figure, axes = new_figure(
-        len(panels), reading="grey: nothing reaches more for as little; bars: sample deviation over seeds"
+        len(panels),
+        reading="grey: Pareto front; hollow: time not ranked; bars: sample deviation over seeds",
     )
     for panel, (key, label, less_is_better) in zip(axes, panels):
         known = [p for p in report.points if finite(_x(p, key, unit).mean, p.psnr.mean)]
@@ -160,7 +161,8 @@ def draw_front(report: CostReport) -> Any | None:
         rivals = [p for p in known if not knows_truth(p.method) and not (p.unranked and key != "model_mb")]
         _front_line(panel, [(_x(p, key, unit).mean, p.psnr.mean) for p in rivals], less_is_better)
         for p in known:
-            _dot(panel, _x(p, key, unit), p.psnr, look[p.curve]["color"])
+            hollow = bool(p.unranked) and key != "model_mb"
+            _dot(panel, _x(p, key, unit), p.psnr, look[p.curve]["color"], hollow=hollow)
         for name in {p.curve for p in known}:  # trainings of several lengths
             line = [(_x(p, key, unit).mean, p.psnr.mean) for p in known if p.curve == name]
             panel.plot([x for x, _ in line], [y for _, y in line], **look[name], linewidth=1.0, alpha=0.6)

@@ -69,6 +69,8 @@ class CostRun:
     timing: Timing
     samples: tuple[tuple[float, float], ...] = ()  # (wall seconds of training, seconds of the calibration)
     kernel_reference_s: float = math.nan
+    scene_hash: str = ""
+    reproduce: str = ""  # the command that makes it again; empty in results of earlier versions
     error: str = ""
     blind: str = ""  # why PSNR over time is unknown; empty: it was probed, or the run failed
 
@@ -149,7 +151,10 @@ def _in_reference(run: CostRun) -> CostRun:
     else:
         times = np.array(walls) * ratio
     points = tuple((float(at), psnr) for at, (_, psnr) in zip(times, run.points))
-    return replace(run, train_s=total, setup_s=run.setup_s * early, points=points)
+    late = run.kernel_reference_s / run.samples[-1][1] if run.samples else ratio
+    per_second = {"ms_per_iteration": ratio, "fps": 1.0 / late if late > 0.0 else math.nan}
+    numbers = {name: value * per_second.get(name, 1.0) for name, value in run.numbers.items()}
+    return replace(run, train_s=total, setup_s=run.setup_s * early, points=points, numbers=numbers)
 
 
 def why_unranked(runs: Iterable[CostRun]) -> str:
@@ -207,6 +212,8 @@ def _run(folder: Path, result: RunResult) -> CostRun:
         timing=timing_of(cost),
         samples=tuple((float(at), float(kernel)) for at, kernel in record.get("samples", ())),
         kernel_reference_s=_number(record.get("kernel_reference_s")),
+        scene_hash=result["scene_hash"],
+        reproduce=str(result.get("reproduce", "")),
         error=result["error"] or "",
         blind="" if result["error"] else damage or unprobed,
     )

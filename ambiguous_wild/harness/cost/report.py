@@ -153,7 +153,7 @@ def plain_data(report: CostReport) -> dict[str, Any]:
         "changes": [_change_row(c) for c in report.changes],
         "notes": list(report.notes),
     }
-    return _finite(data)
+    return dict(finite(data))
 
 
 def _point_row(p: Point) -> dict[str, Any]:
@@ -224,12 +224,12 @@ def _cell(value: Any) -> str:
     return csv_text(value) if isinstance(value, str) else str(value)
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
     """NaN is null, as in a result file; infinity is the string it writes."""
     if isinstance(value, dict):
-        return {k: _finite(v) for k, v in value.items()}
-    if isinstance(value, list):
-        return [_finite(v) for v in value]
+        return {k: finite(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite(v) for v in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None if math.isnan(value) else ("inf" if value > 0 else "-inf")
     return value

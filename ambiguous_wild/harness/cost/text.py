@@ -100,8 +100,9 @@ def _points(report: CostReport) -> Listing:
             number(n["fps"], 1, spread=False),
         ))  # fmt: skip
     took = f"{unit.name} with set-up" if report.setup else unit.name
-    head = ("method", "trained for", "runs", "PSNR dB", took, "on the front", "set-up s", "ms/iter",
-            "Gaussians", "MB", "FPS")  # fmt: skip
+    kind = "ref " if report.reference else ""
+    head = ("method", "trained for", "runs", "PSNR dB", took, "on the front", f"{kind}set-up s",
+            f"{kind}ms/iter", "Gaussians", "MB", f"{kind}FPS")  # fmt: skip
     return Listing(f"what each method reaches, and what it costs ({over})", head, tuple(rows))
 
 

@@ -228,7 +228,8 @@ def _write(board: Path, place: _Place, data: bytes, seed: str, psnr: float, inde
 
 
 def _place(row: Row) -> _Place:
-    return _Place(*(row[k] for k in COLUMNS[:6]), kind=row["kind"])
+    dataset, scene, image, method, setting, options = (row[k] for k in COLUMNS[:6])
+    return _Place(dataset, scene, image, method, setting, options, row["kind"])
 
 
 def _overlay(

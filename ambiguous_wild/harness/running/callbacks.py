@@ -66,6 +66,8 @@ def outcome_line(report: CellReport) -> str:
         return "failed: " + " ".join(report.error.split())
     if report.result is None:
         return "trained"
+    from ambiguous_wild.harness.running.timing import timing_of
+
     cost: Mapping[str, Any] = report.result["cost"]
     values = [float(v) for row in report.result["per_image"] if (v := row.get("psnr")) is not None]
     parts = [f"PSNR {sum(values) / len(values):.2f} dB over {len(values)} test views"] if values else []
@@ -76,4 +78,6 @@ def outcome_line(report: CellReport) -> str:
         "gaussians": "{:,} Gaussians",
     }
     parts += [text.format(cost[name]) for name, text in known.items() if cost.get(name) is not None]
+    timing = timing_of(cost)
+    parts += [f"time not ranked: {timing.reason}"] if timing.verdict == "contended" else []
     return ", ".join(parts)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ambiguous_wild.core import AwError, Scene
+from ambiguous_wild.harness.running.published import published_effects
 from ambiguous_wild.methods.registry import MethodEntry
 from ambiguous_wild.splat.effects import ALL, DEGREES, check_effects
 
@@ -82,11 +83,13 @@ def choose(
 
         plan = plan_without_training(scene)
     out = {}
+    published = published_effects(scene)
     for name, among in allowed.items():
         if plan is None or among == ():
             out[name] = Chosen()
         else:
-            out[name] = Chosen(check_effects(plan.effects(among)), "auto", plan)
+            found = [*plan.effects(among), *(e for e in published if among is None or e in among)]
+            out[name] = Chosen(check_effects(found), "auto", plan)
     return out
 
 

@@ -74,15 +74,11 @@ def render_and_measure(
     Returns:
         Per-image metrics, and for each metric that is missing the reason.
     """
-    missing = {name: reason for name, reason in lpips.available().items() if reason is not None}
     if not truth:
+        missing = {name: reason for name, reason in lpips.available().items() if reason is not None}
         missing |= dict.fromkeys(FULL_IMAGE, "the scene has no test views")
         return [], missing
-    scene = getattr(trainer.data, "scene", None) if scene is None else scene
-    regions = Regions({}, {}) if scene is None else find_regions(scene)
-    missing |= regions.missing
-    names = [name for name in lpips.available() if name not in missing]
-    networks = {name: lpips.load(name) for name in names}
+    measures = measures_of(getattr(trainer.data, "scene", None) if scene is None else scene)
     rows: list[ImageRow] = []
     with atomic_dir(folder) as temporary:
         for t in truth:
@@ -90,15 +86,42 @@ def render_and_measure(
             path.parent.mkdir(parents=True, exist_ok=True)
             image = _fitted(trainer, t) if half else trainer.render(t.view.camera).image
             write_png(path, to_uint8(image.cpu().numpy()))
-            drawn, photo = read_png_rgb(path), t.photo
-            if half:
-                right = slice(photo.shape[1] // 2, None)
-                drawn, photo = (np.ascontiguousarray(picture[:, right]) for picture in (drawn, photo))
-            values = {name: metric(drawn, photo) for name, metric in FULL_IMAGE.items()}
-            values |= regions.psnr(t.view.name, drawn, photo)
-            values |= {name: network(drawn, photo) for name, network in networks.items()}
-            rows.append(image_row(t.view.name, values))
-    return rows, missing
+            rows.append(image_row(t.view.name, measures(t.view.name, read_png_rgb(path), t.photo, half=half)))
+    return rows, measures.missing
+
+
+@dataclass(frozen=True)
+class Measures:
+    """Every metric of a test image that can be measured here, and why the others cannot."""
+
+    networks: dict[str, lpips.Metric]
+    regions: Regions
+    missing: dict[str, str]  # metric -> reason
+
+    def __call__(
+        self,
+        name: str,  # of the test view
+        drawn: np.ndarray,  # [H, W, 3] uint8
+        photo: np.ndarray,  # [H, W, 3] uint8
+        *,
+        half: bool = False,  # of the right half alone
+    ) -> dict[str, float]:
+        """The metrics of one image."""
+        if half:
+            right = slice(photo.shape[1] // 2, None)
+            drawn, photo = (np.ascontiguousarray(picture[:, right]) for picture in (drawn, photo))
+        values = {name: metric(drawn, photo) for name, metric in FULL_IMAGE.items()}
+        values |= self.regions.psnr(name, drawn, photo)
+        return values | {name: network(drawn, photo) for name, network in self.networks.items()}
+
+
+def measures_of(scene: Scene | None) -> Measures:
+    """The metrics of a scene's test images; without a scene, those of whole images."""
+    regions = Regions({}, {}) if scene is None else find_regions(scene)
+    reasons = lpips.available()
+    missing = {name: reason for name, reason in reasons.items() if reason is not None} | regions.missing
+    networks = {name: lpips.load(name) for name in reasons if name not in missing}
+    return Measures(networks, regions, missing)
 
 
 def _fitted(trainer: Trainer, test: TestPhoto) -> torch.Tensor:

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -22,8 +22,11 @@ from ambiguous_wild.harness.running.records import Cost, MaskScores, RunResult
 from ambiguous_wild.harness.running.result import finished_result
 from ambiguous_wild.io.atomic import atomic_path
 from ambiguous_wild.io.images import image_size, read_gray, read_png_rgb
-from ambiguous_wild.io.ply import splat_count
+from ambiguous_wild.io.ply import read_splat_ply, splat_count
 from ambiguous_wild.methods.external.program import LOGS, WORK, Produced, Program, Task
+from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.render import render
+from ambiguous_wild.splat.rendered import Rendered
 from ambiguous_wild.splat.trainer import Trainer
 
 
@@ -52,7 +55,11 @@ def run_program(cell: Cell, folder: Path) -> RunResult:
     )
     produced, time_cost = _timed(program, task)
     truth = evaluate.load_test_photos(cell.scene)
-    drawn = _Drawn(truth, produced.renders)
+    drawn: _Drawn | _Splats
+    if produced.drawn_by_us:
+        drawn = _Splats(produced, cell.device)
+    else:
+        drawn = _Drawn(truth, produced.renders)
     per_image, missing = evaluate.render_and_measure(
         cast(Trainer, drawn),
         truth,
@@ -65,7 +72,9 @@ def run_program(cell: Cell, folder: Path) -> RunResult:
         per_image=per_image,
         missing=missing,
         masks=_masks(cell.scene, produced.masks, folder / "masks"),
-        facts=dict(produced.facts) | ({} if cell.protocol == "full" else {"protocol": cell.protocol}),
+        facts=dict(produced.facts)
+        | ({"drawn_by": "ambiguous_wild"} if produced.drawn_by_us else {})
+        | ({} if cell.protocol == "full" else {"protocol": cell.protocol}),
         cost=cast(Cost, {"device": cell.device, **produced.cost, **time_cost, **_model(produced, folder)}),
     )
 
@@ -116,6 +125,30 @@ class _Drawn:
 
     def render_fitted(self, camera: Camera, photo: torch.Tensor, keep: torch.Tensor) -> torch.Tensor:
         """The plain render: effects of a program cannot be fitted here."""
+        return self.render(camera).image
+
+
+class _Splats:
+    """Stands in for a trained model: the program's splats, drawn by our renderer on a black background."""
+
+    def __init__(self, produced: Produced, device: str) -> None:
+        """
+        Raises:
+            AwError: the file of splats cannot be read.
+        """
+        assert produced.ply is not None
+        known: dict[str, Any] = {
+            name: torch.from_numpy(values) for name, values in read_splat_ply(produced.ply).items()
+        }
+        self.gaussians = Gaussians(**known).to(device)
+        self.data = SimpleNamespace(device=torch.device(device))
+
+    @torch.no_grad()
+    def render(self, camera: Camera) -> Rendered:
+        return render(self.gaussians, camera, sh_degree=self.gaussians.sh_degree)
+
+    def render_fitted(self, camera: Camera, photo: torch.Tensor, keep: torch.Tensor) -> torch.Tensor:
+        """The plain render: splats have no colours of a photo."""
         return self.render(camera).image
 
 

@@ -13,6 +13,7 @@ from ambiguous_wild.harness.planning.decide import Plan
 from ambiguous_wild.harness.running.cell import Cell, CellReport, Overwrite, Protocol
 from ambiguous_wild.harness.running.choosing import choose
 from ambiguous_wild.harness.running.identity import scene_identity
+from ambiguous_wild.harness.running.published import scene_protocol
 from ambiguous_wild.harness.running.run import run_isolated
 from ambiguous_wild.harness.running.run_folder import refuse_other_config, refuse_strange_folder
 from ambiguous_wild.harness.running.training import Tick
@@ -33,7 +34,7 @@ def plan_cells(
     factor: int | None = None,
     effects: str = "none",
     plan: Plan | None = None,
-    protocol: Protocol = "full",
+    protocol: Protocol | None = None,
 ) -> list[Cell]:
     """Every method on every scene with every seed; all names and options are checked before any training.
 
@@ -47,7 +48,7 @@ def plan_cells(
         factor: which images_N; None = what the scene was built for.
         effects: "none", "all", "auto", "default" (auto where the method lets it), or names of effects.
         plan: of the one scene, where it was made before; None = made where one is needed.
-        protocol: "full" measures whole test photos, "half" the right half.
+        protocol: "full" measures whole test photos, "half" the right half; None = what scene.json says.
 
     Raises:
         AwError: unknown method, option or scene; two scenes of the same name.
@@ -68,12 +69,13 @@ def plan_cells(
     for scene in loaded:
         identity = scene_identity(scene)
         chosen = choose(effects, scene, [entry for entry, _ in entries], plan)
+        measured = protocol or scene_protocol(scene)
         for entry, options in entries:
             resolved = with_options(entry.options(), options, f"option of {entry.name}")
             for seed in dict.fromkeys(seeds):
                 config = dataclasses.replace(train, seed=seed)
                 cells.append(
-                    Cell(entry, resolved, scene, identity, config, device, chosen[entry.name], protocol)
+                    Cell(entry, resolved, scene, identity, config, device, chosen[entry.name], measured)
                 )
     return cells
 

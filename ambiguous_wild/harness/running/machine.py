@@ -142,7 +142,10 @@ def _gpu_name(device: str) -> str:
     import torch
 
     index = torch.device(device).index or 0
-    name = getattr(torch.cuda.get_device_properties(index), "uuid", None)
+    try:
+        name = getattr(torch.cuda.get_device_properties(index), "uuid", None)
+    except (RuntimeError, AssertionError):  # a torch without CUDA
+        name = None
     return f"GPU-{name}" if name is not None else str(index)
 
 

@@ -57,6 +57,13 @@ class Meter:
         self.blind = False  # others' work could not be measured
         self._since: tuple[float, float | None, float] | None = None
 
+    @classmethod
+    def of(cls, device: str) -> Meter:
+        """Of a training in this process, with the threads that it was given."""
+        import numba
+
+        return cls(device, int(numba.get_num_threads()) if device == "cpu" else 1)
+
     # -- called by the trainer ---------------------------------------------------------------------
 
     def begin(self, trained_s: float) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,8 +12,10 @@ from typing import TYPE_CHECKING, Any
 import ambiguous_wild
 from ambiguous_wild.core.config import config_hash, flatten, to_plain
 from ambiguous_wild.harness.running.environment import environment
+from ambiguous_wild.harness.running.published import scene_protocol
 from ambiguous_wild.harness.running.records import Provenance, RunResult
 from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.methods.graft import Graft
 from ambiguous_wild.methods.registry import MethodEntry, all_methods
 from ambiguous_wild.splat.pace import TrainConfig
 
@@ -51,7 +54,7 @@ def reproduce(cell: Cell) -> str:
     Where it is written to is left to whoever runs it (-o, by default runs/).
     """
     method, train = cell.method, cell.train
-    name = method.name if "=" in method.name else _base(method).name
+    name = _base(method).name
     given = method.given_as or name
     words = ["aw", "bench", "--method", given, "--scene", str(cell.scene.root.resolve())]
     words += ["--seed", str(train.seed), *_length(train), "--device", cell.device.partition(":")[0]]
@@ -59,7 +62,7 @@ def reproduce(cell: Cell) -> str:
     factor = cell.scene.info.get("loaded_factor")
     words += ["--factor", str(factor)] if factor else []
     words += ["--max-gaussians", str(train.max_gaussians)] if train.max_gaussians is not None else []
-    words += ["--protocol", cell.protocol] if cell.protocol != "full" else []
+    words += ["--protocol", cell.protocol] if cell.protocol != scene_protocol(cell.scene) else []
     for setting in _settings(method, name, cell.options):
         words += ["--set", setting]
     for plugin in _plugins(method):
@@ -75,6 +78,8 @@ def _length(train: TrainConfig) -> list[str]:
 
 def _base(method: MethodEntry) -> MethodEntry:
     """The method that a variant of an ablation is one of: same recipe, another name."""
+    if isinstance(method.recipe, Graft):
+        return replace(method, name=method.recipe.name)
     known = all_methods()
     if method.name in known:
         return method

@@ -68,6 +68,8 @@ class Cost(TypedDict, total=False):
     timing: TimeRecord
     setup_s: float  # features, masks and compilation before the first step
     iterations: int
+    passes: int  # trainings that all of this counts, where there was more than one
+    first_pass_s: float  # of train_s, that of the first
     ms_per_iteration: float
     ms_parts: dict[str, float]  # by part of an iteration
     gaussians: int
@@ -94,6 +96,7 @@ class Environment(TypedDict):
     packages: dict[str, str | None]  # None = not installed
     gpu: NotRequired[str]
     gsplat_max_alpha: NotRequired[float]  # differs between versions of gsplat
+    gpu_options: NotRequired[str]  # $AW_GPU, where it is not the default
 
 
 class Provenance(TypedDict):
@@ -102,6 +105,14 @@ class Provenance(TypedDict):
     environment: Environment
     code_hash: str
     reproduce: str
+
+
+class Rescore(TypedDict):
+    """Metrics that `aw rescore` added to a result, and by which code."""
+
+    metrics: list[str]
+    version: str
+    code_hash: str
 
 
 class RunResult(TypedDict):
@@ -126,6 +137,7 @@ class RunResult(TypedDict):
     environment: NotRequired[Environment]
     code_hash: NotRequired[str]
     reproduce: NotRequired[str]
+    rescored: NotRequired[list[Rescore]]
 
 
 class SceneConfig(TypedDict):

@@ -41,7 +41,9 @@ FIELDS: dict[str, type | tuple[type, ...]] = {
     "version": str,
 }
 # Fields that results of earlier versions lack.
-OPTIONAL: dict[str, type | tuple[type, ...]] = {"environment": dict, "code_hash": str, "reproduce": str}
+OPTIONAL: dict[str, type | tuple[type, ...]] = {
+    "environment": dict, "code_hash": str, "reproduce": str, "rescored": list,
+}  # fmt: skip
 
 
 def write_result(path: Path | str, result: Mapping[str, Any]) -> None:

@@ -44,8 +44,9 @@ class Runs:
 
     images: one row per run, image and metric: scene, method, seed, image, metric, value (NaN = missing).
     runs: one row per run: scene, method, seed, status, error, folder, images, config_hash, scene_hash,
-        version, device, the numbers of "cost", timing ("alone", "contended", "unknown"), timing_reason,
-        timing_kernel, hardware, and mask_iou, mask_precision, mask_recall.
+        version, fit (what was done with test photos, see tables/notes.py), device, the numbers of "cost",
+        timing ("alone", "contended", "unknown"), timing_reason, timing_kernel, hardware, and mask_iou,
+        mask_precision, mask_recall.
     missing: one row per run and missing metric: scene, method, seed, metric, reason.
     """
 
@@ -171,6 +172,7 @@ def _run_row(run: Path, result: RunResult) -> dict[str, Any]:
             "config_hash": result["config_hash"],
             "scene_hash": result["scene_hash"],
             "version": result["version"],
+            "fit": _fit(result["facts"]),
         }
         | {"folder": str(run), "images": len(result["per_image"])}
         | cost
@@ -187,6 +189,16 @@ def _hardware(result: RunResult) -> str:
         return str(known["gpu"])
     threads = result["cost"].get("threads")
     return f"{known['cpu']}, {threads} threads" if known.get("cpu") and threads else ""
+
+
+def _fit(facts: Mapping[str, Any]) -> str:
+    """What the method did with test photos, a key of `notes.FITTED`."""
+    if facts.get("protocol", "full") != "half":
+        return "full"
+    fitted = facts.get("fitted")
+    if not isinstance(fitted, dict):
+        return "unknown"
+    return "fitted" if fitted.get("steps") else "read" if fitted.get("read_by") else "plain"
 
 
 def _missing_rows(results: list[FoundResult]) -> Iterator[dict[str, Any]]:

@@ -21,7 +21,7 @@ import numpy as np
 
 Verdict = Literal["alone", "contended", "unknown"]
 VERDICTS: tuple[Verdict, ...] = ("alone", "contended", "unknown")
-UNTIMED = "its time was not calibrated (an earlier version, or an external program)"
+UNTIMED = "its time was not calibrated (an earlier version, several GPUs, or an external program)"
 # Keys of "cost" that a busy machine changes; whatever ranks one of them asks `why_not_ranked` first.
 TIMED = ("train_s", "reference_s", "setup_s", "ms_per_iteration", "fps", "fps_low", "fps_high")
 

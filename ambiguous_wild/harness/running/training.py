@@ -2,29 +2,27 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numba
 import torch
 
 from ambiguous_wild.core import AwError, Camera
 from ambiguous_wild.harness.pictures import training as pictures_of_training
 from ambiguous_wild.harness.running import evaluate
 from ambiguous_wild.harness.running.cell import Cell
-from ambiguous_wild.harness.running.memory import (
-    is_out_of_gpu_memory,
-    out_of_gpu_memory,
-    peak_memory,
-    reset_peak,
-)
+from ambiguous_wild.harness.running.costs import both_passes, cost_of
+from ambiguous_wild.harness.running.memory import is_out_of_gpu_memory, out_of_gpu_memory, reset_peak
 from ambiguous_wild.harness.running.meter import Meter
 from ambiguous_wild.harness.running.multi_gpu import multi_gpu_cost, train_multi_gpu
-from ambiguous_wild.harness.running.records import Cost, RunResult
+from ambiguous_wild.harness.running.passes import FirstPass, first_pass, of_one_pass
+from ambiguous_wild.harness.running.records import RunResult
 from ambiguous_wild.harness.running.result import finished_result
 from ambiguous_wild.io.ply import write_splat_ply
+from ambiguous_wild.methods.fixed_masks import FixedMasks
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.multi_gpu import shards
@@ -48,8 +46,11 @@ def train_and_measure(
         if cell.gpus > 1:  # before photos lie on the first of them
             train_multi_gpu(cell, folder, cache_dir, tick)
         truth = evaluate.load_test_photos(cell.scene)
-        trainer = _make_trainer(cell, folder, cache_dir, truth)
-        return _train_and_measure(cell, trainer, truth, tick, pictures)
+        first = None
+        if cell.method.passes > 1:
+            first = first_pass(cell, folder, cache_dir, tick)
+        trainer = _make_trainer(cell, folder, cache_dir, truth, first)
+        return _train_and_measure(cell, trainer, truth, tick, pictures, first)
     except Exception as error:
         if not is_out_of_gpu_memory(error):
             raise
@@ -62,25 +63,37 @@ def train_and_measure(
     raise problem
 
 
-def _make_trainer(cell: Cell, folder: Path, cache_dir: Path, truth: list[evaluate.TestPhoto]) -> Trainer:
+def _make_trainer(
+    cell: Cell, folder: Path, cache_dir: Path, truth: list[evaluate.TestPhoto], first: FirstPass | None
+) -> Trainer:
     device = torch.device(cell.device)
     data = load_train_data(cell.scene, device=device, seed=cell.train.seed, cache_dir=cache_dir)
     parts = with_effects(cell.method.build(cell.options), cell.chosen.effects)
+    if first is not None:
+        parts = dataclasses.replace(parts, mask=FixedMasks(first.keeps))
 
     def probe(draw: Callable[[Camera], torch.Tensor]) -> float:
         return evaluate.mean_psnr(truth, lambda camera: draw(camera).cpu().numpy())
 
     before = time.perf_counter()
-    trainer = Trainer(data, parts, cell.train, folder=folder, probe=probe if truth else None)
+    train = of_one_pass(cell)
+    trainer = Trainer(data, parts, train, folder=folder, probe=probe if truth else None)
     # Frozen inputs, instance masks and identities are part of what a method costs.
     trainer.setup_s = time.perf_counter() - before
     if cell.gpus == 1:
-        trainer.meter = Meter(cell.device, int(numba.get_num_threads()) if cell.device == "cpu" else 1)
+        trainer.meter = Meter.of(cell.device)
+    if first is not None:
+        trainer.timeline.before_s = first.cost["train_s"]
     return trainer
 
 
 def _train_and_measure(
-    cell: Cell, trainer: Trainer, truth: list[evaluate.TestPhoto], tick: Tick | None, pictures: bool
+    cell: Cell,
+    trainer: Trainer,
+    truth: list[evaluate.TestPhoto],
+    tick: Tick | None,
+    pictures: bool,
+    first: FirstPass | None,
 ) -> RunResult:
     folder = trainer.folder
     ranks = shards.take_over(trainer, folder) if cell.gpus > 1 else []
@@ -96,7 +109,9 @@ def _train_and_measure(
 
     if not ranks:
         trainer.train(tick=after_iteration)
-    cost = _cost(cell, trainer)  # now: what follows measures, and is no training
+    cost = cost_of(cell, trainer)  # now: what follows measures, and is no training
+    if first is not None:
+        cost = both_passes(first.cost, cost)
     if ranks:
         cost |= multi_gpu_cost(cell, ranks)
     write_splat_ply(
@@ -123,26 +138,13 @@ def _train_and_measure(
 
 def _effect_facts(cell: Cell, trainer: Trainer) -> dict[str, Any]:
     """Which effects were on and what they learnt; empty without any."""
-    facts: dict[str, Any] = {} if cell.protocol == "full" else {"protocol": cell.protocol}
+    facts: dict[str, Any] = {}
+    if cell.protocol == "half":
+        nothing = {"effects": [], "steps": 0}
+        facts |= {
+            "protocol": "half",
+            "fitted": nothing if trainer.effects is None else trainer.effects.fitted(),
+        }
     if cell.chosen.effects:
         facts["effects"] = list(cell.chosen.effects)
     return facts if trainer.effects is None else facts | {"effect_facts": trainer.effects.facts()}
-
-
-def _cost(cell: Cell, trainer: Trainer) -> Cost:
-    n = max(trainer.iteration, 1)
-    cost: Cost = {
-        "train_s": trainer.clock.now(),
-        "cpu_s": trainer.clock.cpu_s,
-        "setup_s": trainer.setup_s,
-        "iterations": trainer.iteration,
-        "ms_per_iteration": trainer.ms_per_iteration,
-        "ms_parts": {name: 1e3 * seconds / n for name, seconds in trainer.clock.parts_s.items()},
-        "gaussians": len(trainer.gaussians),
-    }
-    if isinstance(trainer.meter, Meter):
-        cost |= trainer.meter.cost(trainer.clock.now())
-    cost |= peak_memory(cell.device)
-    cost["device"] = cell.device
-    cost["threads"] = int(numba.get_num_threads())
-    return cost

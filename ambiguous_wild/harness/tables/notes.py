@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from ambiguous_wild.core.config import flatten
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.harness.measures import Measure
-from ambiguous_wild.harness.running.store import Runs
+from ambiguous_wild.harness.running.store import Runs, read_config
 from ambiguous_wild.harness.tables.times import time_notes
-from ambiguous_wild.methods.registry import knows_truth
+from ambiguous_wild.methods.graft import members
+from ambiguous_wild.methods.registry import all_methods, knows_truth
 
 LENGTHS_DIFFER = 1.1  # a note is due where the longest training has this many times the shortest's steps
 
@@ -26,8 +30,10 @@ def notes(
         *(f"incomplete: {i.folder}: {i.reason}" for i in runs.incomplete),
         *_not_ranked(runs),
         *_oracles(methods),
+        *_fitted(runs),
         *_missing(runs, columns),
         *_not_comparable(runs, columns),
+        *_about(runs, methods),
         *time_notes(runs.runs, columns),
     )
 
@@ -60,6 +66,57 @@ def _not_ranked(runs: Runs) -> list[str]:
 def _oracles(methods: Sequence[str]) -> list[str]:
     known = [method for method in methods if knows_truth(method)]
     return [f"oracle (not ranked): {shortlist(known)}: shown exact masks or clean photos"] if known else []
+
+
+FITTED = {
+    "fitted": "colours fitted on the left half of each test photo, the right half measured",
+    "read": "colours read from the left half of each test photo, the right half measured",
+    "plain": "nothing fitted, the right half measured",
+    "unknown": "the right half measured; what was fitted is not recorded",
+    "full": "whole test photos measured, nothing fitted",
+}
+
+
+def _fitted(runs: Runs) -> list[str]:
+    """What every method was allowed to see of test photos; nothing where no run was allowed anything."""
+    ok = runs.runs[runs.runs["status"] == "ok"]
+    if "fit" not in ok or not len(ok) or set(ok["fit"]) == {"full"}:
+        return []
+    lines = []
+    for kind, text in FITTED.items():
+        names = sorted(set(ok[ok["fit"] == kind]["method"]))
+        if names:
+            lines.append(f"test photos: {shortlist(names, limit=30)}: {text}")
+    return lines
+
+
+def _about(runs: Runs, methods: Sequence[str]) -> list[str]:
+    """What each method, or donor of a graft, says about itself; `{key}` stands for an option of its runs."""
+    known = all_methods()
+    lines = []
+    for name in dict.fromkeys(member for method in methods for member in members(method)):
+        if name not in known or not known[name].note:
+            continue
+        own = runs.runs[[name in members(method) for method in runs.runs["method"]]]
+        options = [_options_of(Path(folder), name) for folder in own["folder"]]
+        lines.append(f"{name}: {known[name].about(options)}")
+    return lines
+
+
+def _options_of(folder: Path, name: str) -> dict[str, Any]:
+    """The options of that method in a run, flat; those of a graft stand below its places."""
+    config = read_config(folder)
+    options = config.get("options")
+    if not isinstance(options, dict):
+        return {}
+    written = str(config.get("method"))
+    if "=" in written:
+        host, _, rest = written.rpartition("@")
+        places = {"host": host} | dict(pair.split("=", 1) for pair in rest.split(",") if "=" in pair)
+        options = next((options.get(p) for p, member in places.items() if member == name), {})
+    elif "host" in options:  # a graft that is the variant of an ablation: the method is its donor
+        options = next((value for place, value in options.items() if place != "host"), {})
+    return flatten(options) if isinstance(options, dict) else {}
 
 
 def _missing(runs: Runs, columns: Sequence[Measure]) -> list[str]:

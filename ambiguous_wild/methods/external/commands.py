@@ -18,7 +18,7 @@ from ambiguous_wild.io.atomic import write_json
 from ambiguous_wild.methods.external import templates
 from ambiguous_wild.methods.external.process import end_left_over, run_logged
 from ambiguous_wild.methods.external.program import DONE, Produced, Task
-from ambiguous_wild.methods.external.staging import split_lists, stage
+from ambiguous_wild.methods.external.staging import Photos, split_lists, stage
 
 BEGUN = (
     "begun.json"  # in the program's folder: the command that was started, to know whether it may be resumed
@@ -41,6 +41,8 @@ class CommandProgram:
     environment: tuple[tuple[str, str], ...]
     scene_files: tuple[tuple[str, str], ...]
     timeout_s: float | None
+    photos: Photos = "all"  # what the program sees, see staging.py
+    drawn_by_us: bool = False  # it leaves splats, which our renderer draws
 
     def run(self, task: Task) -> Produced:
         """Train unless that is done, render unless that is done, collect.
@@ -52,7 +54,7 @@ class CommandProgram:
         end_left_over(task.logs)
         lists = split_lists(task.scene)
         files = {name: templates.fill(text, lists) for name, text in self.scene_files}
-        staged = stage(task.scene, task.folder / ".scene", files)
+        staged = stage(task.scene, task.folder / ".scene", files, photos=self.photos)
         try:
             values = self._values(task, staged)
             state = task.work / DONE
@@ -99,12 +101,12 @@ class CommandProgram:
         return dataclasses.asdict(task.options) | {
             "scene": str(staged.absolute()),
             "source": str(task.scene.root.resolve()),
-            "images": "images" if factor == 1 else f"images_{factor}",
+            "images": "images" if factor == 1 or self.photos != "all" else f"images_{factor}",
             "output": str((task.work / "output").absolute()),
             "seed": task.seed,
             "iterations": task.iterations,
             "budget_s": task.budget_s,
-            "factor": factor,
+            "factor": 1 if self.photos == "train" else factor,
             "device": task.device,
         }
 
@@ -120,7 +122,8 @@ class CommandProgram:
 
     def _collect(self, task: Task, values: dict[str, Any], done: dict[str, float]) -> Produced:
         tests, trains = task.scene.test, task.scene.train
-        renders = {view.name: self._find(self.renders, values, view, i) for i, view in enumerate(tests)}
+        drawn = [] if self.drawn_by_us else list(enumerate(tests))
+        renders = {view.name: self._find(self.renders, values, view, i) for i, view in drawn}
         missing = [name for name, found in renders.items() if found is None]
         if missing:
             raise AwError(
@@ -143,6 +146,7 @@ class CommandProgram:
             renders={name: path for name, path in renders.items() if path is not None},
             masks={name: path for name, path in masks.items() if path is not None},
             ply=ply,
+            drawn_by_us=self.drawn_by_us,
             cost=cost,
             facts=self._facts(),
         )

@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import re
 import shlex
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash, from_plain, to_plain
+from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.core.names import check_name
 from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.methods.entry import MethodEntry, NoOptions
 from ambiguous_wild.methods.external import templates
 from ambiguous_wild.methods.external.commands import CommandProgram
 from ambiguous_wild.methods.external.program import no_parts
+from ambiguous_wild.methods.external.staging import Photos
 
 RUN = ("scene", "source", "images", "output", "seed", "iterations", "budget_s", "factor", "device")
 VIEW = ("stem", "name", "index")
 _NO_MATTER = ("summary", "paper", "needs", "timeout_h")
+_LATER = {"photos": "all", "drawn_by": "program"}
 LISTS = ("train_names", "test_names", "train_stems", "test_stems")
 
 
@@ -44,7 +49,24 @@ class Description:
     environment: dict[str, Any] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)  # placeholders of your own; --set NAME.KEY=VALUE
     scene_files: dict[str, Any] = field(default_factory=dict)  # text files that the program wants in {scene}
+    photos: Photos = "all"  # what {scene} holds, see staging.py: "all", "train" alone, or as "nerf-w"
+    drawn_by: Literal["program", "us"] = "program"  # "us": our renderer draws the test views from `ply`
     timeout_h: float = 0.0  # of each command; 0 = none
+
+
+PACKAGED = Path(__file__).parent / "descriptions"
+
+
+def packaged(name: str) -> Path:
+    """The file of a description that comes with the package: external:opensplat.
+
+    Raises:
+        AwError: there is none of that name.
+    """
+    known = sorted(file.stem for file in PACKAGED.glob("*.yaml"))
+    if name not in known:
+        raise unknown("description", name, known, "or write external:PATH.yaml")
+    return PACKAGED / f"{name}.yaml"
 
 
 def load_description(path: Path) -> MethodEntry:
@@ -53,6 +75,8 @@ def load_description(path: Path) -> MethodEntry:
     Raises:
         AwError: no such file, no YAML or TOML, an unknown key or placeholder, or a missing key.
     """
+    if len(path.parts) == 1 and not path.suffix and not path.exists():
+        path = packaged(path.name)
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -67,11 +91,13 @@ def load_description(path: Path) -> MethodEntry:
         renders=description.renders,
         masks=description.masks,
         ply=description.ply,
-        cwd=(path.resolve().parent / Path(description.cwd).expanduser()).resolve(),
+        cwd=_folder(description.cwd, path),
         prefix=_command(description.prefix),
         environment=tuple((str(k), str(v)) for k, v in description.environment.items()),
         scene_files=tuple((str(k), str(v)) for k, v in description.scene_files.items()),
         timeout_s=description.timeout_h * 3600.0 or None,
+        photos=description.photos,
+        drawn_by_us=description.drawn_by == "us",
     )
     _check(program, set(description.options), path)
     return MethodEntry(
@@ -82,9 +108,24 @@ def load_description(path: Path) -> MethodEntry:
         paper=description.paper,
         needs=description.needs or "its own environment",
         # keys without influence on the result may change without a new training
-        source_hash=config_hash({k: v for k, v in to_plain(description).items() if k not in _NO_MATTER}),
+        source_hash=config_hash(_decisive(description)),
         program=program,
     )
+
+
+def _folder(text: str, path: Path) -> Path:
+    """`cwd`, in which $NAME is a variable of the environment."""
+    for name in re.findall(r"\$(\w+)", text):
+        if not os.environ.get(name):
+            raise AwError(f"{path.stem} needs {name}: export {name}=FOLDER, the folder of its repository")
+    return (path.resolve().parent / Path(os.path.expandvars(text)).expanduser()).resolve()
+
+
+def _decisive(description: Description) -> dict[str, Any]:
+    """What decides the result. Later keys count where they differ from their default: runs from before them
+    keep their identity."""
+    plain = {k: v for k, v in to_plain(description).items() if k not in _NO_MATTER}
+    return {k: v for k, v in plain.items() if k not in _LATER or v != _LATER[k]}
 
 
 def _parse(path: Path, content: bytes) -> Mapping[str, Any]:
@@ -119,7 +160,8 @@ def _options_class(options: Mapping[str, Any], path: Path) -> type:
 
 
 def _check(program: CommandProgram, options: set[str], path: Path) -> None:
-    missing = [key for key in ("train", "renders") if not getattr(program, key)]
+    needed = ("train", "ply" if program.drawn_by_us else "renders")
+    missing = [key for key in needed if not getattr(program, key)]
     if missing:
         raise AwError(f"{path} does not say {' and '.join(missing)}; see docs/external-methods.md")
     run = {*RUN, *options}

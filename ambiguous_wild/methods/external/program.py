@@ -35,6 +35,7 @@ class Produced:
     renders: Mapping[str, Path]  # test view -> 8-bit PNG at the size of its photo
     masks: Mapping[str, Path] = field(default_factory=dict)  # train view -> PNG, white = kept
     ply: Path | None = None  # splats, as 3DGS writes them
+    drawn_by_us: bool = False  # there are no renders: the harness draws the test views from `ply`
     cost: Mapping[str, float] = field(default_factory=dict)  # train_s, render_s and other known costs
     facts: Mapping[str, Any] = field(default_factory=dict)
 

@@ -15,18 +15,19 @@ _PLAIN_DENSITY = (
 _CR = ("lambda_cr=0.2",)
 _PRINTED_LOSSES = ("lambda_id=1", "lambda_cr=0.2")
 _NO_GATE = ("mask.gate=0", "mask.least=0")
+_LITERAL = ("mask.threshold=literal", *_NO_GATE, "mask.ceiling=0")
 _NO_AGREEMENT = ("mask.disagree=0", "mask.disagree_units=0")
 _NO_GLOBAL_GATE = ("mask.global_gate=0", "mask.global_units=0")
 # instances judged on the feature grid and united with the global mask, as the paper does
 _ON_FEATURES = ("mask.statistic=evidence", "mask.combine=union", "mask.static_tracks=0.35", "mask.dilation=5")
 _NO_TRACKS = (*_ON_FEATURES[:2], "mask.static_tracks=0", _ON_FEATURES[3])
-_ALL_PRINTED = (
-    "mask.variant=sigmoid", "mask.statistic=entropy", "mask.combine=union", "mask.scope=photo",
-    "mask.threshold=literal", *_NO_GATE, *_NO_AGREEMENT, "mask.static_tracks=0", "mask.least_alpha=0",
-    "mask.ceiling=0", "first_look.on=false", "mask.cosine=plain", "mask.spread=var", *_NO_GLOBAL_GATE,
-    "mask.fill=0", "mask.dilation=5", "density.merge.form=literal", "density.merge.most=0", *_NO_SUPPORT,
-    *_PRINTED_LOSSES,
-)  # fmt: skip
+OTHER_DENSITY = tuple(
+    Variant(name, method=f"refinesplat@density={donor}", text=text)
+    for name, donor, text in (
+        ("pup", "pup-3dgs", "PUP 3D-GS decides who goes"),
+        ("uad", "uad", "ForestSplats' uncertainty-aware density"),
+    )
+)
 
 ABLATIONS = (
     Group(
@@ -62,7 +63,7 @@ ABLATIONS = (
             Variant("t-hard", ("mask.threshold=hard",), "T_hard: a fixed value"),
             Variant("t-statistics", ("mask.threshold=statistics",), "T_statistics: mean and deviation"),
             Variant("t-ent", ("mask.threshold=kapur",), "T_ent"),
-            Variant("t-ent-literal", ("mask.threshold=literal",), "T_ent as printed"),
+            Variant("t-ent-literal", _LITERAL, "T_ent as printed: no gate, floor or ceiling"),
             Variant("t-ent-no-gate", ("mask.threshold=kapur", *_NO_GATE), "T_ent that always cuts"),
         ),
         "Tab. ablation of the threshold with existing methods",
@@ -80,6 +81,7 @@ ABLATIONS = (
             ),
             Variant("both", _NO_SUPPORT, "(d)"),
             Variant("support", ("density.decides=total",), "and Gaussians masked in every photo are removed"),
+            *OTHER_DENSITY,
             # without entropy terms their gradient is 0 and `decides` has no effect, so these rows have them
             Variant(
                 "losses-total", (*_PRINTED_LOSSES, "density.decides=total"), "with L_id, L_cr: L decides"
@@ -89,7 +91,18 @@ ABLATIONS = (
                 "losses-entropy", (*_PRINTED_LOSSES, "density.decides=entropy"), "the entropy terms decide"
             ),
         ),
-        "Tab. analysis of the entropy-aware density control",
+        "Tab. analysis of the entropy-aware density control, comparison of the density control strategy",
+    ),
+    Group(
+        "density-control",
+        "Density control of others in its place (PUP, UAD); the default is EDC",
+        (
+            Variant("pup", method="refinesplat@density=pup-3dgs", text="(a)"),
+            Variant(
+                "uad", method="refinesplat@density=uad", text="(b); a reading: its formula is unverified"
+            ),
+        ),
+        "Tab. comparison of the density control strategy",
     ),
     Group(
         "evidence",
@@ -176,7 +189,7 @@ ABLATIONS = (
             ),
             Variant("union", ("mask.combine=union",), "local or global"),
             Variant("scope-photo", ("mask.scope=photo",), "each photo cut by itself"),
-            Variant("t-ent-literal", ("mask.threshold=literal",), "additive objective"),
+            Variant("t-ent-literal", _LITERAL, "additive objective, no gate, floor or ceiling"),
             Variant("no-gate", _NO_GATE, "always cuts in two"),
             Variant("no-agreement", (*_ON_FEATURES, *_NO_AGREEMENT), "an uncertain identity is enough"),
             Variant(
@@ -192,7 +205,7 @@ ABLATIONS = (
             Variant("no-support", _NO_SUPPORT, "Gaussians masked in every photo stay"),
             Variant("whole-components", ("density.merge.most=0",), "clusters of any size merge"),
             Variant("losses", _PRINTED_LOSSES, "L_id + 0.2 L_cr"),
-            Variant("all", _ALL_PRINTED, "all of them together"),
+            Variant("all", method="refinesplat-printed", text="all of them together"),
         ),
     ),
 )

@@ -62,7 +62,11 @@ class MaskConfig:
     cosine: Literal["calibrated", "plain"] = "calibrated"  # F: in U; `plain` is printed
     normal_units: float = 10.0  # F: distance in units at which the calibrated cosine is 0
     box: int = 3  # F: cells, box filter over U / H
-    spread: Spread = "std"  # F: T_glb = mean + this; `var` is printed
+    perturbation: float | None = (
+        None  # F: R = U / (H + this), printed; None: H is a tenth of its mean at least
+    )
+    spread: Spread = "std"  # F: T_glb = mean + this; `var` is printed; `hard`: T_hard in its place
+    global_hard: float = 10.0  # F: that T_hard, a value of U / H
     global_gate: float = 6.0  # F: robust deviations above the median that M_global needs; 0 = printed
     global_units: float = 8.0  # F: and the distance of the cell itself at least; 0 = printed
     dilation: int = 1  # px at the photo's resolution, 1 = none; 3, 5 (printed), 7 tried in the paper
@@ -74,10 +78,11 @@ class MaskConfig:
             self, "refinesplat.mask",
             hold=(0.01, 1), fill=(0, 1), base=(0, 1), memory=(0, 1), entropy_weight=(0, 1), most=(0, 1),
             least_alpha=(0, 1), w2=(0, 1), normal_units=(1e-6, _ANY), box=(1, _ANY), dilation=(1, _ANY),
+            perturbation=(1e-12, _ANY),
             **dict.fromkeys(
                 ("hard", "gate", "least", "disagree", "disagree_units", "ceiling", "ceiling_least",
                  "static_tracks",
-                 "global_gate", "global_units"), (0, _ANY),
+                 "global_gate", "global_units", "global_hard"), (0, _ANY),
             ),
         )  # fmt: skip
         for name in ("box", "dilation"):
@@ -106,6 +111,8 @@ class RefineSplatConfig:
     features: str = "labhog"  # back end of phi, see docs/foundation-models.md; `dinov2-small` is the paper's
     instances: str = "graph"  # back end of the instance masks; `grounded-video:...` is the paper's
     segments: SegmentConfig = field(default_factory=SegmentConfig)  # of `graph`
+    # instances that a video back end finds in a photo but does not track: left out, or added to that photo
+    untracked: Literal["drop", "add"] = "drop"
     psi: PsiConfig = field(default_factory=PsiConfig)  # the frozen identity classifier
     density: EntropyDensityConfig = field(default_factory=EntropyDensityConfig)  # growth and merging
     mask_start: float = 500.0  # warm-up: until then the first look alone decides which pixels are kept
@@ -119,7 +126,13 @@ class RefineSplatConfig:
     # 0.02 and 0.004, 18.0 with the paper's 1 and 0.2.
     lambda_id: float = 0.0  # of L_id; 1 = printed
     lambda_cr: float = 0.0  # alpha_1, of L_cr; 0.2 = printed, 0.1 to 0.3 tried in the paper
+    weigh_id: bool = True  # L_id of kept cells only; false = printed
+    weigh_cr: bool = True  # L_cr of kept cells only; false = printed
     lambda_dssim: float = 0.2  # of D-SSIM in L_GS
+    ssim: Literal["map", "images"] = "map"  # keep weighs the map of SSIM (printed), or both its pictures
+    factor: Literal["keep", "transient"] = "keep"  # of L_GS; `transient` is M_final itself, as printed
+    lr_opacity: float = 0.05  # of Adam; 3DGS's present code has 0.025
+    appearance: bool = False  # WildGaussians' embedding (32 a photo, 2 x 128), the paper's on Photo Tourism
     per_pixel_short: float = 0.85  # Gaussians per photo pixel at most, in short runs; others are given 1
     identities: int = 255  # P at most
     identity_tracks: int = 3  # SfM tracks that two instances must share to be one identity
@@ -131,7 +144,7 @@ class RefineSplatConfig:
             self, "refinesplat",
             mask_every=(1, _ANY), entropy_every=(1, _ANY), lambda_dssim=(0, 1), identities=(1, 255),
             identity_tracks=(1, _ANY), identity_share=(0, 1), identity_similarity=(-1, 1),
-            per_pixel_short=(1e-3, _ANY),
+            per_pixel_short=(1e-3, _ANY), lr_opacity=(0, _ANY),
             **dict.fromkeys(
                 ("mask_start", "min_mask_start", "reset_pause", "min_reset_pause", "lambda_id", "lambda_cr"),
                 (0, _ANY),

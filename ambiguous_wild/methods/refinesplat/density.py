@@ -14,7 +14,9 @@ from torch import Tensor
 from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.methods.refinesplat.merging import MergeConfig, clusters, merge_members, merge_pairs
+from ambiguous_wild.methods.refinesplat.on_device.merging import merge_couples
 from ambiguous_wild.methods.refinesplat.support import Support, SupportConfig
+from ambiguous_wild.splat import device as devices
 from ambiguous_wild.splat.density import (
     NO_SIZE_PRUNING,
     DensityConfig,
@@ -93,8 +95,7 @@ class EntropyAwareDensity(DensityControl):
     def refine(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> tuple[Gaussians, list[str]]:
         """As 3DGS, and every `min_every` iterations to the end, what no kept pixel supports is removed."""
         gaussians, events = super().refine(step, gaussians, optimiser)
-        due = step.iteration - self.last_judged >= self.config.min_every
-        if events or not due or self.config.support.least_share <= 0:
+        if events or not self._judgement_due(step):
             return gaussians, events  # one change of rows an iteration
         self.last_judged = step.iteration
         self._match(gaussians)
@@ -106,6 +107,13 @@ class EntropyAwareDensity(DensityControl):
         gaussians = self.keep_rows(gaussians, optimiser, ~drop)
         self.log.now.count = len(gaussians)
         return gaussians, ["prune"]
+
+    def due(self, step: Step) -> bool:
+        return super().due(step) or self._judgement_due(step)
+
+    def _judgement_due(self, step: Step) -> bool:
+        due = step.iteration - self.last_judged >= self.config.min_every
+        return due and self.config.support.least_share > 0
 
     def clone_offset(self, gaussians: Gaussians, rows: Tensor) -> Tensor | None:
         """Down the entropy-aware gradient (Fig. 3b), by a share of the standard deviation along it."""
@@ -129,22 +137,35 @@ class EntropyAwareDensity(DensityControl):
         # rows that no view has seen since the last round (fresh copies above all) have no statistic to judge
         score = self.grad_sum / self.seen.clamp(min=1)
         candidates = (self.seen > 0) & (score < config.merge_grad)
-        pairs = merge_pairs(gaussians, candidates.cpu().numpy(), config.merge)
-        if not len(pairs):
+        found = self._merged(gaussians, candidates)
+        if found is None:
             return gaussians
-        cluster = clusters(len(gaussians), pairs, config.merge.most)
-        joined = np.bincount(cluster, minlength=len(cluster))[cluster] > 1
-        if not joined.any():
-            return gaussians
-        rows = torch.from_numpy(np.flatnonzero(joined)).to(gaussians.device)
-        new = merge_members(gaussians.select(rows), cluster[joined])
-        gaussians = self.keep_rows(gaussians, optimiser, torch.from_numpy(~joined).to(gaussians.device))
+        rows, new = found
+        stay = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.device)
+        stay[rows] = False
+        gaussians = self.keep_rows(gaussians, optimiser, stay)
         gaussians = gaussians.cat(new)
         optimiser.append(len(new))  # their moments start at zero
         self._match(gaussians)
         self.merged += len(rows) - len(new)
         self.log.merge(len(rows) - len(new), new.means)
         return gaussians
+
+    def _merged(self, gaussians: Gaussians, candidates: Tensor) -> tuple[Tensor, Gaussians] | None:
+        """Rows that merge and what they become; None where nothing merges."""
+        config = self.config.merge
+        if config.most == 2 and devices.accelerated(gaussians.device):
+            found = merge_couples(gaussians, candidates, config)
+            return None if found is None else (found[0].flatten(), found[1])
+        pairs = merge_pairs(gaussians, candidates.cpu().numpy(), config)
+        if not len(pairs):
+            return None
+        cluster = clusters(len(gaussians), pairs, config.most)
+        joined = np.bincount(cluster, minlength=len(cluster))[cluster] > 1
+        if not joined.any():
+            return None
+        rows = torch.from_numpy(np.flatnonzero(joined)).to(gaussians.device)
+        return rows, merge_members(gaussians.select(rows), cluster[joined])
 
     def _select(self, stay: Tensor) -> None:
         super()._select(stay)

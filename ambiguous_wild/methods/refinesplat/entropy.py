@@ -1,4 +1,4 @@
-"""Entropy of identity logits (RefineSplat, Eq. 4), and how it compares between photo and render.
+"""Entropy of identity logits (RefineSplat, Eq. 3), and how it compares between photo and render.
 
 Everything is computed through log-sigmoid and log-softmax, never through the log of a clipped
 probability: sigma log sigma is 0 at saturated logits and its gradient is finite there.
@@ -22,7 +22,7 @@ Statistic = Literal["structure", "entropy", "surprise", "contrast", "evidence"]
 def entropy(logits: Tensor, variant: Variant = "sigmoid") -> Tensor:
     """H in [0, 1] of logits [..., P].
 
-    sigmoid (printed form, Eq. 4): sum_k -sigma(E_k) log sigma(E_k), over its largest value P / e.
+    sigmoid (printed form, Eq. 3): sum_k -sigma(E_k) log sigma(E_k), over its largest value P / e.
     softmax: -sum_k p_k log p_k over log P; 0 where P = 1.
 
     Returns:

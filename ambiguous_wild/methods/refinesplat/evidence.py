@@ -118,7 +118,7 @@ def make_masks(
     ceiling: float = math.inf,
     unseen: np.ndarray | None = None,
 ) -> Masks:
-    """M_local, M_global and the keep map of one photo (Eqs. 4-8).
+    """M_local, M_global and the keep map of one photo (Eqs. 3-7).
 
     Args:
         maps: from `compare`.
@@ -167,16 +167,17 @@ def make_masks(
 
 
 def _global(maps: Maps, pixels: np.ndarray, threshold: float, config: MaskConfig) -> np.ndarray:
-    """M_global [H, W]: pixels above the threshold, or on the feature grid Eq. 7's ratio of U and H."""
+    """M_global [H, W]: pixels above the threshold, or on the feature grid Eq. 6's ratio of U and H."""
     if config.statistic == "structure":
         return masking.hysteresis(pixels, config.hold * threshold, threshold)
     assert maps.cosine is not None and maps.entropy is not None  # `compare` fills them
     cosine = maps.cosine
     if config.cosine == "calibrated":
         cosine = masking.calibrated_cosine(maps.distance, config.normal_units)
-    r = masking.ratio(masking.uncertainty(cosine), maps.entropy)
-    coarse = masking.global_mask(r, config.box, config.spread, config.global_gate)
-    coarse &= maps.distance > config.global_units
+    r = masking.ratio(masking.uncertainty(cosine), maps.entropy, perturbation=config.perturbation)
+    coarse = masking.global_mask(r, config.box, config.spread, config.global_gate, config.global_hard)
+    if config.global_units > 0:
+        coarse &= maps.distance > config.global_units
     return masking.enlarge(coarse, *pixels.shape)
 
 

@@ -16,6 +16,7 @@ from ambiguous_wild.methods.refinesplat.identity import Psi, psi_arrays, psi_fro
 from ambiguous_wild.methods.refinesplat.masking import grid_labels, instance_means
 from ambiguous_wild.splat.step import TrainData
 from ambiguous_wild.vision.cache import cache_key, cached
+from ambiguous_wild.vision.mask_ops import add_new
 from ambiguous_wild.vision.precompute import instance_labels, photo_features
 from ambiguous_wild.vision.protocols import Features, Instances, SceneFeatures
 
@@ -46,6 +47,13 @@ class FrozenInputs:
         compact = [_compact(label) for label in own] if found.scene_wide else []
         self.labels = [label for label, _ in compact] if compact else own  # [H, W] int32, 0 = none
         self._ids = [ids for _, ids in compact]
+        # [H, W] int32 of each photo: instances that a tracker left out, with labels above those that it has
+        self._added: list[np.ndarray] = []
+        single: Instances | None = getattr(instances, "single", None)  # of a tracker: of one photo
+        if found.scene_wide and single is not None and config.untracked == "add":
+            everything = instance_labels(single, data.photos, names, data.cache_dir).labels
+            self._added = [untracked(label, all_found) for label, all_found in zip(self.labels, everything)]
+            self.labels = [np.maximum(label, added) for label, added in zip(self.labels, self._added)]
         self.counts = [max(int(label.max(initial=0)), 0) for label in self.labels]  # K of each photo
         # [K] bool of each photo: instances that are static by structure from motion
         self.static = static_instances(
@@ -79,17 +87,60 @@ class FrozenInputs:
     def _identities(self, phi: list[Tensor]) -> Identities:
         """The back end's own ids, else by SfM tracks, then by features."""
         config = self._config
-        if self._scene_wide:
-            return most_seen(self._ids, config.identities)
+        if not self._scene_wide:
+            return self._associated(phi, self.labels, config.identities)
+        tracked = most_seen(self._ids, config.identities)
+        room = config.identities - tracked.count
+        if not self._added or room <= 0:
+            return _with_unknown(tracked, self.counts)
+        return _joined(tracked, self._associated(phi, self._added, room), self.counts)
+
+    def _associated(self, phi: list[Tensor], labels: list[np.ndarray], most: int) -> Identities:
+        config = self._config
         return associate(
-            self.labels,
-            _mean_features(phi, self.labels, self.counts),
+            labels,
+            _mean_features(phi, labels, [max(int(label.max(initial=0)), 0) for label in labels]),
             train_tracks(self._data.scene),
             min_shared=config.identity_tracks,
             min_share=config.identity_share,
             min_similarity=config.identity_similarity,
-            most=config.identities,
+            most=most,
         )
+
+
+def untracked(tracked: np.ndarray, found: np.ndarray) -> np.ndarray:
+    """Labels [H, W] int32 of the instances of a photo that a tracker leaves out, above its own labels.
+
+    Trackers follow so many of the largest instances and drop the others (`SamVideoConfig.most`).
+
+    Args:
+        tracked: [H, W] int32, the tracker's labels of the photo, 1..K; 0 = none.
+        found: [H, W] int32, all instances of the photo.
+    """
+    # the largest first; an instance is new unless the tracked ones cover half of it
+    total = int(np.count_nonzero(np.bincount(np.maximum(found, 0).ravel())))
+    most = len(np.unique(tracked[tracked > 0])) + total
+    both, _ = add_new(tracked, found, int(tracked.max(initial=0)) + 1, most)
+    return np.where(tracked > 0, 0, both).astype(np.int32)
+
+
+def _with_unknown(known: Identities, counts: list[int]) -> Identities:
+    """The identities with 0, none, for further labels up to `counts`."""
+    rows = [
+        np.r_[row, np.zeros(count + 1 - len(row), np.int32)].astype(np.int32)
+        for row, count in zip(known.of_instance, counts)
+    ]
+    return Identities(rows, known.count, known.photos_of)
+
+
+def _joined(first: Identities, second: Identities, counts: list[int]) -> Identities:
+    """Identities of tracked labels, then those of the labels that were added above them."""
+    rows = []
+    for a, b in zip(_with_unknown(first, counts).of_instance, _with_unknown(second, counts).of_instance):
+        rows.append(np.where(b > 0, b + first.count, a).astype(np.int32))
+    return Identities(
+        rows, first.count + second.count, np.r_[first.photos_of, second.photos_of].astype(np.int32)
+    )
 
 
 def _compact(label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -38,7 +38,8 @@ def consistency_loss(logits: Tensor, one_hot: Tensor, variant: Variant = "sigmoi
     """L_cr = 1/K sum_j mean_{p,q in j} KL(sigma(E(p)) || sigma(E(q))), in O(N).
 
     Printed as a double loop over pixel pairs. With s = sigma(E), the mean of s_p (log s_p - log s_q) over
-    pairs is mean_p[s log s] - mean_p[s] mean_q[log s], per channel, and likewise for 1 - s.
+    pairs is mean_p[s log s] - mean_p[s] mean_q[log s], per channel; with the same for 1 - s, the covariance
+    of s and E.
 
     Args:
         logits: [n, P].
@@ -57,24 +58,21 @@ def consistency_loss(logits: Tensor, one_hot: Tensor, variant: Variant = "sigmoi
             return (logits * 0.0).sum()
         one_hot = one_hot[used]
         weights, count = one_hot / sizes[used, None], None
-    # logits beyond +-1e4 are saturated; the clamp keeps products of their logs finite
+    # logits beyond +-1e4 are saturated; the clamp keeps products finite
     logits = logits.clamp(-1e4, 1e4)
     if variant == "sigmoid":
-        sides = [
-            (torch.sigmoid(logits), F.logsigmoid(logits)),
-            (torch.sigmoid(-logits), F.logsigmoid(-logits)),
-        ]
+        # both sides of a channel in one: log s - log(1 - s) is the logit
+        s, log_s = torch.sigmoid(logits), logits
     elif variant == "softmax":
-        sides = [(torch.softmax(logits, 1), F.log_softmax(logits, 1))]
+        s, log_s = torch.softmax(logits, 1), F.log_softmax(logits, 1)
     else:
         raise unknown("entropy variant", variant, ("sigmoid", "softmax"))
-    total = logits.new_zeros(len(weights))
     of = one_hot.argmax(0)  # the instance of each cell; cells without one have weight 0
-    for s, log_s in sides:
-        # mean[s l] - mean[s] mean[l] = mean[(s - mean s) (l - mean l)]: if the cells agree, the first form is
-        # a difference of numbers that are equal to seven digits
-        apart = (s - (weights @ s)[of]) * (log_s - (weights @ log_s)[of])
-        total = total + (weights @ apart).sum(1)
+    with torch.no_grad():  # the means have no gradient: deviations from them sum to 0
+        middle, middle_log = (weights @ s)[of], (weights @ log_s)[of]
+    # mean[s l] - mean[s] mean[l] = mean[(s - mean s) (l - mean l)]: if the cells agree, the first form is a
+    # difference of numbers that are equal to seven digits
+    total = weights @ ((s - middle) * (log_s - middle_log)).sum(1)
     return total.mean() if count is None else total.sum() / count
 
 

@@ -1,18 +1,18 @@
-"""Local, global and final masks (RefineSplat, Eqs. 4-8) from maps on the feature grid.
+"""Local, global and final masks (RefineSplat, Eqs. 3-7) from maps on the feature grid.
 
 Masks here are bool, True = transient, until `keep_map`: keep = 1 - M_final. Statistics are in float64.
 """
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 import cv2
 import numpy as np
 
 from ambiguous_wild.core.errors import unknown
 
-Spread = Literal["var", "std", "robust"]
+Spread = Literal["var", "std", "robust", "hard"]
 _COS_FLOOR = -1.0 + 1e-3  # U stays below 2000
 
 
@@ -35,7 +35,7 @@ def instance_means(
     labels: np.ndarray,  # [H, W] int32, instances from 1; 0 and negative labels are none
     count: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Hbar of labels 1..count (Eq. 4), each cell weighted by the instance's area in it.
+    """Hbar of labels 1..count (Eq. 3), each cell weighted by the instance's area in it.
 
     Returns:
         means [count] float64 (NaN for a label without pixels), areas [count] px.
@@ -49,13 +49,13 @@ def instance_means(
 
 
 def local_mask(labels: np.ndarray, flagged: np.ndarray) -> np.ndarray:
-    """M_local [H, W] (Eq. 6): the pixels of flagged instances; flagged [count] is of labels 1..count."""
+    """M_local [H, W] (Eq. 5): the pixels of flagged instances; flagged [count] is of labels 1..count."""
     table = np.r_[False, np.asarray(flagged, dtype=bool)]
     return table[np.clip(labels, 0, len(table) - 1)] & (labels < len(table))
 
 
 def uncertainty(cosine: np.ndarray) -> np.ndarray:
-    """U = 2 / (cos + 1) in [1, 2000] (Eq. 7); a cosine that is not finite counts as 1 (no evidence)."""
+    """U = 2 / (cos + 1) in [1, 2000] (Eq. 6); a cosine that is not finite counts as 1 (no evidence)."""
     cosine = np.nan_to_num(np.asarray(cosine, dtype=np.float64), nan=1.0, posinf=1.0, neginf=1.0)
     return 2.0 / (np.clip(cosine, _COS_FLOOR, 1.0) + 1.0)
 
@@ -69,21 +69,32 @@ def calibrated_cosine(distance: np.ndarray, normal: float) -> np.ndarray:
     return 1.0 - np.clip(np.asarray(distance, dtype=np.float64) / normal, 0.0, 2.0)
 
 
-def ratio(u: np.ndarray, h: np.ndarray, eps_share: float = 0.1) -> np.ndarray:
-    """R = U / max(H, eps) with eps = `eps_share` of H's own mean, so that no H = 0 dominates var(R)."""
-    h = np.asarray(h, dtype=np.float64)
+def ratio(
+    u: np.ndarray, h: np.ndarray, eps_share: float = 0.1, perturbation: float | None = None
+) -> np.ndarray:
+    """R = U / max(H, eps) with eps = `eps_share` of H's own mean, so that no H = 0 dominates var(R).
+
+    With a `perturbation` (printed; its value is not) R = U / (H + perturbation).
+    """
+    u, h = np.asarray(u, dtype=np.float64), np.asarray(h, dtype=np.float64)
+    if perturbation is not None:
+        return u / (h + perturbation)
     eps = max(eps_share * float(h.mean()), 1e-6)
-    return np.asarray(u, dtype=np.float64) / np.maximum(h, eps)
+    return u / np.maximum(h, eps)
 
 
-def global_mask(r: np.ndarray, box: int = 3, spread: Spread = "var", gate: float = 0.0) -> np.ndarray:
-    """M_global [h, w]: box-filtered R above its threshold (Eq. 7).
+def global_mask(
+    r: np.ndarray, box: int = 3, spread: Spread = "var", gate: float = 0.0, hard: float = 0.0
+) -> np.ndarray:
+    """M_global [h, w]: box-filtered R above its threshold (Eq. 6).
 
     Args:
         r: [h, w] float64.
         box: side of the box filter in cells.
-        spread: threshold mean + var (printed), mean + std, or robust: median + gate * 1.4826 MAD.
+        spread: threshold mean + var (printed), mean + std, robust: median + gate * 1.4826 MAD, or hard: the
+            fixed value `hard` (T_hard, with which the paper compares T_glb).
         gate: for every spread, also the least number of robust deviations above the median; 0 = none.
+        hard: of spread `hard`.
     """
     smooth = cv2.blur(np.asarray(r, dtype=np.float64), (box, box), borderType=cv2.BORDER_REPLICATE)
     floor = -np.inf
@@ -97,8 +108,10 @@ def global_mask(r: np.ndarray, box: int = 3, spread: Spread = "var", gate: float
         threshold = float(r.mean() + r.std())
     elif spread == "robust":
         threshold = floor
+    elif spread == "hard":
+        threshold = hard
     else:
-        raise unknown("spread", spread, ("var", "std", "robust"))
+        raise unknown("spread", spread, get_args(Spread))
     return smooth > max(threshold, floor)
 
 

@@ -27,7 +27,7 @@ from ambiguous_wild.splat.density import rotation_matrices
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
 
 Overlap = Literal["normalised", "literal"]
-_EIGEN_FLOOR = 1e-14  # of the largest eigenvalue: condition numbers up to needles of 1e7 to 1
+EIGEN_FLOOR = 1e-14  # of the largest eigenvalue: condition numbers up to needles of 1e7 to 1
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ def overlap(
     d = delta / scale
     # by eigenvalues, floored: two parallel needles of aspect 1e12 are singular in float64, and solve raises
     values, vectors = np.linalg.eigh(normed)
-    squared = (np.einsum("nij,ni->nj", vectors, d) ** 2 / np.maximum(values, _EIGEN_FLOOR)).sum(1)
+    squared = (np.einsum("nij,ni->nj", vectors, d) ** 2 / np.maximum(values, EIGEN_FLOOR)).sum(1)
     log_total = _log_det(normed) + 2 * np.log(scale).sum(1)
     if form == "normalised":
         log_parts = 0.25 * (_log_det(cov_i) + _log_det(cov_j) + 6 * math.log(2.0))
@@ -201,7 +201,7 @@ def scale_rotation(cov: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """log_scales [n, 3] and quats [n, 4] (w, x, y, z) of covariances [n, 3, 3], rotation right-handed."""
     values, vectors = np.linalg.eigh(cov)
     largest = np.maximum(values[:, 2:], 1e-300)
-    values = np.maximum(values, largest * _EIGEN_FLOOR)
+    values = np.maximum(values, largest * EIGEN_FLOOR)
     left = np.linalg.det(vectors) < 0
     vectors[left, :, 0] *= -1.0
     xyzw = Rotation.from_matrix(vectors).as_quat()

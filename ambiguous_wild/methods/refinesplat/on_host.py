@@ -18,6 +18,8 @@ from ambiguous_wild.methods.refinesplat.pixels import PixelEvidence
 from ambiguous_wild.methods.refinesplat.threshold import LearntWeight, robust_floor
 from ambiguous_wild.splat.step import Step
 
+PRICE = 3.0  # of a masked pixel, robust deviations above the median distance, if `disagree` is off
+
 
 class HostMasks:
     """Masks of all views, with what they are computed from beside the render, and the learnt w2."""
@@ -118,10 +120,12 @@ class HostMasks:
         everything = masks.judged
         if self.config.mask.scope == "scene":
             everything = pooled([self.judged[v] for v in sorted(self.judged)])
-        price = robust_floor(everything.distances, max(self.config.mask.disagree, 1.0))
+        deviations = max(self.config.mask.disagree, 1.0) if self.config.mask.disagree > 0 else PRICE
+        price = robust_floor(everything.distances, deviations)
         if len(everything.values) > 1 and np.isfinite(price):
             residuals = everything.distances / max(price, 1e-12)
-            self.weight.learn(everything.values, residuals, everything.areas, masks.cut.floor)
+            floor, form = masks.cut.floor, self.config.mask.threshold
+            self.weight.learn(everything.values, residuals, everything.areas, floor, form)
 
     def state_dict(self) -> dict[str, Any]:
         return {

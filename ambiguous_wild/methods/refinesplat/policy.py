@@ -94,6 +94,8 @@ class RefineSplatMask(PausingMask):
             self.masks.renew(step)
         self.visits[step.view] = visit + 1
         keep = self.masks.keep_of(step.view)
+        if keep is not None and self.config.factor == "transient":
+            keep = 1.0 - keep
         return None if keep is None else shrink_keep(keep, step.divisor)
 
     def cotangent(self, step: Step, keep: Tensor | None) -> Tensor | None:
@@ -182,17 +184,19 @@ class RefineSplatMask(PausingMask):
         logits = inputs.psi(self.inputs.features(upsampled(image, *self.data.photos[step.view].shape[:2])))
         h, w, channels = logits.shape
         flat = logits.reshape(-1, channels)
-        weights = torch.ones(h * w, device=image.device)
-        if keep is not None:
-            # a cell counts only if every pixel in it is kept
-            weights = -F.adaptive_max_pool2d(-keep[None, None], (h, w)).reshape(-1)
+        # unweighted, the capture's own masks still hold
+        own = self.data.user_keep[step.view]
+        everywhere = _cells(None if own is None else shrink_keep(own, step.divisor), h, w, image)
+        kept = _cells(keep, h, w, image)
         variant = config.mask.variant
         loss = (flat * 0.0).sum()
         if config.lambda_id > 0:
             ids = inputs.identities[step.view].reshape(-1)
+            weights = kept if config.weigh_id else everywhere
             loss = loss + config.lambda_id * identity_loss(flat, ids, weights, variant)
         count = self.inputs.counts[step.view]
         if config.lambda_cr > 0 and count:
+            weights = kept if config.weigh_cr else everywhere
             member = instance_matrix(inputs.grid[step.view].reshape(-1), count, weights)
             loss = loss + config.lambda_cr * consistency_loss(flat, member, variant)
         return loss
@@ -219,6 +223,13 @@ class RefineSplatMask(PausingMask):
         self.last_reset = int(state["last_reset"])
         if state["psi"] is not None and self.inputs.semantics.psi is not None:
             self.inputs.semantics.psi.load_state_dict(state["psi"])
+
+
+def _cells(keep: Tensor | None, h: int, w: int, like: Tensor) -> Tensor:
+    """Weights [h * w] of cells under a keep map [H, W]: a cell counts only if every pixel in it is kept."""
+    if keep is None:
+        return torch.ones(h * w, device=like.device)
+    return -F.adaptive_max_pool2d(-keep[None, None], (h, w)).reshape(-1)
 
 
 def _instances(config: RefineSplatConfig) -> Instances:

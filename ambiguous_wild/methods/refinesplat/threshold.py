@@ -1,7 +1,7 @@
-"""The adaptive entropy threshold T_ent (RefineSplat, Eq. 5) and its learnt weight w2.
+"""The adaptive entropy threshold T_ent (RefineSplat, Eq. 4) and its learnt weight w2.
 
 Printed: argmax_t (1 - w2) Ent(Hbar >= t) + w2 Ent(Hbar < t), Ent(X) = -sum x log x on raw values. That sum is
-additive over the two subsets, so for w2 < 1/2 the smallest value wins (everything is transient) and for
+additive over the two subsets, so for w2 < 1/2 the smallest value wins (all others are transient) and for
 w2 > 1/2 the largest (nothing is). The default normalises within each subset (Kapur's maximum entropy):
 q_i = x_i / sum x, Ent = -sum q_i log q_i. Both always divide the set in two, so a gate requires outliers.
 """
@@ -74,8 +74,8 @@ def t_ent(
         return nothing
     scores = objective(order, starts, w2, form)
     start = int(starts[int(np.argmax(scores))])
-    below = order[start - 1] if start else order[0]
-    threshold = 0.5 * (order[start] + below) if start else math.nextafter(order[0], -math.inf)
+    # printed: the subset is H >= t, but the mask is H > T, so the value that gives T is itself kept
+    threshold = order[start] if form == "literal" else 0.5 * (order[start] + order[start - 1])
     return Cut(float(threshold), values > threshold, floor)
 
 
@@ -114,7 +114,7 @@ def robust_floor(values: np.ndarray, gate: float) -> float:
     return median + gate * max(spread, 0.05 * abs(median), 1e-12)
 
 
-def soft_threshold(values: Tensor, starts: Tensor, w2: Tensor, tau: float) -> Tensor:
+def soft_threshold(values: Tensor, starts: Tensor, w2: Tensor, tau: float, form: Form = "kapur") -> Tensor:
     """T = sum_t softmax(objective(t) / tau) t: T_ent with a gradient to w2.
 
     Args:
@@ -122,6 +122,7 @@ def soft_threshold(values: Tensor, starts: Tensor, w2: Tensor, tau: float) -> Te
         starts: [T] index of the smallest upper value of each candidate cut.
         w2: scalar in (0, 1), with a gradient.
         tau: temperature in nats.
+        form: of the objective; `literal` is the printed one.
     """
     x = values.clamp(min=0.0)
     x_log_x = torch.where(x > 0, x * x.clamp(min=1e-30).log(), torch.zeros_like(x))
@@ -129,7 +130,10 @@ def soft_threshold(values: Tensor, starts: Tensor, w2: Tensor, tau: float) -> Te
     total, total_log = torch.cat([zero, x.cumsum(0)]), torch.cat([zero, x_log_x.cumsum(0)])
     lower, lower_log = total[starts], total_log[starts]
     upper, upper_log = total[-1] - lower, total_log[-1] - lower_log
-    score = (1 - w2) * _normalised_t(upper, upper_log) + w2 * _normalised_t(lower, lower_log)
+    if form == "literal":
+        score = (1 - w2) * -upper_log + w2 * -lower_log
+    else:
+        score = (1 - w2) * _normalised_t(upper, upper_log) + w2 * _normalised_t(lower, lower_log)
     return (torch.softmax(score / tau, 0) * x[starts]).sum()
 
 
@@ -154,7 +158,14 @@ class LearntWeight:
     def value(self) -> float:
         return 1.0 / (1.0 + math.exp(-self.theta))
 
-    def learn(self, values: np.ndarray, residuals: np.ndarray, areas: np.ndarray, floor: float) -> None:
+    def learn(
+        self,
+        values: np.ndarray,
+        residuals: np.ndarray,
+        areas: np.ndarray,
+        floor: float,
+        form: Form = "kapur",
+    ) -> None:
         """One step on one photo.
 
         Args:
@@ -162,15 +173,16 @@ class LearntWeight:
             residuals: [K] >= 0, in units of what is normal for the photo: 1 = the price of masking.
             areas: [K] px.
             floor: the gate's bound; only cuts above it are candidates.
+            form: of the objective that T is soft in; other forms than `literal` learn through `kapur`.
         """
         index = np.argsort(values, kind="stable")
         order = values[index]
-        starts = np.flatnonzero((order > floor) & np.r_[False, np.diff(order) > 0])
+        starts = np.flatnonzero((order > floor) & np.r_[form == "literal", np.diff(order) > 0])
         if len(starts) < 2:  # w2 has no influence
             return
         theta = torch.tensor(self.theta, dtype=torch.float64, requires_grad=True)
         x = torch.from_numpy(order)
-        t = soft_threshold(x, torch.from_numpy(starts), torch.sigmoid(theta), tau=TEMPERATURE)
+        t = soft_threshold(x, torch.from_numpy(starts), torch.sigmoid(theta), TEMPERATURE, form)
         spread = max(float(np.std(order)), 1e-9) / 4
         member = torch.sigmoid((x - t) / spread)
         share = torch.from_numpy(areas[index] / max(float(areas.sum()), 1.0))

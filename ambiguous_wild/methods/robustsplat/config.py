@@ -7,7 +7,11 @@ from typing import Literal
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.splat.density import NO_SIZE_PRUNING, DensityConfig
-from ambiguous_wild.vision.backends import check_features
+from ambiguous_wild.vision.backends import DINO, check_features, parse
+
+_SIZES = dict.fromkeys(DINO, 504) | {
+    "vgg16": 252
+}  # px, input of the fine stage; others take the photo's size
 
 
 def _delayed_growth() -> DensityConfig:
@@ -20,7 +24,8 @@ def _delayed_growth() -> DensityConfig:
 class RobustSplatConfig:
     """Times in nominal iterations (of 30 000); the `min_` fields are real iterations of the run.
 
-    "auto" and None are the published form with a net's features, and with hand-made ones what was tuned on
+    "auto" and None are the published form with DINO's features, and with all others, whose cells see a small
+    part of the photo and whose cosines have other scales, what was tuned with `labhog` on
     two simulated captures that are not reported (240x135, 2000 iterations, 10 900 Gaussians). Distractors in
     the background's colours: 26.3 dB and IoU 0.41 with features of the cell alone, 29.1 dB and 0.62 with
     wider context and a wider net, both at lr 0.003; twins of static things: 29.5 dB and 0.68 with the latter.
@@ -28,17 +33,17 @@ class RobustSplatConfig:
 
     features: str = "labhog"  # see vision/backends.py; published: dinov2-small-registers@504,normalise=raw
     coarse_features: str = ""  # of the coarse stage; "" = the same kind at 16/36 of the size, as published
-    coarse_share: float = 16 / 36  # of the side of the pictures that hand-made coarse features see
+    coarse_share: float = 16 / 36  # of the side of the pictures that coarse features see
     cosine: Literal["auto", "calibrated", "plain"] = "auto"  # what the cosine target is made of
     normal_units: float = (
         10.0  # of distance, where the calibrated cosine is 0; the target is 0 from half of it on
     )
     inputs: Literal["auto", "standardised", "raw"] = "auto"  # of the net
-    # cells over which hand-made features are averaged and put beside the cell's own: a net's token sees the
-    # whole photo, a hand-made cell 20 px
-    context: tuple[int, ...] | None = None  # None: 5,15 with hand-made features; nets never take any
-    hidden: int | None = None  # None: 16, published; 64 with hand-made features
-    lr: float | None = None  # None: 0.001, published; 0.003 with hand-made features
+    # cells over which local features are averaged and put beside the cell's own: a token of DINO sees the
+    # whole photo, a cell of labhog 20 px
+    context: tuple[int, ...] | None = None  # None: 5,15 with local features; DINO never takes any
+    hidden: int | None = None  # None: 16, published; 64 with local features
+    lr: float | None = None  # None: 0.001, published; 0.003 with local features
     density: DensityConfig = field(default_factory=_delayed_growth)
     lr_opacity: float = 0.025
     lambda_dssim: float = 0.2
@@ -82,21 +87,30 @@ class RobustSplatConfig:
     @property
     def net_context(self) -> tuple[int, ...]:
         """Sides in cells of the boxes whose means the net sees beside a cell's own features."""
-        if not self.hand_made:
+        if not self.local:
             return ()
         return (5, 15) if self.context is None else self.context
 
     @property
     def net_hidden(self) -> int:
         """Width of the net."""
-        return self.hidden or (64 if self.hand_made else 16)
+        return self.hidden or (64 if self.local else 16)
 
     @property
     def net_lr(self) -> float:
         """Learning rate of the net."""
-        return self.lr or (3e-3 if self.hand_made else 1e-3)
+        return self.lr or (3e-3 if self.local else 1e-3)
 
     @property
-    def hand_made(self) -> bool:
-        """Whether the features come from no net."""
-        return self.features.startswith("labhog")
+    def local(self) -> bool:
+        """Whether a cell of the features sees a small part of the photo: all but DINO's."""
+        return parse(self.features).name not in DINO
+
+    @property
+    def coarse_size(self) -> int | None:
+        """Longer side in px of the coarse net's input; None: the features follow the size of the picture."""
+        found = parse(self.features)
+        size = _SIZES.get(found.name, 0) if found.size is None else found.size
+        if found.size == 0 or not size:
+            return None
+        return round(size * self.coarse_share)

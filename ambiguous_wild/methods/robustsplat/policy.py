@@ -13,6 +13,7 @@ from ambiguous_wild.core import Camera
 from ambiguous_wild.io.palette import MASKED, faded, ramp, tint
 from ambiguous_wild.methods.deferred import deferred
 from ambiguous_wild.methods.masking_common import MaskedShares, PausingMask, upsampled
+from ambiguous_wild.methods.refinesplat.inputs import train_tracks
 from ambiguous_wild.methods.robustsplat import supervision
 from ambiguous_wild.methods.robustsplat.config import RobustSplatConfig
 from ambiguous_wild.methods.robustsplat.net import MaskNet, adam_of, adam_state, load_adam_state
@@ -21,7 +22,7 @@ from ambiguous_wild.splat.parts import State
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.backends import make_features, parse
 from ambiguous_wild.vision.precompute import photo_features
-from ambiguous_wild.vision.protocols import Features
+from ambiguous_wild.vision.protocols import Features, SceneFeatures
 
 
 class RobustSplatMask(PausingMask):
@@ -42,10 +43,10 @@ class RobustSplatMask(PausingMask):
     def setup(self, data: TrainData) -> None:
         self.data = data
         self.histogram = self.histogram.to(data.device)
-        self.fine.fit(data.photos)
+        _fit(self.fine, data.photos, data)
         self.phi = photo_features(self.fine, data.photos, data.cache_dir)
         small = [self._coarse_picture(photo) for photo in data.photos]
-        self.coarse.fit(small)
+        _fit(self.coarse, small, data)
         self.phi_coarse = photo_features(self.coarse, small, data.cache_dir)
         self.inputs = [self._inputs(phi) for phi in self.phi]
         self.net = MaskNet(*self._statistics(), self.config.net_hidden, data.seed)
@@ -162,8 +163,8 @@ class RobustSplatMask(PausingMask):
         return step.draw(camera=known[1]).image.detach()
 
     def _coarse_picture(self, image: Tensor) -> Tensor:
-        """The input of coarse features: a smaller picture for hand-made ones; nets resize by themselves."""
-        if not self.config.hand_made:
+        """The input of coarse features: a smaller picture, except for nets that resize by themselves."""
+        if self.config.coarse_size is not None:
             return image
         share = self.config.coarse_share
         size = [max(round(side * share), 8) for side in image.shape[:2]]
@@ -173,10 +174,10 @@ class RobustSplatMask(PausingMask):
 
     @property
     def _calibrate(self) -> bool:
-        return self.config.cosine == "calibrated" or (self.config.cosine == "auto" and self.config.hand_made)
+        return self.config.cosine == "calibrated" or (self.config.cosine == "auto" and self.config.local)
 
     def _inputs(self, phi: Tensor) -> Tensor:
-        """The net's input of a photo, [h, w, C']: features; hand-made ones also averaged more widely."""
+        """The net's input of a photo, [h, w, C']: features; local ones also averaged more widely."""
         if not self.config.net_context:
             return phi
         maps = phi.permute(2, 0, 1)[None]
@@ -189,7 +190,7 @@ class RobustSplatMask(PausingMask):
     def _statistics(self) -> tuple[Tensor, Tensor]:
         """Mean and std [C] that the net's inputs are standardised by."""
         channels = self.inputs[0].shape[2]
-        raw = self.config.inputs == "raw" or (self.config.inputs == "auto" and not self.config.hand_made)
+        raw = self.config.inputs == "raw" or (self.config.inputs == "auto" and not self.config.local)
         if raw:
             device = self.data.device
             return torch.zeros(channels, device=device), torch.ones(channels, device=device)
@@ -224,10 +225,20 @@ class RobustSplatMask(PausingMask):
         self.loss_sum, self.loss_count = state["losses"]
 
 
+def _fit(features: Features, photos: list[Tensor], data: TrainData) -> None:
+    """Fit to the photos, which may be smaller than the scene's; tracks are in px of the scene's."""
+    if not isinstance(features, SceneFeatures):
+        features.fit(photos)
+        return
+    point, photo, xy = train_tracks(data.scene)
+    scale = photos[0].shape[1] / data.photos[0].shape[1]
+    features.fit_scene(photos, (point, photo, xy * scale), data.cache_dir)
+
+
 def coarse_spec(config: RobustSplatConfig) -> str:
     """The coarse stage's features: the same back end, a net's picture at `coarse_share` of the size."""
-    if config.hand_made:
+    if config.coarse_size is None:
         return config.features
     found = parse(config.features)
-    head = f"{found.name}@{round((found.size or 504) * config.coarse_share)}"
+    head = f"{found.name}@{config.coarse_size}"
     return head + "".join(f",{key}={value}" for key, value in found.options.items())

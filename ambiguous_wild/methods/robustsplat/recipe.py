@@ -1,12 +1,12 @@
 """RobustSplat as a recipe of parts.
 
-Source: "RobustSplat: Decoupling Densification and Dynamics for Transient-Free 3DGS", ICCV 2025
-(arXiv 2506.02751) and its released code. Densification and opacity resets wait until the static
-scene and the masks are stable; a per-pixel net on frozen features learns from the agreement of photos with
-renders, first at a low scale.
+Source: "RobustSplat: Decoupling Densification and Dynamics for Transient-Free 3DGS", ICCV 2025 (arXiv
+2506.02751) and its released code. Densification and opacity resets wait until the static scene and the
+masks are stable; a per-pixel net on frozen features learns from the agreement of photos with renders,
+first at a low scale.
 
-With weights the published form is `features=dinov2-small-registers@504,normalise=raw`. Without, the features
-are hand-made (Lab and HOG); settings that change with that are "auto" in `config.py`.
+With weights the published form is `features=dinov2-small-registers@504,normalise=raw`. Without, the
+features are hand-made (Lab and HOG); settings that change with that are "auto" in `config.py`.
 """
 
 from __future__ import annotations

@@ -41,6 +41,9 @@ class Effect:
     """
 
     name = ""
+    reads_photo = (
+        False  # its colours come from the photo itself: of a test photo, from the part that may be read
+    )
 
     def acts(self, hook: str) -> bool:
         """Whether that hook is to be called at all."""

@@ -40,7 +40,15 @@ class Chain:
     """Knows which effect acts where; one that does not override a hook is not called there."""
 
     def __init__(self, effects: Sequence[Effect], data: TrainData) -> None:
+        """
+        Raises:
+            AwError: two effects of one name; checkpoints and results hold effects by name.
+        """
         self.effects = tuple(effects)
+        names = [effect.name for effect in self.effects]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise AwError(f"effect {twice[0]} is there twice; a method lists each effect once")
         self.views = len(data.photos)
         for effect in self.effects:
             effect.setup(data)
@@ -156,6 +164,13 @@ class Chain:
                 if effect.name in own:
                     effect.fit(own[effect.name])
         return self.render(gaussians, shot, draw).image
+
+    def fitted(self) -> dict[str, Any]:
+        """What `fit_view` does to a test photo: effects that are fitted and steps, effects that read it."""
+        names = [effect.name for effect in self._with("fit")]
+        found: dict[str, Any] = {"effects": names, "steps": FIT_STEPS if names else 0}
+        reading = [effect.name for effect in self.effects if effect.reads_photo]
+        return found | ({"read_by": reading} if reading else {})
 
     def facts(self) -> dict[str, Any]:
         """What every effect says of itself, by its name."""

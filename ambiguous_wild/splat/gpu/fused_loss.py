@@ -11,13 +11,11 @@ from __future__ import annotations
 
 import functools
 import math
-import types
-import warnings
-from collections.abc import Callable
-from typing import Any
 
 import torch
 from torch import Tensor
+
+from ambiguous_wild.splat.gpu.compiled import Compiled, compiles
 
 _REACH = 5  # px, of the 11 taps to either side
 _C1, _C2 = 0.01**2, 0.03**2
@@ -85,61 +83,7 @@ def _map(a: Tensor, b: Tensor) -> Tensor:
     return _ssim(a.permute(2, 0, 1), b.permute(2, 0, 1))[0].permute(1, 2, 0).contiguous()
 
 
-class _Compiled:
-    """A function as torch compiles it on CUDA, or the function itself where torch cannot.
-
-    Each combination of arguments that are no tensors (with a keep map or without, inside or outside) is
-    compiled once, for pictures of any size: height and width are symbols from the start.
-    """
-
-    def __init__(self, function: Callable[..., Any], backend: str | Callable[..., Any] = "inductor") -> None:
-        """
-        Args:
-            function: of tensors [H, W, ...] and constants.
-            backend: of torch.compile.
-        """
-        self.function, self.backend = function, backend
-        self.compiled: dict[tuple[Any, ...], Callable[..., Any]] = {}
-        self.broken: set[tuple[Any, ...]] = set()
-
-    def __call__(self, *arguments: Any) -> Any:
-        kind = tuple(Tensor if isinstance(a, Tensor) else a for a in arguments)
-        if kind in self.broken or not _compiles(arguments[0].device):
-            return self.function(*arguments)
-        # other strides would be another version
-        tensors = [a.contiguous() for a in arguments if isinstance(a, Tensor)]
-        try:
-            if kind not in self.compiled:
-                self.compiled[kind] = torch.compile(
-                    self._of_tensors(kind), fullgraph=True, backend=self.backend
-                )
-                for tensor in tensors:
-                    torch._dynamo.maybe_mark_dynamic(tensor, [0, 1])
-            return self.compiled[kind](*tensors)
-        except torch.cuda.OutOfMemoryError:
-            raise
-        except Exception as error:  # of the compiler: many kinds, none of them the user's
-            self.broken.add(kind)
-            reason = str(error).strip().split("\n")[0][:200]
-            warnings.warn(f"the loss is not compiled and slower for it: {reason}", stacklevel=3)
-            return self.function(*arguments)
-
-    def _of_tensors(self, kind: tuple[Any, ...]) -> Callable[..., Any]:
-        """The function of its tensors alone, everything else a constant."""
-
-        def call(*tensors: Tensor) -> Any:
-            given = iter(tensors)
-            return self.function(*[next(given) if a is Tensor else a for a in kind])
-
-        # versions are counted by code object, and the compiler gives up on one that has several
-        return types.FunctionType(call.__code__.replace(), call.__globals__, closure=call.__closure__)
-
-
-def _compiles(device: torch.device) -> bool:
-    return device.type == "cuda"
-
-
-_compiled_loss, _compiled_map = _Compiled(_loss), _Compiled(_map)
+_compiled_loss, _compiled_map = Compiled(_loss), Compiled(_map)
 
 
 @torch.no_grad()
@@ -162,9 +106,20 @@ def ssim_map_fused(a: Tensor, b: Tensor) -> Tensor:
 
 
 @functools.cache
-def prepare(device: torch.device, height: int, width: int, lambda_dssim: float, weighting: str) -> None:
-    """Compile before the clock starts, once a process; the size is an example: any other is covered."""
-    if device.type == "cuda":
+def prepare(
+    device: torch.device, sizes: frozenset[tuple[int, int]], lambda_dssim: float, weighting: str
+) -> None:
+    """Compile before the clock starts, once a process.
+
+    Args:
+        device: nothing is done unless it is a GPU.
+        sizes: heights and widths that the run has. One version covers all sizes where the compiler keeps
+            height and width as symbols; where it does not, every size is compiled here.
+        lambda_dssim, weighting: as of `losses.photometric`.
+    """
+    if not compiles(device):
+        return
+    for height, width in sorted(sizes, reverse=True):
         render, photo = (torch.zeros(height, width, 3, device=device) for _ in range(2))
         for keep in (None, torch.ones(height, width, device=device)):
             photometric_fused(render, photo, keep, lambda_dssim, weighting)

@@ -1,8 +1,9 @@
 """gsplat's kernels: where they are, and how they are compiled.
 
-gsplat 1.5.3 comes as sources: torch compiles them when they are first used, with nvcc, a C++17 compiler and
-ninja, into a folder that is kept. Processes that compile at the same time break each other's result (each
-first removes that folder), so one process compiles here, before the first render.
+gsplat 1.5.3 comes as sources, which are compiled with nvcc, a C++17 compiler and ninja into a folder that is
+kept. Of this release we compile what is called (`gsplat_cut`), and an interrupted compile goes on where it
+was. Other versions compile themselves when they are first used. Processes that compile at the same time
+break each other's result, so one process compiles here, before the first render.
 """
 
 from __future__ import annotations
@@ -17,10 +18,17 @@ from typing import Any
 
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.lock import patient_lock
+from ambiguous_wild.splat.gpu import gsplat_cut
 
 NAME = "gsplat_cuda"  # of the extension, as gsplat/cuda/_backend.py calls it
 COMPILE_S = 3600.0  # longest wait for the compiler, or for another process that runs it
-_CODE = "import sys; from gsplat.cuda._backend import _C; sys.exit(3 if _C is None else 0)"
+# in a process of its own, which finds the packages where this one does, also under `python -I`
+_FIND = "import sys; sys.path[:] = {path!r}; "
+_WHOLE = "from gsplat.cuda._backend import _C; sys.exit(3 if _C is None else 0)"
+_CUT = (
+    "from pathlib import Path; from ambiguous_wild.splat.gpu.gsplat_cut import compile_here; "
+    "compile_here(Path({package!r}), Path({folder!r}))"
+)
 
 
 def is_prebuilt(package: Path) -> bool:
@@ -29,7 +37,9 @@ def is_prebuilt(package: Path) -> bool:
 
 
 def is_compiled(folder: Path) -> bool:
-    """Whether torch has compiled them into `kernels_folder`; gsplat looks for these two names too."""
+    """Whether they are compiled into that folder; gsplat looks for these two names too."""
+    if folder.name.startswith(gsplat_cut.NAME):
+        return gsplat_cut.is_complete(folder)
     return any((folder / f"{NAME}.{kind}").is_file() for kind in ("so", "lib"))
 
 
@@ -43,12 +53,14 @@ def compile_kernels(
     compiled: Callable[[], bool],
     say: Callable[[str], None],
     *,
+    package: Path | None = None,
     run: Callable[..., Any] = subprocess.run,
 ) -> None:
-    """Have gsplat compile its kernels, in a process of its own, unless they are there.
+    """Compile the kernels, in a process of its own, unless they are there.
 
     Args:
-        folder: `kernels_folder`.
+        folder: of the cut sources, or `kernels_folder`.
+        package: gsplat's folder where its sources are cut; None = gsplat compiles itself.
         compiled: whether they are there; called again after other processes have finished.
         say: gets a line before the compiler starts.
         run: `subprocess.run`.
@@ -66,9 +78,11 @@ def compile_kernels(
         if compiled():
             return
         announce_compile(folder, say)
+        code = _WHOLE if package is None else _CUT.format(package=str(package), folder=str(folder))
+        code = _FIND.format(path=[str(Path(p).resolve()) for p in sys.path]) + code
         try:
             done = run(
-                [sys.executable, "-c", _CODE], capture_output=True, text=True, timeout=COMPILE_S, check=False
+                [sys.executable, "-c", code], capture_output=True, text=True, timeout=COMPILE_S, check=False
             )
         except subprocess.TimeoutExpired:
             raise AwError(f"gsplat did not compile within {COMPILE_S / 60:.0f} minutes") from None

@@ -6,9 +6,11 @@ No other module imports gsplat. Differences between its versions are handled her
 from __future__ import annotations
 
 import functools
+import importlib.util
 import inspect
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -16,10 +18,12 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.extras import install_command
+from ambiguous_wild.splat.gpu.footprint import compensation
 
 NEAR = 0.01  # world units, as on the CPU
 BLUR = 0.3  # px^2, as on the CPU
 TILE = 16  # px
+TESTED = "1.5.3"  # the release that was read line by line
 
 
 @dataclass(frozen=True)
@@ -37,8 +41,9 @@ class Splats:
 class Tiles:
     """The splats of every tile, ordered by depth."""
 
-    offsets: Tensor  # [1, rows, columns] int32
+    offsets: Tensor  # [1, rows, columns] int32, or with one more row
     flatten_ids: Tensor  # [intersections] int32
+    over: Tensor | None = None  # [1] float32, 1 = the lists are too short; None = they cannot be
 
 
 @functools.cache
@@ -55,7 +60,22 @@ def gsplat() -> Any:
             f"the Gaussians are on a GPU and gsplat is not installed: {install_command('cuda')}, "
             "or run with --device cpu"
         ) from None
+    if torch.cuda.is_available():
+        _use_own_build(gsplat)
     return gsplat
+
+
+def _use_own_build(gsplat: Any) -> None:
+    """Let gsplat call the kernels that we compiled of its sources; it looks for `gsplat.csrc` first."""
+    from ambiguous_wild.splat.gpu import gsplat_cut
+    from ambiguous_wild.splat.gpu.gsplat_build import kernels_folder
+
+    package = Path(gsplat.__file__).parent
+    if importlib.util.find_spec("gsplat.csrc") is not None:
+        return
+    folder = gsplat_cut.folder_of(package, kernels_folder(torch.version.cuda))
+    if folder is not None and gsplat_cut.is_complete(folder):
+        gsplat_cut.use(folder)
 
 
 @functools.cache
@@ -108,7 +128,10 @@ def project(
     if not len(means):  # gsplat divides by their number, in C++: the process would end
         none = means.new_zeros((0, 2), dtype=torch.int32)
         return Splats(none, means[:, :2], means[:, 2], scales, opacities)
-    radii, means2d, depths, conics, compensations = gsplat().fully_fused_projection(
+    if antialias:
+        size = size_on(width, height, means.device)
+        opacities = opacities * compensation(means, quats, scales, viewmat, intrinsics, size, blur)
+    radii, means2d, depths, conics, _ = gsplat().fully_fused_projection(
         means=means,
         covars=None,
         quats=quats,
@@ -120,22 +143,50 @@ def project(
         eps2d=blur,
         near_plane=NEAR,
         packed=False,
-        calc_compensations=antialias,
-        opacities=opacities,
+        calc_compensations=False,
+        opacities=opacities.detach(),
     )
-    if antialias:
-        opacities = opacities * compensations[0]
     return Splats(radii[0], means2d[0], depths[0], conics[0], opacities)
+
+
+@functools.cache
+def size_on(width: int, height: int, device: torch.device) -> Tensor:
+    """[2] float32; copied once: a copy from the host in every step would make it wait."""
+    return torch.tensor([width, height], dtype=torch.float32).to(device)
 
 
 def shade(
     degree: int,
-    directions: Tensor,  # [N, 3] from the camera, any length
+    means: Tensor,  # [N, 3]
+    viewmat: Tensor,  # [1, 4, 4] cam_from_world
+    centre: Tensor,  # [3] of that camera
     coefficients: Tensor,  # [N, K, 3], K at least (degree + 1)^2
-    visible: Tensor,  # [N] bool; the others' colours are not computed
+    visible: Tensor,  # [N] bool; the others' colours may be anything
 ) -> Tensor:
-    """Colours [N, 3] of spherical harmonics, 0.5 not added; differentiable."""
-    return gsplat().spherical_harmonics(degree, directions, coefficients, masks=visible)
+    """Colours [N, 3] of spherical harmonics, 0.5 not added; differentiable.
+
+    Raises:
+        AwError: the installed version takes other arguments than those that are known.
+    """
+    call = gsplat().spherical_harmonics
+    if _takes_cameras():
+        found = call(degree, means=means, viewmats=viewmat, coeffs=coefficients)
+        return found.reshape(len(means), coefficients.shape[2])
+    return call(degree, means - centre, coefficients, masks=visible)
+
+
+@functools.cache
+def _takes_cameras() -> bool:
+    """Whether gsplat makes the directions itself, of means and cameras: after 1.5.3 (pull 1048)."""
+    names = list(inspect.signature(gsplat().spherical_harmonics).parameters)
+    if {"means", "viewmats", "coeffs"} <= set(names):
+        return True
+    if names[1:3] == ["dirs", "coeffs"]:
+        return False
+    raise AwError(
+        f"gsplat {version()} is not known here: its spherical_harmonics takes ({', '.join(names)}); "
+        f"install the tested version: pip install 'gsplat=={TESTED}'"
+    )
 
 
 def sort(splats: Splats, width: int, height: int) -> Tiles:
@@ -199,5 +250,8 @@ def blend(
 
 
 def absolute_gradient(batch: Tensor) -> Tensor:
-    """Sums over pixels of |dL/du| and |dL/dv|, [N, 2], after the backward pass of `blend(absolute=True)`."""
-    return batch.absgrad[0]  # type: ignore[attr-defined]  # gsplat stores it on its argument
+    """Sums over pixels of |dL/du| and |dL/dv|, [N, 2], after the backward pass of `blend(absolute=True)`.
+
+    A copy: after 1.5.3 a second backward pass overwrites them in place.
+    """
+    return batch.absgrad[0].clone()  # type: ignore[attr-defined]  # gsplat stores it on its argument

@@ -19,6 +19,7 @@ from typing import Any
 
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.extras import install_command, torch_command
+from ambiguous_wild.splat.gpu import gsplat_cut
 from ambiguous_wild.splat.gpu.gsplat_build import (
     compile_kernels,
     is_compiled,
@@ -49,13 +50,14 @@ class Found:
     torch: Mapping[str, Any]  # see `torch_facts`
     driver: str | None  # what nvidia-smi says of the first GPU; None = it is absent or sees none
     gsplat: str | None  # where its package lies
-    folder: Path  # that torch compiles gsplat into
+    folder: Path  # that its kernels are compiled into
     prebuilt: bool  # its kernels came compiled, with a wheel of one's own
     compiled: bool  # they lie in the folder
     nvcc: str | None  # the CUDA version of the compiler that torch will take; "" = unknown
     compiler: str | None  # of C++
     ninja: str | None
     hidden: str | None  # $CUDA_VISIBLE_DEVICES
+    cut: bool = False  # we compile what is called of its sources, see `gsplat_cut`
 
     @property
     def has_gpu(self) -> bool:
@@ -94,18 +96,20 @@ def look(torch: Mapping[str, Any] | None = None) -> Found:
     facts = torch_facts() if torch is None else torch
     spec = importlib.util.find_spec("gsplat")
     package = None if spec is None or spec.origin is None else Path(spec.origin).parent
-    folder = kernels_folder(facts["built"])
+    kernels = kernels_folder(facts["built"])
+    cut = None if package is None else gsplat_cut.folder_of(package, kernels)
     return Found(
         torch=facts,
         driver=first_line("nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader"),
         gsplat=None if package is None else str(package),
-        folder=folder,
+        folder=cut or kernels,
         prebuilt=package is not None and is_prebuilt(package),
-        compiled=is_compiled(folder),
+        compiled=is_compiled(cut or kernels),
         nvcc=_nvcc(),
         compiler=shutil.which(os.environ.get("CXX", "c++")),
         ninja=shutil.which("ninja", path=search_path()),
         hidden=os.environ.get("CUDA_VISIBLE_DEVICES"),
+        cut=cut is not None,
     )
 
 
@@ -121,7 +125,10 @@ def make_ready(found: Found, say: Callable[[str], None]) -> None:
         AwError: the compiler failed.
     """
     if not found.prebuilt:
-        compile_kernels(found.folder, lambda: found.compiled or is_compiled(found.folder), say)
+        package = Path(found.gsplat) if found.cut and found.gsplat else None
+        compile_kernels(
+            found.folder, lambda: found.compiled or is_compiled(found.folder), say, package=package
+        )
 
 
 def choose(device: str, say: Callable[[str], None], *, looking: Callable[[], Found] | None = None) -> str:
@@ -172,10 +179,10 @@ def no_gsplat(found: Found) -> Lack | None:
 def no_kernels(found: Found) -> Lack | None:
     """Why gsplat's kernels can neither be compiled nor, once they are, be loaded.
 
-    Loading compiled kernels has the same requirements: gsplat looks for nvcc and torch for ninja at every
-    start.
+    Where gsplat compiles itself, loading has the same requirements: gsplat looks for nvcc and torch for
+    ninja at every start.
     """
-    if found.prebuilt:
+    if found.prebuilt or (found.cut and found.compiled):
         return None
     to_do = "to load the kernels it has compiled" if found.compiled else "to compile its kernels"
     built = found.torch["built"]

@@ -20,6 +20,9 @@ from ambiguous_wild.core import AwError, Camera
 from ambiguous_wild.splat.effects.posed import PosedCamera
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
 from ambiguous_wild.splat.gpu import gsplat_seam as seam
+from ambiguous_wild.splat.gpu import options
+from ambiguous_wild.splat.gpu.footprint import visible
+from ambiguous_wild.splat.gpu.tiles import Visits, list_within
 from ambiguous_wild.splat.rendered import (
     NOTHING,
     Cotangents,
@@ -35,7 +38,7 @@ _REMEMBERED = 8192  # cameras; a thousand photos at three sizes, and their test 
 
 
 @dataclass(frozen=True)
-class _OnDevice:
+class OnDevice:
     """A camera as gsplat wants it."""
 
     viewmat: Tensor  # [1, 4, 4]
@@ -43,7 +46,8 @@ class _OnDevice:
     centre: Tensor  # [3]
 
 
-_cameras: OrderedDict[tuple[int, torch.device], tuple[Camera, _OnDevice]] = OrderedDict()
+_cameras: OrderedDict[tuple[int, torch.device], tuple[Camera, OnDevice]] = OrderedDict()
+_visits = Visits()
 _backgrounds: dict[tuple[tuple[float, float, float], torch.device], Tensor] = {}
 
 
@@ -90,7 +94,12 @@ class RenderedCuda:
         self._image, self._alpha, _ = self._blend(self._cut)
         self._depth: Tensor | None = None
         self.image, self.alpha = self._image.detach(), self._alpha.detach()
-        self.visible, self._shown = (splats.radii > 0).all(dim=1), splats.radii
+        self.visible, self._shown = seen(splats, size), splats.radii
+
+    @property
+    def over(self) -> Tensor | None:
+        """[1] float32, 1 = tile lists were too short for this picture; None = they are exact."""
+        return self._tiles.over
 
     @property
     def radii(self) -> Tensor:
@@ -229,23 +238,44 @@ def render_cuda(
         antialias=antialias,
         blur=blur,
     )
-    base = base_colours(leaves, splats, cam.centre, min(sh_degree, gaussians.sh_degree))
+    base = base_colours(leaves, splats, cam, min(sh_degree, gaussians.sh_degree))
     shaded = None if shade is None else _shaded(shade, gaussians, base, splats)
     colours = (base if shaded is None else shaded.colours).clamp(min=0.0)
     size = (camera.width, camera.height)
-    tiles = seam.sort(splats, *size)
+    tiles = _tiles(splats, camera) if graph else seam.sort(splats, *size)
     behind = background_on(background, gaussians.device)
     return RenderedCuda(leaves, splats, colours, tiles, behind, size, shaded)
 
 
-def base_colours(leaves: dict[str, Tensor], splats: seam.Splats, centre: Tensor, degree: int) -> Tensor:
+def _tiles(splats: seam.Splats, camera: Camera) -> seam.Tiles:
+    """Of a step; where the length of the lists is known, nobody waits for it."""
+    size, count = (camera.width, camera.height), len(splats.radii)
+    if options.current().tiles == "exact" or not count:
+        return seam.sort(splats, *size)
+    capacity = _visits.capacity(camera, count)
+    if capacity is None:
+        tiles = seam.sort(splats, *size)
+        _visits.note(camera, count, len(tiles.flatten_ids))
+        return tiles
+    listed = list_within(splats.means2d.detach(), splats.radii, splats.depths.detach(), *size, capacity)
+    _visits.note(camera, count, listed.count)
+    return seam.Tiles(listed.offsets, listed.flatten_ids, listed.over)
+
+
+def seen(splats: seam.Splats, size: tuple[int, int]) -> Tensor:
+    """[N] bool, the Gaussians that cover a pixel centre of a picture of this width and height."""
+    there = seam.size_on(*size, splats.radii.device)
+    return visible(splats.radii, splats.means2d, splats.conics, splats.opacities, there)
+
+
+def base_colours(leaves: dict[str, Tensor], splats: seam.Splats, cam: OnDevice, degree: int) -> Tensor:
     """[N, 3], SH + 0.5, not clamped; rows that are not visible may hold anything."""
     if degree == 0:
         return leaves["sh0"] * SH_C0 + 0.5
     active = leaves["sh_rest"][:, : (degree + 1) ** 2 - 1]
     coefficients = torch.cat([leaves["sh0"][:, None], active], dim=1)
-    visible = (splats.radii > 0).all(dim=1)
-    return seam.shade(degree, leaves["means"] - centre, coefficients, visible) + 0.5
+    drawn = (splats.radii > 0).all(dim=1)
+    return seam.shade(degree, leaves["means"], cam.viewmat, cam.centre, coefficients, drawn) + 0.5
 
 
 def _shaded(shade: Shade, gaussians: Gaussians, base: Tensor, splats: seam.Splats) -> Shaded:
@@ -263,10 +293,10 @@ def _shaded(shade: Shade, gaussians: Gaussians, base: Tensor, splats: seam.Splat
     return Shaded(gaussians, base, colours.detach(), pull)
 
 
-def on_device(camera: Camera, device: torch.device) -> _OnDevice:
+def on_device(camera: Camera, device: torch.device) -> OnDevice:
     """The camera's matrices there, copied once: a copy from the host in every step would make it wait."""
     if isinstance(camera, PosedCamera):  # of pose refinement: another one in every step, made there
-        return _OnDevice(
+        return OnDevice(
             camera.pose.float()[None], camera.intrinsics_there.float()[None], camera.centre.float()
         )
     key = (id(camera), device)
@@ -274,7 +304,7 @@ def on_device(camera: Camera, device: torch.device) -> _OnDevice:
         _cameras.move_to_end(key)
         return _cameras[key][1]
     pose = torch.from_numpy(camera.cam_from_world.astype("float32"))
-    found = _OnDevice(
+    found = OnDevice(
         pose[None].to(device),
         torch.from_numpy(camera.intrinsics.astype("float32"))[None].to(device),
         torch.from_numpy(camera.center.astype("float32")).to(device),

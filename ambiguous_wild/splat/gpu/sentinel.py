@@ -97,6 +97,11 @@ class Sentinel:
         self._sound += 1.0 - self._broken
         return self._broken.clone() if nothing is None else torch.maximum(self._broken, nothing)
 
+    @property
+    def broken(self) -> Tensor:
+        """[1] float32, 1 = a value was not finite since the last look; a copy, nobody waits for it."""
+        return self._broken.clone()
+
     def first_broken(self) -> Broken | None:
         """The first step since the last look at which something was not finite. The host waits."""
         broken, sound = torch.cat([self._broken, self._sound]).tolist()

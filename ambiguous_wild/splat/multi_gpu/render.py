@@ -16,7 +16,7 @@ from torch import Tensor
 from ambiguous_wild.core import Camera
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.gpu import gsplat_seam as seam
-from ambiguous_wild.splat.gpu.render import RenderedCuda, background_on, base_colours, on_device
+from ambiguous_wild.splat.gpu.render import RenderedCuda, background_on, base_colours, on_device, seen
 from ambiguous_wild.splat.multi_gpu.exchange import exchange
 from ambiguous_wild.splat.multi_gpu.ranks import Ranks
 from ambiguous_wild.splat.rendered import NOTHING, Cotangents, Gradients, as_cotangents
@@ -37,6 +37,7 @@ class SharedRendered(RenderedCuda):
         sent: Tensor,  # [C * n, 12]
         received: Tensor,  # [sum of all counts, 12]
         radii: Tensor,  # [C, n, 2] int32 px
+        visible: Tensor,  # [C, n] bool
         camera: Camera,
         background: tuple[float, float, float],
         rank: int,
@@ -46,7 +47,7 @@ class SharedRendered(RenderedCuda):
             leaves: raw parameters of this rank's n Gaussians.
             sent: their splats in each of C cameras.
             received: splats of all ranks in this rank's camera.
-            radii: of what was sent.
+            radii, visible: of what was sent.
             camera: this rank's.
             background: colour.
             rank: this rank, and the place of its camera.
@@ -56,7 +57,7 @@ class SharedRendered(RenderedCuda):
         tiles = seam.sort(splats, *size)
         super().__init__(leaves, splats, colours, tiles, background_on(background, received.device), size)
         self._rank, self._cameras, self._radii = rank, len(radii), radii
-        self._seen = (radii > 0).all(dim=2)
+        self._seen = visible
         # Not a method of this object: graph and object would hold each other, and their memory, for ever.
         self._came_back: list[Tensor] = []
         if sent.requires_grad:
@@ -112,25 +113,27 @@ def render_shared(
     Source: `rasterization(distributed=True)` of gsplat, unpacked: culled splats travel too, so that
     no rank has to ask how many there are.
     """
-    seam.gsplat()
+    seam.ready(gaussians.device.type)
     graph = torch.is_grad_enabled()
     leaves = {name: tensor.detach().requires_grad_(graph) for name, tensor in gaussians.items()}
     scales, opacities = leaves["log_scales"].exp(), torch.sigmoid(leaves["opacity_logits"])
     degree = min(sh_degree, gaussians.sh_degree)
-    packed, radii = [], []
+    packed, radii, visible = [], [], []
     for camera in cameras:
         cam = on_device(camera, gaussians.device)
         splats = seam.project(
             leaves["means"], leaves["quats"], scales, opacities, cam.viewmat, cam.intrinsics,
             camera.width, camera.height, antialias=antialias, blur=blur,
         )  # fmt: skip
-        colours = base_colours(leaves, splats, cam.centre, degree).clamp(min=0.0)
+        colours = base_colours(leaves, splats, cam, degree).clamp(min=0.0)
         packed.append(_packed(splats, colours))
         radii.append(splats.radii)
+        visible.append(seen(splats, (camera.width, camera.height)))
     sent = torch.cat(packed)
     received = exchange(sent, [len(gaussians)] * ranks.size, counts)
     camera = cameras[ranks.rank]
-    return SharedRendered(leaves, sent, received, torch.stack(radii), camera, background, ranks.rank)
+    shown = torch.stack(radii), torch.stack(visible)
+    return SharedRendered(leaves, sent, received, *shown, camera, background, ranks.rank)
 
 
 def _packed(splats: seam.Splats, colours: Tensor) -> Tensor:

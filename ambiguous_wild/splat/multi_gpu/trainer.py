@@ -185,6 +185,8 @@ class SharedTrainer(Trainer):
 
         A step that was called off is not observed: neither its zeros nor its NaN are added.
         """
+        if self.density.due(step) and bool(called_off):  # the same on all ranks; as one GPU does
+            return []
         screens, going = rendered.screens, called_off == 0
         for q, camera in enumerate(self._step_cameras(step.iteration, step.divisor)):
             one = rendered.seen_by(q)

@@ -32,6 +32,7 @@ from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.graft import split_graft
 from ambiguous_wild.methods.references import reference_file, with_file
 from ambiguous_wild.methods.registry import get_method, load_plugin, load_reference
+from ambiguous_wild.methods.second_pass import trained_once
 from ambiguous_wild.splat.pace import TrainConfig
 
 # A node that is lost keeps its lock until the file server forgets it (NFS: 90 s by default).
@@ -92,7 +93,7 @@ def read_sources(plugins: Sequence[Path], methods: Sequence[str]) -> tuple[Sourc
     sources = [_source(str(path), True, path) for path in plugins]
     for name in methods:
         # A graft may have a reference as its host.
-        host, _ = split_graft(name)
+        host, _ = split_graft(trained_once(name))
         file = reference_file(host)
         if file is not None:
             sources.append(_source(host, False, file))

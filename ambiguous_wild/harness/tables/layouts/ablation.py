@@ -52,6 +52,7 @@ def _group(group: GroupFacts, rows: list[VariantRow], columns: list[Measure], da
     notes = [f"{row['variant']} {row['status']}: {row['reason']}" for row in members if row["status"] != "ok"]
     source = f" (paper: {group['source']})" if group["source"] else ""
     notes.append(f"{', '.join(data['scenes'])}; seeds {', '.join(map(str, data['seeds']))}")
+    notes += [f"{data['method']}: {data['note']}"] if data.get("note") else []
     notes += [f"command of the runs: {data['made_by']}"] if data["made_by"] else []
     title = f"{data['method']}, {group['name']}: {group['title']}{source}"
     over = "seeds" if len(data["scenes"]) == 1 else "scenes and seeds"

@@ -1,0 +1,130 @@
+"""Pairs of photos that are likely to overlap, by their SIFT features: no list of all pairs is made.
+
+Each photo's descriptors become one vector (VLAD: Jegou et al., CVPR 2010): per visual word the sum of the
+differences to it, each scaled to unit length. Similar vectors show the same surfaces.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+WORDS = 64  # visual words
+SAMPLE = 20_000  # descriptors that the words are learnt from
+MOST = 1500  # descriptors of a photo that count: the largest features come first in COLMAP
+SIMILAR = 16  # photos that each is matched with
+NEIGHBOURS = 5  # next photos in the order of capture
+_ROWS = 256  # photos compared at a time
+_ROUNDS = 12  # of k-means
+
+
+def embed(
+    read: Callable[[str], np.ndarray],  # name -> [F, 128] uint8
+    names: Sequence[str],
+    seed: int = 0,
+) -> np.ndarray:  # [N, WORDS * 128] float32, unit length; zero where a photo has no features
+    """One vector a photo; holds one photo's descriptors at a time."""
+    generator = np.random.default_rng(seed)
+    share = max(1, SAMPLE // max(len(names), 1))
+    sample = []
+    for name in names:
+        rows = read(name)[:MOST]
+        if len(rows):
+            sample.append(_unit(rows[generator.permutation(len(rows))[:share]]))
+    vectors = np.zeros((len(names), WORDS * 128), np.float32)
+    if not sample:
+        return vectors
+    words = _words(np.concatenate(sample), generator)
+    for index, name in enumerate(names):
+        vectors[index] = _vlad(read(name)[:MOST], words)
+    return vectors
+
+
+def _unit(rows: np.ndarray) -> np.ndarray:
+    values = rows.astype(np.float32)
+    return values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-6)
+
+
+def _words(sample: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """k-means from random rows; an empty word stays where it is."""
+    count = min(WORDS, len(sample))
+    words = sample[generator.permutation(len(sample))[:count]]
+    for _ in range(_ROUNDS):
+        nearest = _nearest(sample, words)
+        for word in range(count):
+            mine = sample[nearest == word]
+            if len(mine):
+                words[word] = mine.mean(axis=0)
+    return words
+
+
+def _nearest(rows: np.ndarray, words: np.ndarray) -> np.ndarray:
+    return np.argmin((words * words).sum(axis=1) - 2 * (rows @ words.T), axis=1)
+
+
+def _vlad(rows: np.ndarray, words: np.ndarray) -> np.ndarray:
+    out = np.zeros((WORDS, 128), np.float32)
+    if len(rows):
+        units = _unit(rows)
+        nearest = _nearest(units, words)
+        for word in np.unique(nearest):
+            out[word] = (units[nearest == word] - words[word]).sum(axis=0)
+        out /= np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-6)
+    flat = out.ravel()
+    return flat / max(float(np.linalg.norm(flat)), 1e-6)
+
+
+def most_similar(
+    vectors: np.ndarray,  # [N, D]
+    queries: Sequence[int],  # rows that look for partners
+    among: Sequence[int],  # rows that may be partners
+    count: int = SIMILAR,
+) -> list[tuple[int, int]]:
+    """(query, partner) pairs, at most `count` a query, the most similar first; equal ones by row."""
+    pool = np.array(among, np.intp)
+    pairs: list[tuple[int, int]] = []
+    for start in range(0, len(queries), _ROWS):
+        chunk = np.array(queries[start : start + _ROWS], np.intp)
+        alike = vectors[chunk] @ vectors[pool].T
+        alike[chunk[:, None] == pool[None]] = -np.inf
+        best = np.argsort(-alike, axis=1, kind="stable")[:, :count]
+        for row, query in enumerate(chunk):
+            pairs += [(int(query), int(pool[k])) for k in best[row] if np.isfinite(alike[row, k])]
+    return pairs
+
+
+def retrieval_pairs(
+    vectors: np.ndarray,  # [N, D], of `embed`
+    names: Sequence[str],  # in the order of capture
+    test_names: set[str],
+) -> list[tuple[str, str]]:
+    """Each photo with the most similar ones and, but for those of a separate test set, the next ones.
+
+    Returns:
+        Each pair once, in a fixed order; fewer than SIMILAR + NEIGHBOURS a photo.
+    """
+    everyone = list(range(len(names)))
+    walk = [i for i in everyone if names[i] not in test_names]
+    pairs = {
+        (walk[i], walk[i + s])
+        for i in range(len(walk))
+        for s in range(1, NEIGHBOURS + 1)
+        if i + s < len(walk)
+    }
+    pairs |= {(min(a, b), max(a, b)) for a, b in most_similar(vectors, everyone, everyone)}
+    return [(names[a], names[b]) for a, b in sorted(pairs)]
+
+
+def pairs_of_tests(
+    vectors: np.ndarray,  # [N, D]
+    names: Sequence[str],
+    test_names: set[str],
+    count: int = 2 * SIMILAR,
+) -> list[tuple[str, str]]:
+    """Photos of a separate test set with the most similar photos of the walk and of the test set."""
+    walk = [i for i, name in enumerate(names) if name not in test_names]
+    tests = [i for i, name in enumerate(names) if name in test_names]
+    pairs = {(min(a, b), max(a, b)) for a, b in most_similar(vectors, tests, walk, count)}
+    pairs |= {(min(a, b), max(a, b)) for a, b in most_similar(vectors, tests, tests, SIMILAR // 2)}
+    return [(names[a], names[b]) for a, b in sorted(pairs)]

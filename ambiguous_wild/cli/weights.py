@@ -1,0 +1,108 @@
+"""`aw weights`: list, download and check pretrained networks."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import click
+
+from ambiguous_wild.core.errors import AwError, counted
+
+
+@click.group(name="weights")
+def command() -> None:
+    """Pretrained networks: for LPIPS, features and instance masks. Nothing needs them by default.
+
+    \b
+    aw weights list                           all networks, their size, licence and source
+    aw weights get lpips efficientnet-lite0   download
+    aw weights check                          load what is there and compare hashes
+    """
+
+
+@command.command(name="list")
+@click.option("--json", "as_json", is_flag=True, help="Print the list as JSON.")
+def list_command(as_json: bool) -> None:
+    """List every network: size, licence, source, use, and whether it is on this machine."""
+    from ambiguous_wild.core.weight_places import weights_folder
+    from ambiguous_wild.vision import weights
+
+    every = weights.KNOWN + weights.OTHER_SIZES
+    rows = list(zip(every, weights.status(every)))
+    if as_json:
+        facts = [
+            {
+                "name": w.name, "present": line.present, "where": line.where, "size_mb": w.size_mb,
+                "licence": w.licence, "source": w.source, "used_for": w.used_for,
+                "archive_sha256": w.package.sha256 if w.package else None,
+                "tensors_sha256": w.tensors or None,
+            }
+            for w, line in rows
+        ]  # fmt: skip
+        click.echo(json.dumps(facts, indent=2, ensure_ascii=False))
+        return
+    width, source = (
+        max(len(text) for text in texts) for texts in zip(*((w.name, w.source) for w, _ in rows))
+    )
+    for w, line in rows:
+        mark = click.style("✓", fg="green") if line.present else "·"
+        size = f"{w.size_mb:.0f} MB" if w.size_mb >= 1 else f"{w.size_mb * 1000:.0f} kB"
+        text = (
+            f"{mark} {w.name.ljust(width)}  {size.rjust(7)}  {w.source.ljust(source)}  {w.licence.ljust(18)}"
+        )
+        click.echo(f"{text}  {w.used_for}")
+    for name, members in weights.GROUPS.items():
+        click.echo(f"\n{name} = {', '.join(members)}")
+    present = sum(line.present for _, line in rows)
+    click.echo(
+        f"{present} of {len(rows)} on this machine; 'aw weights get NAME' downloads into {weights_folder()}"
+    )
+
+
+@command.command(name="get")
+@click.argument("names", nargs=-1, required=True)
+@click.option("--json", "as_json", is_flag=True, help="Print names and places as JSON.")
+def get_command(names: tuple[str, ...], as_json: bool) -> None:
+    """Download networks into AW_WEIGHTS (by default ~/.cache/ambiguous_wild/weights).
+
+    What is there already is not downloaded again. Hashes are checked; pickles are converted to safetensors,
+    and only arrays are read from them.
+    """
+    from ambiguous_wild.vision import fetch, weights
+
+    wanted = weights.chosen(names)
+    places = fetch.get(wanted, lambda line: click.echo(line, err=True))
+    if as_json:
+        rows = [{"name": w.name, "where": str(place)} for w, place in zip(wanted, places)]
+        click.echo(json.dumps(rows, indent=2))
+
+
+@command.command(name="check")
+@click.argument("names", nargs=-1)
+@click.option("--json", "as_json", is_flag=True, help="Print the verdicts as JSON.")
+def check_command(names: tuple[str, ...], as_json: bool) -> None:
+    """Load networks completely and compare hashes; without NAMES all that are on this machine.
+
+    Exit code 2 if one is missing, damaged or another network than its name says.
+    """
+    from ambiguous_wild.vision import weights
+    from ambiguous_wild.vision.verify import verify
+
+    every = weights.KNOWN + weights.OTHER_SIZES
+    wanted = weights.chosen(names) if names else [w for w in every if weights.where(w) is not None]
+    verdicts = []
+    for weight in wanted:
+        verdicts.append(verify(weight))
+        if not as_json:
+            mark = click.style("✓", fg="green") if verdicts[-1].ok else click.style("✗", fg="red")
+            click.echo(f"{mark} {weight.name}: {verdicts[-1].detail}")
+    if as_json:
+        click.echo(json.dumps([dataclasses.asdict(v) for v in verdicts], indent=2, ensure_ascii=False))
+    elif not wanted:
+        click.echo("no weights on this machine; 'aw weights list' lists what can be downloaded")
+    wrong = [v for v in verdicts if not v.ok]
+    if wrong:
+        raise AwError(
+            f"{counted(len(wrong), 'network')} of {len(verdicts)} cannot be used: {wrong[0].name}: {wrong[0].detail}"
+        )

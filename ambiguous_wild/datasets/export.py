@@ -1,0 +1,272 @@
+"""`aw export-scene`: a scene in the layout of another tool."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal
+
+import numpy as np
+
+from ambiguous_wild.core import Scene, View
+from ambiguous_wild.core.errors import AwError, unknown
+from ambiguous_wild.datasets.foreign import without_suffix
+from ambiguous_wild.datasets.photos import link_file
+from ambiguous_wild.io import colmap_binary
+from ambiguous_wild.io.atomic import atomic_dir, check_output
+from ambiguous_wild.io.colmap_model import read_model
+from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage, ModelPoints
+from ambiguous_wild.io.images import read_gray, write_png
+from ambiguous_wild.io.scene_folder import load_scene
+
+Form = Literal["nerfstudio", "nerfbaselines", "colmap", "on-the-go"]
+_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What was written."""
+
+    folder: Path
+    photos: int
+    train: int
+    test: int
+    left_out: tuple[str, ...]  # what the layout cannot hold
+
+
+def export_scene(path: Path, form: str, output: Path, *, copy: bool = False) -> Exported:
+    """Write a scene in another layout, at the size that it is trained at (On-the-go: full size).
+
+    Photos are linked.
+
+    Args:
+        path: a scene folder.
+        form: "nerfstudio", "nerfbaselines", "colmap" or "on-the-go".
+        output: the folder to make; it must not exist, or be empty.
+        copy: copy photos instead of linking them, for a folder that is to be moved.
+
+    Raises:
+        AwError: no scene, an unknown layout, or an output that exists.
+    """
+    if form not in WRITERS:
+        raise unknown("layout", form, WRITERS)
+    scene = load_scene(path)
+    if output.exists() and (not output.is_dir() or any(output.iterdir())):
+        raise AwError(f"{output} exists; nothing is overwritten: choose another -o or remove it")
+    if output.resolve().is_relative_to(scene.root.resolve()):
+        raise AwError(f"{output} lies inside the scene {path}; choose a folder outside it for -o")
+    check_output(output)
+    with atomic_dir(output) as folder:
+        place = _copy if copy else link_file
+        left_out = WRITERS[form](scene, folder, place)
+    return Exported(output, len(scene.views), len(scene.train), len(scene.test), tuple(left_out))
+
+
+Place = Callable[[Path, Path], None]
+
+
+def _copy(source: Path, target: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(source, target)
+
+
+def _stored(view: View) -> str:
+    """The photo's name with the extension of the file that is trained on."""
+    return without_suffix(view.name) + view.image_path.suffix
+
+
+def _sized_model(scene: Scene) -> Model:
+    """The model of the split's photos at the size of the loaded files, a camera a distinct intrinsics."""
+    from ambiguous_wild.io.scene_folder import model_folder
+
+    model = read_model(model_folder(scene.root))
+    by_name = {view.name: view for view in scene.views}
+    cameras: dict[tuple[Any, ...], ModelCamera] = {}
+    images = {}
+    for number, image in model.images.items():
+        view = by_name.get(image.name)
+        if view is None:
+            continue
+        c, full = view.camera, model.cameras[image.camera_id]
+        params = (c.fx, c.fy, c.cx, c.cy)
+        key = (c.width, c.height, *params)
+        if key not in cameras:
+            cameras[key] = ModelCamera(len(cameras) + 1, "PINHOLE", c.width, c.height, params)
+        scale = np.array([c.width / full.width, c.height / full.height])
+        images[number] = ModelImage(
+            number,
+            image.qvec,
+            image.tvec,
+            cameras[key].camera_id,
+            _stored(view),
+            image.xys * scale,
+            image.point_ids,
+        )
+    points = model.points
+    rows = np.isin(points.track_image_ids, sorted(images))
+    owner = np.repeat(np.arange(len(points.ids)), np.diff(points.track_offsets))
+    kept = np.bincount(owner[rows], minlength=len(points.ids))
+    offsets = np.concatenate([[0], np.cumsum(kept)]).astype(np.int64)
+    tracks = (points.track_image_ids[rows], points.track_point2d[rows])
+    trimmed = ModelPoints(points.ids, points.xyz, points.rgb, points.error_px, offsets, *tracks)
+    return Model({c.camera_id: c for c in cameras.values()}, images, trimmed)
+
+
+def _write_lists(scene: Scene, folder: Path) -> None:
+    for side, views in (("train", scene.train), ("test", scene.test)):
+        text = "".join(f"{_stored(view)}\n" for view in views)
+        (folder / f"{side}_list.txt").write_text(text, encoding="utf-8")
+
+
+def _colmap(scene: Scene, folder: Path, place: Place) -> list[str]:
+    """images/, sparse/0, and lists that some readers know."""
+    for view in scene.views:
+        place(view.image_path, folder / "images" / _stored(view))
+    model = _sized_model(scene)
+    sparse = folder / "sparse" / "0"
+    colmap_binary.write_cameras(sparse / "cameras.bin", model.cameras.values())
+    colmap_binary.write_images(sparse / "images.bin", model.images.values())
+    colmap_binary.write_points(sparse / "points3D.bin", model.points)
+    _write_lists(scene, folder)
+    return ["keep masks"] if any(v.keep_path for v in scene.train) else []
+
+
+def _nerfbaselines(scene: Scene, folder: Path, place: Place) -> list[str]:
+    """As COLMAP, with nb-info.json and keep masks of training photos."""
+    _colmap(scene, folder, place)
+    masked = [view for view in scene.train if view.keep_path is not None]
+    for view in masked:
+        _write_mask(view, folder / "masks" / f"{without_suffix(view.name)}.png")
+    if masked:
+        # NerfBaselines wants a mask for every photo, or none; white uses all of a photo.
+        for view in scene.views:
+            target = folder / "masks" / f"{without_suffix(view.name)}.png"
+            if not target.is_file():
+                write_png(target, np.full((view.camera.height, view.camera.width), 255, np.uint8))
+    info = {
+        "loader": "colmap",
+        "loader_kwargs": {"images_path": "images"},
+        "scene": scene.name,
+        "evaluation_protocol": "nerfw" if _half(scene) else "default",
+        "downscale_factor": 1,
+    }
+    _write_json(folder / "nb-info.json", info)
+    return []
+
+
+def _half(scene: Scene) -> bool:
+    known = scene.info.get("evaluation")
+    return isinstance(known, dict) and known.get("protocol") == "half"
+
+
+def _nerfstudio(scene: Scene, folder: Path, place: Place) -> list[str]:
+    """transforms.json with lists, points and masks; read with `--data FOLDER nerfstudio-data`."""
+    frames = []
+    masked = any(view.keep_path for view in scene.train)
+    for view in scene.views:
+        name = f"images/{_stored(view)}"
+        place(view.image_path, folder / name)
+        frame = {"file_path": name, **_intrinsics(view), "transform_matrix": _camera_to_world(view)}
+        if masked:  # nerfstudio wants a mask for every photo, or none
+            mask = f"masks/{without_suffix(view.name)}.png"
+            _write_mask(view, folder / mask)
+            frame["mask_path"] = mask
+        frames.append(frame)
+    points = _point_ply(scene)
+    (folder / "sparse_pc.ply").write_bytes(points)
+    data = {
+        "camera_model": "OPENCV",
+        "ply_file_path": "sparse_pc.ply",
+        "frames": frames,
+        "train_filenames": [f"images/{_stored(v)}" for v in scene.train],
+        "val_filenames": [f"images/{_stored(v)}" for v in scene.test],
+        "test_filenames": [f"images/{_stored(v)}" for v in scene.test],
+    }
+    _write_json(folder / "transforms.json", data)
+    return [*_protocol_lost(scene), "tracks of the points"]
+
+
+def _on_the_go(scene: Scene, folder: Path, place: Place) -> list[str]:
+    """images/, transforms.json, split.json with positions among the names sorted by base name.
+
+    Readers of this layout reduce the photos themselves, so they are full size where the scene has them.
+    """
+    factor = int(scene.info["loaded_factor"])
+    if factor > 1 and (scene.root / "images").is_dir():
+        for view in scene.views:
+            name = PurePosixPath(_stored(view)).name
+            place(view.image_path, folder / f"images_{factor}" / name)
+        scene = load_scene(scene.root, factor=1, verify=False)
+    bases = [PurePosixPath(v.name).stem for v in scene.views]
+    if len(set(bases)) < len(bases):
+        raise AwError(
+            f"{scene.root}: two photos have one base name, which On-the-go's layout cannot tell apart"
+        )
+    views = sorted(scene.views, key=lambda v: PurePosixPath(_stored(v)).name)
+    lenses = {
+        (v.camera.width, v.camera.height, v.camera.fx, v.camera.fy, v.camera.cx, v.camera.cy) for v in views
+    }
+    frames = []
+    for view in views:
+        name = f"images/{PurePosixPath(_stored(view)).name}"
+        place(view.image_path, folder / name)
+        own = {} if len(lenses) == 1 else _intrinsics(view)
+        frames.append({"file_path": name, **own, "transform_matrix": _camera_to_world(view)})
+    shared = _intrinsics(views[0]) if len(lenses) == 1 else {}
+    _write_json(folder / "transforms.json", {**shared, "frames": frames})
+    sides = {"clutter": "train", "extra": "test"}
+    split = {word: [i for i, v in enumerate(views) if v.split == side] for word, side in sides.items()}
+    _write_json(folder / "split.json", {**split, "clean": []})
+    masks = ["keep masks"] if any(v.keep_path for v in scene.train) else []
+    return [*_protocol_lost(scene), "points", *masks]
+
+
+def _protocol_lost(scene: Scene) -> list[str]:
+    return ["the half-photo protocol"] if _half(scene) else []
+
+
+def _intrinsics(view: View) -> dict[str, Any]:
+    c = view.camera
+    lens = dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0)
+    return {"w": c.width, "h": c.height, "fl_x": c.fx, "fl_y": c.fy, "cx": c.cx, "cy": c.cy, **lens}
+
+
+def _camera_to_world(view: View) -> list[list[float]]:
+    """[4, 4] with OpenGL axes."""
+    return (np.linalg.inv(view.camera.cam_from_world) @ _OPENGL).tolist()
+
+
+def _write_mask(view: View, target: Path) -> None:
+    if view.keep_path is None:
+        pixels = np.full((view.camera.height, view.camera.width), 255, np.uint8)
+    else:
+        pixels = np.where(read_gray(view.keep_path) >= 128, 255, 0).astype(np.uint8)
+    write_png(target, pixels)
+
+
+def _point_ply(scene: Scene) -> bytes:
+    points = scene.points
+    layout = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
+    table = np.empty(len(points), layout)
+    for index, axis in enumerate("xyz"):
+        table[axis] = points.xyz[:, index]
+    for index, colour in enumerate(("red", "green", "blue")):
+        table[colour] = points.rgb[:, index]
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
+    head += [f"property {'float' if t == '<f4' else 'uchar'} {n}" for n, t in layout]
+    return "\n".join([*head, "end_header\n"]).encode() + table.tobytes()
+
+
+def _write_json(path: Path, data: Mapping[str, Any]) -> None:
+    path.write_text(json.dumps(data, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+WRITERS: dict[str, Callable[[Scene, Path, Place], list[str]]] = {
+    "nerfstudio": _nerfstudio,
+    "nerfbaselines": _nerfbaselines,
+    "colmap": _colmap,
+    "on-the-go": _on_the_go,
+}

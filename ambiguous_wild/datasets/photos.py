@@ -1,0 +1,286 @@
+"""Photos of an imported scene: linked where they can be used as they are, else undistorted or reduced."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import shutil
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from ambiguous_wild.builder.downsample import downsample_mask, downsample_photo, downsampled_size
+from ambiguous_wild.builder.undistort import Lens, make_lens
+from ambiguous_wild.core.errors import AwError, shortlist
+from ambiguous_wild.datasets.foreign import ForeignScene, camera_size, find_photo, without_suffix
+from ambiguous_wild.datasets.readers.colmap import file_size
+from ambiguous_wild.io.colmap_records import ModelCamera, ModelImage
+from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
+from ambiguous_wild.io.safe_pycolmap import pycolmap
+
+PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
+
+
+@dataclass(frozen=True)
+class PhotoPlan:
+    """What is done to one photo."""
+
+    image: ModelImage
+    source: Path
+    camera: ModelCamera  # at the size of `source`
+    small: Path | None  # a downsampled copy that is linked
+    only_small: bool  # the dataset ships downsampled photos alone
+    convert: bool  # its pixels change, so a PNG is written
+
+
+@dataclass(frozen=True)
+class PlacedPhoto:
+    """A photo in the scene."""
+
+    image: ModelImage  # with its new name and positions
+    camera: ModelCamera  # pinhole
+    notes: tuple[str, ...]  # what was done to it
+    source: str  # relative to the dataset
+
+
+def plan_photos(scene: ForeignScene) -> list[PhotoPlan]:
+    """Find every photo of the split and check its size.
+
+    Raises:
+        AwError: photos are absent, no images, or of another shape than their cameras.
+    """
+    only_small = not scene.photos.is_dir()
+    folder = scene.root / f"images_{scene.factor}" if only_small else scene.photos
+    absent, wrong, plans = [], [], []
+    for image in sorted(scene.model.images.values(), key=lambda i: i.name):
+        if image.name not in scene.split:
+            continue
+        source = find_photo(folder, image.name)
+        if source is None:
+            absent.append(image.name)
+            continue
+        camera = scene.model.cameras[image.camera_id]
+        size = file_size(source)
+        if size is None:
+            wrong.append(f"{image.name} (no image)")
+        elif not _same_shape(size, (camera.width, camera.height)):
+            wrong.append(f"{image.name} ({size[0]}x{size[1]}, its camera {camera_size(camera)})")
+        else:
+            plans.append(_plan(scene, image, source, camera, size, only_small))
+    total = len(scene.split)
+    if absent:
+        raise AwError(
+            f"{len(absent)} of {total} photos that the model registers are not in {folder}: "
+            f"{shortlist(absent, 3)}; copy all of the dataset, or correct the lists"
+        )
+    if wrong:
+        raise AwError(
+            f"{len(wrong)} of {total} photos in {folder} do not fit the model: {shortlist(wrong, 3)}; "
+            "use the "
+            "photos that the model was built from"
+        )
+    return plans
+
+
+def _plan(
+    scene: ForeignScene,
+    image: ModelImage,
+    source: Path,
+    camera: ModelCamera,
+    size: tuple[int, int],
+    only_small: bool,
+) -> PhotoPlan:
+    lens = lens_of(camera) if camera.model not in PINHOLES else None
+    wide = scene.max_width is not None and size[0] > scene.max_width
+    convert = (lens is not None and lens.map_xy is not None) or wide or scene.background is not None
+    small = None
+    if scene.factor > 1 and not convert and not only_small:
+        small = find_photo(scene.root / f"images_{scene.factor}", image.name)
+        found = file_size(small) if small is not None else None
+        if found is not None and not _same_shape(found, size):
+            raise AwError(
+                f"{small} is {found[0]}x{found[1]}, another shape than {source} "
+                f"({size[0]}x{size[1]}): it is no "
+                f"copy of it; remove images_{scene.factor} to make it anew"
+            )
+    at_size = camera if not (convert or only_small) else resized(camera, *size)
+    return PhotoPlan(image, source, at_size, small, only_small, convert)
+
+
+@lru_cache(maxsize=4)  # a map of a photo of 12 megapixels takes 98 MB
+def lens_of(camera: ModelCamera) -> Lens:
+    """The camera's lens; most datasets have one for all photos."""
+    if camera.model not in PINHOLES:
+        return make_lens(camera)
+    size = (camera.width, camera.height)
+    lens = pycolmap.Camera(model=camera.model, width=size[0], height=size[1], params=list(camera.params))
+    return Lens(lens, ModelCamera(camera.camera_id, "PINHOLE", *size, camera.pinhole()), None)
+
+
+def _same_shape(size: tuple[int, int], wanted: tuple[int, int]) -> bool:
+    return abs(size[0] * wanted[1] / wanted[0] - size[1]) <= max(2.0, 0.02 * size[1])
+
+
+def resized(camera: ModelCamera, width: int, height: int) -> ModelCamera:
+    """The camera of the same photo at another size; lens distortion does not depend on it."""
+    if (camera.width, camera.height) == (width, height):
+        return camera
+    sx, sy = width / camera.width, height / camera.height
+    values = list(camera.params)
+    if camera.model in (
+        "SIMPLE_PINHOLE",
+        "SIMPLE_RADIAL",
+        "RADIAL",
+        "SIMPLE_RADIAL_FISHEYE",
+        "RADIAL_FISHEYE",
+    ):
+        # One focal length for both axes: their sizes differ by rounding only.
+        values[0] *= (sx + sy) / 2
+        values[1], values[2] = values[1] * sx, values[2] * sy
+    else:
+        for index, scale in enumerate((sx, sy, sx, sy)):
+            values[index] *= scale
+    return dataclasses.replace(camera, width=width, height=height, params=tuple(values))
+
+
+def place_photo(plan: PhotoPlan, scene: ForeignScene, folder: Path) -> PlacedPhoto:
+    """Put the photo into the scene folder at full size and at the factor; what is there already stays.
+
+    Args:
+        plan: of `plan_photos`.
+        scene: the dataset's.
+        folder: the scene folder that is being made.
+    """
+    stem = without_suffix(plan.image.name)
+    lens = lens_of(plan.camera)
+    notes: list[str] = []
+    full = folder / (f"images_{scene.factor}" if plan.only_small else "images")
+    factor = 1 if plan.only_small else scene.factor
+    pinhole = lens.pinhole
+    if not plan.convert:
+        name = _stored_name(plan)
+        link_file(plan.source, full / name)
+        if factor > 1:
+            if plan.small is not None:
+                link_file(plan.small, folder / f"images_{factor}" / _as(name, plan.small.suffix))
+            else:
+                notes.append(f"downsampled by {factor}")
+                _reduce(read_png_rgb(plan.source), folder / f"images_{factor}" / f"{stem}.png", factor)
+        image = dataclasses.replace(plan.image, name=name)
+        return _placed(scene, plan, image, pinhole, notes)
+    name = f"{stem}.png"
+    wide = scene.max_width is not None and pinhole.width > scene.max_width
+    target = pinhole
+    if wide and scene.max_width is not None:
+        height = max(1, round(pinhole.height * scene.max_width / pinhole.width))
+        target = resized(pinhole, scene.max_width, height)
+        notes.append(f"reduced to {scene.max_width} px")
+    if lens.map_xy is not None:
+        notes.insert(0, "undistorted")
+    if scene.background is not None:
+        notes.insert(0, "put before a background of {}, {}, {}".format(*scene.background))
+    small = folder / f"images_{factor}" / name
+    if not (full / name).is_file() or (factor > 1 and not small.is_file()):
+        pixels = lens.remap(_read(plan.source, scene.background), nearest=False)
+        if wide:
+            pixels = downsample_photo(pixels, target.width, target.height)
+        write_png(full / name, pixels)
+        if factor > 1:
+            _reduce(pixels, small, factor)
+    if factor > 1:
+        notes.append(f"downsampled by {factor}")
+    xys = _points_at(plan, scene, lens)
+    scale = np.array([target.width / pinhole.width, target.height / pinhole.height])
+    image = dataclasses.replace(plan.image, name=name, xys=xys * scale)
+    return _placed(scene, plan, image, target, notes)
+
+
+def _placed(
+    scene: ForeignScene, plan: PhotoPlan, image: ModelImage, camera: ModelCamera, notes: list[str]
+) -> PlacedPhoto:
+    source = plan.source.relative_to(scene.root).as_posix()
+    return PlacedPhoto(image, camera, tuple(notes) or ("linked",), source)
+
+
+def _stored_name(plan: PhotoPlan) -> str:
+    """The photo's name; with the file's extension where that is another one."""
+    return _as(plan.image.name, plan.source.suffix)
+
+
+def _as(name: str, suffix: str) -> str:
+    return name if name.endswith(suffix) else without_suffix(name) + suffix
+
+
+def _points_at(plan: PhotoPlan, scene: ForeignScene, lens: Lens) -> np.ndarray:
+    """[K, 2] px of the model's camera to px of the pinhole camera."""
+    known = scene.model.cameras[plan.image.camera_id]
+    scale = np.array([plan.camera.width / known.width, plan.camera.height / known.height])
+    return lens.undistort_points(plan.image.xys * scale)
+
+
+def _read(path: Path, background: tuple[int, int, int] | None) -> np.ndarray:
+    """[H, W, 3] uint8; alpha is put before the background."""
+    if background is None:
+        return read_png_rgb(path)
+    data = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    if data is None or data.dtype != np.uint8 or data.ndim != 3 or data.shape[2] != 4:
+        return read_png_rgb(path)
+    alpha = data[..., 3:].astype(np.float32) / 255
+    rgb = data[..., 2::-1].astype(np.float32)
+    behind = np.array(background, np.float32) * (1 - alpha)
+    return np.asarray(rgb * alpha + behind + 0.5).astype(np.uint8)
+
+
+def _reduce(pixels: np.ndarray, path: Path, factor: int) -> None:
+    if path.is_file():
+        return
+    width, height = downsampled_size(pixels.shape[1], pixels.shape[0], factor)
+    write_png(path, downsample_photo(pixels, width, height))
+
+
+def place_mask(plan: PhotoPlan, placed: PlacedPhoto, scene: ForeignScene, mask: Path, folder: Path) -> None:
+    """Write the keep mask of a training photo at the size that is trained on.
+
+    Raises:
+        AwError: it has another size than its photo.
+    """
+    target = folder / "masks" / "train" / f"{without_suffix(placed.image.name)}.png"
+    if target.is_file():
+        return
+    pixels = read_gray(mask)
+    height, width = pixels.shape
+    size = file_size(plan.source) or (plan.camera.width, plan.camera.height)
+    final = (placed.camera.width, placed.camera.height)
+    if scene.factor > 1 and not plan.only_small:
+        final = downsampled_size(*final, scene.factor)
+    if (width, height) == size:
+        flat = lens_of(plan.camera).remap(pixels, nearest=True) if plan.convert else pixels
+    elif (width, height) == final and not plan.convert:
+        flat = pixels
+    else:
+        raise AwError(
+            f"{mask} is {width}x{height} but its photo {plan.source.name} {size[0]}x{size[1]}: it is "
+            "the mask "
+            "of another size or photo"
+        )
+    if (flat.shape[1], flat.shape[0]) != final:
+        flat = downsample_mask(flat, *final)
+    write_png(target, np.where(flat >= 128, 255, 0).astype(np.uint8))
+
+
+def link_file(source: Path, target: Path) -> None:
+    """Link `source` at `target` without copying: hard, else symbolic, else a copy."""
+    if target.exists():
+        return
+    target.parent.mkdir(parents=True, exist_ok=True)
+    real = source.resolve()
+    for link in (os.link, os.symlink):
+        try:
+            link(real, target)
+            return
+        except OSError:  # another disk, or a file system without links
+            continue
+    shutil.copyfile(real, target)

@@ -1,0 +1,1 @@
+"""One file a layout: each turns a folder into a `ForeignScene`."""

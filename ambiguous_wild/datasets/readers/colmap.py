@@ -1,0 +1,203 @@
+"""COLMAP models with photos: plain, with lists, and the releases that look like it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path, PurePosixPath
+
+from ambiguous_wild.core.errors import AwError, shortlist
+from ambiguous_wild.core.scene import Split
+from ambiguous_wild.datasets.foreign import SIDES, ForeignScene, inside, split_by_lists
+from ambiguous_wild.io.colmap_model import read_model
+from ambiguous_wild.io.colmap_records import Model
+from ambiguous_wild.io.image_header import header_size
+from ambiguous_wild.io.scene_folder import TEST_EVERY, read_list
+
+LISTS: dict[Split, str] = {"train": "train_list.txt", "test": "test_list.txt"}
+KEYWORDS: dict[str, Split | None] = {"clutter": "train", "extra": "test", "clean": None}
+MODEL_FOLDERS = ("sparse/0", "sparse", "dense/sparse/0", "dense/sparse", "colmap/sparse/0")
+DRONE_WIDTH = 1920  # px; DroneSplat's loader reduces wider photos to it
+_NO_KEEP_MASKS = "are not keep masks of the dataset: left out"
+
+
+def model_folder(root: Path) -> Path | None:
+    """Where the COLMAP model lies; None without one."""
+    for name in MODEL_FOLDERS:
+        folder = root / name
+        if (folder / "cameras.bin").is_file() or (folder / "cameras.txt").is_file():
+            return folder
+    return None
+
+
+def read_named_model(root: Path) -> Model:
+    """The model, its photos' names checked.
+
+    Raises:
+        AwError: no model, a damaged one, or a name that leads out of the folder.
+    """
+    folder = model_folder(root)
+    if folder is None:
+        raise AwError(
+            f"{root} has no COLMAP model in {', '.join(MODEL_FOLDERS[:4])}; build a scene from the photos "
+            "with 'aw build-scene'"
+        )
+    model = read_model(folder)
+    for image in model.images.values():
+        inside(image.name, root)
+    return model
+
+
+def model_names(model: Model) -> list[str]:
+    """Names of the registered photos, sorted."""
+    return sorted(image.name for image in model.images.values())
+
+
+def photo_folder(root: Path) -> Path:
+    """images/, below dense/ where it is there."""
+    for folder in (root / "images", root / "dense" / "images"):
+        if folder.is_dir():
+            return folder
+    return root / "images"  # absent where a release ships downsampled photos alone
+
+
+def shipped_factors(root: Path) -> list[int]:
+    """Factors of the downsampled folders images_N that come with the photos, ascending."""
+    tails = (p.name.removeprefix("images_") for p in root.glob("images_*") if p.is_dir())
+    return sorted(int(t) for t in tails if t.isdigit() and 1 < int(t) <= 64)
+
+
+def read_lists(root: Path) -> dict[Split, list[str]]:
+    """train_list.txt and test_list.txt.
+
+    Raises:
+        AwError: one is missing, empty or unreadable.
+    """
+    found: dict[Split, list[str]] = {}
+    for side in SIDES:
+        path = root / LISTS[side]
+        try:
+            found[side] = read_list(path)
+        except OSError as error:
+            raise AwError(
+                f"{path}: {error.strerror}; both {LISTS['train']} and {LISTS['test']} are needed"
+            ) from error
+        if not found[side]:
+            raise AwError(f"{path} is empty: it must name the {side} photos, one a line")
+    return found
+
+
+def has_lists(root: Path) -> bool:
+    """Whether at least one of the two lists is there."""
+    return any((root / name).is_file() for name in LISTS.values())
+
+
+def read_plain(root: Path) -> ForeignScene:
+    """COLMAP with images: split by lists, else every 8th photo tests."""
+    model = read_named_model(root)
+    names = model_names(model)
+    factors = shipped_factors(root)
+    factor = factors[0] if len(factors) == 1 and not photo_folder(root).is_dir() else 1
+    if has_lists(root):
+        split, missing = split_by_lists(names, read_lists(root), root)
+        return ForeignScene("colmap", root, model, photo_folder(root), split, factor, missing)
+    sides: dict[str, Split] = {n: "train" if i % TEST_EVERY else "test" for i, n in enumerate(names)}
+    note = f"no test set given: every {TEST_EVERY}th photo tests, distractors in it count as truth"
+    return ForeignScene("colmap", root, model, photo_folder(root), sides, factor, notes=(note,))
+
+
+def keyword_sides(names: Iterable[str]) -> dict[str, Split | None]:
+    """Sides by keyword in the file name: clutter trains, extra tests, clean is left out.
+
+    Raises:
+        AwError: a name with no keyword, or with two.
+    """
+    found: dict[str, Split | None] = {}
+    odd = []
+    for name in names:
+        hits = [word for word in KEYWORDS if word in PurePosixPath(name).name.casefold()]
+        if len(hits) == 1:
+            found[name] = KEYWORDS[hits[0]]
+        else:
+            odd.append(f"{name} ({' and '.join(hits) or 'none'})")
+    if odd:
+        raise AwError(
+            f"{len(odd)} photos do not have exactly one of the words {', '.join(KEYWORDS)} in their names: "
+            f"{shortlist(odd, 3)}; rename or remove them, or write train_list.txt and test_list.txt and pass "
+            "--as colmap"
+        )
+    return found
+
+
+def has_keywords(names: Iterable[str]) -> bool:
+    """Whether some names have "clutter" and others "extra"."""
+    bases = [PurePosixPath(n).name.casefold() for n in names]
+    return any("clutter" in b for b in bases) and any("extra" in b for b in bases)
+
+
+def read_robustnerf(root: Path) -> ForeignScene:
+    """RobustNeRF, the SpotLessSplats release and RobustSplat's renamed ones: the split is in the names."""
+    model = read_named_model(root)
+    sides = keyword_sides(model_names(model))
+    split: dict[str, Split] = {name: side for name, side in sides.items() if side is not None}
+    lacking = [side for side in SIDES if side not in split.values()]
+    if lacking:
+        word = {side: word for word, side in KEYWORDS.items() if side}[lacking[0]]
+        raise AwError(f"{root} has no {lacking[0]} photo: no name holds {word!r}; copy all of the release")
+    clean = sum(side is None for side in sides.values())
+    notes = (f"{clean} clean repeats of training views are left out",) if clean else ()
+    factor = _published_factor(root, model)
+    dataset = "" if factor == 1 else "RobustNeRF"
+    return ForeignScene(
+        "robustnerf", root, model, photo_folder(root), split, factor, dataset=dataset, notes=notes
+    )
+
+
+def _published_factor(root: Path, model: Model, factor: int = 8) -> int:
+    """The factor of the papers, or 1 for a release that was downsampled before COLMAP ran."""
+    longest = max(max(c.width, c.height) for c in model.cameras.values())
+    return factor if longest / factor >= 200 or factor in shipped_factors(root) else 1
+
+
+def first_dot(name: str) -> str:
+    """The base name up to its first dot: how DroneSplat compares names."""
+    return PurePosixPath(name).name.partition(".")[0]
+
+
+def read_drone(root: Path) -> ForeignScene:
+    """Drone Imagery of DroneSplat: two lists, names compared up to their first dot, at most 1920 px wide."""
+    model = read_named_model(root)
+    split, missing = split_by_lists(model_names(model), read_lists(root), root, first_dot)
+    notes: tuple[str, ...] = ()
+    if (root / "masks").is_dir():
+        notes = (f"masks/ holds the instances of a segmentation, which {_NO_KEEP_MASKS}",)
+    return ForeignScene(
+        "drone",
+        root,
+        model,
+        photo_folder(root),
+        split,
+        missing=missing,
+        max_width=DRONE_WIDTH,
+        dataset="Drone Imagery",
+        notes=notes,
+    )
+
+
+def read_dualsplat(root: Path) -> ForeignScene:
+    """DualSplat's preparation: lists beside masks and depths of its own, which other methods do not get."""
+    model = read_named_model(root)
+    split, missing = split_by_lists(model_names(model), read_lists(root), root)
+    own = [n for n in ("sam_masks", "pseudo_masks", "depths") if (root / n).is_dir()]
+    notes = (f"{', '.join(own)} are results of a method: left out",)
+    factor = _published_factor(root, model)
+    return ForeignScene("dualsplat", root, model, photo_folder(root), split, factor, missing, notes=notes)
+
+
+def file_size(path: Path) -> tuple[int, int] | None:
+    """(width, height) from the file's header; None where it is no image."""
+    try:
+        with open(path, "rb") as f:
+            # A JPEG may carry previews and colour profiles before its frame.
+            return header_size(f.read(1 << 20))
+    except OSError:
+        return None

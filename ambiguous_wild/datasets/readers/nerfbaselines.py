@@ -1,0 +1,70 @@
+"""NerfBaselines' own folders: nb-info.json names the loader and the evaluation protocol."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from ambiguous_wild.core.errors import AwError, unknown
+from ambiguous_wild.datasets.foreign import Evaluation, ForeignScene, inside, without_suffix
+from ambiguous_wild.datasets.readers.colmap import read_plain
+from ambiguous_wild.datasets.readers.phototourism import NERF_W
+from ambiguous_wild.datasets.readers.transforms import read_blender, read_json, read_transforms
+
+LOADERS = {"colmap": read_plain, "nerfstudio": read_transforms, "blender": read_blender}
+DATASETS = {
+    "phototourism": "Photo Tourism",
+    "nerfonthego": "NeRF On-the-go",
+    "nerfonthego-undistorted": "NeRF On-the-go",
+    "robustnerf": "RobustNeRF",
+}
+PROTOCOLS: dict[str, Evaluation] = {"default": {}, "nerf": {}, "nerfw": NERF_W}
+
+
+def read_nerfbaselines(root: Path) -> ForeignScene:
+    """A folder with nb-info.json.
+
+    Raises:
+        AwError: another loader, protocol or folder than are supported.
+    """
+    path = root / "nb-info.json"
+    info = read_json(path)
+    loader = info.get("loader", "colmap")
+    if loader not in LOADERS:
+        raise unknown(f"loader in {path}", str(loader)[:60], LOADERS)
+    protocol = str(info.get("evaluation_protocol", "default"))
+    if protocol not in PROTOCOLS:
+        raise unknown(f"evaluation_protocol in {path}", protocol[:60], PROTOCOLS)
+    scene = LOADERS[loader](root)
+    options = info.get("loader_kwargs") or {}
+    images = options.get("images_path", "images") if isinstance(options, dict) else "images"
+    factor = _factor(str(images), info.get("downscale_factor"), root, path)
+    masks = {}
+    if (root / "masks").is_dir() and not scene.masks:
+        for name, side in scene.split.items():
+            mask = root / "masks" / f"{without_suffix(name)}.png"
+            if side == "train" and mask.is_file():
+                masks[name] = mask
+    identity = str(info.get("id") or "").lower()
+    return dataclasses.replace(
+        scene,
+        kind="nerfbaselines",
+        factor=factor,
+        masks=scene.masks or masks,
+        dataset=DATASETS.get(identity, scene.dataset),
+        evaluation=PROTOCOLS[protocol],
+    )
+
+
+def _factor(images: str, stated: object, root: Path, path: Path) -> int:
+    """images_8 -> 8; images -> 1."""
+    folder = inside(images, root)
+    tail = folder.removeprefix("images").removeprefix("_")
+    if folder == "images":
+        if isinstance(stated, int) and not isinstance(stated, bool) and stated > 1:
+            # The loader reduces the photos itself.
+            return stated
+        return 1
+    if not tail.isdigit() or not 1 <= int(tail) <= 64:
+        raise AwError(f"{path}: images_path {images[:60]!r} is not supported: images or images_N is")
+    return int(tail)

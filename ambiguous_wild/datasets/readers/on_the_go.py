@@ -1,0 +1,141 @@
+"""NeRF On-the-go: split.json counts frames of transforms.json sorted by name; also undistorted copies."""
+
+from __future__ import annotations
+
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from ambiguous_wild.core.errors import AwError, shortlist
+from ambiguous_wild.core.scene import Split
+from ambiguous_wild.datasets.foreign import ForeignScene, split_by_lists
+from ambiguous_wild.datasets.readers.colmap import (
+    model_folder,
+    model_names,
+    photo_folder,
+    read_lists,
+    read_named_model,
+    shipped_factors,
+)
+from ambiguous_wild.datasets.readers.transforms import frame_name, frames_of, read_frames, read_json
+
+DATASET = "NeRF On-the-go"
+FACTOR, LOW_FACTOR = 8, 4
+LOW_RESOLUTION = ("patio", "arcdetriomphe")  # 1920x1080 sources, published at factor 4
+# Of the twelve, those with undistorted copies: other names are common words.
+SCENES = ("mountain", "fountain", "corner", "patio", "spot", "patio_high", "arcdetriomphe")
+
+
+def plain(name: str) -> str:
+    """A scene's name without what its spellings differ in: Patio-High, patio_high."""
+    return "".join(c for c in name.casefold() if c.isalnum())
+
+
+def is_scene_name(name: str) -> bool:
+    """Whether it is a scene of On-the-go, in any spelling."""
+    return plain(name) in {plain(s) for s in SCENES}
+
+
+def published_factor(root: Path) -> int:
+    """4 for patio and arcdetriomphe, 8 for all others; what a release ships goes before it."""
+    shipped = shipped_factors(root)
+    if len(shipped) == 1:
+        return shipped[0]
+    return LOW_FACTOR if plain(root.resolve().name) in LOW_RESOLUTION else FACTOR
+
+
+def read_split(path: Path, count: int) -> dict[str, list[int]]:
+    """split.json: lists of positions in the sorted frames.
+
+    Raises:
+        AwError: damaged, without clutter or extra, or positions that the frames do not have.
+    """
+    data = read_json(path)
+    found: dict[str, list[int]] = {}
+    for key in ("clutter", "extra", "clean"):
+        rows: Any = data.get(key, [])
+        if not isinstance(rows, list) or not all(
+            isinstance(i, int) and not isinstance(i, bool) for i in rows
+        ):
+            raise AwError(f"{path}: {key!r} is no list of whole numbers")
+        found[key] = rows
+    for key in ("clutter", "extra"):
+        if not found[key]:
+            raise AwError(f"{path} has no {key!r}: clutter trains and extra tests")
+    largest = max(max(found["clutter"]), max(found["extra"]))
+    if largest >= count or min(min(found["clutter"]), min(found["extra"])) < 0:
+        raise AwError(
+            f"{path} counts up to {largest}, but transforms.json has {count} frames: they belong to "
+            "two scenes"
+        )
+    both = sorted(set(found["clutter"]) & set(found["extra"]))
+    if both:
+        raise AwError(f"{path}: position {both[0]} is in clutter and in extra")
+    return found
+
+
+def read_on_the_go(root: Path) -> ForeignScene:
+    """The original release, with or without a COLMAP model of one's own, or an undistorted copy."""
+    if not (root / "split.json").is_file():
+        return _undistorted(root)
+    path = root / "transforms.json"
+    if not path.is_file():
+        raise AwError(
+            f"{root} has split.json without transforms.json, whose sorted frames its numbers count; "
+            "copy it too"
+        )
+    data = read_json(path)
+    names = sorted(
+        (PurePosixPath(frame_name(f, root)) for f in frames_of(data, path)), key=lambda p: (p.name, str(p))
+    )
+    positions = read_split(root / "split.json", len(names))
+    listed: dict[Split, list[str]] = {
+        "train": [names[i].name for i in positions["clutter"]],
+        "test": [names[i].name for i in positions["extra"]],
+    }
+    notes = [f"{len(positions['clean'])} clean photos are left out"] if positions["clean"] else []
+    if model_folder(root) is not None:
+        model, folder = read_named_model(root), photo_folder(root)
+        notes.append("poses from the COLMAP model in the folder, names from transforms.json")
+        source = "model"
+    else:
+        model, folder, _ = read_frames(root, path, data)
+        notes.append("poses from transforms.json; the release has no points, so they are triangulated")
+        source = "triangulate"
+    split, missing = split_by_lists(model_names(model), listed, root / "split.json")
+    return ForeignScene(
+        "on-the-go",
+        root,
+        model,
+        folder,
+        split,
+        published_factor(root),
+        missing,
+        dataset=DATASET,
+        notes=tuple(notes),
+        points=source,  # type: ignore[arg-type]
+    )
+
+
+def _undistorted(root: Path) -> ForeignScene:
+    model = read_named_model(root)
+    odd = sorted({c.model for c in model.cameras.values()} - {"PINHOLE", "SIMPLE_PINHOLE"})
+    split, missing = split_by_lists(model_names(model), read_lists(root), root)
+    notes = (f"cameras are {shortlist(odd)}: undistorted here",) if odd else ()
+    return ForeignScene(
+        "on-the-go",
+        root,
+        model,
+        photo_folder(root),
+        split,
+        _undistorted_factor(root, model),
+        missing,
+        dataset=DATASET,
+        notes=notes,
+    )
+
+
+def _undistorted_factor(root: Path, model: Any) -> int:
+    """As shipped; 1 for copies that were reduced before (504 px), else as published."""
+    longest = max(max(c.width, c.height) for c in model.cameras.values())
+    factor = published_factor(root)
+    return factor if shipped_factors(root) or longest / factor >= 200 else 1

@@ -1,0 +1,112 @@
+"""Photo Tourism with NeRF-W's split: dense/, a table of names, half of each test photo is fitted."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path, PurePosixPath
+
+from ambiguous_wild.core.errors import AwError, shortlist
+from ambiguous_wild.core.scene import Split
+from ambiguous_wild.datasets.foreign import Evaluation, ForeignScene, split_by_lists
+from ambiguous_wild.datasets.readers.colmap import (
+    has_lists,
+    model_names,
+    photo_folder,
+    read_lists,
+    read_named_model,
+)
+
+COLUMNS = ("filename", "id", "split", "dataset")
+NERF_W: Evaluation = {
+    "protocol": "half",
+    "effects": ["appearance"],
+    "source": "NeRF-W: colour is fitted on the left half of a test photo, the right half is measured",
+}
+_LARGEST = 10_000_000  # bytes; the published tables have under 200 kB
+LEAST_SHARE = 0.5  # of the table's photos in the model; below, the table is of another scene
+
+
+def find_table(root: Path) -> Path | None:
+    """The scene's .tsv; None without one.
+
+    Raises:
+        AwError: there are several.
+    """
+    found = sorted(root.glob("*.tsv"))
+    if len(found) > 1:
+        raise AwError(
+            f"{root} has {len(found)} tables: {shortlist(p.name for p in found)}; keep the scene's own"
+        )
+    return found[0] if found else None
+
+
+def read_table(path: Path) -> dict[Split, list[str]]:
+    """Names by side of the rows with an id. The ids themselves are wrong in the published tables.
+
+    Raises:
+        AwError: unreadable, without the columns, or with an unknown side.
+    """
+    try:
+        if path.stat().st_size > _LARGEST:
+            raise AwError(f"{path} is larger than {_LARGEST // 10**6} MB: no table of photos")
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise AwError(
+            f"cannot read {path}: {getattr(error, 'strerror', None) or 'it is not UTF-8'}"
+        ) from error
+    try:
+        rows = list(csv.DictReader(text.splitlines(), delimiter="\t"))
+    except csv.Error as error:
+        raise AwError(f"{path} is no table: {error}") from error
+    lacking = [c for c in COLUMNS[:3] if not rows or c not in rows[0]]
+    if lacking:
+        raise AwError(f"{path} lacks the columns {', '.join(lacking)}; it must have {', '.join(COLUMNS)}")
+    found: dict[Split, list[str]] = {"train": [], "test": []}
+    for number, row in enumerate(rows, start=2):
+        side, name = (row["split"] or "").strip(), (row["filename"] or "").strip()
+        if not (row["id"] or "").strip():
+            continue
+        if side not in found or not name:
+            raise AwError(f"{path}, line {number}: side {side!r} of {name!r} is neither train nor test")
+        found[side].append(name)
+    return found
+
+
+def read_phototourism(root: Path) -> ForeignScene:
+    """dense/images, dense/sparse and <name>.tsv, or the published lists."""
+    model = read_named_model(root)
+    names = model_names(model)
+    table = find_table(root)
+    if table is not None:
+        listed = read_table(table)
+    elif has_lists(root):
+        listed = read_lists(root)
+    else:
+        raise AwError(
+            f"{root} has no split: neither <name>.tsv nor train_list.txt and test_list.txt; copy the .tsv of "
+            "NeRF-W's split into it"
+        )
+    where = table or root
+    total = sum(len(v) for v in listed.values())
+    bases = {PurePosixPath(n).name for n in names}
+    known = sum(PurePosixPath(n).name in bases for v in listed.values() for n in v)
+    if total and known < LEAST_SHARE * total and table is not None:
+        raise AwError(
+            f"{table} names {total} photos, {known} of them are in the model of {len(names)}: it is "
+            "the table "
+            "of another scene"
+        )
+    split, missing = split_by_lists(names, listed, where)
+    unlisted = len(names) - len(split)
+    notes = (f"{unlisted} photos of the model are in no list: left out",) if unlisted else ()
+    return ForeignScene(
+        "photo-tourism",
+        root,
+        model,
+        photo_folder(root),
+        split,
+        missing=missing,
+        dataset="Photo Tourism",
+        evaluation=NERF_W,
+        notes=notes,
+    )

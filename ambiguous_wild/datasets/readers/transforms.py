@@ -1,0 +1,282 @@
+"""transforms.json of nerfstudio and instant-ngp, and Blender's transforms_train.json."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from ambiguous_wild.core.errors import AwError, shortlist
+from ambiguous_wild.core.scene import Split
+from ambiguous_wild.datasets.foreign import (
+    ForeignScene,
+    find_photo,
+    inside,
+    no_points,
+    points_without_tracks,
+    pose_from_opengl,
+    quaternion_from_rotation,
+    split_by_lists,
+)
+from ambiguous_wild.datasets.points import read_point_ply
+from ambiguous_wild.datasets.readers.colmap import file_size, has_lists, read_lists
+from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage
+from ambiguous_wild.io.scene_folder import TEST_EVERY
+
+_LARGEST = 100_000_000  # bytes
+_LENS = ("k1", "k2", "p1", "p2")
+WHITE = (255, 255, 255)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON file that holds a mapping.
+
+    Raises:
+        AwError: unreadable, too large, or something else.
+    """
+    try:
+        if path.stat().st_size > _LARGEST:
+            raise AwError(f"{path} is larger than {_LARGEST // 10**6} MB")
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise AwError(f"cannot read {path}: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise AwError(f"{path} is no JSON ({error}); copy it again") from error
+    if not isinstance(data, dict):
+        raise AwError(f"{path} holds no mapping; copy it again")
+    return data
+
+
+def frames_of(data: Mapping[str, Any], path: Path) -> list[dict[str, Any]]:
+    """The frames, each with a file and a matrix.
+
+    Raises:
+        AwError: there are none, or one lacks either.
+    """
+    frames = data.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise AwError(f"{path} has no frames")
+    for number, frame in enumerate(frames):
+        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
+            raise AwError(f"{path}: frame {number} has no file_path")
+        if "transform_matrix" not in frame:
+            raise AwError(f"{path}: frame {number} ({frame['file_path'][:60]}) has no transform_matrix")
+    return frames
+
+
+def frame_name(frame: Mapping[str, Any], root: Path) -> str:
+    """The frame's path relative to the scene, without a leading "./"."""
+    return inside(str(frame["file_path"]).replace("\\", "/"), root)
+
+
+def _number(values: Mapping[str, Any], key: str, path: Path) -> float | None:
+    value = values.get(key)
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise AwError(f"{path}: {key} is {str(value)[:40]!r}, not a number")
+    return float(value)
+
+
+def frame_camera(
+    number: int, frame: Mapping[str, Any], data: Mapping[str, Any], photo: Path, path: Path
+) -> ModelCamera:
+    """The camera of a frame: its own values before the file's common ones, else the field of view.
+
+    Raises:
+        AwError: no focal length, no size, or a camera model that is not supported.
+    """
+    both = {**data, **frame}
+
+    def value(key: str) -> float | None:
+        return _number(both, key, path)
+
+    width, height = value("w"), value("h")
+    if width is None or height is None:
+        size = file_size(photo)
+        if size is None:
+            raise AwError(f"{path} states no w and h, and {photo} is absent or no image")
+        width, height = map(float, size)
+    fx, fy = value("fl_x"), value("fl_y")
+    angle_x, angle_y = value("camera_angle_x"), value("camera_angle_y")
+    if fx is None and angle_x is not None and 0 < angle_x < math.pi:
+        fx = 0.5 * width / math.tan(0.5 * angle_x)
+    if fy is None and angle_y is not None and 0 < angle_y < math.pi:
+        fy = 0.5 * height / math.tan(0.5 * angle_y)
+    if fx is None and fy is None:
+        raise AwError(f"{path} states neither fl_x nor camera_angle_x: the focal length is unknown")
+    fx, fy = fx or fy or 0.0, fy or fx or 0.0
+    cx, cy = value("cx"), value("cy")
+    cx, cy = (width / 2 if cx is None else cx), (height / 2 if cy is None else cy)
+    lens = [value(k) or 0.0 for k in _LENS]
+    third = [value(k) or 0.0 for k in ("k3", "k4")]
+    model = str(both.get("camera_model", "OPENCV")).upper()
+    fisheye = model == "OPENCV_FISHEYE" or bool(both.get("is_fisheye"))
+    if model not in (
+        "OPENCV",
+        "OPENCV_FISHEYE",
+        "PINHOLE",
+        "SIMPLE_PINHOLE",
+        "SIMPLE_RADIAL",
+        "RADIAL",
+        "PERSPECTIVE",
+    ):
+        raise AwError(
+            f"{path}: camera_model {model[:40]!r} is not supported; undistort the photos to PINHOLE"
+        )
+    size_px = (round(width), round(height))
+    if fisheye:
+        return ModelCamera(number, "OPENCV_FISHEYE", *size_px, (fx, fy, cx, cy, lens[0], lens[1], *third))
+    if any(third):
+        params = (fx, fy, cx, cy, *lens, third[0], 0.0, 0.0, 0.0)
+        return ModelCamera(number, "FULL_OPENCV", *size_px, params)
+    if any(lens):
+        return ModelCamera(number, "OPENCV", *size_px, (fx, fy, cx, cy, *lens))
+    return ModelCamera(number, "PINHOLE", *size_px, (fx, fy, cx, cy))
+
+
+def model_of_frames(frames: Sequence[tuple[str, Mapping[str, Any], ModelCamera]]) -> Model:
+    """A model without points; equal cameras are one."""
+    cameras: dict[tuple[Any, ...], ModelCamera] = {}
+    images: dict[int, ModelImage] = {}
+    for number, (name, frame, camera) in enumerate(sorted(frames, key=lambda f: f[0]), start=1):
+        key = (camera.model, camera.width, camera.height, camera.params)
+        known = cameras.setdefault(
+            key, ModelCamera(len(cameras) + 1, camera.model, camera.width, camera.height, camera.params)
+        )
+        try:
+            pose = pose_from_opengl(np.array(frame["transform_matrix"], dtype=np.float64))
+        except (ValueError, TypeError) as error:
+            raise AwError(f"{name}: its transform_matrix is not [4, 4] numbers") from error
+        except AwError as error:
+            raise AwError(f"{name}: {error}") from None
+        images[number] = ModelImage(
+            number,
+            quaternion_from_rotation(pose[:3, :3]),
+            pose[:3, 3],
+            known.camera_id,
+            name,
+            np.zeros((0, 2)),
+            np.zeros(0, np.int64),
+        )
+    return Model({c.camera_id: c for c in cameras.values()}, images, no_points())
+
+
+def read_frames(
+    root: Path, path: Path, data: Mapping[str, Any]
+) -> tuple[Model, Path, dict[str, Mapping[str, Any]]]:
+    """The model of a transforms file, the folder of its photos, and the frames by the model's names.
+
+    Raises:
+        AwError: damaged, or two frames of one photo.
+    """
+    found: dict[str, Mapping[str, Any]] = {}
+    for frame in frames_of(data, path):
+        name = frame_name(frame, root)
+        photo = find_photo(root, name)
+        name = photo.relative_to(root).as_posix() if photo is not None else name
+        if name in found:
+            raise AwError(f"{path}: {name!r} is there twice; keep one frame of it")
+        found[name] = frame
+    tops = {PurePosixPath(n).parts[0] if len(PurePosixPath(n).parts) > 1 else "" for n in found}
+    # A photo's name is relative to the one folder that holds all of them.
+    top = tops.pop() if len(tops) == 1 else ""
+    folder = root / top if top else root
+    named = {name[len(top) + 1 :] if top else name: frame for name, frame in found.items()}
+    rows = [(n, f, frame_camera(1, f, data, folder / n, path)) for n, f in named.items()]
+    return model_of_frames(rows), folder, named
+
+
+def read_transforms(root: Path) -> ForeignScene:
+    """transforms.json of nerfstudio or instant-ngp."""
+    path = root / "transforms.json"
+    data = read_json(path)
+    model, folder, named = read_frames(root, path, data)
+    names = sorted(named)
+    missing: dict[Split, list[str]] = {}
+    notes: list[str] = []
+    if any(isinstance(data.get(f"{side}_filenames"), list) for side in ("train", "val", "test")):
+        listed = _listed(data, path, root, folder)
+        split, missing = split_by_lists(names, listed, path)
+    elif has_lists(root):
+        split, missing = split_by_lists(names, read_lists(root), root)
+    else:
+        split = {n: "train" if i % TEST_EVERY else "test" for i, n in enumerate(names)}
+        notes.append(f"no test set given: every {TEST_EVERY}th photo tests, distractors in it count as truth")
+    masks = _masks(named, split, root)
+    points = data.get("ply_file_path")
+    studio = isinstance(points, str) or "camera_model" in data or "applied_transform" in data
+    kind = "nerfstudio" if studio else "instant-ngp"
+    if isinstance(points, str):
+        xyz, rgb = read_point_ply(root / inside(points, root))
+        model = Model(model.cameras, model.images, points_without_tracks(xyz, rgb))
+        notes.append(f"points from {points}, without the photos that see them")
+    return ForeignScene(
+        kind,
+        root,
+        model,
+        folder,
+        split,
+        missing=missing,
+        masks=masks,
+        notes=tuple(notes),
+        points="model" if len(model.points.ids) else "triangulate",
+    )
+
+
+def _listed(data: Mapping[str, Any], path: Path, root: Path, folder: Path) -> dict[Split, list[str]]:
+    """nerfstudio's own lists; validation photos test where no others do."""
+    lists: dict[str, list[str]] = {}
+    prefix = "" if folder == root else folder.relative_to(root).as_posix() + "/"
+    for side in ("train", "val", "test"):
+        names = data.get(f"{side}_filenames", [])
+        if not isinstance(names, list) or not all(isinstance(n, str) for n in names):
+            raise AwError(f"{path}: {side}_filenames is no list of names")
+        lists[side] = [inside(n, root).removeprefix(prefix) for n in names]
+    return {"train": lists["train"], "test": lists["test"] or lists["val"]}
+
+
+def _masks(named: Mapping[str, Mapping[str, Any]], split: Mapping[str, Split], root: Path) -> dict[str, Path]:
+    """nerfstudio's masks of training photos: black is ignored, so they are keep masks."""
+    found = {}
+    for name, frame in named.items():
+        mask = frame.get("mask_path")
+        if isinstance(mask, str) and split.get(name) == "train":
+            found[name] = root / inside(mask, root)
+    absent = [str(p) for p in found.values() if not p.is_file()]
+    if absent:
+        raise AwError(f"{len(absent)} masks of {root / 'transforms.json'} are absent: {shortlist(absent, 3)}")
+    return found
+
+
+def read_blender(root: Path) -> ForeignScene:
+    """Blender scenes of NeRF: transforms_train.json and transforms_test.json, RGBA photos before white."""
+    rows, split = [], {}
+    for side in ("train", "test"):
+        path = root / f"transforms_{side}.json"
+        data = read_json(path)
+        for frame in frames_of(data, path):
+            name = frame_name(frame, root)
+            photo = find_photo(root, name)
+            if photo is None:
+                raise AwError(f"{path} names {name}, which is absent; copy all of the scene")
+            name = photo.relative_to(root).as_posix()
+            if name in split:
+                raise AwError(f"{path}: {name!r} is there twice, or on both sides")
+            rows.append((name, frame, frame_camera(1, frame, data, photo, path)))
+            split[name] = side
+    note = "photos with alpha are put before white; initial points are random, as there is no model"
+    return ForeignScene(
+        "blender",
+        root,
+        model_of_frames(rows),
+        root,
+        split,  # type: ignore[arg-type]
+        background=WHITE,
+        points="random",
+        notes=(note,),
+    )

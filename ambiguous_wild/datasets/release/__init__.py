@@ -1,0 +1,1 @@
+"""Scenes packed for release, and the check of such a package."""

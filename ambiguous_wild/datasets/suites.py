@@ -1,0 +1,147 @@
+"""Suites: the scenes of a published table, where they lie in a folder, and how they are measured."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
+
+from ambiguous_wild.core.errors import AwError, shortlist, unknown
+from ambiguous_wild.datasets.readers.on_the_go import plain
+from ambiguous_wild.io.plain_yaml import read_mapping
+
+FILE = Path(__file__).with_name("suites.yaml")
+SLACK = 0.1  # undistorting crops a photo by less than this
+
+
+@dataclass(frozen=True)
+class Suite:
+    """One dataset's table."""
+
+    name: str
+    dataset: str  # as the tables call it
+    tables: dict[str, list[str]]  # which table has which scenes
+    aliases: dict[str, list[str]]  # scene -> other spellings
+    factor: int  # 0 = as published, by scene
+    iterations: int
+    protocol: Literal["full", "half"]
+    license: str
+    width: int = 0  # px, longer side of the photos; 0 = not stated
+    height: int = 0
+
+    @property
+    def scenes(self) -> list[str]:
+        """All scenes, in the order of the tables."""
+        return list(dict.fromkeys(scene for names in self.tables.values() for scene in names))
+
+    def spellings(self, scene: str) -> set[str]:
+        """Folder names of a scene, plain."""
+        return {plain(scene), *(plain(other) for other in self.aliases.get(scene, ()))}
+
+
+def scene_id(scene: str) -> str:
+    """The scene's name in runs: "Patio-High" -> "patio-high"."""
+    return "-".join(scene.casefold().replace("-", " ").split())
+
+
+@cache
+def suites() -> dict[str, Suite]:
+    """By name."""
+    rows: list[dict[str, Any]] = read_mapping(FILE)["suites"]
+    return {row["name"]: Suite(**row) for row in rows}
+
+
+def get_suite(name: str) -> Suite:
+    """The suite of that name.
+
+    Raises:
+        AwError: there is none.
+    """
+    if name not in suites():
+        raise unknown("suite", name, suites())
+    return suites()[name]
+
+
+def find_scenes(suite: Suite, root: Path) -> tuple[dict[str, Path], list[str]]:
+    """Folders of the suite's scenes, directly in `root` or one folder deeper; and the scenes that are absent.
+
+    Raises:
+        AwError: no folder, no scene of the suite, or two folders of one scene.
+    """
+    if not root.is_dir():
+        raise AwError(f"--root {root} is no folder")
+    inner = [p for p in sorted(root.iterdir()) if p.is_dir() and not p.name.startswith(".")]
+    folders = inner + [q for p in inner for q in sorted(p.iterdir()) if q.is_dir()]
+    found: dict[str, Path] = {}
+    for scene in suite.scenes:
+        spellings = suite.spellings(scene)
+        for level in (inner, folders):
+            fits = [p for p in level if plain(p.name) in spellings and _is_scene(p)]
+            if len(fits) > 1:
+                raise AwError(
+                    f"{root} has {len(fits)} folders of the scene {scene}: "
+                    f"{shortlist(map(str, fits))}; keep one"
+                )
+            if fits:
+                found[scene] = fits[0]
+                break
+    absent = [scene for scene in suite.scenes if scene not in found]
+    if not found:
+        raise AwError(
+            f"{root} has no scene of {suite.name}: a folder a scene is needed, called "
+            f"{shortlist(suite.scenes)}"
+        )
+    return found, absent
+
+
+def _is_scene(folder: Path) -> bool:
+    """Whether it holds more than photos: images/ of a scene called "train" is none."""
+    names = (
+        "scene.json",
+        "sparse",
+        "dense",
+        "transforms.json",
+        "transforms_train.json",
+        "nb-info.json",
+        "colmap",
+    )
+    return any((folder / name).exists() for name in names)
+
+
+def suite_of(dataset: str, folder: Path) -> Suite | None:
+    """The suite of a dataset's name, or of the folder that the scene's folder lies in."""
+    for suite in suites().values():
+        own = plain(suite.dataset)
+        if plain(dataset) == own or (not dataset and plain(folder.parent.name) == own):
+            return suite
+    return None
+
+
+def differences(suite: Suite, scene: str, sizes: Sequence[tuple[int, int]], factor: int) -> list[str]:
+    """How a copy differs from what the suite states.
+
+    Args:
+        suite: the suite.
+        scene: the folder's name.
+        sizes: (width, height) of the cameras, px, at full size.
+        factor: downsampling of the copy.
+    """
+    found = []
+    if not any(plain(scene) in suite.spellings(name) for name in suite.scenes):
+        found.append(f"{suite.dataset} has no scene {scene!r}; it has {shortlist(suite.scenes, 20)}")
+    if suite.factor and factor != suite.factor:
+        found.append(f"factor {factor}; {suite.dataset} is measured at {suite.factor}")
+    if suite.width:
+        longer, shorter = max(suite.width, suite.height), min(suite.width, suite.height)
+        odd = [
+            f"{w}x{h}"
+            for w, h in sizes
+            if not (1 - SLACK) * longer <= max(w, h) <= longer
+            or not (1 - SLACK) * shorter <= min(w, h) <= shorter
+        ]
+        if odd:
+            names = shortlist(dict.fromkeys(odd), 3)
+            found.append(f"photos of {names} px; {suite.dataset} has {suite.width}x{suite.height}")
+    return found

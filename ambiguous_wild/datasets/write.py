@@ -1,0 +1,319 @@
+"""Write a dataset's scene as a scene folder: `aw import`."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import shutil
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ambiguous_wild.builder.package import list_files, nerfbaselines_info
+from ambiguous_wild.builder.progress import Bar
+from ambiguous_wild.builder.report import point_checks
+from ambiguous_wild.builder.versions import versions
+from ambiguous_wild.builder.workspace import build_lock, content_key
+from ambiguous_wild.core.errors import AwError, counted, shortlist
+from ambiguous_wild.core.names import check_name
+from ambiguous_wild.datasets.foreign import SIDES, ForeignScene
+from ambiguous_wild.datasets.photos import PhotoPlan, PlacedPhoto, place_mask, place_photo, plan_photos
+from ambiguous_wild.datasets.points import drop_test_only, random_points, triangulate
+from ambiguous_wild.datasets.recognise import read_foreign
+from ambiguous_wild.datasets.suites import differences, suite_of
+from ambiguous_wild.io import colmap_binary
+from ambiguous_wild.io.atomic import check_output, write_json, write_text
+from ambiguous_wild.io.colmap_records import Model
+from ambiguous_wild.io.foreign_files import refuse_foreign_files
+from ambiguous_wild.io.scene_folder import SCENE_SCHEMA, read_scene_json, verify_files
+
+
+@dataclass(frozen=True)
+class ImportSettings:
+    """Settings of `import_scene`."""
+
+    kind: str | None = None  # the layout; None = recognised
+    factor: int | None = None  # downsampling; None = as published
+    name: str = ""  # of the scene; empty = the output folder's
+    license: str = ""  # of the photos
+    dataset: str = ""  # as result tables call it; empty = the layout's
+    drop_test_only_points: bool = False  # points that no training photo sees leak the test photos
+    seed: int = 0  # of matching and of random points
+
+
+@dataclass(frozen=True)
+class ImportResult:
+    """A finished import."""
+
+    scene: Path
+    info: dict[str, Any]  # scene.json
+    why: str  # the evidence for the layout
+    up_to_date: bool
+
+
+def import_scene(
+    source: Path | str,
+    output: Path | str,
+    settings: ImportSettings | None = None,
+    *,
+    overwrite: bool = False,
+    jobs: int | None = None,
+    progress: bool = False,
+) -> ImportResult:
+    """Make a scene folder from a scene of a public dataset, in the layout it was published in.
+
+    Photos are linked unless they must be undistorted or reduced; the dataset is not changed. After a kill
+    the same call goes on with the photos that are left. The output appears complete or not at all.
+
+    Args:
+        source: the folder of one scene.
+        output: the scene folder.
+        settings: see `ImportSettings`.
+        overwrite: replace a scene that was imported from other files or with other settings.
+        jobs: threads; None: one per core. The result does not depend on it.
+        progress: show bars on standard error.
+
+    Raises:
+        AwError: an unknown layout, or a dataset whose files contradict each other.
+    """
+    settings = settings or ImportSettings()
+    root, target = Path(source).resolve(), Path(os.path.abspath(output))
+    if settings.factor is not None and not 1 <= settings.factor <= 64:
+        raise AwError(f"--factor must be between 1 and 64, got {settings.factor}")
+    name = check_name("scene name", settings.name or target.name)
+    if target.resolve().is_relative_to(root) or root.is_relative_to(target.resolve()):
+        raise AwError(
+            f"{target} and the dataset {root} lie inside each other; choose a folder outside for -o"
+        )
+    foreign, why = read_foreign(root, settings.kind)
+    if settings.factor is not None:
+        foreign = dataclasses.replace(foreign, factor=settings.factor)
+    plans = plan_photos(foreign)
+    key = _key(foreign, plans, settings, name)
+    check_output(target)
+    with build_lock(target):
+        known = _existing(target, key, overwrite)
+        if known is not None:
+            return ImportResult(target, known, why, True)
+        work = target.parent / f".{target.name}.import-{key[:16]}"
+        bar = Bar(progress)
+        try:
+            _fill(work, foreign, plans, settings, name, key, jobs or os.cpu_count() or 1, bar)
+        except AwError:
+            shutil.rmtree(work, ignore_errors=True)
+            raise
+        finally:
+            bar.finish()
+        if target.exists():
+            old = target.parent / f".{target.name}.old-{time.time_ns()}"
+            os.replace(target, old)
+            os.replace(work / "scene", target)
+            shutil.rmtree(old)
+        else:
+            os.replace(work / "scene", target)
+        for left in target.parent.glob(f".{target.name}.import-*"):
+            shutil.rmtree(left, ignore_errors=True)
+    info = json.loads((target / "scene.json").read_text(encoding="utf-8"))
+    return ImportResult(target, info, why, False)
+
+
+def _key(foreign: ForeignScene, plans: list[PhotoPlan], settings: ImportSettings, name: str) -> str:
+    """Hash of what the result follows from; photos by name, size and time, as their hashes take long."""
+    model = foreign.model
+    files = [p.source for p in plans] + [p.small for p in plans if p.small] + list(foreign.masks.values())
+    states = [[str(f), f.stat().st_size, f.stat().st_mtime_ns] for f in files if f.exists()]
+    cameras = [[c.model, c.width, c.height, *c.params] for c in model.cameras.values()]
+    poses = [[i.name, *i.qvec.tolist(), *i.tvec.tolist()] for i in model.images.values()]
+    split = sorted(foreign.split.items())
+    kept = dataclasses.asdict(settings) | {"factor": foreign.factor, "name": name, "kind": foreign.kind}
+    points = [len(model.points.ids), float(model.points.xyz.sum()), foreign.points]
+    return content_key(versions(), states, cameras, poses, split, kept, points)
+
+
+def _existing(target: Path, key: str, overwrite: bool) -> dict[str, Any] | None:
+    if not target.exists() or (target.is_dir() and not any(target.iterdir())):
+        return None
+    info = read_scene_json(target) if target.is_dir() else None
+    if info is None:
+        raise AwError(f"{target} exists and is no scene of 'aw import'; choose another -o")
+    if info.get("build_key") == key:
+        verify_files(target, info, quick=True)
+        return dict(info)
+    if not overwrite:
+        raise AwError(
+            f"{target} exists, from other files or settings; pass --overwrite to replace it, or "
+            "choose another -o"
+        )
+    refuse_foreign_files(target, {"scene.json", *info.get("files", {})})
+    return None
+
+
+def _fill(
+    work: Path,
+    foreign: ForeignScene,
+    plans: list[PhotoPlan],
+    settings: ImportSettings,
+    name: str,
+    key: str,
+    jobs: int,
+    bar: Bar,
+) -> None:
+    begun = time.perf_counter()
+    folder = work / "scene"
+    folder.mkdir(parents=True, exist_ok=True)
+    notes = list(foreign.notes)
+    model = _with_points(work, foreign, settings, jobs, bar, notes)
+    foreign = dataclasses.replace(foreign, model=model)
+    by_name = {image.name: image for image in model.images.values()}
+    plans = [dataclasses.replace(plan, image=by_name[plan.image.name]) for plan in plans]
+    dropped = 0
+    if settings.drop_test_only_points:
+        model, dropped = drop_test_only(model, foreign.split)
+        by_name = {image.name: image for image in model.images.values()}
+        plans = [dataclasses.replace(plan, image=by_name[plan.image.name]) for plan in plans]
+        notes.append(f"{dropped} points that no training photo sees are dropped")
+    bar.start("photos", len(plans))
+
+    def one(plan: PhotoPlan) -> PlacedPhoto:
+        placed = place_photo(plan, foreign, folder)
+        mask = foreign.masks.get(plan.image.name)
+        if mask is not None:
+            place_mask(plan, placed, foreign, mask, folder)
+        bar.step()
+        return placed
+
+    with ThreadPoolExecutor(jobs) as pool:
+        placed = list(pool.map(one, plans))
+    bar.finish()
+    sides = {p.image.name: foreign.split[plan.image.name] for plan, p in zip(plans, placed)}
+    scene_model = _write_model(folder, model, placed)
+    for side in SIDES:
+        lines = sorted(n for n, s in sides.items() if s == side)
+        write_text(folder / f"{side}_list.txt", "".join(f"{n}\n" for n in lines))
+    info = nerfbaselines_info(foreign.factor, name)
+    if foreign.evaluation.get("protocol") == "half":
+        info["evaluation_protocol"] = "nerfw"
+    write_json(folder / "nb-info.json", info)
+    record = _record(foreign, settings, name, sides, scene_model, placed, notes, key)
+    record["files"] = list_files(folder, jobs)
+    record["seconds"] = {"import": round(time.perf_counter() - begun, 3)}
+    write_json(folder / "scene.json", record)
+
+
+def _with_points(
+    work: Path, foreign: ForeignScene, settings: ImportSettings, jobs: int, bar: Bar, notes: list[str]
+) -> Model:
+    model = foreign.model
+    if foreign.points == "triangulate":
+        scratch = work / "points"
+        shutil.rmtree(scratch, ignore_errors=True)
+        model = triangulate(
+            scratch, model, foreign.photos, foreign.split, seed=settings.seed, jobs=jobs, bar=bar
+        )
+        if not len(model.points.ids):
+            notes.append("too few points could be triangulated: initial points are random")
+    if not len(model.points.ids):
+        points = random_points(model, foreign.split, blender=foreign.points == "random", seed=settings.seed)
+        model = Model(model.cameras, model.images, points)
+    return model
+
+
+def _write_model(folder: Path, model: Model, placed: list[PlacedPhoto]) -> Model:
+    """Write sparse/0 with the placed photos; cameras that stayed equal keep their number."""
+    cameras: dict[int, Any] = {}
+    images = {}
+    taken: dict[tuple[Any, ...], int] = {}
+    for photo in placed:
+        camera = photo.camera
+        same = (camera.camera_id, camera.width, camera.height, camera.params)
+        if same not in taken:
+            number = camera.camera_id
+            while number in cameras:  # one camera whose photos have several sizes
+                number = max(max(cameras), max(model.cameras)) + 1
+            taken[same] = number
+            cameras[number] = dataclasses.replace(camera, camera_id=number)
+        images[photo.image.image_id] = dataclasses.replace(photo.image, camera_id=taken[same])
+    points = _without_absent(model, set(images))
+    sparse = folder / "sparse" / "0"
+    colmap_binary.write_cameras(sparse / "cameras.bin", cameras.values())
+    colmap_binary.write_images(sparse / "images.bin", images.values())
+    colmap_binary.write_points(sparse / "points3D.bin", points.points)
+    return Model(cameras, images, points.points)
+
+
+def _without_absent(model: Model, present: set[int]) -> Model:
+    """The model whose tracks name present photos alone; points stay."""
+    import numpy as np
+
+    points = model.points
+    lengths = np.diff(points.track_offsets)
+    owner = np.repeat(np.arange(len(lengths)), lengths)
+    rows = np.isin(points.track_image_ids, sorted(present))
+    kept = np.bincount(owner[rows], minlength=len(lengths))
+    offsets = np.concatenate([[0], np.cumsum(kept)]).astype(np.int64)
+    trimmed = dataclasses.replace(
+        points,
+        track_offsets=offsets,
+        track_image_ids=points.track_image_ids[rows],
+        track_point2d=points.track_point2d[rows],
+    )
+    return Model(model.cameras, model.images, trimmed)
+
+
+def _record(
+    foreign: ForeignScene,
+    settings: ImportSettings,
+    name: str,
+    sides: dict[str, Any],
+    model: Model,
+    placed: list[PlacedPhoto],
+    notes: list[str],
+    key: str,
+) -> dict[str, Any]:
+    """scene.json without its files and times."""
+    tests = {n for n, s in sides.items() if s == "test"}
+    only_test, short = point_checks(model, {n: n for n in sides}, tests)
+    warnings = [
+        f"{counted(len(names), f'listed {side} photo')} not in the model: {shortlist(names)}"
+        for side, names in foreign.missing.items()
+        if names
+    ]
+    suite = suite_of(settings.dataset, foreign.root)
+    if suite is not None:
+        full = {(c.width, c.height) for c in foreign.model.cameras.values()}
+        warnings += differences(suite, settings.name or foreign.root.name, sorted(full), foreign.factor)
+    record: dict[str, Any] = {
+        "schema": "ambiguous_wild.scene",
+        "schema_version": SCENE_SCHEMA,
+        "name": name,
+        "license": settings.license or "not stated",
+        "factor": foreign.factor,
+        "images": "images" if foreign.factor == 1 else f"images_{foreign.factor}",
+        "split": "list",
+        "imported": {"layout": foreign.kind, "folder": foreign.root.name, "notes": notes},
+        "counts": {
+            "photos": len(foreign.split) + sum(len(v) for v in foreign.missing.values()),
+            "registered": len(placed),
+            "train": len(sides) - len(tests),
+            "test": len(tests),
+            "cameras": len(model.cameras),
+            "points": len(model.points.ids),
+            "points_seen_in_test_only": only_test,
+            "points_of_track_length_2": short,
+        },
+        "warnings": warnings,
+        "photos": {
+            p.image.name: {"source": p.source, "split": sides[p.image.name], "notes": list(p.notes)}
+            for p in placed
+        },
+        "build_key": key,
+        "inputs": {"settings": dataclasses.asdict(settings), "versions": versions()},
+    }
+    if settings.dataset or foreign.dataset:
+        record["dataset"] = settings.dataset or foreign.dataset
+    if foreign.evaluation:
+        record["evaluation"] = dict(foreign.evaluation)
+    return record

@@ -1,0 +1,174 @@
+"""Metrics that were missing when a run ended, computed from its saved pictures; nothing is trained.
+
+Before anything is added, every number of the result is computed again from renders and photos. Where one
+differs, a file was changed since, and the run is refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Literal, cast
+
+from ambiguous_wild import __version__
+from ambiguous_wild.core import AwError, Scene
+from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.harness.leaderboard.photos import check_photos
+from ambiguous_wild.harness.running.evaluate import Measures, measures_of
+from ambiguous_wild.harness.running.identity import config_identity, scene_identity
+from ambiguous_wild.harness.running.provenance import code_hash
+from ambiguous_wild.harness.running.records import ImageRow, RunResult, metrics_of
+from ambiguous_wild.harness.running.result_file import RESULT, read_result, write_result
+from ambiguous_wild.harness.running.store import read_config, run_folders
+from ambiguous_wild.io.images import read_png_rgb
+from ambiguous_wild.io.lock import folder_lock
+from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.metrics import lpips
+
+Outcome = Literal["rescored", "complete", "unfinished", "refused"]
+
+
+@dataclass(frozen=True)
+class Rescored:
+    """What became of one run."""
+
+    run: Path
+    outcome: Outcome
+    added: tuple[str, ...] = ()  # metrics
+    missing: tuple[str, ...] = ()  # that are still missing
+    error: str = ""
+
+
+def rescore(
+    folders: Sequence[Path],
+    *,
+    scene: Path | None = None,
+    tick: Callable[[int, int], None] = lambda done, total: None,
+) -> list[Rescored]:
+    """Add what can be measured now to every run below the folders.
+
+    Args:
+        folders: of `aw bench`, or folders of such folders.
+        scene: where the scene lies now; None = where each run says.
+        tick: told (runs done, runs) after each.
+
+    Raises:
+        AwError: no such folder, or no run in it.
+    """
+    runs: dict[Path, Path] = {}
+    for root in folders:
+        if not root.is_dir():
+            raise AwError(f"no folder of runs {root}: give the folder that 'aw bench -o' wrote")
+        runs |= {run.resolve(): run for run in run_folders(root)}
+    if not runs:
+        raise AwError(f"no run in {', '.join(map(str, folders))}: 'aw bench -o' makes one")
+    found, scenes = [], _Scenes(scene)
+    for done, run in enumerate(runs.values(), 1):
+        try:
+            found.append(_rescore(run, scenes))
+        except AwError as error:
+            found.append(Rescored(run, "refused", error=str(error)))
+        tick(done, len(runs))
+    return found
+
+
+def could_be_measured(results: Iterable[RunResult]) -> list[str]:
+    """Metrics that these results lack and that can be measured now: weights that have come since."""
+    now = {name for name, reason in lpips.available().items() if reason is None}
+    return sorted({name for result in results for name in result["missing"]} & now)
+
+
+class _Scenes:
+    """Scenes that were opened, each with its metrics: networks are loaded once."""
+
+    def __init__(self, given: Path | None) -> None:
+        self.given = given
+        self._open: dict[tuple[str, int | None], tuple[Scene, str, Measures]] = {}
+
+    def find(self, run: Path, result: RunResult, settings: object) -> tuple[Scene, Measures]:
+        """The run's scene, as it was when it was measured."""
+        known = settings if isinstance(settings, dict) else {}
+        path, factor = str(self.given or known.get("path") or ""), known.get("factor")
+        if not path or not Path(path).is_dir():
+            raise AwError(
+                f"{run}: its scene {path or 'is not named in config.yaml'} is not there: name it with --scene"
+            )
+        key = path, factor if isinstance(factor, int) else None
+        if key not in self._open:
+            scene = load_scene(path, factor=key[1])
+            self._open[key] = scene, scene_identity(scene), measures_of(scene)
+        scene, identity, measures = self._open[key]
+        if identity != result["scene_hash"]:
+            raise AwError(
+                f"{run} was measured on another state of {path}: hash {result['scene_hash'][:12]}, now "
+                f"{identity[:12]}; restore the scene, or name the right one with --scene"
+            )
+        return scene, measures
+
+
+def _rescore(run: Path, scenes: _Scenes) -> Rescored:
+    with folder_lock(run, "aw rescore"):
+        if not (run / RESULT).is_file():
+            return Rescored(run, "unfinished", error=f"no {RESULT}: failed, running or stopped")
+        result, config = read_result(run / RESULT), read_config(run)
+        try:
+            identity = config_identity(config)
+        except (KeyError, TypeError, ValueError, AttributeError):
+            identity = ""
+        if identity != result["config_hash"]:
+            raise AwError(f"{run}: config.yaml is absent, or not that of {RESULT}; restore both files")
+        if not result["per_image"]:
+            return Rescored(run, "complete", missing=tuple(sorted(result["missing"])))
+        scene, measures = scenes.find(run, result, config.get("scene"))
+        renders = _renders(run, result)
+        half = config.get("protocol", "full") == "half"
+        check_photos(run, scene, result["per_image"], renders, half=half)
+        added = _add(result, scene, measures, renders, half=half)
+        missing = tuple(sorted(result["missing"]))
+        if not added:
+            return Rescored(run, "complete", missing=missing)
+        record = {"metrics": list(added), "version": __version__, "code_hash": code_hash()}
+        write_result(run / RESULT, {**result, "rescored": [*result.get("rescored", []), record]})
+    return Rescored(run, "rescored", added, missing)
+
+
+def _renders(run: Path, result: RunResult) -> dict[str, Path]:
+    found = {}
+    for row in result["per_image"]:
+        name = PurePosixPath(row["name"])
+        if name.is_absolute() or ".." in name.parts or "\\" in row["name"]:
+            raise AwError(
+                f"{run} names a test image outside itself: {row['name'][:60]!a}; it is no run of ours"
+            )
+        found[row["name"]] = run / "renders" / "test" / name.with_suffix(".png")
+    gone = [path.name for path in found.values() if not path.is_file()]
+    if gone:
+        raise AwError(f"{run} lacks its renders {shortlist(gone)}: restore them, or run it again")
+    return found
+
+
+def _add(
+    result: RunResult, scene: Scene, measures: Measures, renders: dict[str, Path], *, half: bool
+) -> tuple[str, ...]:
+    """Put the metrics that the result lacks into it; those that no image has a value of stay missing."""
+    photos = {view.name: view.image_path for view in scene.test}
+    known = {
+        metric
+        for row in result["per_image"]
+        for metric, value in metrics_of(row).items()
+        if value is not None
+    }
+    wanted = {*measures.networks, *measures.regions.pixels} - known
+    if not wanted:
+        return ()
+    rows, added = [], set()
+    for row in result["per_image"]:
+        name = row["name"]
+        values = measures(name, read_png_rgb(renders[name]), read_png_rgb(photos[name]), half=half)
+        new = {metric: value for metric, value in values.items() if metric in wanted}
+        added |= set(new)
+        rows.append(cast(ImageRow, {**row, **new}))
+    result["per_image"] = rows
+    result["missing"] = {name: why for name, why in result["missing"].items() if name not in added}
+    return tuple(sorted(added))

@@ -1,0 +1,186 @@
+"""GS-W (Gaussian in the Wild): colours by a net from what a Gaussian is and what it samples in its photo.
+
+Source: EastbeanZhang/Gaussian-Wild. Ours: a small U-Net without ImageNet's weights, on the photo at
+`side` px (published: ResNet-18 at full size); no LPIPS term (it needs VGG's weights); 0.5 is added to
+colours, for the renderer clamps at 0; positions in units of the scene, without a gradient of the net (the
+release's is unverified); boxes start at the photo's size (published: 512 px). A test photo shows the net
+its left half only (the release: all of it); a camera without a photo gets the mean of all photos' maps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ambiguous_wild.core.config import check_limits
+from ambiguous_wild.methods.gsw.net import DYNAMIC, FREE, maps_of, sample, unet_leaves, visibility
+from ambiguous_wild.methods.masking_common import d_keep, hashed_uniform
+from ambiguous_wild.splat.density import DensityConfig
+from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_leaves
+from ambiguous_wild.splat.effects.placing import (
+    Unit,
+    directions,
+    frequencies,
+    projected,
+    with_penalty,
+)
+from ambiguous_wild.splat.field import Row
+from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.parts import MaskPolicy, Parts, Schedule
+from ambiguous_wild.splat.rendered import Cotangents
+from ambiguous_wild.splat.step import Shot, Step, TrainData
+
+INTRINSIC, OCTAVES = 48, 10  # features a Gaussian has; of the code of positions
+
+
+@dataclass(frozen=True)
+class GswConfig:
+    """Options; times in nominal iterations (of 30 000)."""
+
+    density: DensityConfig = field(default_factory=lambda: DensityConfig(grow_grad=4e-4))
+    side: int = 128  # px, the longer side of the photo that the U-Net sees
+    width: int = 16  # channels of its first level
+    lr_unet: float = 2e-3  # to a tenth of it
+    lr_colour: float = 5e-4
+    lr_places: float = 1.0  # of free coordinates, and in px of boxes; to a hundredth of it
+    lr_intrinsic: float = 1.25e-4
+    dropout: float = 0.1  # of what is sampled
+    mask_start: float = 2500.0
+    mask_prior: float = 0.15  # times mean (1 - M)^2
+    outside: float = 1e-3  # times the mean distance of coordinates from [-1, 1]
+
+    def __post_init__(self) -> None:
+        check_limits(self, "gs-w", side=(16, 4096), width=(1, 512), dropout=(0, 0.9))
+
+
+def build(options: GswConfig) -> Parts:
+    """Colours, masks of the same U-Net, and growth from a higher gradient."""
+    effect = GswAppearance(options)
+    return Parts(
+        mask=Visibility(effect), density_config=options.density, weighting="images",
+        schedule=Schedule(lr_means_final=1.6e-7), effects=(effect,),
+    )  # fmt: skip
+
+
+class GswAppearance(Learnt):
+    """colour = net(position, intrinsic feature, samples of three maps, direction)."""
+
+    name, reads_photo = "gs-w", True
+
+    def __init__(self, config: GswConfig) -> None:
+        self.config = config
+
+    def setup(self, data: TrainData) -> None:
+        self.seed, self.unit, self.all_photos = (
+            data.seed,
+            Unit(data.scene.points.xyz, data.device),
+            data.photos,
+        )
+        self._mean: tuple[int, Tensor] | None = None  # maps of no photo in particular, of an iteration
+        super().setup(data)
+
+    def acts(self, hook: str) -> bool:
+        return hook != "fit" and super().acts(hook)  # a test photo is read, nothing is fitted to it
+
+    def leaves(self, data: TrainData, rng: np.random.Generator) -> Mapping[str, Leaf]:
+        found = unet_leaves(self.config.width, rng, self.config.lr_unet)
+        lr, position = self.config.lr_colour, 3 * (1 + 2 * OCTAVES)
+        found |= mlp_leaves("encoder", (position + DYNAMIC + INTRINSIC, 128, 96, 64, 48), rng, lr)
+        found |= mlp_leaves("decoder", (48 + INTRINSIC, 48, 48, 48), rng, lr)
+        return found | mlp_leaves("head", (48 + 3, 48, 3), rng, lr)
+
+    def rows(self, gaussians: Gaussians) -> Mapping[str, Row]:
+        rng, means, rate = np.random.default_rng([self.seed, 0x65]), gaussians.means, self.config.lr_places
+        low, high = means.amin(dim=0), means.amax(dim=0)
+        unit = 2.0 * (means - low) / (high - low).clamp(min=1e-9) - 1.0
+        weights = rng.uniform(size=(FREE * 2, 3))
+        weights /= weights.sum(axis=1, keepdims=True)
+        mixing = torch.tensor(weights, dtype=torch.float32).to(means.device)
+        intrinsic = torch.cat([gaussians.sh0, torch.zeros_like(gaussians.sh0).repeat(1, 15)], dim=1)
+        box = rate / max(self.all_photos[0].shape[:2])
+        return {
+            "gsw_intrinsic": Row(intrinsic.contiguous(), self.config.lr_intrinsic),
+            "gsw_places": Row((unit @ mixing.T).contiguous(), rate, rate / 100),
+            "gsw_box": Row(torch.ones(len(means), 2, device=means.device), box, box / 100),
+        }
+
+    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
+        photo, means, intrinsic = self._seen(shot), visible.means.detach(), visible.extra["gsw_intrinsic"]
+        maps = self._mean_maps(shot, leaf) if photo is None else maps_of(photo, leaf, self.config.side)
+        places, box = visible.extra["gsw_places"], visible.extra["gsw_box"]
+        free = [sample(maps[k], places[:, 2 * k : 2 * k + 2]) for k in range(FREE)]
+        pixels, z = projected(means, shot.camera)
+        width = shot.camera.width // 2 if shot.fitting else shot.camera.width
+        at = torch.stack([pixels[:, 0] / width, pixels[:, 1] / shot.camera.height], dim=1) / box
+        inside = (z > 0) & (at > 0).all(dim=1) & (at < 1).all(dim=1)
+        own = sample(maps[FREE], 2.0 * at - 1.0) * inside[:, None] * (photo is not None)
+        dynamic = torch.cat([*free, own], dim=1)
+        if shot.view is not None and self.config.dropout:
+            key = (self.seed, shot.iteration)
+            kept = hashed_uniform(dynamic.numel(), key, dynamic.device) >= self.config.dropout
+            dynamic = dynamic * kept.reshape(dynamic.shape) / (1.0 - self.config.dropout)
+        code = frequencies(self.unit(means), OCTAVES)
+        hidden = mlp(torch.cat([code, dynamic, intrinsic], dim=1), leaf, "encoder")
+        hidden = mlp(torch.cat([hidden, intrinsic], dim=1), leaf, "decoder")
+        colours = 0.5 + mlp(torch.cat([hidden, directions(means, shot.camera)], dim=1), leaf, "head")
+        return with_penalty(colours, self.config.outside * F.relu(places.abs() - 1.0).mean())
+
+    def _seen(self, shot: Shot) -> Tensor | None:
+        """What the U-Net sees: the photo, and of a test photo the left half."""
+        if shot.photo is None or shot.neutral:
+            return None
+        return shot.photo[:, : shot.photo.shape[1] // 2] if shot.fitting else shot.photo
+
+    @torch.no_grad()
+    def _mean_maps(self, shot: Shot, leaf: Mapping[str, Tensor]) -> Tensor:
+        if self._mean is None or self._mean[0] != shot.iteration:
+            maps = [maps_of(photo, leaf, self.config.side) for photo in self.all_photos]
+            size = maps[0].shape[2:]
+            total = torch.stack([F.interpolate(m, size=size, mode="bilinear") for m in maps]).mean(dim=0)
+            self._mean = (shot.iteration, total)
+        return self._mean[1]
+
+    def learnable(self, shot: Shot) -> dict[str, Tensor]:
+        """Copies of all leaves, for a graph of one's own."""
+        return {name: value.requires_grad_() for name, value in self._leaf(shot).items()}
+
+
+class Visibility(MaskPolicy):
+    """M learns from the residual that it leaves in the loss, against the prior that nothing is masked."""
+
+    learns_by_gradients = True
+
+    def __init__(self, effect: GswAppearance) -> None:
+        self.effect, self.config = effect, effect.config
+
+    def setup(self, data: TrainData) -> None:
+        self.effect.require_setup()
+
+    def keep(self, step: Step) -> Tensor | None:
+        return self.predict(step) if step.nominal > self.config.mask_start else None
+
+    @torch.no_grad()
+    def predict(self, step: Step) -> Tensor:
+        return visibility(step.photo, self.effect._leaf(step), self.config.side)
+
+    def cotangent(self, step: Step, keep: Tensor | None) -> Cotangents | None:
+        if keep is None or step.nominal <= self.config.mask_start:
+            return None
+        with torch.enable_grad():
+            leaf = self.effect.learnable(step)
+            mask = visibility(step.photo, leaf, self.config.side)
+            found = torch.autograd.grad(
+                mask, list(leaf.values()), self.d_mask(step, mask.detach()), allow_unused=True
+            )
+        own = {name: d for name, d in zip(leaf, found) if d is not None}
+        return Cotangents(own={self.effect.name: own})
+
+    def d_mask(self, step: Step, mask: Tensor) -> Tensor:
+        """dL/dM [H, W] of 0.8 |M R - M I| + 0.2 D-SSIM(M R, M I) + prior mean (1 - M)^2."""
+        through = d_keep(step.rendered.image.detach(), step.photo, mask)
+        return through - 2.0 * self.config.mask_prior / mask.numel() * (1.0 - mask)

@@ -1,0 +1,180 @@
+"""HybridGS: every photo has 2D Gaussians on its plane for what only it shows; 3D Gaussians are the rest.
+
+Source: arXiv 2412.03844, its project page and the released code for inference. UNVERIFIED, hence ours:
+every loss weight, rate and length of a stage, and how the stages share the loss: while both learn apart,
+the 3D Gaussians see the photo where the 2D ones leave it uncovered, and the 2D ones see what the 3D ones
+leave over. Ours too: fewer 2D Gaussians (released 10 000), as large as their number asks for and cut at
+`reach`; a penalty on what they cover. The page's supervision by other views is left out: nothing is known
+of it.
+Cost: the 2D Gaussians' windows, `points` times (2 reach)^2 cells, forwards and back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ambiguous_wild.core.config import check_limits
+from ambiguous_wild.methods.masking_common import MaskedShares
+from ambiguous_wild.splat.density import DensityConfig
+from ambiguous_wild.splat.effects.learnt import Leaf, Learnt
+from ambiguous_wild.splat.losses import photometric
+from ambiguous_wild.splat.parts import MaskPolicy, Parts, State
+from ambiguous_wild.splat.rendered import Cotangents
+from ambiguous_wild.splat.step import Shot, Step, TrainData
+
+COVERED = 1.0 / 4.33  # size of a cell in distances between Gaussians: released, 1 px with 10 000 a photo
+FAINT = 2.0 * float(np.log(255.0))  # squared distance in deviations from which a kernel is below 1/255
+
+
+@dataclass(frozen=True)
+class HybridGsConfig:
+    """Options; times in nominal iterations (of 30 000)."""
+
+    density: DensityConfig = field(default_factory=DensityConfig)
+    points: int = 1000  # 2D Gaussians a photo
+    reach: int = 5  # cells; no 2D Gaussian is drawn farther from its centre
+    apart: float = 5000.0  # both kinds learn apart from here on
+    joint: float = 15_000.0  # and together from here on
+    lr: float = 0.05  # of 2D Gaussians
+    area: float = 0.05  # times the mean of what they cover
+
+    def __post_init__(self) -> None:
+        check_limits(self, "hybridgs", points=(1, 1e6), reach=(1, 64), joint=(self.apart, 1e9), lr=(0, 10))
+
+
+def build(options: HybridGsConfig) -> Parts:
+    """A layer of the photo's own over the picture; the rest of the loop is 3DGS."""
+    plane = Plane(options)
+    return Parts(mask=Uncovered(plane), density_config=options.density, effects=(plane,))
+
+
+class Plane(Learnt):
+    """From `joint` on the picture is clip(T + (1 - M) S), with T and M sums of the photo's 2D Gaussians."""
+
+    name = "hybridgs"
+
+    def __init__(self, config: HybridGsConfig) -> None:
+        self.config = config
+
+    def acts(self, hook: str) -> bool:
+        return hook != "fit" and super().acts(hook)  # test photos have no layer
+
+    def leaves(self, data: TrainData, rng: np.random.Generator) -> Mapping[str, Leaf]:
+        shape = (len(data.photos), self.config.points)
+        start = np.zeros((*shape, 9), np.float32)  # position, colour, Cholesky factor, weight
+        start[..., :2] = np.arctanh(rng.uniform(-0.999, 0.999, (*shape, 2)))
+        start[..., 2:5] = 0.5
+        start[..., 5:8] = rng.uniform(0.0, 1.0, (*shape, 3))
+        return {"planar": Leaf(torch.from_numpy(start), self.config.lr, per_photo=True)}
+
+    def layer(self, planar: Tensor, shot: Shot) -> tuple[Tensor, Tensor]:
+        """T [H, W, 3] and M [H, W] of the photo."""
+        found = planar_sums(planar, shot.camera.height, shot.camera.width, self.config.reach).clamp(0.0, 1.0)
+        return found[..., :3], found[..., 3]
+
+    def tone(self, image: Tensor, alpha: Tensor, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
+        if shot.view is None or shot.other_gaussians or shot.nominal < self.config.joint:
+            return image
+        return composed(*self.layer(leaf["planar"], shot), image)
+
+
+def composed(front: Tensor, mask: Tensor, back: Tensor) -> Tensor:
+    """clip(T + (1 - M) S, 0, 1)."""
+    return (front + (1.0 - mask)[..., None] * back.clamp(0.0, 1.0)).clamp(0.0, 1.0)
+
+
+class Uncovered(MaskPolicy):
+    """1 - M weighs the loss while both kinds learn apart; afterwards the picture has it in it."""
+
+    learns_by_gradients = True
+
+    def __init__(self, plane: Plane) -> None:
+        self.plane, self.config, self.shares = plane, plane.config, MaskedShares()
+
+    def setup(self, data: TrainData) -> None:
+        self.plane.require_setup()
+
+    def keep(self, step: Step) -> Tensor | None:
+        keep = self.predict(step)
+        if keep is not None:
+            self.shares.take(step.view, keep)
+        return keep if step.nominal < self.config.joint else None
+
+    @torch.no_grad()
+    def predict(self, step: Step) -> Tensor | None:
+        if step.nominal < self.config.apart:
+            return None
+        return 1.0 - self.plane.layer(self.plane._leaf(step)["planar"], step)[1]
+
+    def cotangent(self, step: Step, keep: Tensor | None) -> Cotangents | None:
+        if step.nominal < self.config.apart:
+            return None
+        with torch.enable_grad():
+            planar = self.plane._leaf(step)["planar"].requires_grad_()
+            front, mask = self.plane.layer(planar, step)
+            outputs, pulls = [mask], [torch.full_like(mask, self.config.area / mask.numel())]
+            if step.nominal < self.config.joint:
+                picture = composed(front, mask, step.rendered.image.detach())
+                outputs.append(picture)
+                pulls.append(photometric(picture.detach(), step.photo, self._user(keep, mask)).d_image)
+            (found,) = torch.autograd.grad(outputs, planar, pulls)
+        return Cotangents(own={self.plane.name: {"planar": found}})
+
+    @staticmethod
+    def _user(keep: Tensor | None, mask: Tensor) -> Tensor | None:
+        """The capture's own mask alone: pixels that are left out although the layer does not cover them."""
+        if keep is None:
+            return None
+        return ((keep > 0) | (mask.detach() >= 1.0)).float()
+
+    def facts(self) -> dict[str, Any]:
+        return {"masked_share": self.shares.mean()}
+
+    def state_dict(self) -> State:
+        return {"shares": self.shares.state_dict()}
+
+    def load_state_dict(self, state: State) -> None:
+        self.shares = MaskedShares.from_state(state["shares"])
+
+
+def planar_sums(planar: Tensor, height: int, width: int, reach: int) -> Tensor:
+    """[H, W, 4]: sum over 2D Gaussians of o (c, 1) g, without order and without a background.
+
+    Args:
+        planar: [n, 9]: p with tanh(p) the centre in [-1, 1]^2, colour, (l1, l2, l3) with the lower factor
+            [[l1 + 0.5, 0], [l2, l3 + 0.5]] of the covariance in cells, and the logit of the weight.
+        height, width: of the picture, px.
+        reach: cells; a kernel is 0 farther from its centre along an axis.
+    """
+    cell = (height * width / len(planar)) ** 0.5 * COVERED  # px
+    half = max(round(reach * cell), 1)
+    centre = torch.stack(
+        [(planar[:, k].tanh() + 1.0) * (0.5 * size) for k, size in enumerate((width, height))], 1
+    )
+    around = torch.arange(-half, half + 1, device=planar.device)
+    base = centre.detach().floor().long()
+    u, v = (base[:, k, None] + around for k in (0, 1))  # [n, K]
+    dx, dy = ((w + 0.5 - centre[:, k, None]) / cell for k, w in enumerate((u, v)))
+    first, below, last = planar[:, 5:6] + 0.5, planar[:, 6:7], planar[:, 7:8] + 0.5
+    x = dx / _apart_from_zero(first)  # [n, K] of columns
+    y = (dy[:, :, None] - (below * x)[:, None, :]) / _apart_from_zero(last)[:, :, None]  # [n, rows, columns]
+    square = x.square()[:, None, :] + y.square()
+    inside = ((v >= 0) & (v < height))[:, :, None] & ((u >= 0) & (u < width))[:, None, :]
+    kernel = torch.where(inside & (square <= FAINT), torch.exp(-0.5 * square), 0.0)
+    weight = torch.sigmoid(planar[:, 8])[:, None, None] * kernel
+    at = (v.clamp(0, height - 1) * width)[:, :, None] + u.clamp(0, width - 1)[:, None, :]
+    values = [weight * planar[:, 2 + k, None, None] for k in range(3)] + [weight]
+    empty = torch.zeros(height * width, dtype=planar.dtype, device=planar.device)
+    sums = [empty.scatter_add(0, at.reshape(-1), value.reshape(-1)) for value in values]
+    return torch.stack(sums, dim=1).reshape(height, width, 4)
+
+
+def _apart_from_zero(x: Tensor) -> Tensor:
+    """x, at least 0.1 from zero on its own side: a factor of the covariance may cross it."""
+    return torch.where(x >= 0, x.clamp(min=0.1), x.clamp(max=-0.1))

@@ -1,0 +1,249 @@
+"""NexusSplats on plain Gaussians: uncertainty is drawn like a colour, light is a code beside each Gaussian.
+
+Source: arXiv 2411.14514 and juliantang324/NexusSplats; which of its settings the tables used is
+unverified. LEFT OUT: anchors, so each Gaussian has codes of its own and 3DGS's growth, without opacity
+resets. Ours too: features (Lab and HOG for DINOv2's, option `features`) with a distance in units of what
+blur alone makes; toned colours are colour + 2 sigmoid(net) - 1; D-SSIM is of the toned picture; growth
+reads the photometric gradient alone; nets are narrower, for they run on each Gaussian, not on each tenth.
+Cost: a second picture a step and the features of the render.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ambiguous_wild.core.config import check_limits
+from ambiguous_wild.methods.masking_common import MaskedShares, WarmUpMask, hashed_uniform, upsampled
+from ambiguous_wild.methods.robustsplat.supervision import calibrated, resized
+from ambiguous_wild.methods.wildgaussians import fourier
+from ambiguous_wild.splat import device
+from ambiguous_wild.splat.density import DensityConfig, DensityControl
+from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_leaves
+from ambiguous_wild.splat.effects.placing import directions, in_picture
+from ambiguous_wild.splat.field import Row
+from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
+from ambiguous_wild.splat.parts import Parts, State
+from ambiguous_wild.splat.rendered import Cotangents, Gradients
+from ambiguous_wild.splat.step import Shot, Step, TrainData
+from ambiguous_wild.vision.backends import check_features, make_features
+from ambiguous_wild.vision.precompute import photo_features
+
+CODE, SHIFT = 32, 4.0  # of photos and of doubts; added to what is drawn, for the renderer clamps at 0
+COLOURING = ("nexussplats", "exposure", "appearance")  # effects that an uncertainty does not go through
+
+
+@dataclass(frozen=True)
+class NexusSplatsConfig:
+    """Options; times in nominal iterations (of 30 000)."""
+
+    features: str = "labhog"  # see vision/backends.py; published: dinov2-small-registers@350
+    appearance: bool = True  # published: on for photo collections, off for captures
+    density: DensityConfig = field(default_factory=lambda: DensityConfig(resets=()))
+    mask_start: float = 2000.0
+    min_mask_start: int = 300  # iterations: earlier renders show too little
+    boundary: bool = False  # photo collections: the lower middle of a picture is masked more easily
+    normal_units: float = 40.0  # of hand-made features: distance, in units of blur, that is 1
+    prior: float = 0.5  # times the mean ln sigma
+    volume: float = 0.01  # times the mean volume of a Gaussian
+    light_width: int = 64  # published 256, for ten Gaussians at once
+    doubt_width: int = 64  # published 128, likewise
+    dropout: float = 0.2
+    lr_code: float = 1e-3  # of photos and doubts
+    lr_light: float = 5e-3  # of a Gaussian's light
+    lr_net: float = 5e-4
+
+    def __post_init__(self) -> None:
+        check_features(self.features)
+        widths = dict.fromkeys(("light_width", "doubt_width"), (1, 4096))
+        check_limits(self, "nexussplats", normal_units=(1e-3, 1e9), dropout=(0, 0.9), **widths)
+
+
+def build(options: NexusSplatsConfig) -> Parts:
+    """Colours and uncertainty of codes; the rest of the loop is 3DGS without resets."""
+    codes = Codes(options)
+    control = type("NexusDensity", (SmallVolumes,), {"weight": options.volume})
+    return Parts(Doubt(codes), control, options.density, effects=(codes,))
+
+
+class Codes(Learnt):
+    """What photos and Gaussians carry, and both nets."""
+
+    name = "nexussplats"
+
+    def __init__(self, config: NexusSplatsConfig) -> None:
+        self.config = config
+
+    def setup(self, data: TrainData) -> None:
+        self.seed = data.seed
+        super().setup(data)
+
+    def acts(self, hook: str) -> bool:
+        return (hook != "shade" or self.config.appearance) and super().acts(hook)
+
+    def leaves(self, data: TrainData, rng: np.random.Generator) -> Mapping[str, Leaf]:
+        def codes() -> Leaf:
+            start = torch.tensor(0.01 * rng.normal(size=(len(data.photos), CODE)), dtype=torch.float32)
+            return Leaf(start, self.config.lr_code, per_photo=True)
+
+        light, doubt, rate = self.config.light_width, self.config.doubt_width, self.config.lr_net
+        return {
+            "light": codes(),
+            "transient": codes(),
+            **mlp_leaves("toned", (3 + 24 + CODE + 3, light, light, 3), rng, rate),
+            **mlp_leaves("doubt", (2 * CODE, doubt, doubt, 1), rng, rate),
+        }
+
+    def rows(self, gaussians: Gaussians) -> Mapping[str, Row]:
+        light = fourier(gaussians.means)
+        noise = 1e-4 * np.random.default_rng([self.seed, 0x4E]).normal(size=tuple(light.shape))
+        light = light + torch.from_numpy(noise.astype(np.float32)).to(light.device)
+        doubt = torch.zeros(len(gaussians), CODE, device=gaussians.device)
+        return {
+            "nexus_light": Row(light, self.config.lr_light),
+            "nexus_doubt": Row(doubt, self.config.lr_code),
+        }
+
+    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
+        photo = leaf["light"].expand(len(visible.base), CODE)
+        towards = directions(visible.means.detach(), shot.camera)
+        inputs = torch.cat([visible.base, visible.extra["nexus_light"], photo, towards], dim=1)
+        if shot.view is not None and self.config.dropout:
+            kept = hashed_uniform(inputs.numel(), (self.seed, shot.iteration), inputs.device)
+            kept = (kept >= self.config.dropout).reshape(inputs.shape) / (1.0 - self.config.dropout)
+            inputs = inputs * kept
+        return visible.base + 2.0 * torch.sigmoid(mlp(inputs, leaf, "toned")) - 1.0
+
+    def doubts(self, codes: Tensor, leaf: Mapping[str, Tensor]) -> Tensor:
+        """[M] raw uncertainty of Gaussians with these codes [M, 32] in the photo of the leaves."""
+        photo = leaf["transient"].expand(len(codes), CODE)
+        return mlp(torch.cat([codes, photo], dim=1), leaf, "doubt")[:, 0]
+
+
+class Doubt(WarmUpMask):
+    """Static where the drawn uncertainty leaves features of photo and render a weight above 1."""
+
+    config: NexusSplatsConfig
+
+    learns_by_gradients = True
+
+    def __init__(self, codes: Codes) -> None:
+        self.codes, self.config = codes, codes.config
+        self.features, self.shares = make_features(self.config.features), MaskedShares()
+        self.pending: Gradients | None = None  # of the step under way
+
+    def setup(self, data: TrainData) -> None:
+        self.codes.require_setup()
+        self.cameras = data.cameras
+        self.features.fit(data.photos)
+        self.phi = photo_features(self.features, data.photos, data.cache_dir)
+
+    def keep(self, step: Step) -> Tensor | None:
+        weight, self.pending = self._weight(step, learn=True)
+        if not self.begun(step):
+            return None
+        keep = kept(weight)
+        self.shares.take(step.view, keep)
+        return keep
+
+    def gradients(self, step: Step, keep: Tensor | None) -> Gradients | None:
+        found, self.pending = self.pending, None
+        return found
+
+    def predict(self, step: Step) -> Tensor | None:
+        return kept(self._weight(step, learn=False)[0]) if self.begun(step) else None
+
+    def _weight(self, step: Step, learn: bool) -> tuple[Tensor, Gradients | None]:
+        """w = 1 / (2 sigma^2) [H, W], sigma = softplus of what is drawn, and gradients of its loss."""
+        g, seen = step.gaussians, self._seen(step)
+        with torch.set_grad_enabled(learn):
+            leaf = {name: value.requires_grad_(learn) for name, value in self.codes._leaf(step).items()}
+            codes = g.extra["nexus_doubt"][seen].detach().requires_grad_(learn)
+            doubts = self.codes.doubts(codes, leaf)
+        drawn = step.draw(gaussians=as_colour(g, seen, doubts.detach()), without=COLOURING)
+        with torch.set_grad_enabled(learn):
+            raw = (drawn.image[..., 0] - SHIFT * drawn.alpha).detach().requires_grad_(learn)
+            sigma = F.softplus(raw)
+            weight = 0.5 / sigma.square()
+            if self.config.boundary:
+                weight = weight / boundary(weight.shape[0], weight.shape[1], weight)
+            weight = weight.clamp(max=3.0)
+        if not learn:
+            return weight, None
+        with torch.enable_grad():
+            loss = (self._distance(step) * weight).mean() + self.config.prior * (sigma + 1e-6).log().mean()
+            (d_raw,) = torch.autograd.grad(loss, raw)
+        image = torch.stack([d_raw, torch.zeros_like(d_raw), torch.zeros_like(d_raw)], dim=2)
+        back = drawn.backward(Cotangents(image=image, alpha=-SHIFT * d_raw))
+        inputs = [codes, *leaf.values()]
+        with torch.enable_grad():
+            found = torch.autograd.grad(doubts, inputs, back.sh0[seen, 0] / SH_C0, allow_unused=True)
+        d_codes = torch.zeros_like(g.extra["nexus_doubt"])
+        d_codes[seen] = found[0]
+        own = {name: d for name, d in zip(leaf, found[1:]) if d is not None}
+        gradients = replace(
+            back, sh0=torch.zeros_like(g.sh0), sh_rest=torch.zeros_like(g.sh_rest), screen_abs=None,
+            screen=torch.zeros_like(back.screen), extra={"nexus_doubt": d_codes}, own={self.codes.name: own},
+        )  # fmt: skip
+        return weight.detach(), gradients
+
+    def _seen(self, step: Step) -> Any:
+        """Rows that may be in the picture; on an accelerator all of them."""
+        if device.accelerated(step.gaussians.device):
+            return slice(None)
+        return torch.nonzero(in_picture(step.gaussians.means, step.camera, margin=0.5)).squeeze(1)
+
+    @torch.no_grad()
+    def _distance(self, step: Step) -> Tensor:
+        """clip(2 - 2 cos, 0, 1) [H, W] of the features of photo and render."""
+        full = self.cameras[step.view]  # not the photo, which may not be on the device
+        seen = self.features(upsampled(step.rendered.image.detach(), full.height, full.width))
+        cosine = F.cosine_similarity(self.phi[step.view], seen, dim=2)
+        if self.config.features.startswith("labhog"):
+            cosine = calibrated(cosine, self.features.unit, self.config.normal_units)
+        return resized((2.0 - 2.0 * cosine).clamp(0.0, 1.0), *step.photo.shape[:2])
+
+    def facts(self) -> dict[str, Any]:
+        return {"masked_share": self.shares.mean(), "features": self.features.name}
+
+    def state_dict(self) -> State:
+        return {"shares": self.shares.state_dict()}
+
+    def load_state_dict(self, state: State) -> None:
+        self.shares = MaskedShares.from_state(state["shares"])
+
+
+def kept(weight: Tensor) -> Tensor:
+    """Where the weight is above 1; a photo without such a pixel is kept whole, or it would teach nothing."""
+    static = weight > 1.0
+    return torch.where(static.any(), static, True).float()
+
+
+def as_colour(gaussians: Gaussians, rows: Any, values: Tensor) -> Gaussians:
+    """The Gaussians with value + `SHIFT` as the colour of `rows`, and none of their harmonics."""
+    colours = torch.full_like(gaussians.sh0, (SHIFT - 0.5) / SH_C0)
+    colours[rows] += values[:, None] / SH_C0
+    return replace(gaussians, sh0=colours, sh_rest=gaussians.sh_rest[:, :0], extra={})
+
+
+def boundary(height: int, width: int, like: Tensor) -> Tensor:
+    """G [H, W] = exp(-((r - 0.5)^2 / (2 0.5^2) + c^2 / (2 0.8^2))) at rows and columns from -1 to 1."""
+    r = torch.linspace(-1, 1, height, device=like.device)[:, None]
+    c = torch.linspace(-1, 1, width, device=like.device)[None, :]
+    return torch.exp(-((r - 0.5) ** 2 / 0.5 + c**2 / 1.28))
+
+
+class SmallVolumes(DensityControl):
+    """3DGS's, with a loss of `weight` times the mean volume: the product of the three scales."""
+
+    weight = 0.0
+
+    def before_step(self, step: Step, gradients: Gradients) -> Gradients:
+        volume = step.gaussians.log_scales.sum(dim=1, keepdim=True).exp()
+        return replace(gradients, log_scales=gradients.log_scales + self.weight / len(volume) * volume)

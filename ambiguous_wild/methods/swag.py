@@ -1,0 +1,161 @@
+"""SWAG: a net of a photo's embedding and a Gaussian's place gives its colour, and may switch it off.
+
+Source: abstract and summaries of arXiv 2403.10427; no code was found. UNVERIFIED: every size, rate, the
+sign of the gate, its regulariser and the threshold of transients: all are choices of ours. The mechanism
+is theirs: hash-encoded positions, one embedding a photo, opacity times a Binary Concrete gate that learns
+without labels. Gaussians that the gate switches off in most of the photos that see them are left out of
+other views. A test photo's embedding is fitted without gates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ambiguous_wild.core.config import check_limits
+from ambiguous_wild.methods.masking_common import hashed_uniform
+from ambiguous_wild.splat import device
+from ambiguous_wild.splat.density import DensityConfig
+from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_leaves
+from ambiguous_wild.splat.effects.placing import Unit, in_picture, with_penalty
+from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
+from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.step import Shot, TrainData
+
+PHOTO, PRIMES = 24, (1, 2_654_435_761, 805_459_861)  # Instant-NGP's
+CLOSED, LEAST = -20.0, 1e-7  # logit of what is left out; opacity below which nothing is drawn
+
+
+@dataclass(frozen=True)
+class SwagConfig:
+    """Options, all of them ours; times in nominal iterations (of 30 000)."""
+
+    density: DensityConfig = field(default_factory=DensityConfig)
+    levels: int = 8  # of the hash grid, with two features each
+    entries: int = 2**14  # a level
+    coarsest: int = 16  # cells a side
+    finer: float = 1.5  # from level to level
+    width: int = 64  # of the net's three hidden layers
+    temperature: float = 0.1  # of the gate
+    gate_start: float = 3000.0
+    start_logit: float = -4.0  # of being off
+    off: float = 0.01  # times the mean gate in the loss
+    transient: float = 0.5  # left out below this share of photos in which it is on
+    lr_grid: float = 0.01
+    lr_net: float = 1e-3
+    lr_photo: float = 1e-3
+
+    def __post_init__(self) -> None:
+        check_limits(
+            self, "swag", levels=(1, 32), entries=(1, 2**24), coarsest=(1, 4096), finer=(1, 4),
+            width=(1, 4096), temperature=(1e-3, 10), transient=(0, 1),
+        )  # fmt: skip
+
+
+def build(options: SwagConfig) -> Parts:
+    """3DGS with that net."""
+    return Parts(effects=(GatedColours(options),), density_config=options.density)
+
+
+class GatedColours(Learnt):
+    """colour' = colour + 2 sigmoid(net) - 1; opacity' = opacity (1 - z), z = 1: switched off."""
+
+    name = "swag"
+
+    def __init__(self, config: SwagConfig) -> None:
+        self.config = config
+
+    def setup(self, data: TrainData) -> None:
+        self.seed, self.unit, self.cameras = data.seed, Unit(data.scene.points.xyz, data.device), data.cameras
+        self._left_out: tuple[float, int, Tensor] | None = None  # of a moment and a number of Gaussians
+        super().setup(data)
+
+    def leaves(self, data: TrainData, rng: np.random.Generator) -> Mapping[str, Leaf]:
+        c = self.config
+        grid = torch.tensor(1e-4 * rng.uniform(-1, 1, (c.levels, c.entries, 2)), dtype=torch.float32)
+        photo = torch.tensor(0.1 * rng.normal(size=(len(data.photos), PHOTO)), dtype=torch.float32)
+        net = mlp_leaves("net", (2 * c.levels + PHOTO + 3, c.width, c.width, c.width, 4), rng, c.lr_net)
+        last = net["net_bias3"].values.clone()
+        last[:3], last[3] = 0.0, c.start_logit
+        net["net_weight3"] = replace(net["net_weight3"], values=0.1 * net["net_weight3"].values)
+        net["net_bias3"] = replace(net["net_bias3"], values=last)
+        net = {name: replace(leaf, final=0.01) for name, leaf in net.items()}
+        return {"grid": Leaf(grid, c.lr_grid, 0.01), "photo": Leaf(photo, c.lr_photo, 0.01, True), **net}
+
+    def encoded(self, means: Tensor, leaf: Mapping[str, Tensor]) -> Tensor:
+        """[N, 2 levels] of positions; they learn nothing from it."""
+        unit = (0.5 + 0.25 * self.unit(means.detach())).clamp(0.0, 1.0)
+        return hash_encoding(unit, leaf["grid"], self.config.coarsest, self.config.finer)
+
+    def _net(self, places: Tensor, colours: Tensor, leaf: Mapping[str, Tensor]) -> Tensor:
+        photo = leaf["photo"].expand(len(places), PHOTO)
+        return mlp(torch.cat([places, photo, colours], dim=1), leaf, "net")
+
+    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
+        found = self._net(self.encoded(visible.means, leaf), visible.base, leaf)
+        return visible.base + 2.0 * torch.sigmoid(found[:, :3]) - 1.0
+
+    def change(self, gaussians: Gaussians, leaf: Mapping[str, Tensor], shot: Shot) -> Mapping[str, Tensor]:
+        logits = gaussians.opacity_logits
+        if shot.nominal < self.config.gate_start or shot.other_gaussians:
+            return {}
+        if shot.view is None:
+            return {"opacity_logits": torch.where(self._transient(gaussians, leaf, shot), CLOSED, logits)}
+        seen: Any = slice(None)
+        if not device.accelerated(logits.device):  # only those that may be drawn
+            seen = torch.nonzero(in_picture(gaussians.means.detach(), shot.camera)).squeeze(1)
+        colours = gaussians.sh0[seen] * SH_C0 + 0.5
+        a = self._net(self.encoded(gaussians.means[seen], leaf), colours, leaf)[:, 3]
+        u = hashed_uniform(len(logits), (self.seed, shot.iteration, 0x5A), logits.device)[seen]
+        z = torch.sigmoid((a + torch.logit(u)) / self.config.temperature)
+        opacity = (torch.sigmoid(logits[seen]) * (1.0 - z)).clamp(LEAST, 1.0 - 1e-6)
+        opened = logits.clone()
+        opened[seen] = torch.logit(opacity)
+        return {"opacity_logits": with_penalty(opened, self.config.off * z.mean())}
+
+    @torch.no_grad()
+    def _transient(self, gaussians: Gaussians, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
+        """[N] bool: off in most of the photos whose pictures it lies in, without noise."""
+        known = self._left_out
+        if known is None or known[:2] != (shot.nominal, len(gaussians)):
+            places, colours = self.encoded(gaussians.means, leaf), gaussians.sh0 * SH_C0 + 0.5
+            on, seen = torch.zeros_like(gaussians.opacity_logits), torch.zeros_like(gaussians.opacity_logits)
+            for row, camera in zip(self._adam["photo"].values, self.cameras):
+                inside = in_picture(gaussians.means, camera, margin=0.0).float()
+                a = self._net(places, colours, {**leaf, "photo": row})[:, 3]
+                on, seen = on + inside * (a <= 0.0), seen + inside
+            known = (shot.nominal, len(gaussians), on < self.config.transient * seen)
+            self._left_out = known
+        return known[2]
+
+    def step(self, own: Mapping[str, Tensor], shot: Shot, called_off: Tensor | None = None) -> None:
+        self._left_out = None
+        super().step(own, shot, called_off)
+
+
+def hash_encoding(unit: Tensor, grid: Tensor, coarsest: int, finer: float) -> Tensor:
+    """[N, 2 L] of positions [N, 3] in [0, 1] from tables [L, T, 2]: trilinear, as Instant-NGP's.
+
+    Level l has floor(coarsest finer^l) cells a side; a corner's entry is the exclusive or of its integer
+    coordinates times `PRIMES`, modulo T.
+    """
+    levels, entries, _ = grid.shape
+    cells = [float(int(coarsest * finer**level)) for level in range(levels)]
+    scaled = torch.stack([unit * count for count in cells])  # [L, N, 3]
+    low = scaled.floor()
+    share, corner, found = scaled - low, low.long(), torch.zeros_like(scaled[:, :, :2])
+    first = (torch.arange(levels, device=grid.device) * entries)[:, None]
+    table = grid.reshape(levels * entries, 2)
+    for number in range(8):
+        weight, key = torch.ones_like(share[:, :, 0]), torch.zeros_like(corner[:, :, 0])
+        for axis in range(3):
+            up = number >> axis & 1
+            weight = weight * (share[:, :, axis] if up else 1.0 - share[:, :, axis])
+            key = key ^ ((corner[:, :, axis] + up) * PRIMES[axis])
+        found = found + weight[:, :, None] * table[first + key % entries]
+    return found.permute(1, 0, 2).reshape(len(unit), 2 * levels)

@@ -1,0 +1,152 @@
+"""Where Gaussians lie for a camera, and codes of positions: what recipes with nets share.
+
+What comes from the camera is copied to the Gaussians' device once a camera: a copy in every step makes the
+host of an accelerator wait.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ambiguous_wild.core import Camera
+from ambiguous_wild.splat.effects.learnt import Leaf
+from ambiguous_wild.splat.effects.posed import PosedCamera
+from ambiguous_wild.splat.gaussians import SH_C0
+from ambiguous_wild.splat.reference import harmonics as lower_harmonics
+
+_MOST = 8192  # cameras kept
+_known: dict[tuple[int, str, torch.dtype], tuple[Camera, Tensor]] = {}
+
+
+def pose_like(camera: Camera, like: Tensor) -> Tensor:
+    """cam_from_world [3, 4] in the type and place of `like`."""
+    if isinstance(camera, PosedCamera):  # of pose refinement: another one in every step, made there
+        return camera.pose[:3].to(like)
+    key = (id(camera), str(like.device), like.dtype)
+    if key not in _known:
+        if len(_known) >= _MOST:
+            _known.clear()
+        pose = torch.as_tensor(camera.cam_from_world[:3].copy(), dtype=like.dtype, device=like.device)
+        _known[key] = (camera, pose)  # the camera too: as long as it lives, its id is its own
+    return _known[key][1]
+
+
+def directions(means: Tensor, camera: Camera) -> Tensor:
+    """Unit vectors [N, 3] from the camera to positions [N, 3] in the world."""
+    pose = pose_like(camera, means)
+    centre = -(pose[:, :3].T @ pose[:, 3])
+    return torch.nn.functional.normalize(means - centre, dim=1)
+
+
+def projected(means: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Pixels [N, 2] of positions [N, 3], and their depth z [N]; behind the camera pixels mean nothing."""
+    pose = pose_like(camera, means)
+    local = means @ pose[:, :3].T + pose[:, 3]
+    z = local[:, 2]
+    x, y = (local[:, :2] / z.clamp(min=1e-3)[:, None]).unbind(1)
+    return torch.stack([camera.fx * x + camera.cx, camera.fy * y + camera.cy], dim=1), z
+
+
+def in_picture(means: Tensor, camera: Camera, margin: float = 0.15) -> Tensor:
+    """[N] bool: before the camera and inside its picture, `margin` of a side around it included."""
+    pixels, z = projected(means, camera)
+    u, v = pixels[:, 0] / camera.width - 0.5, pixels[:, 1] / camera.height - 0.5
+    return (z > 0.01) & (u.abs() <= 0.5 + margin) & (v.abs() <= 0.5 + margin)
+
+
+class Unit:
+    """Positions in units of the scene: 0 at the median, 1 at the 97 % quantile of each axis."""
+
+    def __init__(self, xyz: np.ndarray, place: torch.device) -> None:
+        """
+        Args:
+            xyz: [P, 3] points of the sparse model.
+            place: of the Gaussians.
+        """
+        centre = np.median(xyz, axis=0)
+        spread = np.maximum(np.quantile(np.abs(xyz - centre), 0.97, axis=0), 1e-6)
+        self.centre = torch.tensor(centre, dtype=torch.float32, device=place)
+        self.spread = torch.tensor(spread, dtype=torch.float32, device=place)
+
+    def __call__(self, means: Tensor) -> Tensor:
+        return (means - self.centre) / self.spread
+
+
+def frequencies(x: Tensor, octaves: int) -> Tensor:
+    """[N, (1 + 2 octaves) d] of x [N, d]: x itself, then sin and cos of 2^k x (NeRF's code, input kept)."""
+    scaled = [2.0**k * x for k in range(octaves)]
+    return torch.cat([x, *(f(s) for s in scaled for f in (torch.sin, torch.cos))], dim=1)
+
+
+def conv_leaves(
+    name: str,
+    channels: Sequence[int],
+    rng: np.random.Generator,
+    rate: float,
+    *,
+    side: int = 3,
+    final: float = 1.0,
+) -> dict[str, Leaf]:
+    """Weights and biases of convolutions between these numbers of channels, as torch.nn.Conv2d's."""
+    found = {}
+    for i, (inputs, outputs) in enumerate(pairwise(channels)):
+        for kind, shape in (("weight", (outputs, inputs, side, side)), ("bias", (outputs,))):
+            values = rng.uniform(-1, 1, shape) / np.sqrt(inputs * side * side)
+            found[f"{name}_{kind}{i}"] = Leaf(torch.tensor(values, dtype=torch.float32), rate, final)
+    return found
+
+
+class _Penalty(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: object, values: Tensor, loss: Tensor) -> Tensor:
+        return values.view_as(values)
+
+    @staticmethod
+    def backward(ctx: object, *d_values: Tensor) -> tuple[Tensor, Tensor]:
+        return d_values[0], d_values[0].new_ones(())
+
+
+def with_penalty(values: Tensor, loss: Tensor) -> Tensor:
+    """The values; whatever pulls on them also pulls on `loss` [], with weight 1."""
+    found: Tensor = _Penalty.apply(values, loss)
+    return found
+
+
+_C4 = (
+    2.5033429417967046, -1.7701307697799304, 0.9461746957575601, -0.6690465435572892, 0.10578554691520431,
+    -0.6690465435572892, 0.47308734787878004, -1.7701307697799304, 0.6258357354491761,
+)  # fmt: skip
+
+
+def harmonics(directions: Tensor, degree: int) -> Tensor:
+    """Real spherical harmonics [N, (degree + 1)^2], the constant one included, at unit vectors [N, 3].
+
+    Order and signs of 3DGS; up to degree 4, as gsplat and svox2 have it.
+    """
+    found = [torch.full_like(directions[:, :1], SH_C0), lower_harmonics(directions, min(degree, 3))]
+    if degree >= 4:
+        x, y, z = directions.unbind(1)
+        xx, yy, zz = x * x, y * y, z * z
+        fourth = (
+            x * y * (xx - yy), y * z * (3 * xx - yy), x * y * (7 * zz - 1), y * z * (7 * zz - 3),
+            zz * (35 * zz - 30) + 3, x * z * (7 * zz - 3), (xx - yy) * (7 * zz - 1), x * z * (xx - 3 * yy),
+            xx * (xx - 3 * yy) - yy * (3 * xx - yy),
+        )  # fmt: skip
+        found.append(torch.stack([c * term for c, term in zip(_C4, fourth)], dim=1))
+    return torch.cat(found, dim=1)
+
+
+def ray_directions(camera: Camera, height: int, width: int, like: Tensor) -> Tensor:
+    """Unit vectors [height width, 3] in the world through the cells of a grid over the picture, by rows."""
+    pose = pose_like(camera, like)
+    u = (torch.arange(width, device=like.device) + 0.5) * (camera.width / width)
+    v = (torch.arange(height, device=like.device) + 0.5) * (camera.height / height)
+    x = ((u - camera.cx) / camera.fx)[None, :].expand(height, width)
+    y = ((v - camera.cy) / camera.fy)[:, None].expand(height, width)
+    rays = torch.stack([x, y, torch.ones_like(x)], dim=2).reshape(-1, 3).to(like.dtype)
+    return torch.nn.functional.normalize(rays @ pose[:, :3], dim=1)

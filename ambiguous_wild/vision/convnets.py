@@ -1,0 +1,200 @@
+"""Features of convolutional networks trained on ImageNet: EfficientNet-Lite0 and VGG-16; frozen.
+
+Both are differentiable in the image. `aw weights get` downloads them without a hub.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.core.config import config_hash
+from ambiguous_wild.core.errors import unknown
+from ambiguous_wild.core.tensor_files import read_tensors
+from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.vision import efficientnet, weights
+from ambiguous_wild.vision.calibration import cell_grid, check_image, degraded_distance, whole_cells
+from ambiguous_wild.vision.dino import normalised
+
+_VGG = (64, 64, "M", 128, 128, "M", 256, 256, 256, "M", 512, 512, 512, "M", 512, 512, 512)
+# name of the layer -> (entries of _VGG, stride in px, channels)
+_VGG_LAYERS = {
+    "relu1_2": (2, 1, 64), "relu2_2": (5, 2, 128), "relu3_3": (9, 4, 256), "relu4_3": (13, 8, 512),
+    "relu5_3": (17, 16, 512),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ConvConfig:
+    """Sizes and layers; "" and -1 are the network's defaults in `NETWORKS`."""
+
+    size: int = -1  # px, longer side of the net's input, rounded to whole cells; 0 = the image's size
+    layer: str = ""  # whose output is used
+    fit_photos: int = 8  # photos that `fit` uses
+
+
+@dataclass(frozen=True)
+class _Network:
+    layers: Mapping[str, tuple[int, int, int]]  # name -> (depth, stride in px, channels)
+    layer: str  # default
+    size: int  # default
+    build: Callable[[Mapping[str, Tensor], str], nn.Module]
+    prepare: Callable[[Tensor, int], Tensor]  # pixels in [0, 1] and stride -> input of the net
+
+
+def _vgg(tensors: Mapping[str, Tensor], layer: str) -> nn.Module:
+    """VGG-16 up to a layer of `_VGG_LAYERS`, with torchvision's indices."""
+    layers: list[nn.Module] = []
+    channels = 3
+    for entry in _VGG[: _VGG_LAYERS[layer][0]]:
+        if isinstance(entry, str):
+            layers.append(nn.MaxPool2d(2, 2))
+            continue
+        layers += [nn.Conv2d(channels, entry, 3, 1, 1), nn.ReLU()]
+        channels = entry
+    net = nn.Sequential(*layers)
+    net.load_state_dict({key: tensors[f"features.{key}"] for key in net.state_dict()})
+    return net
+
+
+def _prepare_vgg(pixels: Tensor, stride: int) -> Tensor:
+    return normalised(pixels)
+
+
+def _prepare_efficientnet(pixels: Tensor, stride: int) -> Tensor:
+    """As the net was trained: (x - 127) / 128; moved by half a cell.
+
+    SAME padding puts the centre of cell k at pixel k * stride + stride - 1, not in the middle of the cell.
+    """
+    moved = stride // 2
+    height, width = pixels.shape[2:]
+    shifted = F.pad(pixels, (moved, 0, moved, 0), mode="replicate")[:, :, :height, :width]
+    return (shifted * 255.0 - 127.0) / 128.0
+
+
+NETWORKS = {
+    "efficientnet-lite0": _Network(
+        efficientnet.LAYERS, "stride8", 0, efficientnet.EfficientNetLite0, _prepare_efficientnet
+    ),
+    "vgg16": _Network(_VGG_LAYERS, "relu3_3", 252, _vgg, _prepare_vgg),
+}
+
+
+class ConvFeatures:
+    """Output of one layer, [h, w, C]; the cells divide the image evenly."""
+
+    def __init__(self, name: str, config: ConvConfig | None = None, folder: str | Path | None = None) -> None:
+        """Find the weights; they are loaded at the first call.
+
+        Args:
+            name: a key of `NETWORKS`.
+            config: see `ConvConfig`.
+            folder: of the weights; nothing is searched.
+
+        Raises:
+            AwError: no weights; an invalid setting.
+        """
+        self.config = config or ConvConfig()
+        self._network = NETWORKS[name]
+        layer = self.config.layer or self._network.layer
+        if layer not in self._network.layers:
+            raise unknown(f"layer of {name}", layer, self._network.layers)
+        self._layer = layer
+        _, self.stride, self.channels = self._network.layers[layer]
+        self.size = self._network.size if self.config.size == -1 else self.config.size
+        if self.size < 0 or 0 < self.size < self.stride or self.config.fit_photos < 1:
+            raise AwError(
+                f"{name}: size must be 0 or at least one cell of {self.stride} px and fit_photos at least 1, "
+                f"got {self.size} and {self.config.fit_photos}"
+            )
+        self.path = _file(name, folder)
+        settings = config_hash([self.size, layer, self.config.fit_photos])[:8]
+        self.name = f"conv-1-{name}-{sha256_file(self.path)[:12]}-{settings}"
+        self.unit = 0.1  # until `fit`
+        self._what = name
+        self._model: nn.Module | None = None
+        self._device: torch.device | None = None
+
+    @property
+    def model(self) -> nn.Module:
+        """The net, loaded at first use.
+
+        Raises:
+            AwError: the file is damaged or holds another network.
+        """
+        if self._model is None:
+            tensors = read_tensors(self.path)
+            try:
+                # building a net draws random numbers; keep the caller's generator unchanged
+                with torch.random.fork_rng(devices=[]):
+                    net = self._network.build(tensors, self._layer)
+            except (KeyError, ValueError, RuntimeError) as error:
+                line = " ".join(str(error).split())
+                raise AwError(
+                    f"{self.path} is not {self._what} ({line}); delete it and run: "
+                    f"{weights.get_command(self._what)}"
+                ) from None
+            self._model = net.eval().requires_grad_(False)
+        return self._model
+
+    def fit(self, photos: Sequence[Tensor]) -> None:
+        """Set `unit`, see `calibration.degraded_distance`.
+
+        Raises:
+            AwError: there is no photo.
+        """
+        self.unit = degraded_distance(self, photos, self.config.fit_photos)
+
+    def grid(self, height: int, width: int) -> tuple[int, int]:
+        """Rows and columns of cells for an image of this size in px."""
+        return cell_grid(height, width, self.size, self.stride)
+
+    def precision(self, device: torch.device) -> str:
+        """See `precompute.PreciseFeatures`: torch's default for convolutions on a GPU is TF32."""
+        return "tf32" if device.type == "cuda" and torch.backends.cudnn.allow_tf32 else ""
+
+    def __call__(self, image: Tensor) -> Tensor:
+        """Features [h, w, C] of an image [H, W, 3] in [0, 1].
+
+        Raises:
+            AwError: the image is not [H, W, 3] or smaller than 8 px.
+        """
+        check_image(image)
+        if self._device != image.device:
+            self.model.to(image.device)
+            self._device = image.device
+        rows, columns = self.grid(image.shape[0], image.shape[1])
+        graph = torch.is_grad_enabled() and image.requires_grad
+        with torch.set_grad_enabled(graph):  # the net is frozen: only the image has a gradient
+            pixels = whole_cells(image.float(), rows, columns, self.stride)
+            maps = self.model(self._network.prepare(pixels, self.stride))
+        return maps[0].permute(1, 2, 0).contiguous()
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"unit": self.unit}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.unit = float(state["unit"])
+
+
+def _file(name: str, folder: str | Path | None) -> Path:
+    """The file of the weights."""
+    weight = weights.named(name)
+    if folder is None:
+        path = weights.where(weight)
+        if path is None:
+            how = f"download them with: {weights.get_command(name)}"
+            raise AwError(f"the weights of {name} are missing ({weights.find(weight)[1]}); {how}")
+        return path
+    place = Path(folder).expanduser()
+    found = [place / file for file in weight.files if (place / file).is_file()]
+    if not found:
+        raise AwError(f"{place} has no {' or '.join(weight.files)}")
+    return found[0]

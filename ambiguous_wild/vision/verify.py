@@ -1,0 +1,120 @@
+"""`aw weights check`: whether the weights on this machine are complete and are those that were published."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.vision import hub, weights
+from ambiguous_wild.vision.weights import Weight
+
+_SIDE = 64  # px of the picture that features are computed for
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What was found out about one of the weights."""
+
+    name: str
+    ok: bool
+    detail: str  # what was checked, or what is wrong
+
+
+def verify(weight: Weight) -> Verdict:
+    """Load the weights, every tensor by name and shape, and compare hashes where they are known.
+
+    Features are also computed once. Nothing is downloaded.
+    """
+    try:
+        place = weights.where(weight)
+        if place is None:
+            reason = weights.find(weight)[1]
+            raise AwError(f"{reason}; run: {weights.get_command(weight.name)}")
+        if weight.kind == "file":
+            return Verdict(weight.name, True, f"{_file(weight, place)}: {place}")
+        return Verdict(weight.name, True, f"{_folder(weight, place)}: {place}")
+    except AwError as error:
+        return Verdict(weight.name, False, str(error))
+
+
+def _file(weight: Weight, path: Path) -> str:
+    from ambiguous_wild.vision.convert import read_as_arrays, tensors_digest, used_tensors
+
+    arrays = used_tensors(weight, read_as_arrays(path))
+    stated = path.stem.rpartition("-")[2]  # torchvision's names end in the first 8 digits of the sha256
+    if path.suffix == ".pth" and len(stated) == 8 and set(stated) <= set("0123456789abcdef"):
+        if not sha256_file(path).startswith(stated):
+            raise AwError(f"{path} does not have the sha256 of its name; delete it and download it again")
+    elif tensors_digest(arrays) != weight.tensors:
+        raise AwError(
+            f"{path} holds other tensors than those published; delete it and run: "
+            f"{weights.get_command(weight.name)}"
+        )
+    return f"{len(arrays)} tensors, sha256 as published"
+
+
+def _folder(weight: Weight, folder: Path) -> str:
+    known = _receipt(weight, folder)
+    count = _load(weight, folder)
+    return f"{count} tensors, {'sha256 as downloaded' if known else 'no record of their sha256'}"
+
+
+def _receipt(weight: Weight, folder: Path) -> bool:
+    """Whether the folder holds hashes from its download; they are compared."""
+    path = folder / hub.RECEIPT
+    if not path.is_file():
+        return False
+    try:
+        stated = json.loads(path.read_text(encoding="utf-8"))["sha256"]
+        wrong = [name for name in weight.files if sha256_file(folder / name) != stated[name]]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise AwError(f"cannot read {path} ({error}); delete {folder} and download it again") from None
+    if wrong:
+        raise AwError(
+            f"{folder / wrong[0]} has changed since its download; delete {folder} and run: "
+            f"{weights.get_command(weight.name)}"
+        )
+    return True
+
+
+def _load(weight: Weight, folder: Path) -> int:
+    """Load the model; the number of its tensors."""
+    from ambiguous_wild.vision.pretrained import load, locate
+
+    if weight.used_for == "features":
+        from ambiguous_wild.vision.dino import DinoFeatures
+
+        features = DinoFeatures(weight.name, folder=folder)
+        _try(features, weight.name)
+        model = features.model
+    elif weight.name.startswith("grounding"):
+        from ambiguous_wild.vision.grounded import HARMLESS
+
+        source = locate(weight.name, ("grounding-dino",), folder)
+        model = load(source, "GroundingDinoForObjectDetection", harmless=HARMLESS)
+    else:
+        from ambiguous_wild.vision.sam import SamInstances
+
+        model = SamInstances(weight.name, folder=folder).model
+        if weight.name.startswith("sam2"):
+            from ambiguous_wild.vision.sam_video import SamVideoInstances
+
+            model = SamVideoInstances(weight.name, folder=folder).model
+    return len(model.state_dict())
+
+
+def _try(features: object, name: str) -> None:
+    """Compute features of a picture; they must be finite and differ from place to place."""
+    import torch
+
+    ramp = torch.linspace(0, 1, _SIDE)
+    image = torch.stack(
+        [ramp.expand(_SIDE, -1), ramp[:, None].expand(-1, _SIDE), ramp.flip(0).expand(_SIDE, -1)]
+    )
+    with torch.no_grad():
+        found = features(image.permute(1, 2, 0))  # type: ignore[operator]
+    if not bool(torch.isfinite(found).all()) or not bool(found.std() > 0):
+        raise AwError(f"the features of {name} are not finite or equal everywhere; download it again")

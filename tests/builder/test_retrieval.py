@@ -1,0 +1,75 @@
+"""Pairs by similar features: overlapping photos are found, and their number grows with the photos alone."""
+
+import numpy as np
+import pytest
+
+from ambiguous_wild.builder.pipeline import build_scene
+from ambiguous_wild.builder.retrieval import (
+    NEIGHBOURS,
+    SIMILAR,
+    embed,
+    most_similar,
+    pairs_of_tests,
+    retrieval_pairs,
+)
+from ambiguous_wild.builder.settings import BuildSettings
+from tests.builder.capture_maker import write_capture
+
+
+def places(count, per_place, seed=0):
+    """Descriptors of photos of several places, shuffled: those of one place share most features."""
+    rng = np.random.default_rng(seed)
+    stock = [rng.integers(0, 256, (120, 128), dtype=np.uint8) for _ in range(count)]
+    place = rng.permutation(np.repeat(np.arange(count), per_place))
+    names = [f"p{i:03d}" for i in range(len(place))]
+    photos = {}
+    for name, k in zip(names, place):
+        own = rng.integers(0, 256, (30, 128), dtype=np.uint8)
+        shared = stock[k][rng.permutation(120)[:90]].astype(np.int16) + rng.integers(-6, 7, (90, 128))
+        photos[name] = np.concatenate([np.clip(shared, 0, 255).astype(np.uint8), own])
+    return names, place, photos
+
+
+def test_photos_of_one_place_find_each_other():
+    names, place, photos = places(6, 8)
+    vectors = embed(photos.__getitem__, names)
+    found = most_similar(vectors, range(len(names)), range(len(names)), 7)
+    right = np.mean([place[a] == place[b] for a, b in found])
+    assert right > 0.95  # by chance: 0.15
+    assert np.array_equal(vectors, embed(photos.__getitem__, names))
+
+
+def test_the_number_of_pairs_is_linear():
+    rng = np.random.default_rng(1)
+    vectors = rng.normal(size=(1000, 64)).astype(np.float32)
+    names = [f"p{i:04d}" for i in range(1000)]
+    tests = set(names[::8])
+    pairs = retrieval_pairs(vectors, names, tests)
+    assert len(pairs) <= 1000 * (SIMILAR + NEIGHBOURS) < 30 * 1000
+    assert len(pairs) == len({frozenset(p) for p in pairs})
+    assert ("p0001", "p0002") in pairs and all(a != b for a, b in pairs)
+    of_tests = pairs_of_tests(vectors, names, tests)
+    assert len(of_tests) <= len(tests) * (2 * SIMILAR + SIMILAR // 2)
+    assert all(a in tests or b in tests for a, b in of_tests)
+    assert {n for p in of_tests for n in p} >= tests
+
+
+def test_a_photo_without_features_has_neighbours_only():
+    names, _, photos = places(2, 4)
+    photos[names[0]] = np.zeros((0, 128), np.uint8)
+    vectors = embed(photos.__getitem__, names)
+    assert not vectors[0].any() and np.isfinite(vectors).all()
+    assert embed(lambda name: np.zeros((0, 128), np.uint8), names).shape == (8, 64 * 128)
+
+
+@pytest.mark.parametrize("matcher", ["retrieval", "sequential"])
+def test_a_scene_is_built_from_such_pairs(matcher, tmp_path):
+    """Also with a separate test set, whose partners come from retrieval."""
+    write_capture(tmp_path / "raw" / "train", 8)
+    (tmp_path / "raw" / "test").mkdir()
+    for name in ("p02.jpg", "p05.jpg"):
+        (tmp_path / "raw" / "train" / name).rename(tmp_path / "raw" / "test" / name)
+    settings = BuildSettings(factor=2, max_features=800, matcher=matcher)
+    info = build_scene(tmp_path / "raw", tmp_path / "scene", settings, jobs=2).info
+    assert info["counts"]["registered"] == 8
+    assert info["chosen"]["matcher"] == matcher and 0 < info["counts"]["pairs"] <= 28

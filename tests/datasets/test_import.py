@@ -1,0 +1,343 @@
+"""Every layout gives the scene that it was made from."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ambiguous_wild.builder.downsample import downsample_photo
+from ambiguous_wild.cli import bench, import_dataset
+from ambiguous_wild.core import AwError
+from ambiguous_wild.datasets.recognise import READERS, recognise
+from ambiguous_wild.datasets.suites import suites
+from ambiguous_wild.datasets.write import ImportSettings, import_scene
+from ambiguous_wild.harness.running.grid import plan_cells
+from ambiguous_wild.io.images import read_gray, read_png_rgb
+from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.splat.pace import TrainConfig
+from tests.command_line import aw
+from tests.datasets import layouts
+
+KINDS = [k for k in layouts.LAYOUTS if k not in ("instant-ngp", "blender")]
+
+
+@pytest.fixture(scope="module")
+def native(tmp_path_factory):
+    return load_scene(layouts.native(tmp_path_factory.mktemp("native") / "scene"))
+
+
+@pytest.fixture(scope="module")
+def imported(tmp_path_factory):
+    """kind -> (the dataset's folder, the result of its import), each made once."""
+    base, made = tmp_path_factory.mktemp("layouts"), {}
+
+    def of(kind):
+        if kind not in made:
+            root = layouts.LAYOUTS[kind](base / "raw" / kind)
+            made[kind] = root, import_scene(root, base / "scenes" / kind, ImportSettings(factor=1))
+        return made[kind]
+
+    return of
+
+
+def same_cameras(views, others):
+    for a, b in zip(views, others, strict=True):
+        assert np.allclose(a.camera.cam_from_world, b.camera.cam_from_world, atol=1e-6)
+        assert np.allclose(a.camera.intrinsics, b.camera.intrinsics, atol=1e-6)
+        assert (a.camera.width, a.camera.height) == (b.camera.width, b.camera.height)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_cameras_pixels_and_split_are_those_of_the_native_scene(kind, native, imported):
+    root, done = imported(kind)
+    scene = load_scene(done.scene)
+    assert done.info["imported"]["layout"] == kind
+    assert [(v.name, v.split) for v in scene.views] == [(v.name, v.split) for v in native.views]
+    same_cameras(scene.views, native.views)
+    for a, b in zip(scene.views, native.views):
+        assert np.array_equal(read_png_rgb(a.image_path), read_png_rgb(b.image_path))
+    assert np.allclose(scene.points.xyz, native.points.xyz, atol=1e-5)
+    # a photo that is used as it is lies on the disk once
+    source = root / done.info["photos"][scene.views[0].name]["source"]
+    assert scene.views[0].image_path.samefile(source)
+
+
+@pytest.mark.parametrize("kind", [k for k in KINDS if k not in ("nerfstudio", "on-the-go")])
+def test_tracks_still_meet_their_points(kind, imported):
+    scene = load_scene(imported(kind)[1].scene)
+    owner = np.repeat(np.arange(len(scene.points)), np.diff(scene.points.track_offsets))
+    for index, view in enumerate(scene.views):
+        rows = scene.points.track_views == index
+        world = np.column_stack([scene.points.xyz[owner[rows]], np.ones(rows.sum())])
+        cam = (world @ view.camera.cam_from_world.T)[:, :3] @ view.camera.intrinsics.T
+        assert rows.sum() > 20
+        assert np.allclose(cam[:, :2] / cam[:, 2:], scene.points.track_xy[rows], atol=1e-3)
+
+
+def test_a_downsampled_scene_has_our_pixels_and_scaled_cameras(native, tmp_path):
+    done = import_scene(layouts.robustnerf(tmp_path / "raw"), tmp_path / "scene", ImportSettings(factor=2))
+    scene = load_scene(done.scene)
+    for a, b in zip(scene.views, native.views):
+        assert np.array_equal(
+            read_png_rgb(a.image_path), downsample_photo(read_png_rgb(b.image_path), 32, 18)
+        )
+        assert np.isclose(a.camera.fx, b.camera.fx / 2)
+
+
+def test_on_the_go_is_read_at_its_published_factor(tmp_path):
+    done = import_scene(layouts.on_the_go(tmp_path / "fountain"), tmp_path / "scene")
+    assert done.info["factor"] == 8
+    assert load_scene(done.scene).views[0].camera.width == 8
+    assert done.info["dataset"] == "NeRF On-the-go"
+
+
+def test_shipped_downsampled_photos_are_linked(tmp_path):
+    root = layouts.on_the_go_undistorted(tmp_path / "patio-high")
+    assert recognise(root)[0] == "on-the-go"
+    done = import_scene(root, tmp_path / "scene")
+    view = load_scene(done.scene).views[0]
+    assert view.image_path.samefile(root / "images_8" / view.name)
+
+
+def test_downsampled_photos_alone_are_enough(tmp_path):
+    root = layouts.on_the_go_undistorted(tmp_path / "corner")
+    for path in (root / "images").iterdir():
+        path.unlink()
+    (root / "images").rmdir()
+    scene = load_scene(import_scene(root, tmp_path / "scene").scene)
+    assert (scene.views[0].camera.width, scene.views[0].camera.height) == (8, 4)
+
+
+def test_blender_has_white_behind_and_the_field_of_view(native, imported):
+    scene = load_scene(imported("blender")[1].scene)
+    assert [v.split for v in scene.views] == ["test"] * 2 + ["train"] * 5  # test/... sorts before train/...
+    by_base = {Path(v.name).name: v for v in scene.views}
+    for view in native.views:
+        other = by_base[view.name]
+        assert np.allclose(other.camera.cam_from_world, view.camera.cam_from_world, atol=1e-6)
+        pixels, wanted = read_png_rgb(other.image_path), read_png_rgb(view.image_path).copy()
+        wanted[:4, :4] = 255
+        assert np.array_equal(pixels, wanted)
+        assert np.isclose(other.camera.fx, layouts.FX) and other.camera.cx == layouts.WIDTH / 2
+    assert len(scene.points) == 100_000 and np.abs(scene.points.xyz).max() <= 1.3
+
+
+def test_lens_distortion_is_taken_out(tmp_path):
+    """Oracle: where a point of the world falls in the undistorted photo, by its own camera."""
+    root = layouts.robustnerf(tmp_path / "raw")
+    model = layouts.make_model([*layouts.NAMES, "clean000.png"])
+    from ambiguous_wild.io.colmap_records import ModelCamera
+    from ambiguous_wild.io.safe_pycolmap import pycolmap
+
+    params = (70.0, 71.0, 31.5, 18.5, -0.3, 0.05, 0.001, 0.0)
+    lens = pycolmap.Camera(model="OPENCV", width=64, height=36, params=list(params))
+    model.cameras[1] = ModelCamera(1, "OPENCV", 64, 36, params)
+    layouts.write_model(root / "sparse" / "0", model)
+    scene = load_scene(import_scene(root, tmp_path / "scene", ImportSettings(factor=1)).scene)
+    view = scene.views[0]
+    # A bright square is put where the lens sees one direction, and must come out where the pinhole sees it.
+    ray = np.array([0.25, 0.1])
+    spot = np.asarray(lens.img_from_cam(np.array([[*ray, 1.0]])))[0]
+    photo = np.zeros((36, 64, 3), np.uint8)
+    row, column = int(spot[1]), int(spot[0])
+    photo[row - 1 : row + 2, column - 1 : column + 2] = 255
+    from ambiguous_wild.io.images import write_png
+
+    write_png(root / "images" / view.name, photo)
+    other = load_scene(import_scene(root, tmp_path / "again", ImportSettings(factor=1)).scene).views[0]
+    flat = read_png_rgb(other.image_path)[..., 0].astype(float)
+    rows, columns = np.mgrid[: flat.shape[0], : flat.shape[1]] + 0.5
+    found = np.array([(flat * columns).sum(), (flat * rows).sum()]) / flat.sum()
+    centre = np.asarray(lens.cam_from_img(np.array([[column + 0.5, row + 0.5]])))[0]
+    expected = centre * [other.camera.fx, other.camera.fy] + [other.camera.cx, other.camera.cy]
+    assert np.abs(found - expected).max() < 0.3
+
+
+def test_the_test_protocol_comes_with_the_scene(imported, tmp_path):
+    """A newcomer gets half photos and fitted appearance on Photo Tourism, and whole photos elsewhere."""
+    train = TrainConfig(iterations=5)
+    tourism = plan_cells(
+        ["refinesplat", "3dgs"], [imported("photo-tourism")[1].scene], [0], train, effects="default"
+    )
+    assert [cell.protocol for cell in tourism] == ["half", "half"]
+    assert "appearance" in tourism[0].chosen.effects and tourism[1].chosen.effects == ()
+    plain = plan_cells(["refinesplat"], [imported("robustnerf")[1].scene], [0], train, effects="default")
+    assert plain[0].protocol == "full" and "appearance" not in plain[0].chosen.effects
+    asked = plan_cells(["3dgs"], [imported("photo-tourism")[1].scene], [0], train, protocol="full")
+    assert asked[0].protocol == "full"
+    made = layouts.nerfbaselines(tmp_path / "nb", "nerfw")
+    assert import_scene(made, tmp_path / "scene").info["evaluation"]["protocol"] == "half"
+
+
+def test_keep_masks_of_nerfstudio_keep_their_meaning(imported):
+    view = load_scene(imported("nerfstudio")[1].scene).train[0]
+    assert view.keep_path is not None
+    mask = read_gray(view.keep_path)
+    assert (mask[:, :20] == 0).all() and (mask[:, 20:] == 255).all()
+
+
+def test_points_of_test_photos_are_dropped_on_demand(imported, tmp_path):
+    root = imported("colmap")[0]
+    done = import_scene(root, tmp_path / "scene", ImportSettings(drop_test_only_points=True))
+    assert imported("colmap")[1].info["counts"]["points_seen_in_test_only"] == 10
+    assert done.info["counts"]["points"] == 50
+    assert done.info["counts"]["points_seen_in_test_only"] == 0
+    assert len(load_scene(done.scene).points) == 50
+
+
+def test_names_that_the_model_lacks_are_counted_and_said(tmp_path):
+    root = layouts.native(tmp_path / "raw")
+    layouts.write_lists(root, test=[*layouts.TEST, "lost.png"])
+    done = aw("import", root, "-o", tmp_path / "scene")
+    assert done.returncode == 0
+    assert "warning: 1 listed test photo not in the model: lost.png" in done.stdout
+
+
+def test_the_same_import_again_does_nothing_and_another_is_refused(imported, tmp_path):
+    root = layouts.native(tmp_path / "raw")
+    first = import_scene(root, tmp_path / "scene")
+    state = (first.scene / "scene.json").stat().st_mtime_ns
+    assert import_scene(root, tmp_path / "scene").up_to_date
+    assert (first.scene / "scene.json").stat().st_mtime_ns == state
+    with pytest.raises(AwError, match="--overwrite"):
+        import_scene(root, tmp_path / "scene", ImportSettings(factor=2))
+    again = import_scene(root, tmp_path / "scene", ImportSettings(factor=2), overwrite=True)
+    assert again.info["factor"] == 2
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["raw", "scene"]
+
+
+def test_trained_like_the_native_scene(native, imported, tmp_path):
+    """100 iterations on what was imported give the bits of the native scene."""
+    for name, scene in (("native", native.root), ("robustnerf", imported("robustnerf")[1].scene)):
+        words = ["bench", "--method", "3dgs", "--scene", scene, "--iterations", "100", "--probes", "0"]
+        done = aw(*words, "-o", tmp_path / name, "--no-pictures", "--threads", "1")
+        assert done.returncode == 0, done.stderr
+    clouds = [next((tmp_path / n).rglob("point_cloud.ply")).read_bytes() for n in ("native", "robustnerf")]
+    assert clouds[0] == clouds[1]
+
+
+def _no_list(root):
+    layouts.native(root)
+    (root / "test_list.txt").unlink()
+
+
+def _other_table(root):
+    layouts.phototourism(root)
+    rows = [f"other{i}.jpg\t{i}\ttrain\tx" for i in range(9)]
+    (root / "toy.tsv").write_text("\n".join(["filename\tid\tsplit\tdataset", *rows]) + "\n")
+
+
+def _mask_size(root):
+    layouts.nerfstudio(root)
+    from ambiguous_wild.io.images import write_png
+
+    write_png(root / "masks" / "m.png", np.zeros((50, 40), np.uint8))
+
+
+def _photo_absent(root):
+    layouts.robustnerf(root)
+    (root / "images" / "extra001.png").unlink()
+
+
+def _two_splits(root):
+    layouts.on_the_go(root)
+    (root / "toy.tsv").write_text("filename\tid\tsplit\tdataset\n")
+
+
+def _keyword(root):
+    layouts.robustnerf(root)
+    layouts.write_model(root / "sparse" / "0", layouts.make_model([*layouts.NAMES, "other.png"]))
+
+
+def _long_split(root):
+    layouts.on_the_go(root)
+    (root / "split.json").write_text(json.dumps({"clutter": [0, 1], "extra": [99]}))
+
+
+def _outside(root):
+    layouts.instant_ngp(root)
+    text = (root / "transforms.json").read_text().replace("./images/extra000.png", "../../secret.png")
+    (root / "transforms.json").write_text(text)
+
+
+def _matrix(root):
+    layouts.instant_ngp(root)
+    data = json.loads((root / "transforms.json").read_text())
+    data["frames"][0]["transform_matrix"] = [[1, 2], [3, 4]]
+    (root / "transforms.json").write_text(json.dumps(data))
+
+
+def _turned(root):
+    layouts.native(root)
+    from ambiguous_wild.io.images import write_png
+
+    write_png(root / "images" / "clutter001.png", np.zeros((64, 36, 3), np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (_no_list, "test_list.txt"),
+        (_other_table, "table of another scene"),
+        (_mask_size, "m.png is 40x50 but its photo clutter000.png 64x36"),
+        (_photo_absent, "1 of 7 photos that the model registers are not in"),
+        (_two_splits, "choose one with --as"),
+        (_keyword, "other.png (none)"),
+        (_long_split, "they belong to two scenes"),
+        (_outside, "outside itself"),
+        (_matrix, "clutter000.png"),
+        (_turned, "clutter001.png (36x64, its camera 64x36)"),
+        (lambda root: root.mkdir(), "no known layout"),
+    ],
+)
+def test_a_wrong_dataset_is_one_line_and_nothing_is_left(spoil, message, tmp_path):
+    spoil(tmp_path / "raw")
+    done = aw("import", tmp_path / "raw", "-o", tmp_path / "scene")
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1 and "Traceback" not in done.stderr
+    assert [p.name for p in tmp_path.iterdir()] == ["raw"]
+
+
+def test_points_are_triangulated_where_the_dataset_has_poses_alone(tmp_path):
+    """Oracle: photos of two walls with exact cameras; the points must lie on the walls."""
+    from tests.builder import capture_maker as maker
+
+    paths = maker.write_capture(tmp_path / "raw" / "images", 6)
+    frames = []
+    for path, eye in zip(paths, maker.eyes(6)):
+        z = np.array([0.0, 0.0, 5.2]) - eye
+        z /= np.linalg.norm(z)
+        x = np.cross([0.0, 1.0, 0.0], z)
+        x /= np.linalg.norm(x)
+        c2w = np.eye(4)
+        c2w[:3, :3], c2w[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), eye
+        matrix = (c2w @ layouts.OPENGL).tolist()
+        frames.append({"file_path": f"images/{path.name}", "transform_matrix": matrix})
+    shared = {"w": maker.WIDTH, "h": maker.HEIGHT, "fl_x": maker.FOCAL, "fl_y": maker.FOCAL}
+    (tmp_path / "raw" / "transforms.json").write_text(json.dumps({**shared, "frames": frames}))
+    done = import_scene(tmp_path / "raw", tmp_path / "scene", jobs=2)
+    assert done.info["imported"]["layout"] == "instant-ngp"
+    scene = load_scene(done.scene)
+    for view, eye in zip(scene.views, maker.eyes(6)):
+        assert np.allclose(view.camera.center, eye, atol=1e-6)
+    assert len(scene.points) > 100
+    distances = []
+    for corner, u, v, _ in maker.walls():
+        normal = np.cross(u, v)
+        distances.append(np.abs((scene.points.xyz - corner) @ normal / np.linalg.norm(normal)))
+    assert np.median(np.min(distances, axis=0)) < 0.02
+    assert (scene.points.track_views >= 0).all()
+
+
+def test_too_few_matches_give_random_points_and_say_so(imported):
+    done = imported("instant-ngp")[1]
+    assert "too few points could be triangulated: initial points are random" in done.info["imported"]["notes"]
+    assert done.info["counts"]["points"] == 100_000
+
+
+def test_the_command_offers_what_there_is():
+    """The command line lists names without importing the readers."""
+    assert set(import_dataset.KINDS) == set(READERS)
+    assert set(bench.SUITES) == set(suites())

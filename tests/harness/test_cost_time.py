@@ -1,0 +1,262 @@
+"""Cost in reference seconds, the one-line answer, and the recommended setting."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from ambiguous_wild.cli.cost import command
+from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.cost import here
+from ambiguous_wild.harness.cost.answer import answers
+from ambiguous_wild.harness.cost.curves import curves_of
+from ambiguous_wild.harness.cost.pairs import changes
+from ambiguous_wild.harness.cost.read import Found, read_cost_runs
+from ambiguous_wild.harness.cost.recommend import additive, in_words, leave_out, recommend, value_at, words_of
+from ambiguous_wild.harness.cost.report import cost_report, plain_data
+from ambiguous_wild.harness.cost.text import to_text
+from tests.harness.fake_cost import cost_run
+from tests.tiny_scene import write_tiny_scene
+
+RISING = [(10.0, 10.0), (20.0, 18.0), (40.0, 20.0)]
+BUSY = {"verdict": "contended", "reason": "2 runs shared the machine", "kernel": "cpu-1"}
+
+
+def timed(samples: list[list[float]], kernel_reference_s: float = 0.25) -> dict[str, Any]:
+    record = {"verdict": "alone", "reason": "", "kernel": "cpu-1"}
+    return record | {"samples": samples, "kernel_reference_s": kernel_reference_s}
+
+
+def read(*folders: Path) -> Found:
+    return read_cost_runs(folders)
+
+
+def test_times_are_those_of_the_reference_machine(tmp_path: Path) -> None:
+    # twice as slow as the reference machine, then as fast
+    samples = [[0.0, 0.5], [20.0, 0.5], [20.0, 0.25], [40.0, 0.25]]
+    cost_run(
+        tmp_path, "a", psnr=(20.0,), train_s=40.0, probes=RISING, timing=timed(samples), reference_s=30.0
+    )
+    found = read(tmp_path)
+    (run,) = found.runs
+    assert found.reference and run.train_s == 30.0
+    assert [at for at, _ in run.points] == [5.0, 10.0, 30.0]
+    assert run.setup_s == 2.5
+    text = to_text(cost_report(found))
+    assert "reference seconds of training to reach a test PSNR" in text
+
+
+def test_runs_without_calibration_keep_the_wall_and_are_not_ranked(tmp_path: Path) -> None:
+    cost_run(tmp_path, "a", psnr=(20.0,), train_s=40.0, probes=RISING)
+    cost_run(tmp_path, "b", psnr=(21.0,), train_s=50.0, probes=RISING, timing=None)
+    found = read(tmp_path)
+    assert not found.reference
+    report = cost_report(found)
+    points = {p.curve: p for p in report.points}
+    assert points["a"].front and not points["b"].front and "not calibrated" in points["b"].unranked
+    assert any("wall seconds" in note for note in report.notes)
+
+
+def test_contended_runs_are_a_range_and_never_on_the_front(tmp_path: Path) -> None:
+    for seed, seconds in ((0, 129.0), (1, 168.0), (2, 230.0)):
+        cost_run(tmp_path, "a", seed=seed, psnr=(25.0,), train_s=seconds, timing=BUSY, effects=("exposure",))
+        cost_run(tmp_path / "n", "a", seed=seed, psnr=(24.0,), train_s=100.0, probes=[(50.0, 20.0)])
+    report = cost_report(read(tmp_path))
+    points = {p.curve: p for p in report.points}
+    busy = points["a + exposure"]
+    assert not busy.front and points["a plain"].front
+    assert (busy.low * 60.0, busy.high * 60.0) == (129.0, 230.0)
+    assert "3 of 3 runs contended: 2 runs shared the machine" in busy.unranked
+    text = to_text(report)
+    assert "2.15 to 3.83" in text and "not ranked" in text
+    (change,) = report.changes
+    assert change.db.mean == 1.0 and math.isnan(change.per_minute) and change.unranked
+    data = plain_data(report)
+    assert data["curves"][0]["not_ranked"] or data["curves"][1]["not_ranked"]
+    reach = next(row for row in report.reach if row.curve == "a + exposure" and row.reached)
+    assert reach.unranked and reach.high * 60.0 == 230.0
+
+
+def test_one_line_says_what_most_of_the_quality_and_the_last_db_take(tmp_path: Path) -> None:
+    for seed in (0, 1):
+        cost_run(tmp_path, "fast", seed=seed, psnr=(27.0,), train_s=60.0,
+                 probes=[(20.0, 24.0), (40.0 + seed, 26.0)])  # fmt: skip
+        cost_run(tmp_path, "good", seed=seed, psnr=(30.0,), train_s=600.0,
+                 probes=[(200.0, 26.0), (400.0, 28.0), (500.0, 29.0)])  # fmt: skip
+    cost_run(tmp_path, "3dgs+truth", psnr=(40.0,), train_s=5.0, probes=[(1.0, 39.0)])
+    curves = curves_of(read(tmp_path).runs)
+    (answer,) = answers(curves)
+    assert answer.best == 30.0 and answer.best_curve == "good" and answer.ranked
+    assert answer.most_curve == "fast"  # 27 dB: at its end, sooner than the other
+    assert answer.most_s == pytest.approx(60.0) and answer.most_spread_s == 0.0
+    assert answer.last_s == pytest.approx(100.0)
+    assert answer.text == (
+        "on yard 90 % of the best PSNR (30.0 dB) takes 60 s ± 0.0 s (fast), the last dB 100 s (good)"
+    )
+    assert answer.text in to_text(cost_report(read(tmp_path)))
+
+
+def test_an_answer_says_what_was_not_measured(tmp_path: Path) -> None:
+    cost_run(tmp_path, "a", psnr=(30.0,), train_s=600.0, probes=[(100.0, 29.5)], timing=BUSY)
+    (answer,) = answers(curves_of(read(tmp_path).runs))
+    assert answer.bound and "takes at most 100 s (a)" in answer.text
+    assert "the last dB not measured" in answer.text and "not all of these runs were alone" in answer.text
+
+
+def test_resolution_gaussians_and_parts_are_changes_of_their_own(tmp_path: Path) -> None:
+    cost_run(tmp_path / "1", "a", psnr=(20.0,), train_s=60.0, train={"resolution": "coarse-to-fine"})
+    cost_run(tmp_path / "2", "a", psnr=(21.0,), train_s=90.0, ms=200.0, train={"resolution": "full"})
+    cost_run(tmp_path / "3", "b", psnr=(20.0,), train_s=60.0, train={"max_gaussians": 5000})
+    cost_run(tmp_path / "4", "b", psnr=(20.5,), train_s=75.0, ms=200.0, train={"max_gaussians": 20000})
+    cost_run(tmp_path / "5", "c", psnr=(22.0,), train_s=90.0, options={"x": 1, "y": 1})
+    cost_run(tmp_path / "5", "c@parts-without", psnr=(21.0,), train_s=60.0, options={"x": 0, "y": 0})
+    found = {change.kind: change for change in changes(read(tmp_path).runs)}
+    assert found.keys() == {"resolution", "gaussians", "part"}
+    assert (found["resolution"].before, found["resolution"].after) == ("coarse-to-fine", "full")
+    assert found["resolution"].per_minute == pytest.approx(2.0)
+    assert (found["gaussians"].before, found["gaussians"].after) == ("5000", "20000")
+    assert found["gaussians"].per_minute == pytest.approx(2.0)
+    part = found["part"]
+    assert (part.method, part.before, part.after) == ("c", "as it is", "parts-without")
+    assert part.db.mean == -1.0 and part.minutes.mean == pytest.approx(-0.5)
+
+
+# -- the recommended setting ------------------------------------------------------------------------
+
+
+def grid(root: Path, scenes: dict[str, float]) -> None:
+    """Two methods and two numbers of Gaussians, 30 s and 300 s: `fast` is better at 30 s, `good` at 300 s."""
+    ends = {("fast", 30.0): 2.0, ("fast", 300.0): 3.0, ("good", 30.0): 0.0, ("good", 300.0): 6.0}
+    for scene, level in scenes.items():
+        for (method, seconds), gain in ends.items():
+            for count, more in ((5000, -0.5), (20000, 0.0)):
+                cost_run(
+                    root / f"{seconds:g}" / str(count), method, scene, psnr=(20.0 + level + gain + more,),
+                    train_s=seconds, budget_s=seconds, train={"max_gaussians": count},
+                    scene_hash=scene, reproduce=f"aw bench --method {method} --scene /x/{scene} --seed 0 "
+                    f"--budget {seconds:g}s --effects none --max-gaussians {count}",
+                )  # fmt: skip
+
+
+def test_the_setting_that_is_best_within_the_budget_is_recommended(tmp_path: Path) -> None:
+    grid(tmp_path, {"one": 0.0, "two": 5.0, "three": -3.0})
+    runs = read(tmp_path).runs
+    short, long = recommend(runs, "new", 30.0), recommend(runs, "new", 300.0)
+    assert short.choices[0].name == "fast max_gaussians=20000"
+    assert long.choices[0].name == "good max_gaussians=20000" and not long.own
+    assert [c.behind for c in long.choices] == pytest.approx([0.0, 0.5, 3.0, 3.5])
+    assert long.command("my scene") == (
+        "aw bench --method good --effects none --max-gaussians 20000 --scene 'my scene' --budget 300s"
+    )
+    # a machine of half the speed needs the setting for half the time
+    assert recommend(runs, "new", 60.0, speed=0.5).choices[0].name == short.choices[0].name
+    text = in_words(long, "my scene")
+    assert "for new within 5 min on this machine: good" in text and "3.00 dB less" in text
+    assert "within 60 s on this machine (30 s of the reference machine)" in in_words(
+        recommend(runs, "new", 60.0, speed=0.5), "s"
+    )
+
+
+def test_scenes_that_a_setting_lacks_do_not_favour_it(tmp_path: Path) -> None:
+    cost_run(tmp_path, "a", "easy", psnr=(30.0,), train_s=60.0)
+    cost_run(tmp_path, "b", "easy", psnr=(31.0,), train_s=60.0)
+    cost_run(tmp_path, "b", "hard", psnr=(20.0,), train_s=60.0)
+    found = recommend(read(tmp_path).runs, "new", 60.0)
+    assert [c.name for c in found.choices] == ["b", "a"]  # by their means it would be the other way round
+    assert found.choices[1].behind == pytest.approx(1.0)
+
+
+def test_a_scene_that_was_measured_is_judged_by_its_own_runs(tmp_path: Path) -> None:
+    grid(tmp_path, {"one": 0.0})
+    cost_run(tmp_path / "own", "fast", "mine", psnr=(40.0,), train_s=200.0, scene_hash="mine")
+    cost_run(tmp_path / "own", "good", "mine", psnr=(35.0,), train_s=200.0, scene_hash="mine")
+    found = recommend(read(tmp_path).runs, "other name", 300.0, scene_hash="mine")
+    assert found.own and found.choices[0].method == "fast" and found.choices[0].psnr == 40.0
+
+
+def test_busy_runs_oracles_and_lengths_above_the_budget_do_not_count(tmp_path: Path) -> None:
+    cost_run(tmp_path, "slow", psnr=(40.0,), train_s=600.0)
+    cost_run(tmp_path, "busy", psnr=(39.0,), train_s=50.0, timing=BUSY)
+    cost_run(tmp_path, "3dgs+truth", psnr=(38.0,), train_s=50.0)
+    cost_run(tmp_path, "plain", psnr=(20.0,), train_s=50.0)
+    found = recommend(read(tmp_path).runs, "new", 60.0)
+    assert [c.name for c in found.choices] == ["plain"]
+    assert "2 runs shared the machine" in found.notes[0]
+    with pytest.raises(AwError, match="the shortest took 50 s"):
+        recommend(read(tmp_path).runs, "new", 10.0)
+
+
+def test_psnr_between_two_lengths_lies_on_a_line_over_log_time(tmp_path: Path) -> None:
+    for seconds, psnr in ((30.0, 20.0), (300.0, 24.0)):
+        cost_run(tmp_path / f"{seconds:g}", "a", psnr=(psnr,), train_s=seconds, budget_s=seconds)
+    curves = curves_of(read(tmp_path).runs)
+    assert value_at(curves, "yard", 30.0 * math.sqrt(10.0)) == pytest.approx(22.0)
+    assert value_at(curves, "yard", 3000.0) == 24.0
+    assert math.isnan(value_at(curves, "yard", 10.0)) and math.isnan(value_at(curves, "absent", 100.0))
+    assert value_at(curves, "yard", 29.5) == 20.0  # a budget is met to within a step
+
+
+def test_parts_of_settings_and_scenes_are_found_again() -> None:
+    rng = np.random.default_rng(0)
+    setting, scene = rng.normal(size=4), 10.0 * rng.normal(size=5)
+    values = {
+        (str(i), str(j)): float(setting[i] + scene[j]) for i in range(4) for j in range(5) if (i + j) % 4
+    }
+    parts, rest = additive(values)
+    np.testing.assert_allclose(np.diff([parts[str(i)] for i in range(4)]), np.diff(setting), atol=1e-9)
+    assert all(abs(value) < 1e-9 for value in rest.values())
+
+
+def test_held_back_scenes_say_how_good_a_recommendation_is(tmp_path: Path) -> None:
+    grid(tmp_path, {"one": 0.0, "two": 5.0, "held": 1.0, "back": 2.0})
+    found = leave_out(read(tmp_path).runs, ["held", "back"], 300.0)
+    assert found == {
+        "held": ("good max_gaussians=20000", 0.0),
+        "back": ("good max_gaussians=20000", 0.0),
+    }
+    with pytest.raises(AwError, match="left to learn from"):
+        leave_out(read(tmp_path).runs, ["one", "two", "held", "back"], 300.0)
+
+
+def test_the_words_of_a_setting_are_not_those_of_a_stranger(tmp_path: Path) -> None:
+    cost_run(tmp_path, "a", reproduce="aw bench --method a --scene x --evil 'rm -rf /' --set a.k=2 --seed 3")
+    (run,) = read(tmp_path).runs
+    assert words_of(run) == ("--method", "a", "--set", "a.k=2")
+    cost_run(tmp_path / "old", "b", effects=("exposure",))
+    cost_run(tmp_path / "bad", "c", reproduce="aw bench 'unfinished")
+    words = {r.method: words_of(r) for r in read(tmp_path).runs}
+    assert words["b"] == ("--method", "b", "--effects", "exposure")
+    assert words["c"] == ("--method", "c", "--effects", "none")
+
+
+def test_the_command_recommends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = write_tiny_scene(tmp_path / "scene")
+    grid(tmp_path / "runs", {"one": 0.0, "two": 1.0})
+    monkeypatch.setattr(here, "speed_here", lambda found: 2.0)
+    words = [str(tmp_path / "runs"), "--recommend", str(scene), "--budget", "150s"]
+    done = CliRunner().invoke(command, words)
+    assert done.exit_code == 0, done.output
+    assert "good max_gaussians=20000" in done.output.splitlines()[0]
+    told = json.loads(CliRunner().invoke(command, [*words, "--json"]).stdout)
+    assert told["reference_s"] == 300.0 and told["command"].endswith("--budget 150s")
+    error = CliRunner().invoke(command, words[:3]).exception
+    assert isinstance(error, AwError) and "--budget" in str(error)
+    assert not (Path.cwd() / "cost").exists()
+
+
+def test_the_speed_of_this_machine_is_that_of_its_calibration(monkeypatch: pytest.MonkeyPatch) -> None:
+    from ambiguous_wild.splat import calibration
+
+    class Kernel:
+        def seconds(self) -> float:
+            return 0.5
+
+    monkeypatch.setattr(calibration, "calibration", lambda device: Kernel())
+    expected = calibration.KERNELS["cpu"].reference_s / 0.5
+    assert here.speed_here(Found((), ())) == pytest.approx(expected)

@@ -1,0 +1,68 @@
+"""What tables say about a method below its rows."""
+
+from pathlib import Path
+
+import yaml
+
+from ambiguous_wild.harness.ablation.plan import plan_study
+from ambiguous_wild.harness.ablation.report import report, to_markdown
+from ambiguous_wild.harness.running.store import read_runs
+from ambiguous_wild.harness.tables.comparison import comparison
+from ambiguous_wild.methods import MethodEntry, register, registry
+from ambiguous_wild.splat.pace import TrainConfig
+from tests.harness.fake_runs import fake_result, save
+from tests.tiny_scene import write_tiny_scene
+
+
+def notes_of(root: Path, *methods: tuple[str, dict]) -> list[str]:  # type: ignore[type-arg]
+    save(root, *(fake_result(name) for name, _ in methods))
+    for name, options in methods:
+        folder = "".join(c if c.isalnum() else "_" for c in name)
+        config = {"method": name, "options": options}
+        (root / "yard" / folder / "seed0" / "config.yaml").write_text(yaml.safe_dump(config))
+    return list(comparison(read_runs(root)).notes)
+
+
+def test_refinesplat_is_said_to_be_weight_free(tmp_path):
+    (note,) = [n for n in notes_of(tmp_path, ("3dgs", {}), ("refinesplat", {})) if "weight-free" in n]
+    assert note.startswith("refinesplat: ")
+    assert not [n for n in notes_of(tmp_path / "other", ("3dgs", {})) if "weight-free" in n]
+
+
+def test_the_papers_method_names_the_networks_of_its_runs(tmp_path):
+    options = {"features": "sceneconv", "instances": "graph", "mask": {"w2": None}}
+    notes = notes_of(tmp_path, ("refinesplat-paper", options))
+    assert any("features sceneconv, instances graph" in n for n in notes)
+    nothing = notes_of(tmp_path / "old", ("refinesplat-paper", {}))
+    assert any("features not recorded" in n for n in nothing)
+
+
+def test_variants_and_grafts_are_their_methods(tmp_path):
+    variant = {"features": "labhog", "instances": "graph"}
+    graft = {"host": {"features": "x"}, "mask": {"features": "sceneconv", "instances": "graph"}}
+    notes = notes_of(
+        tmp_path,
+        ("refinesplat-paper@masks-local", variant),
+        ("robustsplat@mask=refinesplat-paper", graft),
+    )
+    (note,) = [n for n in notes if n.startswith("refinesplat-paper: ")]
+    assert "features labhog/sceneconv, instances graph" in note
+
+
+def test_a_graft_in_an_ablation_names_the_options_of_its_donor(tmp_path):
+    options = {"host": {"features": "x"}, "mask": {"features": "sceneconv", "instances": "graph"}}
+    notes = notes_of(tmp_path, ("refinesplat-paper@plug-in-wildgaussians-t-ent", options))
+    assert any("features sceneconv, instances graph" in n for n in notes)
+
+
+def test_the_report_of_an_ablation_says_it_too(tmp_path):
+    scene = write_tiny_scene(tmp_path / "scene")
+    plan = plan_study("refinesplat-paper", [scene], [0], TrainConfig(iterations=9), groups=["alpha1"])
+    data = report(plan, tmp_path / "runs")
+    assert "features labhog, instances graph" in to_markdown(data)
+
+
+def test_a_note_of_a_plugin_may_hold_options(tmp_path, monkeypatch):
+    monkeypatch.setattr(registry, "_registered", {})
+    register(MethodEntry("mine", "", "m:f", note="of size {size}"))
+    assert "mine: of size 3" in notes_of(tmp_path, ("mine", {"size": 3}))

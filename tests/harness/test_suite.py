@@ -1,0 +1,146 @@
+"""Whole tables from folders of scenes in their published layouts."""
+
+import re
+import shutil
+
+import pytest
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.datasets.suites import differences, find_scenes, get_suite, scene_id, suites
+from ambiguous_wild.harness.suite import prepare_suite, suite_layouts, suite_methods
+from ambiguous_wild.harness.tables.layouts.reported import read_reported
+from ambiguous_wild.io.scene_folder import read_scene_json
+from tests.command_line import aw
+from tests.datasets import layouts
+
+# Large enough to be measured at factor 8.
+SIZE = {"WIDTH": 160, "HEIGHT": 96, "FX": 170.0, "FY": 171.0, "CX": 79.5, "CY": 48.5}
+SUITES = {
+    "ambiguous-wild": (layouts.robustnerf, ["Humanoid", "porter", "Wood"]),
+    "on-the-go": (layouts.on_the_go, ["mountain", "patio_high"]),
+    "robustnerf": (layouts.robustnerf, ["android3", "crab2"]),
+    "photo-tourism": (layouts.phototourism, ["brandenburg_gate", "trevi-fountain"]),
+    "drone": (layouts.drone, ["Simingshan", "Sculpture"]),
+}
+
+
+@pytest.fixture
+def large(monkeypatch):
+    for name, value in SIZE.items():
+        monkeypatch.setattr(layouts, name, value)
+
+
+@pytest.mark.parametrize("name", SUITES)
+def test_a_suite_end_to_end(name, large, tmp_path):
+    make, folders = SUITES[name]
+    for folder in folders:
+        make(tmp_path / "root" / folder)
+    words = ["bench", "--suite", name, "--root", tmp_path / "root", "--method", "3dgs", "--iterations", "10"]
+    done = aw(*words, "-o", tmp_path / "runs", "--probes", "0", "--no-pictures", "--threads", "1")
+    assert done.returncode == 0, done.stderr
+    suite = get_suite(name)
+    assert done.stdout.count(suite.dataset) >= 1
+    rows = done.stdout.splitlines()
+    assert any(line.startswith("3dgs ") for line in rows)
+    if name != "robustnerf":  # no table of the paper has it
+        assert "reported: printed in a paper, not measured here" in done.stdout
+        assert any(line.startswith("  RefineSplat ") for line in rows)
+    # the protocol and factor of the papers, without an option
+    config = next((tmp_path / "runs").rglob("config.yaml")).read_text()
+    assert ("protocol: half" in config) == (suite.protocol == "half")
+    info = read_scene_json(next((tmp_path / "runs" / ".scenes").iterdir()))
+    assert info["dataset"] == suite.dataset
+    assert info["factor"] == (suite.factor or 8)
+    missing = [s for s in suite.scenes if scene_id(s) not in {p.name for p in (tmp_path / "runs").iterdir()}]
+    assert (f"not here: {', '.join(missing)}" in done.stdout) == bool(missing)
+    again = aw(*words, "-o", tmp_path / "runs", "--probes", "0", "--no-pictures", "--threads", "1")
+    assert again.returncode == 0 and "imported" not in again.stderr
+
+
+def test_reported_numbers_stand_in_their_own_rows(large, tmp_path):
+    """Every number of our row is measured here, and every reported one is printed as in its table."""
+    layouts.drone(tmp_path / "root" / "SimingShan")
+    prepared = prepare_suite(get_suite("drone"), tmp_path / "root", tmp_path / "runs")
+    done = aw(
+        "bench", "--method", "3dgs", "--scene", prepared.scenes["simingshan"], "--iterations", "5",
+        "-o", tmp_path / "runs", "--probes", "0", "--no-pictures", "--threads", "1",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    (layout,) = suite_layouts(prepared, tmp_path / "runs")
+    measured = [line for line in layout.lines if line.kind == "measured"]
+    reported = [line for line in layout.lines if line.kind == "reported"]
+    assert [line.name for line in measured] == ["3dgs"]
+    assert all(not e.printed for line in measured for e in line.entries)
+    assert all(e.printed or e.state == "blank" for line in reported for e in line.entries)
+    numbers = [n for n in read_reported() if n.dataset == "Drone Imagery" and n.scene == "SimingShan"]
+    printed = {(n.method, n.metric): n.text for n in numbers if not n.setting}
+    row = next(line for line in reported if line.name == "RefineSplat")
+    psnr = next(i for i, c in enumerate(layout.columns) if c.scene and c.measure.key == "psnr")
+    assert row.entries[psnr].printed == printed["RefineSplat", "psnr"]
+    # One scene of two: the papers' mean over both would mislead.
+    assert all(
+        not e.printed for line in reported for c, e in zip(layout.columns, line.entries) if not c.scene
+    )
+
+
+def test_scenes_are_found_in_any_spelling(tmp_path):
+    suite = get_suite("on-the-go")
+    for name in ("Patio-High", "nested/spot"):
+        (tmp_path / name / "sparse").mkdir(parents=True)
+    (tmp_path / "corner").mkdir()  # photos of a scene, no scene
+    found, absent = find_scenes(suite, tmp_path)
+    assert {k: v.relative_to(tmp_path).as_posix() for k, v in found.items()} == {
+        "Patio-High": "Patio-High",
+        "Spot": "nested/spot",
+    }
+    assert absent == ["Mountain", "Fountain", "Corner", "Patio"]
+    (tmp_path / "patio_high" / "sparse").mkdir(parents=True)
+    with pytest.raises(AwError, match="2 folders of the scene Patio-High"):
+        find_scenes(suite, tmp_path)
+    with pytest.raises(AwError, match="has no scene of drone"):
+        find_scenes(get_suite("drone"), tmp_path)
+
+
+def test_the_registry_has_the_papers_scenes():
+    wild = get_suite("ambiguous-wild")
+    assert len(wild.scenes) == 18 and wild.factor == 8 and (wild.width, wild.height) == (1920, 1080)
+    reported = {(n.dataset, n.scene) for n in read_reported() if n.known}
+    for suite in suites().values():
+        if suite.name != "robustnerf":
+            assert all((suite.dataset, scene) in reported for scene in suite.scenes)
+    assert {"3dgs", "refinesplat", "robustsplat", "dronesplat", "wildgaussians"} <= set(suite_methods(wild))
+    assert suite_methods(get_suite("robustnerf")) == ["3dgs", "refinesplat"]
+
+
+def test_a_copy_is_compared_with_the_registry():
+    wild = get_suite("ambiguous-wild")
+    assert differences(wild, "Stone", [(1920, 1080), (1078, 1900)], 8) == []
+    found = differences(wild, "stones", [(1280, 720)], 4)
+    assert len(found) == 3
+    assert "no scene 'stones'" in found[0] and "factor 4" in found[1] and "1280x720" in found[2]
+
+
+def test_a_scene_under_another_name_is_refused(large, tmp_path):
+    scene = tmp_path / "root" / "Sculpture"
+    aw("import", layouts.drone(tmp_path / "raw"), "-o", tmp_path / "other")
+    shutil.copytree(tmp_path / "other", scene)
+    with pytest.raises(AwError, match="is the scene 'other'"):
+        prepare_suite(get_suite("drone"), tmp_path / "root", tmp_path / "runs")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--suite", "on-the-go"], "--root DIR"),
+        (["--suite", "on-the-go", "--root", "absent"], "is no folder"),
+        (["--suite", "on-the-run", "--root", "."], "'on-the-run'"),
+        (["--root", ".", "--method", "3dgs", "--scene", "x"], "--root goes with --suite"),
+        (["--scene", "x"], "--method is missing"),
+        (["--method", "3dgs"], "--scene is missing"),
+    ],
+)
+def test_mistakes_are_one_line(words, message, tmp_path):
+    done = aw("bench", *words, "-o", tmp_path / "runs", cwd=tmp_path)
+    assert done.returncode == 2
+    assert message in done.stderr and done.stderr.count("\n") == 1
+    assert not re.search("Traceback", done.stderr) and not (tmp_path / "runs").exists()

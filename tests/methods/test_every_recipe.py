@@ -1,0 +1,97 @@
+"""Every recipe draws test views, resumes to the same bits, and does not make an accelerator's host wait."""
+
+import pytest
+import torch
+
+from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.io.scene_folder import load_scene
+from tests.host_reads import moved, no_transfers
+from tests.methods.baselines import bits, parts_of, resumed_equals_whole, trainer_of
+from tests.splat import fake_gsplat
+from tests.splat.test_whole_step import late
+from tests.tiny_scene import with_points, write_tiny_scene
+
+# method: options that make it small; growth often, in a run of 120 iterations
+GROWTH = {"density.every": "2000", "density.min_every": "10"}
+RECIPES = {
+    "gs-w": {**GROWTH, "side": "32", "width": "4"},
+    "splatfacto-w": {**GROWTH, "width": "16"},
+    "swag": {**GROWTH, "levels": "2", "entries": "256", "width": "8"},
+    "nexussplats": {**GROWTH, "light_width": "8", "doubt_width": "8"},
+    "hybridgs": {**GROWTH, "points": "60", "apart": "5000"},
+    "t-3dgs": {**GROWTH, "min_mask_start": "10"},
+    "forestsplats": {**GROWTH, "points": "40", "width": "8", "side": "32", "appearance": "true"},
+}
+CPU_ALONE = {"uad": "count"}
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
+
+
+@pytest.fixture(scope="module")
+def sparse(scene):
+    return with_points(load_scene(scene), 60)
+
+
+@pytest.mark.parametrize("method", RECIPES)
+def test_resuming_gives_the_same_bits(scene, tmp_path, method):
+    resumed_equals_whole(scene, tmp_path, lambda: parts_of(method, **RECIPES[method]))
+    whole, again = (
+        trainer_of(scene, tmp_path / name, parts_of(method, **RECIPES[method])) for name in ("whole", "parts")
+    )
+    assert whole.resume() and again.resume() and bits(whole) == bits(again)
+    camera, photo = whole.data.cameras[0], whole.data.photos[0]
+    left = torch.zeros(photo.shape[:2])
+    left[:, : photo.shape[1] // 2] = 1.0
+    for trainer in (whole, again):
+        assert torch.isfinite(trainer.render(camera).image).all()
+    fitted = [trainer.render_fitted(camera, photo, left) for trainer in (whole, again)]
+    assert torch.equal(*fitted) and torch.isfinite(fitted[0]).all()
+    # what lies right of the middle of a test photo is not looked at
+    other = photo.clone()
+    other[:, photo.shape[1] // 2 :] = 0.5
+    assert torch.equal(whole.render_fitted(camera, other, left), fitted[0])
+
+
+@pytest.mark.parametrize("method", ["spotlesssplats", "spotlesssplats-cluster", "mip-splatting", *RECIPES])
+def test_a_step_on_an_accelerator_leaves_the_host_alone(sparse, tmp_path, monkeypatch, method):
+    with fake_gsplat.installed(monkeypatch):
+        trainer = late(sparse, tmp_path, method)
+        trainer.step()
+        trainer = moved(trainer)
+        for _ in range(12):
+            trainer.timeline.loss(trainer.step())
+        with no_transfers():
+            for _ in range(12):
+                trainer.timeline.loss(trainer.step())
+
+
+@pytest.mark.parametrize("method", ["gs-w", "splatfacto-w", "nexussplats", "hybridgs", "forestsplats"])
+def test_masks_that_read_an_effect_are_not_grafted_without_it(scene, tmp_path, method):
+    with pytest.warns(UserWarning, match="leaves out"):
+        made = parts_of(f"3dgs@mask={method}")
+    with pytest.raises(AwError, match=f"HOST@mask={method},effects={method}"):
+        trainer_of(scene, tmp_path, made)
+
+
+@pytest.mark.parametrize("method", ["gs-w", "nexussplats"])
+def test_masks_are_grafted_with_the_effect_that_they_read(scene, tmp_path, method):
+    parts = parts_of(f"3dgs@mask={method},effects={method}")
+    trainer = trainer_of(scene, tmp_path, parts)
+    learnt = {"gs-w": "mask_weight1", "nexussplats": "doubt_weight2"}[method]
+    before = parts.effects[0]._adam[learnt].values.clone()
+    for _ in range(12):  # of 120: masks begin at a twelfth
+        trainer.step()
+    assert not torch.equal(parts.effects[0]._adam[learnt].values, before)
+    assert not parts.mask.mask.regularises()
+
+
+@pytest.mark.parametrize("method", CPU_ALONE)
+def test_what_gsplat_does_not_offer_is_refused_in_one_line(sparse, tmp_path, monkeypatch, method):
+    with (
+        fake_gsplat.installed(monkeypatch),
+        pytest.raises(AwError, match=f"{CPU_ALONE[method]}.*gsplat.*--device cpu"),
+    ):
+        late(sparse, tmp_path, method)

@@ -1,0 +1,66 @@
+"""docs/fidelity.md: its files and options exist, and its values are those of the methods."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+import ambiguous_wild
+from ambiguous_wild.core.config import flatten, to_plain
+from ambiguous_wild.methods import get_method
+
+PACKAGE = Path(ambiguous_wild.__file__).parent
+PAGE = PACKAGE.parent / "docs" / "fidelity.md"
+METHODS = ("refinesplat-printed", "refinesplat-paper", "refinesplat")
+VERDICTS = ("as printed", "repaired", "replaced", "not stated")
+
+
+def rows() -> list[list[str]]:
+    table = [line for line in PAGE.read_text(encoding="utf-8").splitlines() if line.startswith("| ")]
+    start = next(k for k, line in enumerate(table) if line.startswith("| paper | code |"))
+    return [[cell.strip() for cell in line.strip().strip("|").split("|")] for line in table[start + 1 :]]
+
+
+def quoted(cell: str) -> str:
+    found = re.match(r"`([^`]+)`", cell)
+    return found[1] if found else ""
+
+
+@pytest.mark.parametrize("row", rows(), ids=lambda row: row[2] or row[0])
+def test_every_row_is_true(row):
+    assert len(row) == 8, row
+    assert (PACKAGE / quoted(row[1])).is_file(), f"no file {row[1]}"
+    option = quoted(row[2])
+    if not option:
+        return
+    for method, cell in zip(METHODS, row[3:6], strict=True):
+        options = flatten(to_plain(get_method(method).options()))
+        assert option in options, f"{method} has no option {option}"
+        if quoted(cell):  # the networks depend on the machine
+            assert str(options[option]) == quoted(cell), f"{method}.{option}"
+            assert cell.rpartition("`")[2].strip() in VERDICTS, cell
+
+
+def test_every_equation_of_the_method_has_a_row():
+    text = " ".join(row[0] for row in rows())
+    for number in (
+        2,
+        3,
+        4,
+        5,
+        6,
+        7,
+        8,
+        10,
+        11,
+        12,
+        13,
+    ):  # 1 is 3DGS, 9 its gradient, 14 the sum of the losses
+        assert re.search(rf"Eq\. {number}\b", text), f"Eq. {number}"
+
+
+def test_options_that_other_cells_name_exist():
+    known = flatten(to_plain(get_method("refinesplat").options()))
+    for row in rows():
+        for name in re.findall(r"`([a-z_.]+)=", " ".join(row[6:])):
+            assert name in known, name

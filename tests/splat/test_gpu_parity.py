@@ -1,0 +1,215 @@
+"""Where the accelerator differed from the CPU: versions of gsplat, tiny splats, needles, masked photos."""
+
+import sys
+from dataclasses import replace
+
+import pytest
+import torch
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.splat.cpu.render import render_cpu
+from ambiguous_wild.splat.density import DensityConfig
+from ambiguous_wild.splat.gpu import compiled, fused_loss
+from ambiguous_wild.splat.parts import MaskPolicy, Parts
+from ambiguous_wild.splat.reference import render_reference
+from ambiguous_wild.splat.render import render
+from ambiguous_wild.splat.rendered import Cotangents
+from tests.tiny_scene import with_points, write_tiny_scene
+
+from . import fake_gsplat
+from .scenes import camera, cotangents, doubles, gaussians
+from .test_trainer import trainer_for
+
+
+@pytest.fixture
+def fake(monkeypatch):
+    with fake_gsplat.installed(monkeypatch):
+        yield
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return with_points(load_scene(write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")), 60)
+
+
+# -- versions of gsplat ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_harmonics_of_either_version_are_the_reference(monkeypatch, degree):
+    g, cam = gaussians(3), camera()
+    d = cotangents(cam.height, cam.width)["d_image"]
+    leaves = {name: value.requires_grad_(True) for name, value in doubles(g).items()}
+    for version, clamp in (("1.5.3", 0.999), ("1.6.0", 0.99)):
+        truth = render_reference(leaves, cam, sh_degree=degree, max_alpha=clamp).image
+        wanted = torch.autograd.grad((truth * d).sum(), [leaves["means"], leaves["sh_rest"]])
+        with fake_gsplat.installed(monkeypatch, version):
+            rendered = render(g, cam, sh_degree=degree)
+            assert (rendered.image - truth).abs().max() < 3e-5, version
+            grads = rendered.backward(d)
+        for name, value in zip(("means", "sh_rest"), wanted):
+            assert (getattr(grads, name) - value).abs().max() < 3e-5 * value.abs().max(), (version, name)
+
+
+def test_a_version_with_other_arguments_is_refused_in_one_line(monkeypatch):
+    def spherical_harmonics(degree, rays, camera_ids, coeffs):
+        raise AssertionError("called")
+
+    with fake_gsplat.installed(monkeypatch, "1.9.0"):
+        monkeypatch.setattr(sys.modules["gsplat"], "spherical_harmonics", spherical_harmonics)
+        with pytest.raises(
+            AwError, match=r"gsplat 1\.9\.0 .*\(degree, rays, camera_ids, coeffs\).*==1\.5\.3"
+        ):
+            render(gaussians(3), camera(), sh_degree=1)
+
+
+@pytest.mark.parametrize("version", ["1.5.3", "1.6.0"])
+def test_absolute_sums_survive_the_second_backward_pass(monkeypatch, version):
+    """After 1.5.3 gsplat overwrites them in place."""
+    g, cam = gaussians(4), camera()
+    d, needs = cotangents(cam.height, cam.width), frozenset({"absolute"})
+    with fake_gsplat.installed(monkeypatch, version):
+        alone = render(g, cam).backward(Cotangents(d["d_image"]), needs).screen_abs
+        both = render(g, cam).backward(Cotangents(d["d_image"], 5 * d["d_image_extra"]), needs).screen_abs
+    assert torch.equal(alone, both) and alone.max() > 0
+
+
+# -- splats ---------------------------------------------------------------------------------------
+
+
+def test_splats_that_cover_no_pixel_centre_are_not_visible_as_on_the_cpu(fake):
+    g, cam = gaussians(0, 600), camera()
+    g.log_scales.fill_(-9.0)  # the blur alone: under a pixel
+    g.opacity_logits.copy_(torch.linspace(-5.5, -3.0, 600))  # faint: their contours are small
+    there, cpu = render(g, cam), render_cpu(g, cam)
+    drawn = (there._shown > 0).all(1)
+    assert torch.equal(there.visible, cpu.visible)
+    assert int((drawn & ~cpu.visible).sum()) > 20  # gsplat's own box counts these
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_is_visible_is_what_the_cpu_draws(fake, seed):
+    g, cam = gaussians(seed, 400), camera()
+    there, cpu = render(g, cam), render_cpu(g, cam)
+    apart = there.visible != cpu.visible
+    # gsplat's radius ends at 3.33 deviations, the contour of opaque splats at the border a little later
+    assert int(apart.sum()) <= 2 and int(cpu.visible.sum()) > 100
+
+
+def test_antialiased_needles_keep_their_opacity_and_its_gradient(fake):
+    """A determinant as a difference of products is 0 for them in float32."""
+    g, cam = gaussians(5, 40), camera()
+    g.log_scales[:] = torch.tensor([0.0, -7.0, -7.0])
+    g.opacity_logits.fill_(3.0)
+    d = cotangents(cam.height, cam.width)["d_image"]
+    leaves = {name: value.requires_grad_(True) for name, value in doubles(g).items()}
+    truth = render_reference(leaves, cam, sh_degree=0, antialias=True)
+    wanted = torch.autograd.grad((truth.image * d).sum(), [leaves["log_scales"], leaves["opacity_logits"]])
+    rendered = render(g, cam, sh_degree=0, antialias=True)
+    assert truth.image.max() > 0.05
+    assert (rendered.image - truth.image).abs().max() < 1e-3
+    grads = rendered.backward(d)
+    for name, value in zip(("log_scales", "opacity_logits"), wanted):
+        assert (getattr(grads, name) - value).abs().max() < 2e-3 * value.abs().max(), name
+    narrow = wanted[0][:, 1:].abs().max()  # what a zero gradient of antialiasing would lose
+    assert narrow > 0 and (grads.log_scales[:, 1:] - wanted[0][:, 1:]).abs().max() < 1e-2 * narrow
+
+
+# -- masked photos --------------------------------------------------------------------------------
+
+
+class Nothing(MaskPolicy):
+    """Keeps nothing at one iteration, everything else at the others."""
+
+    def __init__(self, iteration):
+        self.iteration = iteration
+
+    def keep(self, step):
+        return torch.full_like(step.photo[..., 0], float(step.iteration != self.iteration))
+
+
+def growing(scene, folder, bare):
+    config = DensityConfig(start=0.0, every=1.0, min_every=6, resets=(), max_gaussians=300)
+    parts = Parts(density_config=replace(config, grow_grad=1e-9), mask=Nothing(bare))
+    trainer = trainer_for(scene, folder, parts=parts, iterations=30, probes=0)
+    counts = []
+    for _ in range(9):
+        trainer.step()
+        counts.append(len(trainer.gaussians))
+    return counts, trainer
+
+
+def test_growth_waits_for_the_next_photo_where_one_is_all_masked(scene, tmp_path, fake, monkeypatch):
+    """As on the CPU, which returns before growth; the round is made at the next step."""
+    counts, trainer = growing(scene, tmp_path / "gpu", 6)
+    with monkeypatch.context() as patch:
+        patch.setattr("ambiguous_wild.splat.device.accelerated", lambda device: str(device) != "cpu")
+        cpu, other = growing(scene, tmp_path / "cpu", 6)
+    assert counts[5] == 60 and counts[6] > 60
+    assert [n > 60 for n in counts] == [n > 60 for n in cpu]
+    assert trainer.density.last_growth == other.density.last_growth == 7
+    assert trainer.skipped == other.skipped != set()
+
+
+@pytest.mark.parametrize(("off", "due", "grows"), [(1.0, True, False), (0.0, True, True), (1.0, False, True)])
+def test_several_gpus_put_off_a_round_of_growth_as_one_does(off, due, grows):
+    """`called_off` is the same on all ranks; only a step at which something would change asks for it."""
+    from types import SimpleNamespace
+    from unittest.mock import MagicMock
+
+    from ambiguous_wild.splat.multi_gpu.trainer import SharedTrainer
+
+    trainer = MagicMock()
+    trainer.density.due.return_value, trainer._step_cameras.return_value = due, []
+    trainer.density.refine.return_value = ("model", ["prune"])
+    step = SimpleNamespace(iteration=8, divisor=1)
+    events = SharedTrainer._change_density(trainer, step, MagicMock(), None, torch.tensor([off]))
+    assert (events == ["prune"]) == trainer.density.refine.called == grows
+
+
+# -- the loss, compiled before the clock starts ---------------------------------------------------
+
+
+def test_every_size_of_the_run_is_compiled_before_it_starts(scene, tmp_path, fake, monkeypatch):
+    seen = []
+
+    def record(render, photo, keep, lambda_dssim, weighting):
+        seen.append((*render.shape[:2], keep is not None))
+
+    monkeypatch.setattr(fused_loss, "compiles", lambda device: True)
+    monkeypatch.setattr(fused_loss, "photometric_fused", record)
+    monkeypatch.setattr("ambiguous_wild.splat.resolution.SMALLEST_SIDE", 10)
+    fused_loss.prepare.cache_clear()
+    trainer = trainer_for(scene, tmp_path, iterations=30, probes=0, resolution="coarse-to-fine")
+    sizes = {(48 // d, 64 // d) for d in trainer.pace.divisors}
+    assert len(sizes) > 1
+    assert sorted(seen) == sorted((*size, masked) for size in sizes for masked in (False, True))
+    before = len(seen)
+    trainer_for(scene, tmp_path, iterations=30, probes=0, resolution="coarse-to-fine")
+    assert len(seen) == before  # once a process
+    fused_loss.prepare.cache_clear()
+
+
+def test_photos_of_several_sizes_are_all_counted(scene, tmp_path):
+    from ambiguous_wild.splat.pyramid import Pyramid
+
+    trainer = trainer_for(scene, tmp_path, iterations=2, probes=0)
+    cameras = [c.resized(40, 30) if i % 2 else c for i, c in enumerate(trainer.data.cameras)]
+    pyramid = Pyramid(replace(trainer.data, cameras=cameras))
+    assert pyramid.sizes((1, 2)) == {(48, 64), (24, 32), (30, 40), (15, 20)}
+
+
+def test_a_function_of_rows_is_compiled_for_any_number_of_them(monkeypatch):
+    monkeypatch.setattr(compiled, "compiles", lambda device: True)
+    graphs = []
+
+    def counting(graph, inputs):
+        graphs.append(graph)
+        return graph.forward
+
+    call = compiled.Compiled(lambda rows, one: rows * one[:, None], backend=counting)
+    for n in (5, 9, 100):
+        rows, one = torch.rand(n, 3), torch.rand(n)
+        assert torch.equal(call(rows, one), rows * one[:, None])
+    assert len(graphs) == 1 and not call.broken

@@ -1,0 +1,193 @@
+"""EfficientNet-Lite0 and VGG-16 against plain second implementations, on random tensors in their layout."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+import torch.nn.functional as F
+from safetensors.torch import save_file
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.vision import efficientnet, weights
+from ambiguous_wild.vision.convnets import NETWORKS, ConvConfig, ConvFeatures
+from ambiguous_wild.vision.labhog import blurred_noisy_copy
+
+VGG = [(0, 3, 64), (2, 64, 64), (5, 64, 128), (7, 128, 128), (10, 128, 256), (12, 256, 256), (14, 256, 256)]
+
+
+def vgg_tensors() -> dict[str, torch.Tensor]:
+    g = torch.Generator().manual_seed(1)
+    made = {}
+    for index, into, out in VGG:
+        made[f"features.{index}.weight"] = torch.randn(out, into, 3, 3, generator=g) * math.sqrt(
+            2 / (9 * into)
+        )
+        made[f"features.{index}.bias"] = 0.1 * torch.randn(out, generator=g)
+    return made
+
+
+def efficientnet_tensors() -> dict[str, torch.Tensor]:
+    g = torch.Generator().manual_seed(2)
+    made: dict[str, torch.Tensor] = {}
+
+    def conv(name: str, norm: str, out: int, into: int, kernel: int) -> None:
+        made[f"{name}.weight"] = (
+            torch.randn(out, into, kernel, kernel, generator=g) / math.sqrt(into) / kernel
+        )
+        made[f"{norm}.weight"] = 0.5 + torch.rand(out, generator=g)
+        made[f"{norm}.bias"] = torch.randn(out, generator=g)
+        made[f"{norm}.running_mean"] = torch.randn(out, generator=g)
+        made[f"{norm}.running_var"] = 0.2 + torch.rand(out, generator=g)
+
+    conv("_conv_stem", "_bn0", 32, 3, 3)
+    for i, (kernel, _, expansion, into, out) in enumerate(efficientnet.BLOCKS[:5]):
+        wide = into * expansion
+        if expansion > 1:
+            conv(f"_blocks.{i}._expand_conv", f"_blocks.{i}._bn0", wide, into, 1)
+        conv(f"_blocks.{i}._depthwise_conv", f"_blocks.{i}._bn1", wide, 1, kernel)
+        conv(f"_blocks.{i}._project_conv", f"_blocks.{i}._bn2", out, wide, 1)
+    return made
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("nets")
+    save_file(vgg_tensors(), place / "vgg16.safetensors")
+    save_file(efficientnet_tensors(), place / "efficientnet-lite0.safetensors")
+    return place
+
+
+def plain_vgg(image: torch.Tensor) -> torch.Tensor:
+    """relu3_3 [C, h, w] of an image [H, W, 3]."""
+    state = vgg_tensors()
+    mean, std = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
+    x = ((image - mean) / std).permute(2, 0, 1)[None]
+    for index, _, _ in VGG:
+        if index in (5, 10):
+            x = F.max_pool2d(x, 2)
+        x = F.conv2d(x, state[f"features.{index}.weight"], state[f"features.{index}.bias"], padding=1).relu()
+    return x[0]
+
+
+def plain_efficientnet(pixels: torch.Tensor, blocks: int) -> torch.Tensor:
+    """As the reference: batch norms apart, SAME padding by its formula; input [1, 3, H, W] in [-1, 1]."""
+    state = efficientnet_tensors()
+
+    def conv(x: torch.Tensor, name: str, norm: str, stride: int = 1, groups: int = 1) -> torch.Tensor:
+        kernel = state[f"{name}.weight"].shape[2]
+        pads = []
+        for side in (x.shape[3], x.shape[2]):
+            total = max((math.ceil(side / stride) - 1) * stride + kernel - side, 0)
+            pads += [total // 2, total - total // 2]
+        y = F.conv2d(F.pad(x, pads), state[f"{name}.weight"], stride=stride, groups=groups)
+        parts = [state[f"{norm}.{k}"] for k in ("running_mean", "running_var", "weight", "bias")]
+        return F.batch_norm(y, *parts, eps=1e-3)
+
+    x = conv(pixels, "_conv_stem", "_bn0", 2).clamp(0, 6)
+    for i, (_, stride, expansion, into, out) in enumerate(efficientnet.BLOCKS[: blocks + 1]):
+        y = x
+        if expansion > 1:
+            y = conv(y, f"_blocks.{i}._expand_conv", f"_blocks.{i}._bn0").clamp(0, 6)
+        y = conv(y, f"_blocks.{i}._depthwise_conv", f"_blocks.{i}._bn1", stride, y.shape[1]).clamp(0, 6)
+        y = conv(y, f"_blocks.{i}._project_conv", f"_blocks.{i}._bn2")
+        x = x + y if stride == 1 and into == out else y
+    return x
+
+
+def test_vgg_equals_the_plain_network(folder: Path, photo) -> None:
+    image = photo(0, 64, 96)
+    found = ConvFeatures("vgg16", ConvConfig(size=0), folder)(image)
+    assert found.shape == (16, 24, 256)
+    assert torch.allclose(found, plain_vgg(image).permute(1, 2, 0), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("layer", "blocks", "shape"), [("stride8", 4, (8, 12, 40)), ("stride4", 2, (16, 24, 24))]
+)
+def test_efficientnet_equals_the_plain_network(
+    folder: Path, photo, layer: str, blocks: int, shape: tuple[int, ...]
+) -> None:
+    image = photo(1, 64, 96)
+    features = ConvFeatures("efficientnet-lite0", ConvConfig(layer=layer), folder)
+    found = features(image)
+    assert found.shape == shape
+    pixels = (image.permute(2, 0, 1)[None] * 255 - 127) / 128
+    moved = features.stride // 2
+    pixels = F.pad(pixels, (moved, 0, moved, 0), mode="replicate")[:, :, :64, :96]
+    expected = plain_efficientnet(pixels, blocks)[0].permute(1, 2, 0)
+    assert torch.allclose(found, expected, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_a_cell_sees_the_middle_of_its_pixels(folder: Path, name: str) -> None:
+    """Otherwise masks on the grid lie beside the objects: without the shift by 4 px, 3.5 px beside them."""
+    features = ConvFeatures(name, ConvConfig(size=0), folder)
+    image = torch.full((96, 96, 3), 0.5, requires_grad=True)
+    found = features(image)
+    row = column = 48 // features.stride
+    (gradient,) = torch.autograd.grad(found[row, column].square().sum(), image)
+    weight = gradient.abs().sum(2).double()
+    at = torch.arange(96).double() + 0.5
+    middle = (row + 0.5) * features.stride
+    for axis in (0, 1):
+        centre = float((weight.sum(1 - axis) * at).sum() / weight.sum())
+        assert abs(centre - middle) < 1.0, centre
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_sizes_gradients_and_the_unit(folder: Path, photo, name: str) -> None:
+    features = ConvFeatures(name, ConvConfig(size=64), folder)
+    image = photo(2, 90, 130).requires_grad_(True)
+    found = features(image)
+    assert found.shape[:2] == features.grid(90, 130) and found.shape[2] == features.channels
+    (gradient,) = torch.autograd.grad(found.sum(), image)
+    assert gradient.shape == image.shape and bool((gradient != 0).any())
+    assert not features(image.detach()).requires_grad
+    assert all(not p.requires_grad for p in features.model.parameters())
+    features.fit([photo(k, 90, 130) for k in range(3)])
+    one, two = features(photo(0, 90, 130)), features(blurred_noisy_copy(photo(0, 90, 130), 0))
+    distance = float((1 - F.cosine_similarity(one, two, dim=2)).mean())
+    assert 0.2 * features.unit < distance < 5 * features.unit
+    again = ConvFeatures(name, ConvConfig(size=64), folder)
+    again.load_state_dict(features.state_dict())
+    assert again.unit == features.unit and again.name == features.name
+    other = ConvFeatures(name, ConvConfig(size=72), folder)
+    assert other.name != features.name
+    with pytest.raises(AwError, match="without training photos"):
+        features.fit([])
+    with pytest.raises(AwError, match="at least 8x8"):
+        features(torch.zeros(4, 40, 3))
+
+
+def test_loading_keeps_the_callers_random_numbers(folder: Path, photo) -> None:
+    torch.manual_seed(5)
+    expected = torch.rand(1)
+    torch.manual_seed(5)
+    ConvFeatures("vgg16", None, folder)(photo(0, 40, 40))
+    assert torch.equal(torch.rand(1), expected)
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.parametrize("damage", ["missing", "shape", "cut", "pickle"])
+def test_files_of_another_network_are_named(tmp_path: Path, name: str, damage: str, photo) -> None:
+    tensors = vgg_tensors() if name == "vgg16" else efficientnet_tensors()
+    key = next(k for k in tensors if k.endswith("weight") and tensors[k].ndim == 4)
+    path = tmp_path / weights.named(name).files[0]
+    if damage == "missing":
+        del tensors[key]
+    elif damage == "shape":
+        tensors[key] = tensors[key][:5].clone()
+    save_file(tensors, path)
+    if damage == "cut":
+        path.write_bytes(path.read_bytes()[:2000])
+    elif damage == "pickle":
+        torch.save({"a": Path("x")}, path)
+    words = f"is not {name}.*aw weights get {name}" if damage in ("missing", "shape") else "cannot be read"
+    with pytest.raises(AwError, match=words) as error:
+        ConvFeatures(name, None, tmp_path)(photo(0, 40, 40))
+    assert "\n" not in str(error.value)
+    with pytest.raises(AwError, match=f"has no {path.name}"):
+        ConvFeatures(name, None, tmp_path / "absent")

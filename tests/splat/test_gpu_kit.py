@@ -86,7 +86,7 @@ def test_the_kit_holds_what_a_stage_needs_and_nothing_else(small, package, tmp_p
 
 def test_a_kit_that_is_too_large_or_of_another_release_is_refused(small, package, tmp_path, monkeypatch):
     monkeypatch.setattr(small, "LIMIT_MB", 0.1)
-    with pytest.raises(AwError, match="more than 0.1"):
+    with pytest.raises(AwError, match=r"more than 0\.1"):
         small.pack(tmp_path / "out", python="3.12", gsplat=package, wheels=False)
     (package / "cuda/csrc/Intersect.cpp").unlink()
     gsplat_cut.sources.cache_clear()

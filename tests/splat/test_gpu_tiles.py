@@ -1,4 +1,4 @@
-"""Tile lists of a fixed length: the same pictures, nothing read, and a step that is called off if too short."""
+"""Tile lists of a fixed length: the same pictures, nothing read, a step that is called off if too short."""
 
 import numpy as np
 import pytest

@@ -18,6 +18,7 @@ from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.datasets.foreign import ForeignScene, camera_size, find_photo, without_suffix
 from ambiguous_wild.datasets.readers.colmap import file_size
 from ambiguous_wild.io.colmap_records import ModelCamera, ModelImage
+from ambiguous_wild.io.image_header import MAX_PIXELS
 from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
@@ -66,10 +67,15 @@ def plan_photos(scene: ForeignScene) -> list[PhotoPlan]:
         size = file_size(source)
         if size is None:
             wrong.append(f"{image.name} (no image)")
+        elif size[0] * size[1] > MAX_PIXELS:
+            wrong.append(
+                f"{image.name} ({size[0]}x{size[1]}, more than {MAX_PIXELS // 1_000_000} megapixels)"
+            )
         elif not _same_shape(size, (camera.width, camera.height)):
             wrong.append(f"{image.name} ({size[0]}x{size[1]}, its camera {camera_size(camera)})")
         else:
             plans.append(_plan(scene, image, source, camera, size, only_small))
+    _refuse_same_stems(scene)
     total = len(scene.split)
     if absent:
         raise AwError(
@@ -85,6 +91,17 @@ def plan_photos(scene: ForeignScene) -> list[PhotoPlan]:
     return plans
 
 
+def _refuse_same_stems(scene: ForeignScene) -> None:
+    """Two photos that differ in their extension alone would be one PNG."""
+    seen: dict[str, str] = {}
+    for name in sorted(scene.split):
+        other = seen.setdefault(without_suffix(name), name)
+        if other != name:
+            raise AwError(
+                f"{scene.root}: photos {other!r} and {name!r} differ in their extension only; rename one"
+            )
+
+
 def _plan(
     scene: ForeignScene,
     image: ModelImage,
@@ -93,7 +110,7 @@ def _plan(
     size: tuple[int, int],
     only_small: bool,
 ) -> PhotoPlan:
-    lens = lens_of(camera) if camera.model not in PINHOLES else None
+    lens = lens_of(resized(camera, *size)) if camera.model not in PINHOLES else None
     wide = scene.max_width is not None and size[0] > scene.max_width
     convert = (lens is not None and lens.map_xy is not None) or wide or scene.background is not None
     small = None

@@ -12,6 +12,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import re
+import shutil
 import sys
 import zipfile
 from pathlib import Path
@@ -22,13 +23,16 @@ NAMES = {"pillow": "PIL"}  # what is imported, where it is not the name of the w
 
 
 def unpack(wheels: Path, site: Path) -> list[str]:
-    """Unpack wheels whose module is missing; returns the names of those that it made available.
+    """Unpack wheels whose module is missing, each into a folder of its own; returns their names.
 
-    Exits with 2 where a wheel is for another version of Python.
+    The folders are put at the end of `sys.path`. Exits with 2 where a wheel is for another Python.
     """
     made = []
     for wheel in sorted(wheels.glob("*.whl")):
         name = wheel.name.split("-")[0].lower()
+        place = site / name
+        if place.is_dir():
+            sys.path.append(str(place))
         if importlib.util.find_spec(NAMES.get(name, name)) is not None:
             continue
         tag = re.search(r"-cp(\d)(\d+)-(abi3|cp\d+)", wheel.name)
@@ -38,15 +42,18 @@ def unpack(wheels: Path, site: Path) -> list[str]:
             if built > here or (tag[3] != "abi3" and built != here):
                 wanted = ".".join(map(str, here))
                 fail(f"{wheel.name} is not for Python {wanted}; pack the kit again with --python {wanted}")
+        part = site / f"{name}.part"
+        shutil.rmtree(part, ignore_errors=True)  # of a call that was stopped
         with zipfile.ZipFile(wheel) as archive:
-            archive.extractall(site)
-        made.append(name)
+            archive.extractall(part)
+        for path in [*part.rglob("bin/*"), *part.rglob("*.data/scripts/*")]:
+            path.chmod(0o755)  # archives of zip keep no permissions
+        part.rename(place)
+        sys.path.append(str(place))
         importlib.invalidate_caches()
-    for program in (site / "ninja" / "data" / "bin", site / "bin", *site.glob("*.data/scripts")):
-        if program.is_dir():
-            for path in program.iterdir():
-                path.chmod(0o755)  # archives of zip keep no permissions
-            os.environ["PATH"] = f"{program}{os.pathsep}{os.environ.get('PATH', '')}"
+        made.append(name)
+    for folder in [*site.rglob("bin"), *site.rglob("*.data/scripts")]:
+        os.environ["PATH"] = f"{folder}{os.pathsep}{os.environ.get('PATH', '')}"
     return made
 
 
@@ -79,8 +86,7 @@ def rehearse(words: list[str]) -> int:
 def main() -> int:
     words = sys.argv[1:]
     # not the site folder first: what the machine has goes before what the kit brings, gsplat excepted
-    sys.path[:0] = [str(HERE), str(HERE / "benchmarks"), str(HERE / "site")]
-    sys.path.append(str(SITE))
+    sys.path[:0] = [str(HERE), str(HERE / "benchmarks"), str(HERE / "lib")]
     if importlib.util.find_spec("torch") is None:
         fail(f"{sys.executable} has no torch: run this with the Python that has it")
     made = unpack(HERE / "wheels", SITE)
@@ -89,7 +95,7 @@ def main() -> int:
     os.environ.setdefault("TORCH_EXTENSIONS_DIR", str(HERE / ".kernels"))
     # for processes that this one starts
     os.environ["PYTHONPATH"] = os.pathsep.join(
-        [str(HERE), str(HERE / "benchmarks"), str(HERE / "site"), str(SITE)]
+        [str(HERE), str(HERE / "benchmarks"), str(HERE / "lib"), str(SITE)]
     )
     if "--rehearse" in words:
         return rehearse([word for word in words if word != "--rehearse"])

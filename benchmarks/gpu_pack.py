@@ -53,7 +53,7 @@ PYTHON = (
     "version.py", "rendering.py", "distributed.py", "utils.py", "_helper.py", "cuda/__init__.py",
     "cuda/_wrapper.py", "cuda/_torch_impl.py",
 )  # fmt: skip
-_INIT = '''"""gsplat {version} (Apache-2.0), cut to what is called here; the files beside this one are unchanged."""
+_INIT = '''"""gsplat {version} (Apache-2.0), cut to what is called here; other files are unchanged."""
 
 from .cuda._wrapper import (
     fully_fused_projection,
@@ -87,7 +87,7 @@ def pack(
         raise AwError(f"{out / 'kit'} is there already; remove it, or give another folder")
     with tempfile.TemporaryDirectory() as temporary, atomic_dir(out / "kit") as kit:
         _code(kit)
-        _gsplat(kit / "site" / "gsplat", _found_gsplat(gsplat, Path(temporary)))
+        _gsplat(kit / "lib" / "gsplat", _found_gsplat(gsplat, Path(temporary)))
         if wheels:
             _wheels(kit / "wheels", python)
         if scene is None:

@@ -136,7 +136,7 @@ def _train_one(args: argparse.Namespace, method: str) -> dict[str, Any]:
 
 
 def budget(args: argparse.Namespace) -> dict[str, Any]:
-    """Trainings of a given number of seconds: the defaults of `--budget`, coarse to fine and fewer Gaussians."""
+    """Trainings of a number of seconds, with the defaults of `--budget`: coarse to fine, fewer Gaussians."""
     notes = Notes(args, "budget")
     rows = [notes.get(method, lambda method=method: _budget_one(args, method)) for method in args.methods]
     for row in rows:
@@ -288,9 +288,9 @@ STAGES: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
 
 def lacking(stages: list[str], methods: list[str]) -> list[str]:
     """One line for each stage or method that cannot run here; parity runs what it can."""
-    lines = []
     names = [*(m if m in MODULES else method_of(m) for m in methods), *(s for s in stages if s == "same")]
-    for name in dict.fromkeys(names):
-        if lacks := missing(name):
-            lines.append(f"{name} needs {', '.join(lacks)}, which this machine lacks")
-    return lines
+    return [
+        f"{name} needs {', '.join(lacks)}, which this machine lacks"
+        for name in dict.fromkeys(names)
+        if (lacks := missing(name))
+    ]

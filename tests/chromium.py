@@ -24,13 +24,23 @@ PATIENCE_S = 120.0  # a loaded machine is no failure
 class Browser:
     """One page of a headless browser; every request it makes and every error it prints is kept."""
 
-    def __init__(self, profile: Path, *, width: int = 1280, height: int = 800, mobile: bool = False) -> None:
+    def __init__(
+        self,
+        profile: Path,
+        *,
+        width: int = 1280,
+        height: int = 800,
+        mobile: bool = False,
+        webgl: bool = False,
+    ) -> None:
         assert PROGRAM is not None
         self.events: list[dict[str, Any]] = []
         self._number, self._rest = 0, b""
         to_read, self._write = os.pipe()
         self._read, to_write = os.pipe()
-        words = [PROGRAM, "--headless=new", "--no-sandbox", "--disable-gpu", "--remote-debugging-pipe",
+        # WebGL on the processor, for machines without a GPU
+        gpu = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"] if webgl else ["--disable-gpu"]
+        words = [PROGRAM, "--headless=new", "--no-sandbox", *gpu, "--remote-debugging-pipe",
                  "--no-first-run", "--disable-dev-shm-usage", "--hide-scrollbars",
                  f"--user-data-dir={profile}", "about:blank"]  # fmt: skip
         # Chromium reads its commands from 3 and answers on 4; a shell moves the pipes there.

@@ -28,10 +28,11 @@ ALLOWED: dict[str, set[str]] = {
     "metrics": {"core"},
     "splat": {"core", "io"},
     "methods": {"core", "io", "splat", "vision"},
-    "harness": BELOW_HARNESS,
+    "viewing": {"core", "io", "metrics", "splat"},
+    "harness": BELOW_HARNESS | {"viewing"},
     "study": {"core", "io", "metrics", "harness"},
     "stress": {"core", "metrics", "splat", "methods"},
-    "cli": BELOW_HARNESS | {"harness", "study", "stress"},
+    "cli": BELOW_HARNESS | {"viewing", "harness", "study", "stress"},
 }
 HEAVY = ("torch", "numba", "pycolmap", "cv2", "matplotlib", "transformers", "scipy", "pandas", "skimage")
 FILES = sorted(PACKAGE.rglob("*.py"))

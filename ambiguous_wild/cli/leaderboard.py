@@ -168,22 +168,45 @@ def remove_command(
     help="Show those of the *.csv in this folder.  [default: BOARD/reported, with --reported]",
 )
 @click.option("--title", default="Leaderboard", show_default=True, help="Of the page.")
+@click.option(
+    "--models",
+    multiple=True,
+    type=PathName(),
+    metavar="RUNS",
+    help="Run folders, or folders of them: their models go into pages behind the entries; repeatable.",
+)
 @_json
 def publish_command(
-    board: Path, out: Path, reported: bool, reported_from: Path | None, title: str, as_json: bool
+    board: Path,
+    out: Path,
+    reported: bool,
+    reported_from: Path | None,
+    title: str,
+    models: tuple[Path, ...],
+    as_json: bool,
 ) -> None:
     """Write CSVs and a page that works from a file, from the board's CSVs alone.
 
-    OUT holds index.html, data/ and images/ afterwards; an earlier page there is replaced.
+    OUT holds index.html, data/, images/ and with --models models/ afterwards; an earlier page there is replaced.
     """
     import dataclasses
 
     from ambiguous_wild.harness.leaderboard.publish import publish
 
-    done = publish(board, out, reported=reported, reported_from=reported_from, title=title)
+    done = publish(
+        board,
+        out,
+        reported=reported,
+        reported_from=reported_from,
+        title=title,
+        models=models,
+        say=lambda text: click.echo(text, err=True),
+    )
     if as_json:
         click.echo(json.dumps(dataclasses.asdict(done), indent=2))
     told = f"{done.runs} runs of {done.datasets} datasets, {done.images} pictures"
+    if models:
+        told += f", {done.model_pages} pages with models"
     if done.reported_from is not None:
         told += f", {done.reported} reported numbers from {done.reported_from}"
     click.echo(f"wrote {out / 'index.html'}: {told}", err=True)

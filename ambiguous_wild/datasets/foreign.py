@@ -11,7 +11,7 @@ import numpy as np
 
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.core.scene import Split
-from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelPoints
+from ambiguous_wild.io.colmap_records import LARGEST_COORDINATE, Model, ModelCamera, ModelPoints
 
 SIDES: tuple[Split, Split] = ("train", "test")
 SUFFIXES = (".jpg", ".jpeg", ".png", ".JPG", ".JPEG", ".PNG")
@@ -55,6 +55,8 @@ def inside(name: str, root: Path) -> str:
         AwError: it is absolute, empty or holds "..".
     """
     pure = PurePosixPath(name)
+    if not name.isprintable():  # lists hold one name a line, in UTF-8
+        raise AwError(f"{root} has a photo called {ascii(name)[:80]}, which no list can hold; rename it")
     if pure.is_absolute() or ".." in pure.parts or not pure.parts or "\\" in name or "\0" in name:
         raise AwError(f"{root} names a file outside itself: {name[:80]!r}; do not use this dataset")
     return str(pure)
@@ -149,6 +151,8 @@ def pose_from_opengl(matrix: np.ndarray) -> np.ndarray:
     rotation = c2w[:3, :3] @ np.diag([1.0, -1.0, -1.0])
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
         raise AwError("a transform_matrix has no rotation in its left 3x3 part (scaled or mirrored)")
+    if not (np.abs(c2w[:3, 3]) < LARGEST_COORDINATE).all():
+        raise AwError(f"a transform_matrix has the position {c2w[:3, 3].tolist()}, which is too far away")
     pose = np.eye(4)
     pose[:3, :3] = rotation.T
     pose[:3, 3] = -rotation.T @ c2w[:3, 3]

@@ -6,6 +6,7 @@ import dataclasses
 import os
 import shutil
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -17,7 +18,9 @@ from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.datasets.foreign import ForeignScene, camera_size, find_photo, without_suffix
 from ambiguous_wild.datasets.readers.colmap import file_size
 from ambiguous_wild.io.colmap_records import ModelCamera, ModelImage
+from ambiguous_wild.io.image_header import MAX_PIXELS
 from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
+from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
 
@@ -64,10 +67,15 @@ def plan_photos(scene: ForeignScene) -> list[PhotoPlan]:
         size = file_size(source)
         if size is None:
             wrong.append(f"{image.name} (no image)")
+        elif size[0] * size[1] > MAX_PIXELS:
+            wrong.append(
+                f"{image.name} ({size[0]}x{size[1]}, more than {MAX_PIXELS // 1_000_000} megapixels)"
+            )
         elif not _same_shape(size, (camera.width, camera.height)):
             wrong.append(f"{image.name} ({size[0]}x{size[1]}, its camera {camera_size(camera)})")
         else:
             plans.append(_plan(scene, image, source, camera, size, only_small))
+    _refuse_same_stems(scene)
     total = len(scene.split)
     if absent:
         raise AwError(
@@ -83,6 +91,17 @@ def plan_photos(scene: ForeignScene) -> list[PhotoPlan]:
     return plans
 
 
+def _refuse_same_stems(scene: ForeignScene) -> None:
+    """Two photos that differ in their extension alone would be one PNG."""
+    seen: dict[str, str] = {}
+    for name in sorted(scene.split):
+        other = seen.setdefault(without_suffix(name), name)
+        if other != name:
+            raise AwError(
+                f"{scene.root}: photos {other!r} and {name!r} differ in their extension only; rename one"
+            )
+
+
 def _plan(
     scene: ForeignScene,
     image: ModelImage,
@@ -91,7 +110,7 @@ def _plan(
     size: tuple[int, int],
     only_small: bool,
 ) -> PhotoPlan:
-    lens = make_lens(camera) if camera.model not in PINHOLES else None
+    lens = lens_of(resized(camera, *size)) if camera.model not in PINHOLES else None
     wide = scene.max_width is not None and size[0] > scene.max_width
     convert = (lens is not None and lens.map_xy is not None) or wide or scene.background is not None
     small = None
@@ -106,6 +125,16 @@ def _plan(
             )
     at_size = camera if not (convert or only_small) else resized(camera, *size)
     return PhotoPlan(image, source, at_size, small, only_small, convert)
+
+
+@lru_cache(maxsize=4)  # a map of a photo of 12 megapixels takes 98 MB
+def lens_of(camera: ModelCamera) -> Lens:
+    """The camera's lens; most datasets have one for all photos."""
+    if camera.model not in PINHOLES:
+        return make_lens(camera)
+    size = (camera.width, camera.height)
+    lens = pycolmap.Camera(model=camera.model, width=size[0], height=size[1], params=list(camera.params))
+    return Lens(lens, ModelCamera(camera.camera_id, "PINHOLE", *size, camera.pinhole()), None)
 
 
 def _same_shape(size: tuple[int, int], wanted: tuple[int, int]) -> bool:
@@ -143,7 +172,7 @@ def place_photo(plan: PhotoPlan, scene: ForeignScene, folder: Path) -> PlacedPho
         folder: the scene folder that is being made.
     """
     stem = without_suffix(plan.image.name)
-    lens = make_lens(plan.camera)
+    lens = lens_of(plan.camera)
     notes: list[str] = []
     full = folder / (f"images_{scene.factor}" if plan.only_small else "images")
     factor = 1 if plan.only_small else scene.factor
@@ -245,7 +274,7 @@ def place_mask(plan: PhotoPlan, placed: PlacedPhoto, scene: ForeignScene, mask: 
     if scene.factor > 1 and not plan.only_small:
         final = downsampled_size(*final, scene.factor)
     if (width, height) == size:
-        flat = make_lens(plan.camera).remap(pixels, nearest=True) if plan.convert else pixels
+        flat = lens_of(plan.camera).remap(pixels, nearest=True) if plan.convert else pixels
     elif (width, height) == final and not plan.convert:
         flat = pixels
     else:

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from ambiguous_wild.harness.running.cell import Cell, CellReport, Outcome, Overwrite, Protocol
     from ambiguous_wild.harness.running.records import RunResult
     from ambiguous_wild.harness.running.store import Runs
+    from ambiguous_wild.harness.showing.page import Viewer
 
 Place = Literal["mask", "density", "regulariser"]
 Words = str | Path
@@ -68,6 +69,19 @@ class RunReport:
         known = [value for value in values if value is not None]
         return sum(known) / len(known) if known and len(known) == len(values) else None
 
+    def show(self, height: int = 640) -> Viewer:
+        """The page of `aw view` for this run; as the last value of a notebook's cell it is shown there.
+
+        Args:
+            height: of the frame, px.
+
+        Raises:
+            AwError: the run has no model, or its scene is not where it was.
+        """
+        from ambiguous_wild.harness.showing.page import Viewer
+
+        return Viewer([self.folder], height=height)
+
 
 @dataclass(frozen=True)
 class BenchReport:
@@ -99,6 +113,12 @@ class BenchReport:
         from ambiguous_wild.harness.running.store import read_runs
 
         return read_runs(self.folders[0] if folder is None else folder)
+
+    def show(self, height: int = 640) -> Viewer:
+        """The page of `aw view` with every model side by side, for a notebook; see `RunReport.show`."""
+        from ambiguous_wild.harness.showing.page import Viewer
+
+        return Viewer([run.folder for run in self.runs if run.outcome != "failed"], height=height)
 
 
 def bench(

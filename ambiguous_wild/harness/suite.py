@@ -91,7 +91,7 @@ def _ready(
 
 
 def suite_methods(suite: Suite, reported_from: Path | None = None) -> list[str]:
-    """The methods of ours that a table of the suite's dataset reports; RefineSplat where none does."""
+    """Our methods that tables of the suite's dataset report; 3DGS and RefineSplat where none does."""
     from ambiguous_wild.harness.tables.layouts.reported import read_reported
     from ambiguous_wild.methods.registry import all_methods
 
@@ -106,7 +106,7 @@ def suite_layouts(prepared: PreparedSuite, runs: Path, reported_from: Path | Non
     Args:
         prepared: of `prepare_suite`.
         runs: folder of the runs.
-        reported_from: reported tables; None = those of the package.
+        reported_from: reported tables; None = those that come with the package.
 
     Raises:
         AwError: no finished run.

@@ -32,6 +32,7 @@ class _Name:
     """One of the admitted names. No attribute can be set on it: BUILD would reach `__setattr__`."""
 
     __slots__ = ("_name",)
+    _name: str
 
     def __init__(self, name: str) -> None:
         object.__setattr__(self, "_name", name)

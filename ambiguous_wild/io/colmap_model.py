@@ -48,7 +48,7 @@ def read_model(folder: Path | str) -> Model:
             points=colmap_text.read_points(paths[2]),
         )
     for camera in model.cameras.values():
-        _check_camera(root, camera)
+        check_camera(root, camera)
     names: set[str] = set()
     for image in model.images.values():
         if not PurePosixPath(image.name).name or "\0" in image.name:
@@ -77,8 +77,13 @@ def read_model(folder: Path | str) -> Model:
     return model
 
 
-def _check_camera(root: Path, camera: ModelCamera) -> None:
-    """Raise AwError for an impossible size or focal length, before it is divided by or allocated."""
+def check_camera(root: Path, camera: ModelCamera) -> None:
+    """Raise AwError for an impossible size or focal length, before it is divided by or allocated.
+
+    Args:
+        root: where the camera is stated, for the message.
+        camera: of a model.
+    """
     size = (camera.width, camera.height)
     whole = all(0 < side <= LARGEST_SIDE for side in size) and bool(np.isfinite(camera.params).all())
     focal = camera.params[:2] if camera.model in _TWO_FOCALS else camera.params[:1]

@@ -25,8 +25,8 @@ class Variant:
     features: str = (
         ""  # a features back end it needs, see vision/backends.py; without its weights the row is missing
     )
-    # another method, if the paper compares with one; `settings` are then of the study's method as its donor, or
-    # of the graft where the study's method is its host
+    # another method, if the paper compares with one; `settings` are then of the study's method as its donor,
+    # or of the graft where the study's method is its host
     method: str = ""
 
 

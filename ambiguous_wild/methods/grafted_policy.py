@@ -9,7 +9,7 @@ import numpy as np
 from torch import Tensor
 
 from ambiguous_wild.splat.parts import MaskPolicy, State
-from ambiguous_wild.splat.rendered import Cotangents, Gradients
+from ambiguous_wild.splat.rendered import Cotangents, Gradients, as_cotangents
 from ambiguous_wild.splat.step import Step, TrainData
 
 
@@ -28,10 +28,14 @@ class GraftedPolicy(MaskPolicy):
         return self.mask.keep(step)
 
     def cotangent(self, step: Step, keep: Tensor | None) -> Cotangents | Tensor | None:
-        return None if self.regulariser is None else self.regulariser.cotangent(step, keep)
+        mine = self.mask.cotangent(step, keep) if self.mask.learns_by_gradients else None
+        other = None if self.regulariser is None else self.regulariser.cotangent(step, keep)
+        return other if mine is None else mine if other is None else as_cotangents(mine, other)
 
     def gradients(self, step: Step, keep: Tensor | None) -> Gradients | None:
-        return None if self.regulariser is None else self.regulariser.gradients(step, keep)
+        mine = self.mask.gradients(step, keep) if self.mask.learns_by_gradients else None
+        other = None if self.regulariser is None else self.regulariser.gradients(step, keep)
+        return other if mine is None else mine if other is None else mine + other
 
     def predict(self, step: Step) -> Tensor | None:
         return self.mask.predict(step)

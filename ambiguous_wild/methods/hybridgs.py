@@ -92,8 +92,13 @@ def composed(front: Tensor, mask: Tensor, back: Tensor) -> Tensor:
 class Uncovered(MaskPolicy):
     """1 - M weighs the loss while both kinds learn apart; afterwards the picture has it in it."""
 
+    learns_by_gradients = True
+
     def __init__(self, plane: Plane) -> None:
         self.plane, self.config, self.shares = plane, plane.config, MaskedShares()
+
+    def setup(self, data: TrainData) -> None:
+        self.plane.require_setup()
 
     def keep(self, step: Step) -> Tensor | None:
         keep = self.predict(step)

@@ -131,12 +131,15 @@ class Doubt(WarmUpMask):
 
     config: NexusSplatsConfig
 
+    learns_by_gradients = True
+
     def __init__(self, codes: Codes) -> None:
         self.codes, self.config = codes, codes.config
         self.features, self.shares = make_features(self.config.features), MaskedShares()
         self.pending: Gradients | None = None  # of the step under way
 
     def setup(self, data: TrainData) -> None:
+        self.codes.require_setup()
         self.cameras = data.cameras
         self.features.fit(data.photos)
         self.phi = photo_features(self.features, data.photos, data.cache_dir)

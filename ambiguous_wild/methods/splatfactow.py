@@ -141,6 +141,9 @@ class TrimmedLoss(MaskPolicy):
         self.low: float | Tensor = 1.0
         self.rounds = 0
 
+    def setup(self, data: TrainData) -> None:
+        self.effect.require_setup()
+
     def keep(self, step: Step) -> Tensor | None:
         if step.nominal < self.config.mask_start:
             return None

@@ -29,6 +29,14 @@ BUILTIN_TRAITS = {
         "entropy of features, by instance and pixel", "", "late; merging", "net of identities",
         source="summaries", published="DINOv2 ViT-S/14, instances with ids of a video",
     ),
+    "refinesplat-paper": Traits(
+        "entropy of features, by instance and pixel", "", "late; merging", "net of identities",
+        source="summaries", published="DINOv2 ViT-S/14, instances with ids of a video",
+    ),
+    "refinesplat-printed": Traits(
+        "entropy of features, by instance and pixel", "", "late; merging", "net of identities",
+        source="summaries", published="DINOv2 ViT-S/14, instances with ids of a video",
+    ),
     "robustsplat": Traits(
         "net on features", "", "late", "mask net", source="code", published="DINOv2 ViT-S/14 with registers",
     ),

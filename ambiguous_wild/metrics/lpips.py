@@ -1,8 +1,9 @@
 """LPIPS v0.1 from weights on disk, without the lpips package, torchvision or downloads.
 
-Each variant needs two files: torchvision's backbone and the linear heads of the LPIPS repository, as published
-(.pth) or as `aw weights get lpips` stores them (.safetensors). If one is absent, the metric is *missing*, with
-the reason; it is never 0 or another variant's value. torch is imported only when a network is loaded.
+Each variant needs two files: torchvision's backbone and the linear heads of the LPIPS repository, as
+published (.pth) or as `aw weights get lpips` stores them (.safetensors). If one is absent, the metric is
+*missing*, with the reason; it is never 0 or another variant's value. torch is imported only when a network
+is loaded.
 
 Source: Zhang et al., CVPR 2018; layout of the layers and of the files: richzhang/PerceptualSimilarity.
 """

@@ -130,7 +130,6 @@ class DensityControl:
             The Gaussians to go on with and what happened: any of "grow", "reset".
         """
         events: list[str] = []
-        config = self.config
         if self._growth_due(step):
             self._match(gaussians)
             # Lazily stepped rows are brought up to date first: growth copies parameters.

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from torch import Tensor
@@ -32,6 +32,9 @@ class MaskPolicy:
     step's resolution, 1 = static, 0 = transient; `None` means all of it.
     """
 
+    # its masks learn by `cotangent` and `gradients`, with an effect of its method: no losses of a regulariser
+    learns_by_gradients: ClassVar[bool] = False
+
     def setup(self, data: TrainData) -> None:
         """Called once before the first step (and again when a run resumes): frozen inputs, own nets."""
 
@@ -53,6 +56,8 @@ class MaskPolicy:
     def regularises(self) -> bool:
         """Whether the policy has losses of its own; where not, a graft leaves it out altogether."""
         own = type(self)
+        if self.learns_by_gradients:
+            return False
         return own.cotangent is not MaskPolicy.cotangent or own.gradients is not MaskPolicy.gradients
 
     def predict(self, step: Step) -> Tensor | None:

@@ -193,11 +193,12 @@ class Run(ABC):
         row = self.timeline.add(self.iteration, len(self.gaussians), self.clock)
         if probing and self.probe is not None:
             spent = dict(self.clock.parts_s)
-            row["psnr_probe"] = self.probe(self._probe_image)
+            row["psnr_probe"] = self.probe(self.picture)
             self.clock.parts_s = spent
 
     @torch.no_grad()
-    def _probe_image(self, camera: Camera) -> Tensor:
+    def picture(self, camera: Camera) -> Tensor:
+        """What a camera sees, [H, W, 3], between two steps; the run ends with the same bits as without it."""
         # Rows the optimiser has put off are brought up to date first; it computes what a later step
         # would have computed, so that probing changes nothing (a test compares the bits).
         self.optimiser.prepare(camera)

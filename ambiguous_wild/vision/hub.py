@@ -47,7 +47,7 @@ def download(weight: Weight, folder: Path) -> None:
         missing = [name for name in wanted if name not in stated]
         if not missing:
             for name in wanted:
-                _one_file(weight.hub_id, name, info.sha, folder, stated[name])
+                _one_file(weight.hub_id, name, info.sha or "main", folder, stated[name])
     except AwError:
         raise
     except Exception as error:  # no network, no permission, no such repository, disk full

@@ -151,3 +151,16 @@ def test_noise_of_a_grey_card_is_its_sigma() -> None:
     got = noise(np.repeat(card, 3, axis=2).round().astype(np.uint8))
     assert got == pytest.approx(4, rel=0.15)  # the flattest tenth lies below the mean
     assert np.isnan(noise(np.zeros((64, 64, 3), np.uint8)))
+
+
+def test_matches_are_those_of_opencv():
+    from ambiguous_wild.builder.photo_comparison import RATIO, _ratio_matches
+
+    rng = np.random.default_rng(2)
+    a = rng.integers(0, 256, (200, 128), dtype=np.uint8)
+    b = rng.integers(0, 256, (150, 128), dtype=np.uint8)
+    b[:80] = np.clip(a[40:120].astype(int) + rng.integers(-40, 41, (80, 128)), 0, 255)
+    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(a.astype(np.float32), b.astype(np.float32), k=2)
+    wanted = [(m.queryIdx, m.trainIdx) for m, n in pairs if m.distance < RATIO * n.distance]
+    found = _ratio_matches(a, b)
+    assert len(wanted) >= 80 and list(zip(*(part.tolist() for part in found))) == wanted

@@ -275,9 +275,53 @@ def _turned(root):
     write_png(root / "images" / "clutter001.png", np.zeros((64, 36, 3), np.uint8))
 
 
+def _stems(root):
+    layouts.native(root)
+    names = [*layouts.NAMES, "clutter000.jpg"]
+    layouts.write_photos(root / "images", ["clutter000.jpg"])
+    layouts.write_model(root / "sparse" / "0", layouts.make_model(names))
+    layouts.write_lists(root, [*layouts.TRAIN, "clutter000.jpg"])
+
+
+def _newline(root):
+    layouts.native(root)
+    layouts.write_model(root / "sparse" / "0", layouts.make_model([*layouts.NAMES[:-1], "a\nb.png"]))
+
+
+def _transforms(**changes):
+    def spoil(root):
+        layouts.instant_ngp(root)
+        data = json.loads((root / "transforms.json").read_text())
+        (root / "transforms.json").write_text(json.dumps({**data, **changes}))
+
+    return spoil
+
+
+def _far(root):
+    layouts.instant_ngp(root)
+    data = json.loads((root / "transforms.json").read_text())
+    data["frames"][1]["transform_matrix"][0][3] = 1e300
+    (root / "transforms.json").write_text(json.dumps(data))
+
+
+def _protocol(root):
+    layouts.nerfbaselines(root)
+    (root / "nb-info.json").write_text(json.dumps({"loader": ["colmap"], "evaluation_protocol": {}}))
+
+
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
+        (_stems, "'clutter000.jpg' and 'clutter000.png' differ in their extension only"),
+        (_newline, "which no list can hold"),
+        (_transforms(w=64e9, h=36e9, k1=0.1), "the model is damaged"),
+        (_transforms(fl_x=0), "the model is damaged"),
+        (_transforms(fl_x="wide"), "fl_x is 'wide', not a number"),
+        (_transforms(camera_model=["x"]), "camera_model"),
+        (_transforms(frames=[{"file_path": 3}]), "frame 0 has no file_path"),
+        (_transforms(ply_file_path="../p.ply"), "outside itself"),
+        (_far, "too far away"),
+        (_protocol, "unknown loader"),
         (_no_list, "test_list.txt"),
         (_other_table, "table of another scene"),
         (_mask_size, "m.png is 40x50 but its photo clutter000.png 64x36"),

@@ -7,6 +7,7 @@ import io
 import json
 import math
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from hypothesis import strategies as st
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.measures import MEASURES
 from ambiguous_wild.harness.running.store import Runs, read_runs
+from ambiguous_wild.harness.tables.fit import divided
 from ambiguous_wild.harness.tables.layouts import build, plain_formats
 from ambiguous_wild.harness.tables.layouts.ablation import ablation
 from ambiguous_wild.harness.tables.layouts.grid import Column, Layout, LayoutCell, Line, ranked
@@ -60,13 +62,27 @@ def results(*scenes: str) -> list[dict]:  # type: ignore[type-arg]
 
 def test_the_papers_layout_has_scenes_side_by_side_and_the_mean_last(tmp_path: Path) -> None:
     (layout,) = build.paper(runs_of(tmp_path, *results("one", "two")))
-    assert layout.groups == [("one", 3), ("two", 3), ("Mean", 3)]
-    assert [c.measure.key for c in layout.columns[:3]] == ["psnr", "ssim", "lpips_alex"]
+    assert layout.groups == [("one", 2), ("two", 2), ("Mean", 2)]  # LPIPS is empty: left out
+    assert [c.measure.key for c in layout.columns[:2]] == ["psnr", "ssim"]
     assert entry(layout, "a", "one").value == 21.5 and entry(layout, "a", "one").rank == 2
     assert entry(layout, "b", "Mean").rank == 1 and entry(layout, "b", "Mean").spread == pytest.approx(
         math.sqrt(0.5)
     )
-    assert entry(layout, "b", "one", "lpips_alex").state == "missing"
+    assert any("lpips_alex" in note for note in layout.notes)
+
+
+def test_wide_layouts_become_tables_that_fit(tmp_path: Path) -> None:
+    (layout,) = build.paper(runs_of(tmp_path, *results("one", "two", "three")))
+    parts = divided(layout, 60)
+    assert len(parts) > 1 and [c for p in parts for c in p.columns] == list(layout.columns)
+    for part in parts:
+        assert all(len(line.entries) == len(part.columns) for line in part.lines)
+        text = plain_formats.to_text([replace(part, notes=())]).splitlines()
+        table = text[: next(i for i, line in enumerate(text) if not line.strip())]
+        assert max(map(len, table[1:])) <= 60
+        assert len({c.group for c in part.columns}) == len(part.groups)
+    assert [p.notes for p in parts[:-1]] == [()] * (len(parts) - 1) and parts[-1].notes == layout.notes
+    assert divided(layout, 1000) == [layout]
 
 
 def test_many_scenes_go_into_several_tables_with_one_mean(tmp_path: Path) -> None:

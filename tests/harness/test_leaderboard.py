@@ -59,7 +59,7 @@ def test_the_same_runs_in_any_order_give_the_same_bytes(runs: Path, tmp_path: Pa
         assert add(tmp_path / "b", path).exit_code == 0
     first = content(tmp_path / "a")
     assert first == content(tmp_path / "b")
-    assert sum(name.endswith(".jpg") for name in first) == 4  # one photo, three methods; the lowest seed's
+    assert sum(name.endswith(".jpg") for name in first) == 8  # two views: photo, three methods; lowest seed
     before = {p: p.stat().st_mtime_ns for p in (tmp_path / "a").rglob("*.csv")}
     again = add(tmp_path / "a", runs)
     assert "5 there already" in again.stderr and again.exit_code == 0
@@ -214,7 +214,7 @@ def test_other_numbers_for_a_cell_need_replace(one: Path, tmp_path: Path) -> Non
     assert "1 replaced" in add(board, worse, "--replace").stderr
     after = content(board)
     changed = {name for name in before if before[name] != after[name]}
-    assert len(after) == len(before) and len(changed) == 4  # two tables, the index, the render
+    assert len(after) == len(before) and len(changed) == 5  # two tables, the index, two renders
     assert aw("check", "--board", board).exit_code == 0
 
 

@@ -76,7 +76,7 @@ def edit_index(board: Path) -> None:
     lines = path.read_text().splitlines(keepends=True)
     render = next(i for i, line in enumerate(lines) if ",3dgs," in line)
     cells = lines[render].split(",")
-    lines[render] = ",".join([*cells[:-4], "99.5", *cells[-3:]])
+    lines[render] = ",".join([*cells[:-5], "99.5", *cells[-4:]])
     path.write_text("".join(lines))
 
 

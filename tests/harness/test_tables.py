@@ -17,8 +17,10 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.measures import MEASURES, measure
 from ambiguous_wild.harness.running.store import read_runs
 from ambiguous_wild.harness.tables.comparison import Table, TableCell, comparison
+from ambiguous_wild.harness.tables.fit import fitted
 from ambiguous_wild.harness.tables.render import (
     RENDERERS,
+    display_width,
     plain,
     to_csv,
     to_latex,
@@ -185,9 +187,61 @@ def test_who_knows_the_truth_is_not_ranked(tmp_path: Path) -> None:
 
 def test_missing_metrics_carry_their_reason_once(tmp_path: Path) -> None:
     table = table_of(tmp_path, fake_result("a"), fake_result("b"))
-    assert cell(table, "a", "lpips_alex").state == "missing"
+    assert "lpips_alex" not in [c.key for c in table.columns]  # an empty column says nothing
     told = [n for n in table.notes if "lpips_alex" in n]
     assert told == ["missing: lpips_alex: weights missing: put heads.pth into W"]
+
+
+def test_a_column_that_was_asked_for_stays_though_it_is_empty(tmp_path: Path) -> None:
+    table = table_of(tmp_path, fake_result("a"), metrics=("psnr", "lpips_alex"))
+    assert cell(table, "a", "lpips_alex").state == "missing"
+
+
+def test_scenes_where_a_measure_is_undefined_are_left_out_of_its_mean(tmp_path: Path) -> None:
+    masked = {"iou": 0.8, "precision": 0.9, "recall": 0.85, "images": 2}
+    nothing = {"iou": 0.0, "precision": 0.0, "recall": None, "images": 2}  # a pixel masked, no distractor
+    table = table_of(
+        tmp_path,
+        fake_result("a", "one", masks=masked),
+        fake_result("a", "clean", masks=nothing),
+        fake_result("b", "one", masks={**masked, "iou": 0.6}),
+        fake_result("b", "clean", masks=nothing),
+        fake_result("c", "one"),
+        fake_result("c", "clean"),
+    )
+    assert cell(table, "a", "mask_iou").value == 0.8 and cell(table, "b", "mask_iou").value == 0.6
+    assert cell(table, "c", "mask_iou").state == "missing"  # it has no masks at all
+    assert [b.scene for b in table.blocks][1] == "clean"
+    assert cell(table, "a", "mask_iou", 1).state == "missing"
+    assert "undefined on clean, left out of the mean: mask IoU" in table.notes
+    # A gap that is no such case: no mean.
+    (tmp_path / "more").mkdir()
+    table = table_of(
+        tmp_path / "more", fake_result("a", "one", masks=masked), fake_result("a", "two"),
+        fake_result("b", "one", masks=masked), fake_result("b", "two", masks=masked),
+    )  # fmt: skip
+    assert cell(table, "a", "mask_iou").state == "missing" and cell(table, "b", "mask_iou").value == 0.8
+
+
+@pytest.mark.parametrize("width", [40, 60, 100])
+def test_text_fits_the_width_and_names_what_it_leaves_out(width: int, tmp_path: Path) -> None:
+    more = {"flip": 0.2, "psnr_covered": 19.0, "ssim_inria": 0.7, "lpips_vgg": 0.3}
+    rows = [{"name": "0.png", "psnr": 20.0, "ssim": 0.5, "lpips_alex": 0.2, **more}]
+    table = table_of(
+        tmp_path,
+        *(fake_result(m, seed=k, per_image=rows, missing={}) for m in ("a", "longer") for k in (0, 1)),
+    )
+    shown = fitted(table, width)
+    lines = to_text(shown).splitlines()
+    aligned = [line for line in lines if line.startswith(("a ", "longer", "method", "─"))]
+    assert len(aligned) == 4 and max(map(display_width, aligned)) <= width
+    keys = [c.key for c in shown.columns]
+    assert keys[0] == "psnr" and "lpips_alex" in keys and len(keys) < len(table.columns)
+    (note,) = [n for n in shown.notes if n.startswith("not shown")]
+    named = note.partition(": ")[2].partition("; ")[0].split(", ")
+    assert named == [c.label for c in table.columns if c.key not in keys]
+    # The widest columns of all still leave one.
+    assert [c.key for c in fitted(table, 1).columns] == ["psnr"]
 
 
 def test_a_reason_that_concerns_some_names_them(tmp_path: Path) -> None:

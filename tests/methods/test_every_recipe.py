@@ -68,6 +68,26 @@ def test_a_step_on_an_accelerator_leaves_the_host_alone(sparse, tmp_path, monkey
                 trainer.timeline.loss(trainer.step())
 
 
+@pytest.mark.parametrize("method", ["gs-w", "splatfacto-w", "nexussplats", "hybridgs", "forestsplats"])
+def test_masks_that_read_an_effect_are_not_grafted_without_it(scene, tmp_path, method):
+    with pytest.warns(UserWarning, match="leaves out"):
+        made = parts_of(f"3dgs@mask={method}")
+    with pytest.raises(AwError, match=f"HOST@mask={method},effects={method}"):
+        trainer_of(scene, tmp_path, made)
+
+
+@pytest.mark.parametrize("method", ["gs-w", "nexussplats"])
+def test_masks_are_grafted_with_the_effect_that_they_read(scene, tmp_path, method):
+    parts = parts_of(f"3dgs@mask={method},effects={method}")
+    trainer = trainer_of(scene, tmp_path, parts)
+    learnt = {"gs-w": "mask_weight1", "nexussplats": "doubt_weight2"}[method]
+    before = parts.effects[0]._adam[learnt].values.clone()
+    for _ in range(12):  # of 120: masks begin at a twelfth
+        trainer.step()
+    assert not torch.equal(parts.effects[0]._adam[learnt].values, before)
+    assert not parts.mask.mask.regularises()
+
+
 @pytest.mark.parametrize("method", CPU_ALONE)
 def test_what_gsplat_does_not_offer_is_refused_in_one_line(sparse, tmp_path, monkeypatch, method):
     with (

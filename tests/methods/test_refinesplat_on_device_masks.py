@@ -175,7 +175,14 @@ def padded(values: np.ndarray) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("name", VALUES)
-@pytest.mark.parametrize("settings", [{}, {"gate": 0.0}, {"gate": 0.0, "least": 0.0}, {"threshold": "hard"}])
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {}, {"gate": 0.0}, {"gate": 0.0, "least": 0.0}, {"threshold": "hard"}, {"threshold": "statistics"},
+        {"threshold": "statistics", "gate": 0.0, "least": 0.0}, {"threshold": "literal"},
+        {"threshold": "literal", "gate": 0.0, "least": 0.0},
+    ],
+)  # fmt: skip
 def test_t_ent_and_the_learnt_weight_are_the_hosts(name, settings):
     values, config = VALUES[name], MaskConfig(**{"least": 1.5, "hard": 2.0, **settings})
     for w2 in (0.2, 0.5, 0.8):
@@ -209,6 +216,7 @@ LABELS = np.random.default_rng(3).integers(-1, 7, (8, 11)).repeat(6, 0).repeat(7
     [
         {}, {"combine": "union"}, {"use_global": False}, {"use_local": False}, {"dilation": 5},
         {"most": 0.05}, {"scope": "photo"}, {"threshold": "hard", "hard": 8.0}, {"fill": 0.0},
+        {"threshold": "literal"}, {"threshold": "statistics"},
         {"gate": 0.0, "least": 3.0},
     ],
 )  # fmt: skip

@@ -86,7 +86,7 @@ def moved(policy: RefineSplatMask) -> RefineSplatMask:
     "changes",
     [
         {}, {"combine": "union", "threshold": "hard"}, {"dilation": 5, "scope": "photo", "w2": 0.5},
-        {"gate": 0.0, "ceiling": 0.0, "memory": 0.0},
+        {"gate": 0.0, "ceiling": 0.0, "memory": 0.0}, {"threshold": "literal"}, {"threshold": "statistics"},
     ],
 )  # fmt: skip
 def test_an_examination_reads_nothing_back(scene, changes):

@@ -129,7 +129,6 @@ def test_pictures_are_drawn_of_what_the_device_holds(scene, accelerated, tmp_pat
     [
         ({"statistic": "evidence"}, "statistic=evidence"),
         ({"entropy_weight": 0.5}, "entropy_weight=0.5"),
-        ({"threshold": "literal"}, "threshold=literal"),
     ],
 )
 def test_what_the_device_cannot_do_is_done_on_the_host_and_said(scene, accelerated, changes, named):

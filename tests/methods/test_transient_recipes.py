@@ -83,17 +83,18 @@ def test_gradients_of_the_uncertainty_are_those_of_its_loss(nexus):
     distance = policy._distance(step)
     codes, leaf = step.gaussians.extra["nexus_doubt"], policy.codes._leaf(step)
 
-    def loss(moved):
-        doubts = policy.codes.doubts(moved, leaf)
+    def loss(doubts):
         drawn = step.draw(gaussians=as_colour(step.gaussians, slice(None), doubts), without=("nexussplats",))
-        sigma = torch.nn.functional.softplus(drawn.image[..., 0] - SHIFT * drawn.alpha)
+        sigma = torch.nn.functional.softplus(drawn.image[..., 0] - SHIFT * drawn.alpha).double()
         return (distance / (2 * sigma**2).clamp(min=1 / 3)).mean() + 0.5 * (sigma + 1e-6).log().mean()
 
     found = gradients.extra["nexus_doubt"]
     row = int(found.abs().sum(dim=1).argmax())
-    for column in (0, 7):
-        want = slope(loss, codes, (row, column), 0.05)
-        assert found[row, column].item() == pytest.approx(want, rel=0.05, abs=2e-7)
+    slope_of_doubt = slope(loss, policy.codes.doubts(codes, leaf), row, 0.05)
+    with torch.enable_grad():
+        code = codes[row : row + 1].clone().requires_grad_()
+        (through,) = torch.autograd.grad(policy.codes.doubts(code, leaf).sum(), code)
+    torch.testing.assert_close(found[row], (slope_of_doubt * through[0]).float(), rtol=0.03, atol=1e-7)
     assert gradients.own["nexussplats"].keys() >= {"transient", "doubt_weight0", "doubt_bias2"}
     assert not gradients.sh0.any() and not gradients.screen.any() and gradients.means.any()
     assert torch.equal(keep > 1, policy.predict(step) > 0)
@@ -115,8 +116,8 @@ def test_volumes_are_pulled_down(nexus):
 
 
 def test_doubts_find_what_features_do_not_explain(scene, tmp_path):
-    options = {"lr_code": "0.02", "appearance": "false"}
-    trainer = trained(scene, tmp_path, parts_of("nexussplats", **options), iterations=500)
+    options = {"lr_code": "0.02", "appearance": "false", "min_mask_start": "150"}
+    trainer = trained(scene, tmp_path, parts_of("nexussplats", **options), iterations=300)
     inside, outside = masked_more_inside(trainer)
     assert inside < outside - 0.2
 

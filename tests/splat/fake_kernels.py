@@ -60,18 +60,19 @@ def projection_bwd(means, covars, quats, scales, viewmats, Ks, width, height, ep
 
 
 def harmonics_fwd(degree, dirs, coeffs, masks):
-    shade = fake_gsplat.spherical_harmonics(degree, dirs, coeffs)
+    shade = fake_gsplat.spherical_harmonics(
+        degree, dirs.reshape(-1, 3), coeffs.reshape(-1, *coeffs.shape[-2:])
+    )
     # rows left out are memory as it was
-    return torch.where(masks[:, None], shade, torch.nan)
+    return torch.where(masks[..., None], shade.view(dirs.shape), torch.nan)
 
 
 def harmonics_bwd(bases, degree, dirs, coeffs, masks, v_colors, wanted):
     assert wanted
-    v_colors = torch.where(masks[:, None], v_colors, 0.0)
-    v_dirs, v_coeffs = pulled(
-        lambda d, c: [fake_gsplat.spherical_harmonics(degree, d, c)], (dirs, coeffs), [v_colors]
-    )
-    return v_coeffs, v_dirs
+    v_colors = torch.where(masks[..., None], v_colors, 0.0).reshape(-1, 3)
+    shapes, flat = (dirs.shape, coeffs.shape), (dirs.reshape(-1, 3), coeffs.reshape(-1, *coeffs.shape[-2:]))
+    v_dirs, v_coeffs = pulled(lambda d, c: [fake_gsplat.spherical_harmonics(degree, d, c)], flat, [v_colors])
+    return v_coeffs.view(shapes[1]), v_dirs.view(shapes[0])
 
 
 def intersect_tile(

@@ -137,7 +137,7 @@ def test_a_resumed_run_equals_an_undisturbed_one(scene, tmp_path, names):
 def test_a_render_between_steps_changes_nothing(scene, tmp_path):
     plain, probed = (trainer_for(scene, tmp_path / n, ALL, iterations=140) for n in ("plain", "probed"))
     plain.train()
-    probed.train(tick=lambda t: (t._probe_image(t.data.cameras[0]), t.make_step(t.iteration, 1)))
+    probed.train(tick=lambda t: (t.picture(t.data.cameras[0]), t.make_step(t.iteration, 1)))
     assert bits(probed) == bits(plain)
 
 

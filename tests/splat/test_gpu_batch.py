@@ -118,7 +118,7 @@ def test_what_cannot_be_shared_is_refused(scene, tmp_path, fake, monkeypatch):
     with pytest.raises(AwError, match="2 to 4, got 5"):
         batch(scene, tmp_path, 5)
     entry = get_method("robustsplat")
-    with pytest.raises(AwError, match="2 views a step, as .*masks of"):
+    with pytest.raises(AwError, match=r"2 views a step, as .*masks of"):
         batch(scene, tmp_path, 2, entry.build(entry.options()))
     with pytest.raises(AwError, match="budget"):
         batch(scene, tmp_path, 2, budget_s=1.0)

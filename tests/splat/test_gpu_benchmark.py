@@ -233,3 +233,38 @@ def test_a_scene_of_several_sizes_has_no_graph_and_the_other_figures(gpu, tmp_pa
     code, results, page = run(gpu, tmp_path, "cost", methods=["3dgs"])
     assert code == 0 and "the scene has 2" in results["gpu-cost"]["left_out"]["3dgs, CUDA graph"]
     assert "- 3dgs, CUDA graph failed: a graph needs" in page
+
+
+BARE = """
+import sys
+sys.path.insert(0, {benchmarks!r})
+import pytest
+from tests.splat import fake_gsplat
+
+with fake_gsplat.installed(pytest.MonkeyPatch()):
+    import gpu
+    import gpu_stages
+    gpu_stages.BLOCK = 2
+    usual = ["--scene", {scene!r}, "--work", {work!r}, "--results", {work!r}, "--iterations", "4",
+             "--device", "cpu", "--warm-up", "1", "--turns", "1"]
+    code = gpu.main([*usual, "--stages", "build", "train", "cost", "--methods", "3dgs", "robustsplat"])
+    print("code", code, sorted(set(sys.modules) & set(Absent.names)))
+    try:
+        gpu.main([*usual, "--methods", "refinesplat"])
+    except SystemExit as end:
+        print("refused", end.code)
+"""
+
+
+def test_it_runs_where_little_is_installed(tmp_path):
+    from .test_few_packages import ABSENT
+    from .test_few_packages import run as run_bare
+
+    scene = write_tiny_scene(tmp_path / "scene")
+    done = run_bare(
+        BARE, absent=(*ABSENT, "cv2", "transformers"), benchmarks=str(BENCHMARKS), scene=str(scene),
+        work=str(tmp_path / "work"),
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "code 0 []" in done.stdout and done.stdout.rstrip().endswith("refused 2")
+    assert "refinesplat needs scipy, cv2, which this machine lacks" in done.stderr

@@ -152,6 +152,22 @@ def test_growth_waits_for_the_next_photo_where_one_is_all_masked(scene, tmp_path
     assert trainer.skipped == other.skipped != set()
 
 
+@pytest.mark.parametrize(("off", "due", "grows"), [(1.0, True, False), (0.0, True, True), (1.0, False, True)])
+def test_several_gpus_put_off_a_round_of_growth_as_one_does(off, due, grows):
+    """`called_off` is the same on all ranks; only a step at which something would change asks for it."""
+    from types import SimpleNamespace
+    from unittest.mock import MagicMock
+
+    from ambiguous_wild.splat.multi_gpu.trainer import SharedTrainer
+
+    trainer = MagicMock()
+    trainer.density.due.return_value, trainer._step_cameras.return_value = due, []
+    trainer.density.refine.return_value = ("model", ["prune"])
+    step = SimpleNamespace(iteration=8, divisor=1)
+    events = SharedTrainer._change_density(trainer, step, MagicMock(), None, torch.tensor([off]))
+    assert (events == ["prune"]) == trainer.density.refine.called == grows
+
+
 # -- the loss, compiled before the clock starts ---------------------------------------------------
 
 

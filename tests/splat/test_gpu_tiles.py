@@ -1,4 +1,4 @@
-"""Tile lists of a fixed length: the same pictures, nothing read, and a step that is called off if too short."""
+"""Tile lists of a fixed length: the same pictures, nothing read, a step that is called off if too short."""
 
 import numpy as np
 import pytest
@@ -19,6 +19,7 @@ from .test_trainer import trainer_for
 @pytest.fixture
 def fake(monkeypatch):
     monkeypatch.setattr(render, "_visits", tiles.Visits())
+    monkeypatch.setattr(tiles, "STEP", 2048)  # the stand-in draws every entry at every pixel
     with fake_gsplat.installed(monkeypatch):
         yield
 

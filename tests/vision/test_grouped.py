@@ -49,9 +49,9 @@ def test_similar_neighbours_merge_first_and_the_rest_stays() -> None:
 
 
 def test_like_segments_that_do_not_touch_stay_apart() -> None:
-    labels = stripes(3)
-    merged = group(labels, np.array([[1.0, 0], [0, 1], [1, 0]]), GroupConfig(alike=0.5, fewest=1))
-    assert len(np.unique(merged[:, [0, 23]])) == 2
+    features = np.array([[1.0, 0], [0, 1], [1, 0], [1, 0.1]])
+    merged = group(stripes(4), features, GroupConfig(alike=0.3, fewest=1))
+    assert merged[0, ::8].tolist() == [1, 2, 3, 3]
 
 
 def test_a_group_is_compared_by_all_of_its_pixels() -> None:

@@ -29,9 +29,9 @@ def read_nerfbaselines(root: Path) -> ForeignScene:
     """
     path = root / "nb-info.json"
     info = read_json(path)
-    loader = info.get("loader", "colmap")
+    loader = str(info.get("loader", "colmap"))
     if loader not in LOADERS:
-        raise unknown(f"loader in {path}", str(loader)[:60], LOADERS)
+        raise unknown(f"loader in {path}", loader[:60], LOADERS)
     protocol = str(info.get("evaluation_protocol", "default"))
     if protocol not in PROTOCOLS:
         raise unknown(f"evaluation_protocol in {path}", protocol[:60], PROTOCOLS)

@@ -24,6 +24,7 @@ from ambiguous_wild.datasets.foreign import (
 )
 from ambiguous_wild.datasets.points import read_point_ply
 from ambiguous_wild.datasets.readers.colmap import file_size, has_lists, read_lists
+from ambiguous_wild.io.colmap_model import check_camera
 from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage
 from ambiguous_wild.io.scene_folder import TEST_EVERY
 
@@ -107,9 +108,9 @@ def frame_camera(
         fx = 0.5 * width / math.tan(0.5 * angle_x)
     if fy is None and angle_y is not None and 0 < angle_y < math.pi:
         fy = 0.5 * height / math.tan(0.5 * angle_y)
-    if fx is None and fy is None:
+    fx, fy = (fy if fx is None else fx), (fx if fy is None else fy)
+    if fx is None or fy is None:
         raise AwError(f"{path} states neither fl_x nor camera_angle_x: the focal length is unknown")
-    fx, fy = fx or fy or 0.0, fy or fx or 0.0
     cx, cy = value("cx"), value("cy")
     cx, cy = (width / 2 if cx is None else cx), (height / 2 if cy is None else cy)
     lens = [value(k) or 0.0 for k in _LENS]
@@ -145,6 +146,7 @@ def model_of_frames(frames: Sequence[tuple[str, Mapping[str, Any], ModelCamera]]
     images: dict[int, ModelImage] = {}
     for number, (name, frame, camera) in enumerate(sorted(frames, key=lambda f: f[0]), start=1):
         key = (camera.model, camera.width, camera.height, camera.params)
+        check_camera(Path(name), camera)
         known = cameras.setdefault(
             key, ModelCamera(len(cameras) + 1, camera.model, camera.width, camera.height, camera.params)
         )

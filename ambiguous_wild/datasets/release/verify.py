@@ -110,9 +110,10 @@ def _check_croissant(path: Path, sums: dict[str, str]) -> None:
     if not isinstance(data, dict) or data.get("conformsTo") != VERSION:
         raise AwError(f"{where} is not in Croissant 1.1")
     listed = {}
-    for entry in data.get("distribution") or []:
+    entries = data.get("distribution")
+    for entry in entries if isinstance(entries, list) else []:
         if isinstance(entry, dict) and entry.get("@type") == "cr:FileObject":
-            listed[entry.get("contentUrl")] = entry.get("sha256")
+            listed[str(entry.get("contentUrl"))] = entry.get("sha256")
     wanted = {n: d for n, d in sums.items() if n.endswith((".zip", ".csv"))}
     if listed != wanted:
         odd = sorted(str(n) for n in set(listed) ^ set(wanted)) or sorted(

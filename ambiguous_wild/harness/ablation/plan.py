@@ -139,8 +139,8 @@ def plan_study(
 
 
 def _settings_of(variant: Variant, method: str, own: Sequence[str]) -> list[str]:
-    """What a variant that is another method is trained with: the study's settings where the method is a donor of
-    the graft, and its own."""
+    """Settings of a variant that is another method: the study's where its method is the donor of the graft,
+    and the variant's own."""
     peer = get_method(variant.method)
     shared = own if peer.option_keys(method, "key") else []
     return [*shared, *(f"{method}.{text}" for text in variant.settings)]

@@ -47,6 +47,14 @@ class Change:
     unranked: str = ""  # why the minutes cannot be trusted; empty where they can
 
     @property
+    def what(self) -> str:
+        """The change in words."""
+        if self.kind == "effect":
+            return self.name
+        before_after = f"{self.before} → {self.after}"
+        return before_after if self.kind == "part" else f"{self.name} {before_after}"
+
+    @property
     def per_minute(self) -> float:
         """dB an extra minute; NaN where it takes no longer, or a run was not alone."""
         if not self.minutes.mean > 0.0 or self.same_time or self.unranked:

@@ -217,9 +217,8 @@ def draw_changes(report: CostReport) -> Any | None:
 
 
 def _what(change: Change) -> str:
-    if change.kind == "effect":
-        return f"{change.method}: + {change.name}, {change.length}"
-    return f"{change.method}: {change.name} {change.before} → {change.after}, {change.length}"
+    plus = "+ " if change.kind == "effect" else ""
+    return f"{change.method}: {plus}{change.what}, {change.length}"
 
 
 def _price(change: Change, unit: Unit) -> str:

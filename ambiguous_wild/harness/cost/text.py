@@ -149,10 +149,9 @@ def _changed(title: str, rows: Sequence[Change], unit: Unit) -> Listing:
             "extra ms/iter", f"dB per extra {'ref ' if unit.name.startswith('ref') else ''}min")  # fmt: skip
     lines = []
     for c in rows:
-        what = c.name if c.kind == "effect" else f"{c.name} {c.before} → {c.after}"
         interval = MISSING if math.isnan(c.low) else f"{c.low:+.2f} to {c.high:+.2f}"
         lines.append((
-            what, c.method, c.length, str(c.pairs), number(c.db, 2, sign=True), interval,
+            c.what, c.method, c.length, str(c.pairs), number(c.db, 2, sign=True), interval,
             number(unit.of(c.minutes), unit.digits, sign=True), number(c.ms, 1, sign=True), per_minute(c),
         ))  # fmt: skip
     return Listing(title, head, tuple(lines))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 from ambiguous_wild.harness.leaderboard.entry import ALONE, Entry, in_order
@@ -45,7 +46,11 @@ PAPERS = {
 
 
 def facts(
-    entries: Sequence[Entry], index: Iterable[Mapping[str, str]], reported: Reported, files: list[str]
+    entries: Sequence[Entry],
+    index: Iterable[Mapping[str, str]],
+    reported: Reported,
+    files: list[str],
+    models: Mapping[str, str] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """The page's data, ready for JSON.
 
@@ -54,6 +59,7 @@ def facts(
         index: rows of `pictures.read_index`.
         reported: numbers that papers print; may be empty.
         files: names of the CSVs beside the page.
+        models: page that shows a run's model, by hash of its result.
     """
     order = in_order({k for e in entries for k in e.quality})
     missing = {k for e in entries for k in e.missing}
@@ -74,6 +80,7 @@ def facts(
         "methods": {name: _method(name) for name in sorted({e.method for e in entries})},
         "measures": measures,
         "runs": [_run(e) for e in entries],
+        "models": dict(models),
         "images": [
             {k: v for k, v in row.items() if k not in ("sha256", "psnr")}
             | {"psnr": _number(to_number(row["psnr"], "psnr"))}

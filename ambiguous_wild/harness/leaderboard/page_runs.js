@@ -10,6 +10,7 @@ function oneRun(run) {
   return h("div", { class: "run" },
     h("p", {}, h("strong", {}, `${run.scene}, seed ${run.seed}`), `: ${values.join(", ")}`),
     h("p", { class: "small" }, `${run.images} test images; ${checked}; ${run.device}, ${run.hardware}, ${load}; version ${run.version}; configuration ${run.config_hash.slice(0, 12)}, scene ${run.scene_hash.slice(0, 12)}, result ${run.result_hash.slice(0, 12)}${run.source ? `, its file ${run.source.slice(0, 12)}` : ""}${run.code_hash ? `, code ${run.code_hash.slice(0, 12)}` : ""}`),
+    Object.hasOwn(DATA.models, run.result_hash) ? h("p", {}, h("a", { href: DATA.models[run.result_hash] }, "Fly through the model")) : null,
     needs(run),
     h("div", { class: "row" }, code, h("button", { type: "button", class: "copy", "aria-label": "Copy the commands", onclick: (e) => copy(code, e.currentTarget) }, "Copy")));
 }

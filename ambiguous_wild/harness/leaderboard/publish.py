@@ -9,7 +9,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from ambiguous_wild.harness.audit.table import REPORTED
 from ambiguous_wild.harness.leaderboard import pictures
 from ambiguous_wild.harness.leaderboard.board import files_of, read_board
 from ambiguous_wild.harness.leaderboard.entry import Entry
+from ambiguous_wild.harness.leaderboard.models import ModelPages, write_model_pages
 from ambiguous_wild.harness.leaderboard.page_facts import facts
 from ambiguous_wild.harness.leaderboard.reported import SOURCE, Printed, Reported, read_reported, reported_csv
 from ambiguous_wild.io.atomic import atomic_dir, check_output, sweep_siblings, write_json
@@ -28,7 +29,7 @@ from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.lock import folder_lock
 
 GENERATOR = '<meta name="generator" content="aw leaderboard publish">'
-OURS = {"index.html", "data", "images"}
+OURS = {"index.html", "data", "images", "models"}
 MANIFEST = "data/files.json"  # every other file of the page
 SCRIPTS = (
     "page_data.js", "page_table.js", "page_matrix.js", "page_runs.js", "page_plot.js", "page_compare.js",
@@ -45,6 +46,7 @@ class Published:
     images: int
     reported: int
     reported_from: str | None = None  # the folder that was looked into; None: not asked for
+    model_pages: int = 0
 
 
 def publish(
@@ -54,6 +56,8 @@ def publish(
     reported: bool = False,
     reported_from: Path | None = None,
     title: str = "Leaderboard",
+    models: Sequence[Path] = (),
+    say: Callable[[str], None] = lambda text: None,
 ) -> Published:
     """Write the page; an earlier page in `out` is replaced once the new one is whole.
 
@@ -63,6 +67,8 @@ def publish(
         reported: show what papers print, too: BOARD/reported/*.csv, else the tables of this package.
         reported_from: show what papers print, too, from this folder.
         title: of the page.
+        models: run folders, or folders of them; their models go into pages of `aw view`, OUT/models/*.html.
+        say: told which entries have no model there.
 
     Raises:
         AwError: the board is damaged, or `out` holds something else.
@@ -90,7 +96,8 @@ def publish(
                 _copy_picture(
                     pictures.folder_of(board) / row["file"], folder / "images" / row["file"], row["sha256"]
                 )
-            text = page(title, facts(entries, index, printed, names))
+            pages = write_model_pages(entries, models, folder, say) if models else ModelPages({}, 0)
+            text = page(title, facts(entries, index, printed, names, pages.links))
             (folder / "index.html").write_text(text, encoding="utf-8")
             write_json(folder / MANIFEST, list_names(folder))
     return Published(
@@ -99,6 +106,7 @@ def publish(
         images=len(index),
         reported=len(printed.numbers),
         reported_from=None if source is None else str(source),
+        model_pages=pages.pages,
     )
 
 

@@ -55,9 +55,11 @@ def run_program(cell: Cell, folder: Path) -> RunResult:
     )
     produced, time_cost = _timed(program, task)
     truth = evaluate.load_test_photos(cell.scene)
-    drawn: _Drawn | _Splats = _Drawn(truth, produced.renders)
+    drawn: _Drawn | _Splats
     if produced.drawn_by_us:
         drawn = _Splats(produced, cell.device)
+    else:
+        drawn = _Drawn(truth, produced.renders)
     per_image, missing = evaluate.render_and_measure(
         cast(Trainer, drawn),
         truth,

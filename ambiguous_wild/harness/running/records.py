@@ -96,6 +96,7 @@ class Environment(TypedDict):
     packages: dict[str, str | None]  # None = not installed
     gpu: NotRequired[str]
     gsplat_max_alpha: NotRequired[float]  # differs between versions of gsplat
+    gpu_options: NotRequired[str]  # $AW_GPU, where it is not the default
 
 
 class Provenance(TypedDict):

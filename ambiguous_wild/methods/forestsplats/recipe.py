@@ -115,5 +115,8 @@ class Mixed(MaskPolicy):
     def __init__(self, nets: Nets) -> None:
         self.forest = Forest(nets)
 
+    def setup(self, data: TrainData) -> None:
+        self.forest.nets.require_setup()
+
     def predict(self, step: Step) -> Tensor | None:
         return 1.0 - self.forest.mask(step)

@@ -153,8 +153,13 @@ class GswAppearance(Learnt):
 class Visibility(MaskPolicy):
     """M learns from the residual that it leaves in the loss, against the prior that nothing is masked."""
 
+    learns_by_gradients = True
+
     def __init__(self, effect: GswAppearance) -> None:
         self.effect, self.config = effect, effect.config
+
+    def setup(self, data: TrainData) -> None:
+        self.effect.require_setup()
 
     def keep(self, step: Step) -> Tensor | None:
         return self.predict(step) if step.nominal > self.config.mask_start else None

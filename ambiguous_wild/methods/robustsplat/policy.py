@@ -43,7 +43,7 @@ class RobustSplatMask(PausingMask):
     def setup(self, data: TrainData) -> None:
         self.data = data
         self.histogram = self.histogram.to(data.device)
-        _fit(self.fine, data.photos, data)
+        _fit(self.fine, list(data.photos), data)
         self.phi = photo_features(self.fine, data.photos, data.cache_dir)
         small = [self._coarse_picture(photo) for photo in data.photos]
         _fit(self.coarse, small, data)

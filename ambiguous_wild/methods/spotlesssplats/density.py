@@ -38,7 +38,7 @@ class SpotLessDensity(DensityControl):
     @torch.no_grad()
     def refine(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> tuple[Gaussians, list[str]]:
         gaussians, events = super().refine(step, gaussians, optimiser)
-        if not self.cut and step.nominal >= self.config.free_colour:
+        if self._cut_due(step):
             optimiser.bind(gaussians)
             optimiser.reset_moments(["sh_rest"])  # postponed steps are made first
             gaussians.sh_rest.clamp_(max=self.config.most_colour)
@@ -46,7 +46,10 @@ class SpotLessDensity(DensityControl):
         return gaussians, events
 
     def due(self, step: Step) -> bool:
-        return super().due(step) or (not self.cut and step.nominal >= self.config.free_colour)
+        return super().due(step) or self._cut_due(step)
+
+    def _cut_due(self, step: Step) -> bool:
+        return not self.cut and step.nominal >= self.config.free_colour
 
     def state_dict(self) -> dict[str, Any]:
         return super().state_dict() | {"cut": self.cut}

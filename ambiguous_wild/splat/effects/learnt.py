@@ -85,6 +85,14 @@ class Learnt(Effect):
         self._leaves = dict(self.leaves(data, np.random.default_rng(seed)))
         self._adam = {name: RowAdam(self._table(leaf).to(data.device)) for name, leaf in self._leaves.items()}
 
+    def require_setup(self) -> None:
+        """Raise AwError where the run lacks this effect: a mask policy that reads it was grafted alone."""
+        if not hasattr(self, "_adam"):
+            raise AwError(
+                f"the masks of {self.name} need its effects too: "
+                f"write HOST@mask={self.name},effects={self.name}"
+            )
+
     def _table(self, leaf: Leaf) -> Tensor:
         values = leaf.values.detach().to(torch.float32)
         if not leaf.per_photo:

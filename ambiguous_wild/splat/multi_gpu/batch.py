@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -105,8 +106,9 @@ class BatchTrainer(Trainer):
         progress = self.progress(step.iteration)
         called_off = torch.maximum(off.amin(0), self.sentinel.broken)
         names = [name for name, _ in self.gaussians.items()]
-        total = {n: torch.stack([getattr(g, n) for _, _, g in seen]).mean(0) for n in names}
+        total: dict[str, Any] = {n: torch.stack([getattr(g, n) for _, _, g in seen]).mean(0) for n in names}
         mean = replace(seen[-1][2], **total)
+        assert mean.visible is not None  # kernels on a GPU always tell
         with part("optimiser"):
             self.optimiser.step(mean, mean.visible, self._rates(progress), called_off=called_off)
         with part("density"):

@@ -16,7 +16,7 @@ from ambiguous_wild.methods.refinesplat.first_look import FirstLook
 from ambiguous_wild.methods.refinesplat.on_device.maps import sized
 from ambiguous_wild.methods.refinesplat.on_device.masks import Labels, PhotoMasks, make_masks
 from ambiguous_wild.methods.refinesplat.on_device.pixels import PixelEvidence
-from ambiguous_wild.methods.refinesplat.on_device.threshold import FORMS, learnt
+from ambiguous_wild.methods.refinesplat.on_device.threshold import learnt
 from ambiguous_wild.methods.refinesplat.threshold import Cut
 
 if TYPE_CHECKING:
@@ -30,8 +30,6 @@ def only_on_host(config: RefineSplatConfig) -> str | None:
         return f"refinesplat.mask.statistic={mask.statistic}"
     if mask.entropy_weight > 0:
         return f"refinesplat.mask.entropy_weight={mask.entropy_weight}"
-    if mask.threshold not in FORMS:
-        return f"refinesplat.mask.threshold={mask.threshold}"
     return None
 
 

@@ -17,8 +17,6 @@ from ambiguous_wild.methods.refinesplat.config import MaskConfig
 from ambiguous_wild.methods.refinesplat.on_device.ranks import spread_of
 from ambiguous_wild.methods.refinesplat.threshold import TEMPERATURE, THETA_LIMIT, LearntWeight
 
-FORMS = ("kapur", "hard")  # of the threshold that are implemented here
-
 
 @dataclass(frozen=True)
 class Pool:
@@ -33,6 +31,7 @@ class Pool:
     upper: Tensor  # [n] entropy of the upper set of a cut below each value
     more_below: Tensor  # [n] how much greater that of the lower set is
     above_previous: Tensor  # [n] bool: larger than the one before, so a cut may lie between
+    logs: Tensor  # [2, n] sum x log x of the lower and the upper set of a cut below each value
 
     def floor(self, gate: float) -> Tensor:
         """`threshold.robust_floor`, 0-d; NaN if all are missing."""
@@ -67,26 +66,54 @@ def pool_of(values: Tensor) -> Pool:
     lower, upper = (totals.log() - logs / totals).masked_fill_(totals <= 0, 0.0)
     above_previous = F.pad(order[1:] > order[:-1], (1, 0))
     return Pool(
-        order, index, x, through[0, -1], *spread_of(values), upper, lower - upper, above_previous
+        order, index, x, through[0, -1], *spread_of(values), upper, lower - upper, above_previous, logs
     )  # fmt: skip
 
 
 def t_ent(pool: Pool, w2: Tensor, config: MaskConfig) -> Cut:
-    """`threshold.t_ent` of form kapur or hard."""
+    """`threshold.t_ent`."""
     if config.threshold == "hard":
         fixed = torch.full_like(pool.middle, config.hard)
         return Cut(fixed, fixed)
     floor = pool.floor(config.gate) if config.gate > 0 else torch.full_like(pool.middle, -math.inf)
     if config.floor > 0:
         floor = floor.clamp(min=config.floor)
+    if config.threshold == "statistics":
+        there = ~pool.order.isnan()
+        count = there.sum()
+        mean = pool.total / count
+        away = (pool.x - mean) * there
+        statistics = mean + (torch.dot(away, away) / count).sqrt()
+        return Cut(torch.where(_apart(pool), torch.maximum(statistics, floor), math.inf), floor)
+    if config.threshold == "literal":
+        return _literal(pool, w2, floor)
     candidate, scores = _candidates(pool, w2, floor)
     start = scores.argmax().clamp(min=1)
     between = 0.5 * (pool.order.take(start) + pool.order.take(start - 1))
     apart = candidate.any()
     if config.gate <= 0:  # with a gate, its bound is above values that are all equal
-        last = pool.order.nan_to_num(nan=-math.inf).amax()
-        apart = apart & (last - pool.order[0] > 1e-9 * last.abs().clamp(min=1e-300))
+        apart = apart & _apart(pool)
     return Cut(torch.where(apart, between, math.inf), floor)
+
+
+def _apart(pool: Pool) -> Tensor:
+    """0-d bool: there are two values that differ."""
+    last = pool.order.nan_to_num(nan=-math.inf).amax()
+    return last - pool.order[0] > 1e-9 * last.abs().clamp(min=1e-300)
+
+
+def _literal(pool: Pool, w2: Tensor, floor: Tensor) -> Cut:
+    """The printed objective, on raw sums; it may cut below the smallest value."""
+    candidate = pool.above_previous.clone()
+    candidate[0] = True
+    candidate &= pool.order > floor
+    lower, upper = pool.logs
+    scores = ((1.0 - w2) * -upper + w2 * -lower).masked_fill(~candidate, -math.inf)
+    start = scores.argmax()
+    between = 0.5 * (pool.order.take(start) + pool.order.take((start - 1).clamp(min=0)))
+    lowest = torch.nextafter(pool.order[0], torch.full_like(pool.middle, -math.inf))
+    threshold = torch.where(start > 0, between, lowest)
+    return Cut(torch.where(candidate.any() & _apart(pool), threshold, math.inf), floor)
 
 
 def _candidates(pool: Pool, w2: Tensor, floor: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,181 @@
+"""The models of finished runs, with their scene, ready to be shown together."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from ambiguous_wild.core import AwError, Scene
+from ambiguous_wild.core.config import from_plain
+from ambiguous_wild.core.errors import shortlist, unknown
+from ambiguous_wild.harness.running.records import metrics_of
+from ambiguous_wild.harness.running.result_file import RESULT, read_result
+from ambiguous_wild.harness.running.store import CONFIG, read_config, run_folders
+from ambiguous_wild.io.ply import splat_count
+from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.methods.references import is_reference
+from ambiguous_wild.methods.registry import get_method
+from ambiguous_wild.viewing.model import Look, Model
+
+PLY = "point_cloud.ply"
+MASKS = "masks"
+
+
+@dataclass(frozen=True)
+class Found:
+    """A finished run with its model."""
+
+    run: Path
+    scene: str  # name
+    scene_hash: str
+    model: Model
+    half: bool  # measured on the right half of each test photo
+    note: str = ""  # how it is drawn, where that may not be as in training
+
+
+@dataclass(frozen=True)
+class Shown:
+    """Models of one scene."""
+
+    scene: Scene
+    models: tuple[Model, ...]
+    notes: tuple[str, ...]  # what is not shown, and why; what a number means
+
+
+def read_models(
+    paths: Sequence[Path], *, scene: str | None = None, scene_folder: Path | None = None
+) -> Shown:
+    """The models of the runs below some folders, and the scene they were trained on.
+
+    Args:
+        paths: run folders, or folders of runs.
+        scene: name of the scene, where the runs are of several.
+        scene_folder: where it lies; None = where the runs say.
+
+    Raises:
+        AwError: no run, no model in any, runs of several scenes, or the scene is not where it was.
+    """
+    found, notes = find_models(paths)
+    names = sorted({f.scene for f in found})
+    if scene is not None:
+        found = [f for f in found if f.scene == scene]
+        if not found:
+            raise unknown("scene", scene, names)
+    elif len(names) > 1:
+        raise AwError(f"these runs are of {len(names)} scenes ({shortlist(names)}): choose one with --scene")
+    if len({f.scene_hash for f in found}) > 1:
+        runs = shortlist(sorted(str(f.run) for f in found), 3)
+        raise AwError(
+            f"scene {found[0].scene!r} is not the same for all of these runs: {runs}; name them one by one"
+        )
+    if any(f.half for f in found):
+        notes.append("PSNR of runs with --protocol half is that of the right half of each test photo")
+    return Shown(open_scene(found[0].run, scene_folder), tuple(f.model for f in found), tuple(notes))
+
+
+def find_models(paths: Sequence[Path]) -> tuple[list[Found], list[str]]:
+    """Finished runs that have a model, in the order of their paths, and a line for each other run.
+
+    Labels tell runs of the same method apart by seed, then by folder.
+
+    Raises:
+        AwError: no such folder, or no run with a model in any of them.
+    """
+    found: list[Found] = []
+    notes: list[str] = []
+    for root in paths:
+        if not root.is_dir():
+            raise AwError(
+                f"no folder of runs {root}: give the folder that 'aw bench -o' wrote, or a run in it"
+            )
+        for run in dict.fromkeys(run_folders(root)):
+            if any(f.run.samefile(run) for f in found):
+                continue
+            try:
+                found.append(_found(run))
+            except AwError as error:
+                notes.append(f"not shown: {error}")
+                continue
+            if found[-1].note:
+                notes.append(found[-1].note)
+    if not found:
+        why = f" ({notes[0]})" if notes else ""
+        raise AwError(f"no finished run with a {PLY} below {shortlist(map(str, paths))}{why}")
+    return _with_labels(found), notes
+
+
+def open_scene(run: Path, folder: Path | None = None) -> Scene:
+    """The scene of a run, with the photos it was trained on.
+
+    Args:
+        run: its folder.
+        folder: where the scene lies; None = where the run says.
+
+    Raises:
+        AwError: it is not there, or damaged.
+    """
+    asked = read_config(run).get("scene")
+    if not isinstance(asked, dict):
+        raise AwError(f"{run / CONFIG} names no scene; run 'aw bench' again to replace it")
+    path = Path(str(asked.get("path"))) if folder is None else folder
+    if not path.is_dir():
+        raise AwError(f"the scene of {run} is not at {path}: say where it lies with --scene-folder")
+    factor = asked.get("factor")
+    return load_scene(path, factor=factor if isinstance(factor, int) else None)
+
+
+def _found(run: Path) -> Found:
+    result = read_result(run / RESULT)
+    if result["status"] != "ok":
+        raise AwError(f"{run} failed: {result['error']}")
+    ply = run / PLY
+    if not ply.is_file():
+        raise AwError(f"{run} has no {PLY}: an external program may keep its model elsewhere")
+    splat_count(ply)
+    config = read_config(run)
+    look, note = read_look(config)
+    psnr = {row["name"]: metrics_of(row).get("psnr") for row in result["per_image"]}
+    model = Model(
+        label=result["method"],
+        ply=ply,
+        look=look,
+        psnr={name: float(value) for name, value in psnr.items() if value is not None},
+        masks=run / MASKS if (run / MASKS).is_dir() else None,
+    )
+    half = config.get("protocol") == "half"
+    return Found(run, result["scene"], result["scene_hash"], model, half, note)
+
+
+def read_look(config: Mapping[str, Any]) -> tuple[Look, str]:
+    """How the run's method draws, from its recipe with the run's options and effects; and a note, or "".
+
+    A method that is not registered here is drawn as plain 3DGS. The name is the run's, which may be a
+    stranger's: no file that it refers to is imported.
+    """
+    name = str(config.get("method", ""))
+    options = config.get("options")
+    try:
+        if is_reference(name):
+            raise AwError(f"{name} is a file")
+        entry = get_method(name)
+        if entry.program is not None:
+            return Look(), ""
+        chosen = from_plain(type(entry.options()), options if isinstance(options, dict) else {}, "options")
+        parts = entry.build(chosen)
+    except AwError:
+        known = "drawn as plain 3DGS; if it is a method of yours, name its file with --plugin"
+        return Look(), f"{name}: its recipe is not known here: {known}"
+    antialias = parts.antialias or "antialias" in (config.get("effects") or ())
+    return Look(parts.sh_degree, antialias, parts.blur, parts.background), ""
+
+
+def _with_labels(found: list[Found]) -> list[Found]:
+    labels = [f.model.label for f in found]
+    if len(set(labels)) < len(labels):
+        labels = [f"{f.model.label}, {f.run.name}" for f in found]
+    twice = {label for label, count in Counter(labels).items() if count > 1}
+    labels = [str(f.run) if label in twice else label for f, label in zip(found, labels)]
+    return [replace(f, model=replace(f.model, label=label)) for f, label in zip(found, labels)]

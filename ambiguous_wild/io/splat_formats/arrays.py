@@ -1,0 +1,94 @@
+"""What the formats share: Gaussians as arrays, quantisation, order along a space-filling curve."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from ambiguous_wild.core import AwError
+
+Arrays = Mapping[str, np.ndarray]  # raw parameters as `io.ply.read_splat_ply` gives them
+SH_C0 = 0.28209479177387814
+_NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh0", "sh_rest")
+_MOST_LOGIT = 15.0  # sigmoid differs from 0 and 1 by 3e-7 there; formats that keep alpha hold no infinity
+
+
+def finite(gaussians: Arrays) -> dict[str, np.ndarray]:
+    """The Gaussians that can be drawn: rows with a value that is not finite are left out, quaternions have
+    norm 1."""
+    sound = np.ones(len(gaussians["means"]), bool)
+    for name in _NAMES:
+        sound &= np.isfinite(gaussians[name]).reshape(len(sound), -1).all(axis=1)
+    norm = np.linalg.norm(gaussians["quats"].astype(np.float64), axis=1)
+    sound &= norm > 0
+    kept = {name: np.asarray(gaussians[name], np.float32)[sound] for name in _NAMES}
+    kept["quats"] = (kept["quats"] / norm[sound, None]).astype(np.float32)
+    return kept
+
+
+def sigmoid(logits: np.ndarray) -> np.ndarray:
+    return 1.0 / (1.0 + np.exp(-logits.astype(np.float64)))
+
+
+def logit(alpha: np.ndarray) -> np.ndarray:
+    """Inverse of `sigmoid`, clamped to finite values."""
+    with np.errstate(divide="ignore"):
+        found = np.log(alpha) - np.log1p(-alpha.astype(np.float64))
+    return np.clip(found, -_MOST_LOGIT, _MOST_LOGIT).astype(np.float32)
+
+
+def rounded(
+    values: np.ndarray,
+    most: int,  # largest code
+) -> np.ndarray:  # int64 in [0, most]
+    """The nearest codes."""
+    return np.clip(np.floor(values.astype(np.float64) + 0.5), 0, most).astype(np.int64)
+
+
+def along_curve(means: np.ndarray) -> np.ndarray:
+    """Row order along a Morton curve of 10 bits an axis, so that neighbours in space are neighbours in the
+    file."""
+    low, high = means.min(axis=0, initial=np.inf), means.max(axis=0, initial=-np.inf)
+    span = np.where(high > low, high - low, 1.0)
+    cells = np.clip((means - low) / span * 1023.0, 0, 1023).astype(np.uint64)
+    code = np.zeros(len(means), np.uint64)
+    for bit in range(10):
+        for axis in range(3):
+            code |= ((cells[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
+    return np.argsort(code, kind="stable")
+
+
+def largest_first(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Index of the largest component [N], and the other three [N, 3] with the sign that makes it positive."""
+    largest = np.abs(quats).argmax(axis=1)
+    rows = np.arange(len(quats))
+    signed = quats * np.where(quats[rows, largest] < 0, -1.0, 1.0)[:, None]
+    others = np.array([[j for j in range(4) if j != i] for i in range(4)])
+    return largest, np.take_along_axis(signed, others[largest], axis=1)
+
+
+def from_largest(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Quaternions [N, 4] of what `largest_first` gave."""
+    quats = np.empty((len(largest), 4))
+    places = np.array([[j for j in range(4) if j != i] for i in range(4)])
+    np.put_along_axis(quats, places[largest], others, axis=1)
+    rest = np.sqrt(np.clip(1.0 - (others**2).sum(axis=1), 0.0, None))
+    quats[np.arange(len(largest)), largest] = rest
+    return quats
+
+
+def read_bytes(path: Path | str, most: int) -> bytes:
+    """The whole file.
+
+    Raises:
+        AwError: it cannot be read, or has more than `most` bytes.
+    """
+    path = Path(path)
+    try:
+        if path.stat().st_size > most:
+            raise AwError(f"{path} has {path.stat().st_size:,} bytes, more than a model can have")
+        return path.read_bytes()
+    except OSError as error:
+        raise AwError(f"cannot read {path}: {error.strerror or error}") from None

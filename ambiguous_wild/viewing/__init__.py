@@ -1,0 +1,1 @@
+"""Show trained models: pages, videos, exported files, a live view. Knows models and scenes, not runs."""

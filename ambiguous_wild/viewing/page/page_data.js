@@ -1,0 +1,72 @@
+// What the page knows, and small helpers. Text of scenes and methods enters as text, never as markup.
+const DATA = JSON.parse(document.getElementById("data").textContent);
+const $ = (id) => document.getElementById(id);
+const PHOTO = "photo";
+const state = { left: 0, right: DATA.models.length > 1 ? 1 : PHOTO, mode: "single", view: null, masks: true, frusta: false, cut: 50, path: [] };
+
+function h(name, attributes = {}, ...children) {
+  const element = document.createElement(name);
+  for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
+  element.append(...children);
+  return element;
+}
+
+function fill(select, options) {
+  select.replaceChildren(...options.map(([value, text]) => h("option", { value }, text)));
+}
+
+/** The bytes of an element that holds base64 text; the text is dropped when it is not needed again. */
+function bytesOf(id) {
+  const binary = atob($(id).textContent);
+  const bytes = new Uint8Array(binary.length);
+  for (let i = 0; i < binary.length; i++) bytes[i] = binary.charCodeAt(i);
+  return bytes;
+}
+
+/** three.js, OrbitControls and Spark: one module, unpacked here because a page from a file cannot load another. */
+async function loadRenderer() {
+  const stream = new Blob([bytesOf("renderer")]).stream().pipeThrough(new DecompressionStream("gzip"));
+  const text = await new Response(stream).blob();
+  const url = URL.createObjectURL(new Blob([text], { type: "text/javascript" }));
+  try {
+    return await import(url);
+  } finally {
+    URL.revokeObjectURL(url);
+    $("renderer").textContent = "";
+  }
+}
+
+const shown = (value, digits = 2) => (typeof value === "number" ? value.toFixed(digits) : "—");
+
+function image(uri) {
+  return new Promise((resolve, reject) => {
+    const picture = new Image();
+    picture.onload = () => resolve(picture);
+    picture.onerror = () => reject(new Error("a photo of this page is damaged"));
+    picture.src = uri;
+  });
+}
+
+/** Paint a view's photo into a canvas; what the method's mask leaves out turns red. */
+async function paintPhoto(canvas, view, model) {
+  const photo = await image(view.photo);
+  canvas.width = photo.naturalWidth;
+  canvas.height = photo.naturalHeight;
+  const context = canvas.getContext("2d", { willReadFrequently: true });
+  context.drawImage(photo, 0, 0);
+  const mask = state.masks && model && model.masks[view.name];
+  if (!mask) return false;
+  const keep = await image(mask);
+  const pixels = context.getImageData(0, 0, canvas.width, canvas.height);
+  context.imageSmoothingEnabled = false;
+  context.drawImage(keep, 0, 0, canvas.width, canvas.height);
+  const kept = context.getImageData(0, 0, canvas.width, canvas.height).data;
+  for (let i = 0; i < kept.length; i += 4) {
+    if (kept[i] > 127) continue;
+    pixels.data[i] = 0.45 * pixels.data[i] + 0.55 * 255;
+    pixels.data[i + 1] *= 0.45;
+    pixels.data[i + 2] *= 0.45;
+  }
+  context.putImageData(pixels, 0, 0);
+  return true;
+}

@@ -1,0 +1,251 @@
+// What is chosen, what moves the camera, and the way all of it comes together.
+let R, T, camera, controls, over, under, wanted = true, pressed = new Set();
+const isBeside = () => state.mode === "beside";
+const panes = () => (state.mode === "single" ? [over] : [over, under]);
+const dirty = () => { wanted = true; };
+
+function psnrLine() {
+  const view = DATA.views[state.view];
+  if (!view) return `${DATA.models.length} ${DATA.models.length === 1 ? "model" : "models"}; free camera`;
+  const chosen = [state.left, ...(state.mode === "single" ? [] : [state.right])].filter((c) => c !== PHOTO);
+  const values = chosen.filter((c) => Object.hasOwn(DATA.models[c].psnr, view.name))
+    .map((c) => `${DATA.models[c].label} ${shown(DATA.models[c].psnr[view.name])} dB`);
+  return [`${view.split} photo`, ...values].join(" · ");
+}
+
+async function drawPhotos() {
+  const view = DATA.views[state.view];
+  const model = DATA.models[state.left === PHOTO ? state.right : state.left];
+  const atPane = panes().some((pane) => pane.choice === PHOTO);
+  $("photo").hidden = !view || atPane;
+  for (const pane of panes()) await pane.drawPhoto(view, model);
+  if (!view || atPane) return;
+  const masked = await paintPhoto($("photo").querySelector("canvas"), view, model);
+  $("photo").querySelector("figcaption").textContent = masked ? `${view.name}, mask of ${model.label}` : view.name;
+}
+
+function placeFrame() {
+  const view = DATA.views[state.view];
+  $("frame").hidden = !view;
+  if (!view) return;
+  const { scale, left, top } = fitted(view, over.element.clientWidth, over.element.clientHeight);
+  Object.assign($("frame").style, { left: `${left}px`, top: `${top}px`, width: `${scale * view.width}px`, height: `${scale * view.height}px` });
+}
+
+/** Cut the upper pane and its label at the handle. */
+function placeCut() {
+  $("over").style.clipPath = state.mode === "cut" ? `inset(0 ${100 - state.cut}% 0 0)` : "none";
+  $("handle").style.left = `${state.cut}%`;
+  $("slider").value = state.cut;
+}
+
+async function refresh() {
+  for (const mode of ["single", "beside", "cut"]) $(mode).setAttribute("aria-pressed", String(state.mode === mode));
+  for (const key of ["frusta", "masks"]) $(key).setAttribute("aria-pressed", String(state[key]));
+  $("stage").dataset.mode = state.mode;
+  $("right-choice").hidden = state.mode === "single";
+  $("left").value = String(state.left);
+  $("right").value = String(state.right);
+  $("view").value = state.view === null ? "" : String(state.view);
+  $("said").textContent = psnrLine();
+  placeCut();
+  placeFrame();
+  busy("loading the model");
+  try {
+    await over.show(state.left);
+    if (state.mode !== "single") await under.show(state.right);
+    await drawPhotos();
+    if (state.frusta) paintAllFrusta();
+    busy("");
+  } catch (error) {
+    busy(`cannot show this model: ${error.message}`);
+  }
+  dirty();
+}
+
+const busy = (text) => { $("busy").textContent = text; };
+function busyFor(text) {
+  busy(text);
+  setTimeout(() => { if ($("busy").textContent === text) busy(""); }, 2500);
+}
+
+function paintAllFrusta() {
+  for (const pane of panes()) {
+    if (!pane.frusta || pane.painted) continue;
+    pane.painted = true;
+    paintFrusta(T, pane.frusta, DATA.views, dirty).catch((error) => busy(error.message));
+  }
+}
+
+function choose(changes) {
+  Object.assign(state, changes);
+  if (state.view !== null) state.lens = state.view;
+  controls.enabled = true;
+  return refresh();
+}
+
+function step(by) {
+  const count = DATA.views.length;
+  if (count) choose({ view: ((state.view ?? (by > 0 ? -1 : 0)) + by + count) % count });
+}
+
+/** Leave the photo's camera at its place: from here on the mouse turns it about the middle of the scene. */
+function free() {
+  if (state.view === null) return;
+  const forward = new T.Vector3(0, 0, -1).applyQuaternion(camera.quaternion);
+  const middle = new T.Vector3(...DATA.middle);
+  const depth = Math.max(middle.sub(camera.position).dot(forward), 0.2 * DATA.extent);
+  controls.target.copy(camera.position).addScaledVector(forward, depth);
+  state.view = null;
+  refresh();
+}
+
+function home() {
+  const up = new T.Vector3(...DATA.up), first = DATA.views.find((v) => v.split === "test") ?? DATA.views[0];
+  controls.target.set(...DATA.middle);
+  lookThrough(T, camera, first, 100, 100);
+  const away = camera.position.clone().sub(controls.target).multiplyScalar(1.4).addScaledVector(up, 0.4 * DATA.extent);
+  camera.position.copy(controls.target).add(away);
+  camera.up.copy(up);
+  choose({ view: null });
+}
+
+function addToPath() {
+  state.path.push(pathEntry(camera));
+  $("path").textContent = `Path (${state.path.length})`;
+}
+
+/** Keys move the camera while they are held. */
+function fly(seconds) {
+  const way = new T.Vector3(
+    (pressed.has("d") ? 1 : 0) - (pressed.has("a") ? 1 : 0),
+    (pressed.has("e") ? 1 : 0) - (pressed.has("q") ? 1 : 0),
+    (pressed.has("s") ? 1 : 0) - (pressed.has("w") ? 1 : 0),
+  );
+  if (!way.lengthSq()) return;
+  free();
+  way.applyQuaternion(camera.quaternion).multiplyScalar(0.5 * DATA.extent * Math.min(seconds, 0.1));
+  camera.position.add(way);
+  controls.target.add(way);
+  dirty();
+}
+
+let last = performance.now();
+function loop(now) {
+  requestAnimationFrame(loop);
+  fly((now - last) / 1000);
+  last = now;
+  if (!wanted) return;
+  wanted = false;
+  const width = over.element.clientWidth, height = over.element.clientHeight;
+  if (!width || !height) return;
+  if (state.view === null) {
+    controls.update();
+    freeProjection(camera, width, height);
+    camera.updateMatrixWorld(true);
+  } else lookThrough(T, camera, DATA.views[state.view], width, height);
+  for (const pane of panes()) pane.draw(camera);
+}
+
+function pick(event) {
+  if (!state.frusta) return;
+  const pane = isBeside() && event.clientX > $("stage").getBoundingClientRect().left + $("stage").clientWidth / 2 ? under : over;
+  if (!pane.frusta) return;
+  const box = pane.element.getBoundingClientRect();
+  const at = new T.Vector2((2 * (event.clientX - box.left)) / box.width - 1, 1 - (2 * (event.clientY - box.top)) / box.height);
+  const ray = new T.Raycaster();
+  ray.setFromCamera(at, camera);
+  const faces = pane.frusta.children.filter((f) => f.visible).map((f) => f.children[1]);
+  const hit = ray.intersectObjects(faces, false)[0];
+  if (hit) choose({ view: hit.object.userData.view });
+}
+
+function onKey(event) {
+  if (event.ctrlKey || event.metaKey || event.altKey || /^(SELECT|INPUT)$/.test(event.target.tagName)) return;
+  const key = event.key.toLowerCase();
+  if ("wasdqe".includes(key) && key.length === 1) pressed.add(key);
+  else if (key === "arrowright") step(1);
+  else if (key === "arrowleft") step(-1);
+  else if (key === "c") choose({ frusta: !state.frusta });
+  else if (key === "m") choose({ masks: !state.masks });
+  else if (key === "h") home();
+  else if (key === "p") addToPath();
+  else if (key === "v") choose({ mode: { single: "beside", beside: "cut", cut: "single" }[state.mode] });
+  else if (/^[1-9]$/.test(key) && Number(key) <= DATA.models.length) choose({ left: Number(key) - 1 });
+  else return;
+  event.preventDefault();
+}
+
+function cutAt(clientX) {
+  const box = $("stage").getBoundingClientRect();
+  state.cut = Math.min(Math.max((100 * (clientX - box.left)) / box.width, 0), 100);
+  placeCut();
+}
+
+function listen() {
+  for (const mode of ["single", "beside", "cut"]) $(mode).addEventListener("click", () => choose({ mode }));
+  for (const key of ["frusta", "masks"]) $(key).addEventListener("click", () => choose({ [key]: !state[key] }));
+  const chosen = (value) => (value === PHOTO ? PHOTO : Number(value));
+  for (const side of ["left", "right"]) $(side).addEventListener("change", (event) => choose({ [side]: chosen(event.target.value) }));
+  $("view").addEventListener("change", (event) => (event.target.value === "" ? free() : choose({ view: Number(event.target.value) })));
+  $("previous").addEventListener("click", () => step(-1));
+  $("next").addEventListener("click", () => step(1));
+  $("home").addEventListener("click", home);
+  $("path").addEventListener("click", () => (state.path.length > 1 ? savePath() : busyFor("press P at two cameras or more, then save the path")));
+  $("slider").addEventListener("input", () => { state.cut = Number($("slider").value); placeCut(); });
+  $("help-button").addEventListener("click", () => {
+    $("help").hidden = !$("help").hidden;
+    $("help-button").setAttribute("aria-expanded", String(!$("help").hidden));
+  });
+  window.addEventListener("keydown", onKey);
+  window.addEventListener("keyup", (event) => pressed.delete(event.key.toLowerCase()));
+  window.addEventListener("blur", () => pressed.clear());
+  let down = null;
+  $("touch").addEventListener("pointerdown", (event) => { down = [event.clientX, event.clientY]; });
+  $("touch").addEventListener("pointerup", (event) => {
+    if (down && Math.hypot(event.clientX - down[0], event.clientY - down[1]) < 5) pick(event);
+  });
+  controls.addEventListener("start", free);
+  controls.addEventListener("change", dirty);
+  new ResizeObserver(() => { placeFrame(); drawPhotos(); dirty(); }).observe($("stage"));
+  window.addEventListener("hashchange", recall);
+}
+
+/** `#left=NAME&right=NAME&mode=cut&view=NAME` opens the page there; what is not known is ignored. */
+function recall() {
+  const words = new URLSearchParams(location.hash.slice(1));
+  const changes = {};
+  for (const side of ["left", "right"]) {
+    const index = DATA.models.findIndex((m) => m.label === words.get(side));
+    if (index >= 0) changes[side] = index;
+    else if (words.get(side) === PHOTO) changes[side] = PHOTO;
+  }
+  if (["single", "beside", "cut"].includes(words.get("mode"))) changes.mode = words.get("mode");
+  const view = DATA.views.findIndex((v) => v.name === words.get("view"));
+  if (view >= 0) changes.view = view;
+  return choose(changes);
+}
+
+async function start() {
+  const models = DATA.models.map((m, i) => [String(i), typeof m.mean === "number" ? `${m.label} (${shown(m.mean)} dB)` : m.label]);
+  for (const side of ["left", "right"]) fill($(side), [...models, [PHOTO, "the photo"]]);
+  fill($("view"), [["", "free"], ...DATA.views.map((v, i) => [String(i), `${v.split}: ${v.name}`])]);
+  $("notes").replaceChildren(...DATA.notes.map((note) => h("li", {}, note)));
+  busy("starting");
+  R = await loadRenderer();
+  T = R.THREE;
+  camera = new T.PerspectiveCamera();
+  camera.up.set(...DATA.up);
+  controls = new R.OrbitControls(camera, $("touch"));
+  controls.minDistance = 0.01 * DATA.extent;
+  controls.maxDistance = 50 * DATA.extent;
+  over = new Pane(R, $("over"), dirty);
+  under = new Pane(R, $("under"), dirty);
+  listen();
+  const first = DATA.views.findIndex((v) => v.split === "test");
+  state.view = first >= 0 ? first : DATA.views.length ? 0 : null;
+  await recall();
+  requestAnimationFrame(loop);
+}
+
+start().catch((error) => busy(`this browser cannot show the models: ${error.message} (WebGL 2 is needed)`));

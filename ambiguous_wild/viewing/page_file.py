@@ -1,0 +1,199 @@
+"""One HTML file with models, photos, masks and the program that draws them; it loads nothing else."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import json
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ambiguous_wild.core import AwError, Scene, View
+from ambiguous_wild.io.atomic import check_output, refuse_file, write_text
+from ambiguous_wild.io.splat_formats.spz import spz_bytes
+from ambiguous_wild.viewing.model import Model
+from ambiguous_wild.viewing.photos import mask_uris, photo_uris
+from ambiguous_wild.viewing.reduce import reduced
+from ambiguous_wild.viewing.space import space_of
+
+PAGE = "index.html"
+GENERATOR = '<meta name="generator" content="aw view">'
+MOST_GAUSSIANS = 150_000  # a model in the page, by default: about 6 MB, and what a phone still turns smoothly
+MOST_PHOTO_BYTES = 1_000_000  # of text for all photos
+SCRIPTS = ("page_data.js", "page_camera.js", "page_panes.js", "page_main.js")
+_HERE = Path(__file__).resolve().parent / "page"
+
+
+@dataclass(frozen=True)
+class Page:
+    """What was written."""
+
+    path: Path
+    bytes: int
+    models_bytes: int  # of these, text of the models
+    notes: tuple[str, ...]
+
+
+def check_page_folder(folder: Path) -> None:
+    """Check, before anything is read, that the page can be written there.
+
+    Raises:
+        AwError: the path is a file, cannot be written, or holds a page of something else.
+    """
+    refuse_file(folder)
+    path = folder / PAGE
+    check_output(path)
+    if path.exists():
+        head = path.read_text(encoding="utf-8", errors="replace")[:2000] if path.is_file() else ""
+        if GENERATOR not in head:
+            raise AwError(f"{path} is no page of 'aw view'; choose another -o")
+
+
+def write_page(
+    folder: Path,
+    scene: Scene,
+    models: Sequence[Model],
+    *,
+    title: str,
+    most_gaussians: int = MOST_GAUSSIANS,
+    notes: Sequence[str] = (),
+    say: Callable[[str], None] = lambda text: None,
+) -> Page:
+    """Write FOLDER/index.html, whole or not at all.
+
+    Args:
+        folder: made where there is none; other files in it stay.
+        scene: of all the models.
+        models: at least one.
+        title: of the page; any text.
+        most_gaussians: a larger model is reduced to so many, with a note.
+        notes: lines below the models.
+        say: told what is done.
+
+    Raises:
+        AwError: the folder holds another page, or a model cannot be read.
+    """
+    check_page_folder(folder)
+    text, models_bytes, told = page_text(
+        scene, models, title=title, most_gaussians=most_gaussians, notes=notes, say=say
+    )
+    write_text(folder / PAGE, text)
+    return Page(folder / PAGE, len(text.encode("utf-8")), models_bytes, told)
+
+
+def page_text(
+    scene: Scene,
+    models: Sequence[Model],
+    *,
+    title: str,
+    most_gaussians: int = MOST_GAUSSIANS,
+    notes: Sequence[str] = (),
+    say: Callable[[str], None] = lambda text: None,
+) -> tuple[str, int, tuple[str, ...]]:
+    """The page, how much of it is models, and its notes; see `write_page`."""
+    if not models:
+        raise AwError("no model to show")
+    views = (*scene.test, *scene.train)
+    told, elements, facts = list(notes), [], []
+    for number, model in enumerate(models):
+        say(f"{model.label}: {model.count:,} Gaussians")
+        gaussians = model.read()
+        cameras = [view.camera for view in views]
+        fewer = reduced(gaussians, cameras, most_gaussians)
+        given, shown = len(gaussians["means"]), len(fewer["means"])
+        if shown < min(given, most_gaussians):
+            told.append(
+                f"{model.label}: {given - shown:,} Gaussians with values that are not finite left out"
+            )
+        elif shown < given:
+            told.append(
+                f"{model.label}: reduced from {given:,} to {shown:,} Gaussians for this page; "
+                "its PSNR is that of the whole model"
+            )
+        packed, _ = spz_bytes(fewer, antialias=model.look.antialias)
+        element = f"model-{number}"
+        elements.append(
+            f'<script id="{element}" type="text/plain">{base64.b64encode(packed).decode("ascii")}</script>'
+        )
+        facts.append(_model_facts(model, element, views, scene.train))
+    for line in told:
+        say(line)
+    space = space_of(scene)
+    data = {
+        "up": space.up.tolist(),
+        "middle": space.middle.tolist(),
+        "extent": space.extent,
+        "frustum": 0.08 * space.extent,
+        "views": [_view_facts(v, uri) for v, uri in zip(views, photo_uris(views, MOST_PHOTO_BYTES))],
+        "models": facts,
+        "notes": told,
+    }
+    return _fill(title, data, "\n".join(elements)), sum(map(len, elements)), tuple(told)
+
+
+def _model_facts(model: Model, element: str, views: Sequence[View], train: Sequence[View]) -> dict[str, Any]:
+    psnr = {v.name: model.psnr[v.name] for v in views if np.isfinite(model.psnr.get(v.name, np.nan))}
+    return {
+        "label": model.label,
+        "element": element,
+        "antialias": model.look.antialias,
+        "blur": model.look.blur,
+        "background": list(model.look.background),
+        "psnr": psnr,
+        "mean": sum(psnr.values()) / len(psnr) if psnr else None,
+        "masks": {} if model.masks is None else mask_uris(model.masks, train),
+    }
+
+
+def _view_facts(view: View, photo: str) -> dict[str, Any]:
+    camera = view.camera
+    return {
+        "name": view.name,
+        "split": view.split,
+        "width": camera.width,
+        "height": camera.height,
+        "fx": camera.fx,
+        "fy": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "cam_from_world": camera.cam_from_world.ravel().tolist(),
+        "photo": photo,
+    }
+
+
+def _fill(title: str, data: Mapping[str, Any], models: str) -> str:
+    """The template with everything in it; texts can be anything and stay text."""
+    style = (_HERE / "page.css").read_text(encoding="utf-8")
+    script = "\n".join((_HERE / name).read_text(encoding="utf-8") for name in SCRIPTS)
+    text = json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    for char in "<>&\u2028\u2029":  # no text in it can end the element it stands in
+        text = text.replace(char, f"\\u{ord(char):04x}")
+    # Spark's WebAssembly is compiled from bytes, its workers come from blobs; nothing may be fetched.
+    policy = (
+        f"default-src 'none'; img-src data: blob:; style-src {_digest(style)}; worker-src blob:; "
+        f"script-src {_digest(script)} blob: 'wasm-unsafe-eval'; base-uri 'none'; form-action 'none'"
+    )
+    licences = html.escape((_HERE / "licences.txt").read_text(encoding="utf-8"), quote=False)
+    parts = {
+        "POLICY": policy,
+        "TITLE": html.escape(title),
+        "STYLE": style,
+        "DATA": text,
+        "MODELS": models,
+        "RENDERER": base64.b64encode((_HERE / "renderer.js.gz").read_bytes()).decode("ascii"),
+        "LICENCES": licences.replace("--", "—"),  # they stand in a comment
+        "SCRIPT": script,
+    }
+    # In one pass: what is put in is not looked at again.
+    template = (_HERE / "page.html").read_text(encoding="utf-8")
+    return re.sub(r"/\*([A-Z]+)\*/", lambda found: parts[found[1]], template)
+
+
+def _digest(text: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"

@@ -1,0 +1,89 @@
+"""The commands that a board gives: what they are made of, and the same numbers from an empty folder."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from ambiguous_wild.core import Scene
+from ambiguous_wild.harness.leaderboard.board import read_board
+from ambiguous_wild.harness.leaderboard.reproduce import preparation
+from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.simulate.presets import preset, resized
+from ambiguous_wild.simulate.spec_file import parse_spec, plain_spec
+from tests.tiny_scene import write_tiny_scene
+
+SETTINGS = {"factor": 2, "camera": "auto", "matcher": "auto", "seed": 0, "strict": False}
+
+
+def scene_of(root: Path, truth: object, settings: object = SETTINGS) -> Scene:
+    scene = load_scene(write_tiny_scene(root))
+    (root / "truth" / "capture.json").write_text(json.dumps(truth))
+    return replace(scene, info={**scene.info, "settings": settings})
+
+
+def test_a_preset_is_named_with_what_differs_from_it(tmp_path: Path) -> None:
+    spec = plain_spec(resized(preset("courtyard"), 12, 480))
+    scene = scene_of(tmp_path / "yard", {"preset": "courtyard", "seed": 3, "spec": spec})
+    assert preparation(scene) == [
+        "aw simulate courtyard --views 12 --width 480 --seed 3 -o raw/yard",
+        "aw build-scene raw/yard -o yard --factor 2",
+    ]
+    more = scene_of(tmp_path / "b c", {"preset": "courtyard", "seed": 0, "spec": spec},
+                    {**SETTINGS, "mapper": "global", "max_features": 500, "strict": True})  # fmt: skip
+    assert preparation(more)[1] == (
+        "aw build-scene 'raw/b c' -o 'b c' --factor 2 --mapper global --max-features 500 --strict"
+    )
+
+
+def test_another_spec_is_written_out(tmp_path: Path) -> None:
+    spec = replace(preset("courtyard"), summary="it's mine; $(rm -rf ~)", arc_deg=33.0)
+    scene = scene_of(tmp_path / "own", {"preset": "courtyard", "seed": 0, "spec": plain_spec(spec)})
+    write, simulate, _ = preparation(scene)
+    subprocess.run(["bash", "-c", write], cwd=tmp_path, check=True)
+    assert parse_spec((tmp_path / "own.yaml").read_text()) == spec
+    assert simulate == "aw simulate ./own.yaml -o raw/own" and "\n" not in write
+
+
+@pytest.mark.parametrize("truth", [None, [], {}, {"spec": 3}, {"preset": "x", "seed": "0", "spec": {}}])
+def test_what_was_not_simulated_has_no_commands(truth: object, tmp_path: Path) -> None:
+    assert preparation(scene_of(tmp_path / "s", truth)) == [] and preparation(None) == []
+
+
+def test_the_commands_give_the_same_psnr_in_an_empty_folder(tmp_path: Path) -> None:
+    program = tmp_path / "bin" / "aw"
+    program.parent.mkdir()
+    program.write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} -m ambiguous_wild.cli.main "$@"\n')
+    program.chmod(0o755)
+    root = str(Path(__file__).resolve().parents[2])
+    path = os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))
+    environment = os.environ | {
+        "PATH": f"{program.parent}{os.pathsep}{os.environ['PATH']}",
+        "PYTHONPATH": path,
+    }
+
+    def bash(line: str, folder: Path) -> None:
+        folder.mkdir(exist_ok=True)
+        done = subprocess.run(
+            ["bash", "-c", line], cwd=folder, env=environment, capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr
+
+    first, empty = tmp_path / "first", tmp_path / "empty"
+    bash("aw simulate tiny --views 8 --width 256 --no-sheet -o photos", first)
+    bash("aw build-scene photos -o small --factor 2", first)
+    bash("aw bench --method 3dgs --scene small --iterations 20 --no-pictures -o runs", first)
+    bash("aw leaderboard add runs --board board --images 0", first)
+    (entry,) = read_board(first / "board")
+    bash(entry.reproduce, empty)
+    bash(f"aw leaderboard add runs --board {shlex.quote(str(first / 'again'))} --images 0", empty)
+    (again,) = read_board(first / "again")
+    assert again.scene_hash == entry.scene_hash and again.config_hash == entry.config_hash
+    assert again.quality == entry.quality and again.reproduce == entry.reproduce

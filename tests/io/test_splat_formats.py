@@ -1,0 +1,228 @@
+"""Compressed PLY, SPZ, SOG and glTF: against files of another implementation, and back from our own.
+
+tests/io/data/splats holds a model of 40 Gaussians as a plain PLY and what PlayCanvas's splat-transform 2.7.1
+made of it (SPZ through Niantic's own library).
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import json
+import shutil
+import struct
+import subprocess
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.io.ply import read_splat_ply, write_splat_ply
+from ambiguous_wild.io.splat_formats import compressed_ply, gltf, sog, spz
+from ambiguous_wild.io.splat_formats.arrays import finite
+
+THEIRS = Path(__file__).parent / "data" / "splats"
+Arrays = dict[str, np.ndarray]
+READ: dict[str, Callable[[Path], Arrays]] = {
+    "compressed.ply": compressed_ply.read_compressed_ply,
+    "spz": spz.read_spz,
+    "sog": sog.read_sog,
+    "glb": gltf.read_gltf,
+}
+WRITE: dict[str, Callable[[Path, Arrays], int]] = {
+    "compressed.ply": compressed_ply.write_compressed_ply,
+    "spz": spz.write_spz,
+    "sog": sog.write_sog,
+    "glb": gltf.write_gltf,
+}
+# Largest error of positions, quaternions (1 - cosine), log scales, opacity, colour, harmonics; codebooks of
+# SOG hold 256 values for everything, its quaternions 8 bits.
+LOOSE = {
+    "compressed.ply": (0.02, 1e-5, 0.01, 0.003, 0.02, 0.02),
+    "spz": (0.001, 1e-5, 0.04, 0.003, 0.02, 0.07),
+    "sog": (0.002, 1e-3, 0.06, 0.005, 0.06, 0.45),
+    "glb": (0.0, 1e-6, 1e-6, 1e-6, 0.0, 0.0),
+}
+TOOL = shutil.which("splat-transform")
+
+
+def model(count: int = 700, rest: int = 15, seed: int = 0) -> Arrays:
+    rng = np.random.default_rng(seed)
+    arrays = {
+        "means": rng.normal(0, 3, (count, 3)),
+        "quats": rng.normal(size=(count, 4)),
+        "log_scales": rng.normal(-4, 1, (count, 3)),
+        "opacity_logits": rng.normal(0, 2, count),
+        "sh0": rng.normal(0, 0.8, (count, 3)),
+        "sh_rest": rng.normal(0, 0.1, (count, rest, 3)),
+    }
+    return {name: value.astype(np.float32) for name, value in arrays.items()}
+
+
+def matched(found: Arrays, given: Arrays) -> Arrays:
+    """The rows of `found` in the order of `given`: formats reorder."""
+    distance = np.linalg.norm(found["means"][None] - given["means"][:, None], axis=2)
+    rows = distance.argmin(axis=1)
+    assert sorted(rows) == list(range(len(found["means"])))
+    return {name: value[rows] for name, value in found.items()}
+
+
+def alpha(logits: np.ndarray) -> np.ndarray:
+    return 1 / (1 + np.exp(-logits.astype(np.float64)))
+
+
+def check_near(found: Arrays, given: Arrays, limits: tuple[float, ...]) -> None:
+    given = finite(given)
+    found = matched(found, given)
+    seen = alpha(given["opacity_logits"]) > 0.01  # WebP keeps no colour of what is transparent
+    assert np.abs(found["means"] - given["means"]).max() <= limits[0]
+    assert (1 - np.abs((found["quats"] * given["quats"]).sum(axis=1))).max() <= limits[1]
+    assert np.abs(found["log_scales"] - given["log_scales"]).max() <= limits[2]
+    assert np.abs(alpha(found["opacity_logits"]) - alpha(given["opacity_logits"])).max() <= limits[3]
+    assert np.abs(found["sh0"] - given["sh0"])[seen].max() <= limits[4]
+    assert found["sh_rest"].shape == given["sh_rest"].shape
+    assert np.abs(found["sh_rest"] - given["sh_rest"]).max(initial=0.0) <= limits[5]
+
+
+@pytest.mark.parametrize("ending", ["compressed.ply", "spz", "sog"])
+def test_what_another_program_wrote_is_read(ending: str) -> None:
+    given = read_splat_ply(THEIRS / "model.ply")
+    check_near(READ[ending](THEIRS / f"model.{ending}"), given, LOOSE[ending])
+
+
+@pytest.mark.parametrize("rest", [0, 3, 8, 15])
+@pytest.mark.parametrize("ending", WRITE)
+def test_there_and_back(tmp_path: Path, ending: str, rest: int) -> None:
+    given, path = model(rest=rest), tmp_path / f"model.{ending}"
+    assert WRITE[ending](path, given) == 700
+    check_near(READ[ending](path), given, LOOSE[ending])
+    first = path.read_bytes()
+    WRITE[ending](path, given)
+    assert path.read_bytes() == first  # the same model, the same bytes
+
+
+@pytest.mark.parametrize("ending", WRITE)
+def test_gaussians_that_cannot_be_drawn_are_left_out(tmp_path: Path, ending: str) -> None:
+    given, path = model(20), tmp_path / f"model.{ending}"
+    given["means"][3, 1], given["sh_rest"][4, 2, 0], given["quats"][5] = np.nan, np.inf, 0.0
+    assert WRITE[ending](path, given) == 17
+    assert len(READ[ending](path)["means"]) == 17
+
+
+@pytest.mark.parametrize("ending", WRITE)
+def test_one_gaussian_and_equal_values(tmp_path: Path, ending: str) -> None:
+    given, path = model(1), tmp_path / f"model.{ending}"
+    WRITE[ending](path, given)
+    check_near(READ[ending](path), given, LOOSE[ending])
+
+
+def test_sizes_are_in_the_order_that_people_expect(tmp_path: Path) -> None:
+    given, sizes = model(4000), {}
+    write_splat_ply(tmp_path / "model.ply", given)
+    for ending, write in WRITE.items():
+        write(tmp_path / f"model.{ending}", given)
+        sizes[ending] = (tmp_path / f"model.{ending}").stat().st_size
+    plain = (tmp_path / "model.ply").stat().st_size
+    assert sizes["spz"] < sizes["compressed.ply"] < 0.3 * plain and sizes["sog"] < sizes["compressed.ply"]
+
+
+def test_the_header_of_spz_is_the_specified_one() -> None:
+    data, count = spz.spz_bytes(model(5), antialias=True)
+    magic, version, points, degree, bits, flags, reserved = struct.unpack_from(
+        "<IIIBBBB", gzip.decompress(data)
+    )
+    assert (magic, version, points, degree, flags, reserved) == (0x5053474E, 3, 5, 3, 1, 0) and count == 5
+    assert 12 <= bits <= 18
+
+
+def test_far_positions_keep_what_24_bits_allow(tmp_path: Path) -> None:
+    given = model(10)
+    given["means"] *= 1000
+    spz.write_spz(tmp_path / "far.spz", given)
+    error = np.abs(matched(spz.read_spz(tmp_path / "far.spz"), given)["means"] - given["means"]).max()
+    assert error <= np.abs(given["means"]).max() / 2**22
+    given["means"][0, 0] = 1e9
+    with pytest.raises(AwError, match="8 388 607 units"):
+        spz.write_spz(tmp_path / "too-far.spz", given)
+    assert not (tmp_path / "too-far.spz").exists()
+
+
+def test_gltf_follows_the_extension(tmp_path: Path) -> None:
+    given, path = model(6, rest=3), tmp_path / "m.glb"
+    gltf.write_gltf(path, given)
+    data = path.read_bytes()
+    assert data[:4] == b"glTF" and struct.unpack_from("<II", data, 4) == (2, len(data))
+    length = struct.unpack_from("<I", data, 12)[0]
+    head = json.loads(data[20 : 20 + length])
+    assert head["extensionsUsed"] == ["KHR_gaussian_splatting"]
+    primitive = head["meshes"][0]["primitives"][0]
+    assert primitive["mode"] == 0 and primitive["extensions"]["KHR_gaussian_splatting"]["kernel"] == "ellipse"
+    names = {f"KHR_gaussian_splatting:SH_DEGREE_1_COEF_{c}" for c in range(3)}
+    names |= {f"KHR_gaussian_splatting:{n}" for n in ("ROTATION", "SCALE", "OPACITY", "SH_DEGREE_0_COEF_0")}
+    assert set(primitive["attributes"]) == {"POSITION", "COLOR_0"} | names
+    accessor = head["accessors"][primitive["attributes"]["POSITION"]]
+    assert accessor["count"] == 6
+    assert np.allclose(accessor["min"], given["means"].min(axis=0)) and np.allclose(
+        accessor["max"], given["means"].max(axis=0)
+    )
+    body = data[20 + length + 8 :]
+    view = head["bufferViews"][
+        head["accessors"][primitive["attributes"]["KHR_gaussian_splatting:SCALE"]]["bufferView"]
+    ]
+    scale = np.frombuffer(body, "<f4", 18, view["byteOffset"]).reshape(6, 3)
+    assert np.allclose(scale, np.exp(given["log_scales"]), rtol=1e-6)
+
+
+@pytest.mark.parametrize("ending", READ)
+def test_damaged_files_are_one_line(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"bad.{ending}"
+    WRITE[ending](path, model(30))
+    whole = path.read_bytes()
+    for data in (b"", b"hello", whole[: len(whole) // 2], whole[:40], b"\0" * 200):
+        path.write_bytes(data)
+        with pytest.raises(AwError, match="bad"):
+            READ[ending](path)
+    with pytest.raises(AwError, match="cannot read"):
+        READ[ending](tmp_path / "absent")
+
+
+def test_a_small_spz_that_unpacks_to_much_is_refused(tmp_path: Path) -> None:
+    head = struct.pack("<IIIBBBB", 0x5053474E, 3, 4_000_000_000, 3, 12, 0, 0)
+    (tmp_path / "bomb.spz").write_bytes(gzip.compress(head + b"\0" * 10_000_000))
+    with pytest.raises(AwError, match="cut short"):
+        spz.read_spz(tmp_path / "bomb.spz")
+
+
+def test_a_sog_of_another_version_is_refused(tmp_path: Path) -> None:
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w") as archive:
+        archive.writestr("meta.json", json.dumps({"version": 7}))
+    (tmp_path / "m.sog").write_bytes(out.getvalue())
+    with pytest.raises(AwError, match="version 7"):
+        sog.read_sog(tmp_path / "m.sog")
+
+
+@pytest.mark.skipif(
+    TOOL is None, reason="no splat-transform in PATH (npm install -g @playcanvas/splat-transform)"
+)
+@pytest.mark.parametrize("ending", ["compressed.ply", "spz", "sog"])
+def test_another_program_reads_what_we_wrote(tmp_path: Path, ending: str) -> None:
+    assert TOOL is not None
+    given = model(500)
+    WRITE[ending](tmp_path / f"m.{ending}", given)
+    done = subprocess.run(
+        [TOOL, "-w", "-q", str(tmp_path / f"m.{ending}"), str(tmp_path / "back.ply")],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    back = read_splat_ply(tmp_path / "back.ply")
+    assert len(back["means"]) == 500
+    back["opacity_logits"] = np.clip(back["opacity_logits"], -15, 15)
+    check_near(finite(back), given, LOOSE[ending])
+    ours = READ[ending](tmp_path / f"m.{ending}")
+    assert np.abs(finite(back)["means"] - ours["means"]).max() < 1e-5
+    assert np.abs(back["sh_rest"] - ours["sh_rest"]).max() < 1e-5

@@ -1,0 +1,198 @@
+"""The page of `aw view` as a file: what it holds, what it refuses, hostile names, reduction."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.showing.page import Viewer, view_runs
+from ambiguous_wild.harness.showing.read import read_look
+from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.io.splat_formats.spz import read_spz
+from ambiguous_wild.viewing import page_file
+from ambiguous_wild.viewing.model import Look
+from ambiguous_wild.viewing.reduce import importance, reduced
+from tests.command_line import aw
+from tests.tiny_scene import TEST, TRAIN, write_tiny_scene
+from tests.viewing.wall_runs import wall_model, write_shown_run
+
+HOSTILE = '</script><img src=x onerror="alert(1)">&-->'
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("shown")
+    scene = write_tiny_scene(root / "porch")
+    write_shown_run(root / "runs", scene, "3dgs", noise=20.0)
+    write_shown_run(root / "runs", scene, HOSTILE, noise=5.0)
+    return root / "runs"
+
+
+def facts(page: str) -> dict[str, Any]:
+    found = re.search(r'<script id="data" type="application/json">(.*?)</script>', page, re.S)
+    assert found is not None
+    return json.loads(found[1])
+
+
+def test_the_page_holds_models_photos_masks_and_numbers(runs: Path, tmp_path: Path) -> None:
+    done = aw("view", runs, "-o", tmp_path / "out", "--title", HOSTILE)
+    assert done.returncode == 0, done.stderr
+    page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
+    data = facts(page)
+    assert [v["name"] for v in data["views"]] == TEST + TRAIN
+    assert {m["label"] for m in data["models"]} == {"3dgs", HOSTILE}
+    for model in data["models"]:
+        assert set(model["psnr"]) == set(TEST) and model["mean"] == pytest.approx(
+            np.mean([*model["psnr"].values()])
+        )
+        assert set(model["masks"]) == set(TRAIN[:2])
+        text = re.search(f'<script id="{model["element"]}" type="text/plain">([^<]*)</script>', page)
+        assert text is not None
+        (tmp_path / "m.spz").write_bytes(base64.b64decode(text[1]))
+        assert len(read_spz(tmp_path / "m.spz")["means"]) == 2500
+    models = sum(map(len, re.findall(r'<script id="model-\d+".*?</script>', page)))
+    assert len(page.encode()) - models < 3_000_000
+    assert "index.html: " in done.stderr
+
+
+def test_names_stay_text(runs: Path, tmp_path: Path) -> None:
+    view_runs([runs], tmp_path, title=HOSTILE)
+    page = (tmp_path / "index.html").read_text(encoding="utf-8")
+    assert "<img" not in page and page.count("<script") == page.count("</script>") == 5
+    assert "&lt;/script&gt;" in page and "\\u003c/script\\u003e" in page
+
+
+def test_the_page_allows_itself_nothing_from_elsewhere(runs: Path, tmp_path: Path) -> None:
+    view_runs([runs], tmp_path)
+    page = (tmp_path / "index.html").read_text(encoding="utf-8")
+    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', page)
+    assert policy is not None
+    assert policy[1].startswith("default-src 'none'") and "connect-src" not in policy[1]
+    assert not re.search(
+        r"https?:|unsafe-inline|unsafe-eval'? |\*", policy[1].replace("'wasm-unsafe-eval'", "")
+    )
+
+
+def test_licences_of_the_bundled_program_are_in_the_page(runs: Path, tmp_path: Path) -> None:
+    view_runs([runs], tmp_path)
+    page = (tmp_path / "index.html").read_text(encoding="utf-8")
+    comment = re.search(r"<!-- Licences.*?-->", page, re.S)
+    assert comment is not None
+    for name in ("@sparkjsdev/spark 2.2.0", "three 0.180.0", "fflate"):
+        assert name in comment[0]
+    assert comment[0].count("Permission is hereby granted, free of charge") == 3
+
+
+def test_the_bundle_is_that_of_the_build_script() -> None:
+    root = Path(__file__).resolve().parents[2]
+    wanted = json.loads((root / "scripts/viewer/package.json").read_text())["dependencies"]
+    licences = (root / "ambiguous_wild/viewing/page/licences.txt").read_text()
+    assert all(f"{name} {version}" in licences for name, version in wanted.items())
+    program = gzip.decompress((root / "ambiguous_wild/viewing/page/renderer.js.gz").read_bytes())
+    assert b"SparkRenderer" in program and b"sourceMappingURL" not in program
+    assert "resolved" not in (root / "scripts/viewer/package-lock.json").read_text()
+
+
+def test_the_same_runs_give_the_same_bytes(runs: Path, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        view_runs([runs], tmp_path / name)
+    assert (tmp_path / "a/index.html").read_bytes() == (tmp_path / "b/index.html").read_bytes()
+    view_runs([runs], tmp_path / "a", title="new")  # an earlier page is replaced
+    (note,) = facts((tmp_path / "a/index.html").read_text())["notes"]
+    assert note.startswith(HOSTILE) and "drawn as plain 3DGS" in note
+
+
+def test_another_page_is_not_replaced(runs: Path, tmp_path: Path) -> None:
+    (tmp_path / "index.html").write_text("mine")
+    done = aw("view", runs, "-o", tmp_path)
+    assert done.returncode == 2 and "no page of 'aw view'" in done.stderr and done.stderr.count("\n") == 1
+    assert (tmp_path / "index.html").read_text() == "mine"
+    (tmp_path / "file").write_text("x")
+    assert "is a file" in aw("view", runs, "-o", tmp_path / "file").stderr
+
+
+def test_a_large_model_is_reduced_with_a_note(runs: Path, tmp_path: Path) -> None:
+    done = aw("view", runs, "-o", tmp_path, "--max-gaussians", 1000)
+    note = "3dgs: reduced from 2,500 to 1,000 Gaussians for this page; its PSNR is that of the whole model"
+    assert note in done.stderr and note in facts((tmp_path / "index.html").read_text())["notes"]
+
+
+def test_what_covers_most_of_the_photos_stays(tmp_path: Path) -> None:
+    scene = load_scene(write_tiny_scene(tmp_path / "s"))
+    cameras = [view.camera for view in scene.views]
+    model = wall_model(300)
+    model["means"][0], model["opacity_logits"][1], model["log_scales"][2] = (0, 0, -5), -12, -12
+    score = importance(model, cameras)
+    assert score[0] == 0 and score[1] < 1e-3 * np.median(score) and score[2] < 1e-3 * np.median(score)
+    kept = reduced(model, cameras, 200)
+    assert len(kept["means"]) == 200 and not (kept["means"][:, 2] < 0).any()
+    rows = [int(np.flatnonzero((model["means"] == mean).all(axis=1))[0]) for mean in kept["means"]]
+    assert rows == sorted(rows)
+    assert len(reduced(model, cameras, 300)["means"]) == 300
+
+
+def test_what_cannot_be_shown_is_one_line(runs: Path, tmp_path: Path) -> None:
+    for words, told in (
+        ([tmp_path / "none"], "no folder of runs"),
+        ([tmp_path], "no finished run with a point_cloud.ply"),
+        ([runs, "--scene", "hall"], "unknown scene 'hall'"),
+        ([runs, "--scene-folder", tmp_path / "gone"], "say where it lies with --scene-folder"),
+        ([], "no RUNS"),
+        ([runs, "--live", runs.parent / "porch"], "leave RUNS out"),
+    ):
+        done = aw("view", *words, "-o", tmp_path / "out")
+        assert done.returncode == 2 and told in done.stderr, done.stderr
+        assert not (tmp_path / "out").exists() or not any((tmp_path / "out").iterdir())
+
+
+def test_runs_of_two_scenes_need_a_choice(runs: Path, tmp_path: Path) -> None:
+    other = write_tiny_scene(tmp_path / "yard", distractors=False)
+    write_shown_run(tmp_path / "runs", other, "3dgs")
+    with pytest.raises(AwError, match="choose one with --scene"):
+        view_runs([runs, tmp_path / "runs"], tmp_path / "out")
+    page = view_runs([runs, tmp_path / "runs"], tmp_path / "out", scene="yard")
+    assert len(facts(page.path.read_text())["models"]) == 1
+
+
+def test_seeds_have_labels_of_their_own(runs: Path, tmp_path: Path) -> None:
+    scene = runs.parent / "porch"
+    for seed in (0, 1):
+        write_shown_run(tmp_path / "runs", scene, "3dgs", seed)
+    write_shown_run(tmp_path / "longer", scene, "3dgs", 0, iterations=200)
+    page = view_runs([tmp_path / "runs"], tmp_path / "a").path.read_text()
+    assert [m["label"] for m in facts(page)["models"]] == ["3dgs, seed0", "3dgs, seed1"]
+    page = view_runs(
+        [tmp_path / "runs", tmp_path / "longer", tmp_path / "runs"], tmp_path / "b"
+    ).path.read_text()
+    labels = [m["label"] for m in facts(page)["models"]]
+    assert len(labels) == len(set(labels)) == 3 and "3dgs, seed1" in labels
+
+
+def test_a_notebook_shows_the_page_in_a_frame(runs: Path) -> None:
+    viewer = Viewer([runs])
+    frame = viewer._repr_html_()
+    assert frame.startswith('<iframe sandbox="allow-scripts" srcdoc="') and frame.count("<") == 2
+    assert "3dgs" in repr(viewer) and len(page_file.SCRIPTS) == 4
+
+
+def test_a_stranger_s_method_name_imports_no_file(runs: Path, tmp_path: Path) -> None:
+    (tmp_path / "evil.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\ndef recipe(options): ...\n")
+    config = {"method": f"{tmp_path / 'evil.py'}:recipe", "options": {}}
+    look, note = read_look(config)
+    assert not (tmp_path / "ran").exists() and look == Look() and "--plugin" in note
+    assert read_look({"method": "3dgs", "options": {}, "effects": ["antialias"]})[0].antialias
+    assert read_look({"method": "3dgs", "options": {"gone": 1}})[1] != ""
+
+
+def test_photos_stay_below_their_share_of_the_page(runs: Path) -> None:
+    views = load_scene(runs.parent / "porch").views
+    uris = page_file.photo_uris(views, 1)
+    assert len(uris) == len(views) and all(uri.startswith("data:image/jpeg;base64,") for uri in uris)

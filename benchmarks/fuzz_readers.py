@@ -20,6 +20,7 @@ import fuzz_samples
 import numpy as np
 import yaml
 
+from ambiguous_wild.core.tensor_files import read_tensors
 from ambiguous_wild.harness.audit.table import read_tables
 from ambiguous_wild.harness.leaderboard import board, pictures
 from ambiguous_wild.harness.planning.file import read_plan
@@ -27,7 +28,6 @@ from ambiguous_wild.harness.running.run_folder import refuse_other_config
 from ambiguous_wild.harness.running.store import read_runs
 from ambiguous_wild.io import archive, images, ply, scene_folder
 from ambiguous_wild.io.photos import read_photo
-from ambiguous_wild.metrics import lpips
 from ambiguous_wild.simulate import capture, spec_file
 from ambiguous_wild.simulate.composite.cutouts import read_cutouts
 from ambiguous_wild.splat import checkpoint
@@ -212,7 +212,7 @@ def _many() -> list[Reader]:
         Reader("archive zip", ".zip", functools.partial(fuzz_samples.archives, "zip"), _unpack),
         Reader("archive tar", ".tar", functools.partial(fuzz_samples.archives, "tar"), _unpack),
         Reader("checkpoint", ".safetensors", fuzz_samples.checkpoints, checkpoint.load),
-        Reader("LPIPS weights", ".pth", fuzz_samples.weights, lpips._read),
+        Reader("LPIPS weights", ".pth", fuzz_samples.weights, read_tensors),
         Reader(
             "label map PNG",
             ".png",

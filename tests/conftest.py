@@ -7,11 +7,20 @@ from __future__ import annotations
 
 import os
 import sys
+from contextlib import suppress
 
 import pytest
 
+with suppress(ImportError):  # torch.utils.cpp_extension wants it, and it refuses to come after distutils
+    import setuptools  # noqa: F401
 
-def pytest_collection_modifyitems(items):
+
+def pytest_collection_modifyitems(config, items):
+    if not config.option.markexpr and not os.environ.get("AW_SLOW_TESTS"):
+        skip = pytest.mark.skip(reason="slow: set AW_SLOW_TESTS=1, or select it with -m slow")
+        for item in items:
+            if item.get_closest_marker("slow"):
+                item.add_marker(skip)
     wanted = [item for item in items if item.get_closest_marker("gpu")]
     if not wanted:
         return

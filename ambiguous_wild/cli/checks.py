@@ -27,10 +27,9 @@ from ambiguous_wild.splat.gpu import readiness
 PACKAGE = Path(__file__).resolve().parent.parent
 DISTRIBUTION = "ambiguous-wild"
 SMALL_MEMORY_GB = 2.0  # COLMAP and a training of 100 000 Gaussians need this much
-UNUSED = "not used by this version yet"
 SMALL_DISK_GB = 1.0  # photos, features and one run
 # What a remedy that is a command begins with.
-COMMANDS = (f"{sys.executable} ", f"{shlex.quote(sys.executable)} ", "sudo ", "brew ", "python3 ", "#")
+COMMANDS = (f"{sys.executable} ", f"{shlex.quote(sys.executable)} ", "sudo ", "brew ", "python3 ", "aw ", "#")
 _PIP = f"{shlex.quote(sys.executable)} -m pip"
 
 
@@ -38,7 +37,7 @@ _PIP = f"{shlex.quote(sys.executable)} -m pip"
 class Check:
     """One line of the report."""
 
-    group: Literal["core", "optional", "planned"]  # planned: not used by this version
+    group: Literal["core", "optional"]
     name: str
     ok: bool
     detail: str  # what was found
@@ -65,7 +64,6 @@ def all_checks() -> list[Check]:
         *_metrics(),
         _git(),
         *_extras(),
-        *_planned(),
     ]
 
 
@@ -255,6 +253,7 @@ def _extras() -> list[Check]:
     packages = {
         "ray": ("ray", "aw bench --engine ray"),
         "pi-heif": ("heic", "HEIC photos of phones"),
+        "viser": ("view", "aw view --live"),
         "choix": ("study", "aw study score: ranking"),
         "nltk": ("study", "aw study score: agreement"),
     }
@@ -271,18 +270,6 @@ def _extras() -> list[Check]:
         what, _, fix = str(error).partition(": ")
         checks.append(Check("optional", "nerfbaselines", False, what, fix))
     return checks
-
-
-def _planned() -> list[Check]:
-    """Packages of later versions, listed without a command, since installing them has no use yet."""
-    packages = {"viser": "interactive viewer"}
-    return [
-        Check(
-            "planned", name, bool(version := installed(name)),
-            f"{'installed' if version else 'not installed'}, {UNUSED} ({use})",
-        )
-        for name, use in packages.items()
-    ]  # fmt: skip
 
 
 def _vision() -> list[Check]:

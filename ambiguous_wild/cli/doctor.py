@@ -29,7 +29,7 @@ def command(as_json: bool) -> None:
         facts = {"ok": not broken, "checks": [dataclasses.asdict(c) for c in checks]}
         click.echo(json.dumps(facts, indent=2, ensure_ascii=False))
     else:
-        for group in ("core", "optional", "planned"):
+        for group in ("core", "optional"):
             _print_group(group, [c for c in checks if c.group == group])
     if broken:
         names = ", ".join(c.name for c in broken)
@@ -53,8 +53,6 @@ def _print_group(group: str, checks: list[Check]) -> None:
 
 
 def _mark(check: Check) -> str:
-    if check.group == "planned":  # not a result
-        return "·"
     if check.ok:
         return click.style("✓", fg="green")
     return click.style("✗", fg="red" if check.group == "core" else "yellow")

@@ -44,6 +44,7 @@ def score(key: Key, raters: list[Rater], seed: int = 0) -> Scores:
         seed: of the bootstrap over raters.
     """
     kept = [replace(r, answers=tuple(a for a in r.answers if not a.too_fast)) for r in raters]
+    kept = [r for r in kept if r.answers]  # whoever has none left changes no interval
     return {
         "study": key.study,
         "title": key.title,

@@ -34,7 +34,7 @@ def test_the_core_works_where_the_tests_run(report: list[Check]) -> None:
 def test_whatever_lacks_comes_with_a_way_to_get_it(report: list[Check]) -> None:
     for c in report:
         assert c.detail
-        assert bool(c.fix) is (not c.ok and c.group != "planned"), c
+        assert bool(c.fix) is not c.ok, c
         if c.fix:
             assert subprocess.run(["bash", "-n", "-c", c.fix]).returncode == 0, c.fix
             assert c.fix.startswith((*checks.COMMANDS, "export ", "unset ", "df ")), c.fix
@@ -65,15 +65,6 @@ def test_a_system_package_comes_with_the_command_of_the_machine(
     monkeypatch.setattr(checks.readiness, "first_line", lambda *words: None)
     fix = checks._git().fix
     assert fix.startswith("# install git from https://") if not tool else f"{tool} install" in fix
-
-
-def test_what_no_code_uses_yet_is_said_so_and_not_asked_for(report: list[Check]) -> None:
-    planned = {c.name: c for c in report if c.group == "planned"}
-    assert planned.keys() == {"viser"}
-    assert all("not used by this version yet" in c.detail for c in planned.values())
-    source = "".join(p.read_text() for p in checks.PACKAGE.rglob("*.py"))
-    for package in planned:  # the day one is imported, it is planned no more
-        assert f"import {package}" not in source and f"from {package}" not in source
 
 
 def test_what_one_command_needs_comes_with_its_extra(
@@ -115,11 +106,7 @@ def test_the_report_prints_every_check(monkeypatch: pytest.MonkeyPatch, report: 
     monkeypatch.setattr(checks, "all_checks", lambda: report)
     out = CliRunner().invoke(command, [], catch_exceptions=False).output
     for c in report:
-        assert (
-            f"{'·' if c.group == 'planned' else '✓' if c.ok else '✗'} {c.name}" in out
-            and c.detail in out
-            and c.fix in out
-        )
+        assert f"{'✓' if c.ok else '✗'} {c.name}" in out and c.detail in out and c.fix in out
     facts = json.loads(CliRunner().invoke(command, ["--json"], catch_exceptions=False).output)
     assert facts["ok"] is True
     assert [Check(**c) for c in facts["checks"]] == report

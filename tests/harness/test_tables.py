@@ -253,7 +253,7 @@ def test_a_reason_that_concerns_some_names_them(tmp_path: Path) -> None:
 
 def test_a_null_without_a_reason_is_noted(tmp_path: Path) -> None:
     images = [{"name": "0.png", "psnr": 20.0, "ssim": 0.5}, {"name": "1.png", "psnr": 21.0, "ssim": None}]
-    table = table_of(tmp_path, fake_result("a", per_image=images, missing={}))
+    table = table_of(tmp_path, fake_result("a", per_image=images, missing={}), fake_result("b"))
     assert cell(table, "a", "ssim").state == "missing"
     assert "missing: ssim, no reason given, for 1.png (a on yard)" in table.notes
 
@@ -289,7 +289,9 @@ def test_incomplete_runs_are_below_the_table(tmp_path: Path) -> None:
 
 
 def test_columns_and_scenes_can_be_chosen(tmp_path: Path) -> None:
-    results = [fake_result("a", s, masks={"iou": 0.5, "images": 2}) for s in ("one", "two", "three")]
+    results = [
+        fake_result("a", s, masks={"iou": 0.5, "recall": 0.6, "images": 2}) for s in ("one", "two", "three")
+    ]
     table = table_of(tmp_path, *results, metrics=["mask_iou", "psnr", "psnr"], scenes=["two"])
     assert [c.key for c in table.columns] == ["mask_iou", "psnr"] and table.scenes == ("two",)
     assert cell(table, "a", "mask_iou").value == 0.5

@@ -1,6 +1,7 @@
 """docs/fidelity.md: its files and options exist, and its values are those of the methods."""
 
 import re
+from itertools import takewhile
 from pathlib import Path
 
 import pytest
@@ -16,9 +17,10 @@ VERDICTS = ("as printed", "repaired", "replaced", "not stated")
 
 
 def rows() -> list[list[str]]:
-    table = [line for line in PAGE.read_text(encoding="utf-8").splitlines() if line.startswith("| ")]
-    start = next(k for k, line in enumerate(table) if line.startswith("| paper | code |"))
-    return [[cell.strip() for cell in line.strip().strip("|").split("|")] for line in table[start + 1 :]]
+    lines = PAGE.read_text(encoding="utf-8").splitlines()
+    start = next(k for k, line in enumerate(lines) if line.startswith("| paper | code |"))
+    table = takewhile(lambda line: line.startswith("|"), lines[start + 2 :])  # below the rule
+    return [[cell.strip() for cell in line.strip().strip("|").split("|")] for line in table]
 
 
 def quoted(cell: str) -> str:

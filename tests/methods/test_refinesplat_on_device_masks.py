@@ -198,7 +198,7 @@ def test_t_ent_and_the_learnt_weight_are_the_hosts(name, settings):
         before, areas = host.theta, 1 + np.arange(len(values)) * 10.0
         price = max(robust_floor(values, max(config.disagree, 1.0)), 1e-12)
         if len(values) > 1:
-            host.learn(values, values / price, areas, float(low.floor))
+            host.learn(values, values / price, areas, float(low.floor), config.threshold)
         theta = torch.tensor(before, dtype=torch.float64)
         found = threshold.learnt(theta, pool, padded(areas), low.floor, config)
         # T is rounded to 1e-16, and divided by a spread of 2.5e-10 at least

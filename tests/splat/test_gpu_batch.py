@@ -18,7 +18,6 @@ from tests.tiny_scene import with_points, write_tiny_scene
 
 from . import fake_gsplat
 from .test_trainer import trainer_for
-from .test_watchdog import Poison
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +63,7 @@ def test_it_learns_and_grows_and_iterations_count_photos(scene, tmp_path, fake, 
     first = float(trainer.step())
     while not trainer.done:
         last = float(trainer.step())
-    assert trainer.iteration == 40 and last < 0.8 * first
+    assert trainer.iteration == 40 and last < 0.85 * first
     assert len(trainer.gaussians) > 80
     assert all(bool(torch.isfinite(t).all()) for _, t in trainer.gaussians.items())
 
@@ -106,8 +105,15 @@ def test_a_photo_that_is_all_masked_leaves_the_others(scene, tmp_path, fake):
     assert torch.equal(trainer.gaussians.sh0, after.sh0)
 
 
+class Broken(One):
+    """Gives weights that are no numbers in some iterations."""
+
+    def keep(self, step):
+        return super().keep(step).masked_fill(torch.tensor(step.iteration in self.bare), torch.nan)
+
+
 def test_what_breaks_is_named(scene, tmp_path, fake):
-    trainer = batch(scene, tmp_path, parts=Parts(mask=Poison([3])))
+    trainer = batch(scene, tmp_path, parts=Parts(mask=Broken({3})))
     trainer.watchdog.every = 3
     with pytest.raises(NonFinite, match=r"iteration 3, view"):
         for _ in range(6):
@@ -122,6 +128,7 @@ def test_what_cannot_be_shared_is_refused(scene, tmp_path, fake, monkeypatch):
         batch(scene, tmp_path, 2, entry.build(entry.options()))
     with pytest.raises(AwError, match="budget"):
         batch(scene, tmp_path, 2, budget_s=1.0)
-    monkeypatch.setattr("ambiguous_wild.splat.device.accelerated", lambda device: False)
-    with pytest.raises(AwError, match="of a GPU"):
-        batch(scene, tmp_path, 2)
+    with monkeypatch.context() as patch:  # undone before the stand-in goes
+        patch.setattr("ambiguous_wild.splat.device.accelerated", lambda device: False)
+        with pytest.raises(AwError, match="of a GPU"):
+            batch(scene, tmp_path, 2)

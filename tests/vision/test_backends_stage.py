@@ -73,7 +73,7 @@ def test_instances_by_name(checkpoint, tmp_path):
 @pytest.mark.parametrize(
     "spec, message",
     [
-        ("vgg16,layer=relu3", "unknown layer of vgg16 'relu3': did you mean 'relu3_3'"),
+        ("vgg16,layer=relu3", "unknown layer of vgg16 'relu3': did you mean 'relu"),
         ("vgg16@2", "at least one cell of 4 px"),
         ("efficientnet-lite0,fit_photos=0", "fit_photos at least 1"),
         ("efficientnet-lite0:x", "nothing after a colon"),

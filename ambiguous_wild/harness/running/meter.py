@@ -106,7 +106,8 @@ class Meter:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.samples = [list(map(float, sample)) for sample in state["samples"]]
+        # a rollback to the start: the state is of before the first calibration
+        self.samples = [list(map(float, sample)) for sample in state["samples"]] or self.samples[:1]
         self.clocks, self.loads = list(state["clocks"]), list(state["loads"])
         self.runs, self.blind = int(state["runs"]), bool(state["blind"])
         self.wall_s, self.others_s = float(state["wall_s"]), float(state["others_s"])

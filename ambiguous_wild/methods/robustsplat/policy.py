@@ -13,7 +13,6 @@ from ambiguous_wild.core import Camera
 from ambiguous_wild.io.palette import MASKED, faded, ramp, tint
 from ambiguous_wild.methods.deferred import deferred
 from ambiguous_wild.methods.masking_common import MaskedShares, PausingMask, upsampled
-from ambiguous_wild.methods.refinesplat.inputs import train_tracks
 from ambiguous_wild.methods.robustsplat import supervision
 from ambiguous_wild.methods.robustsplat.config import RobustSplatConfig
 from ambiguous_wild.methods.robustsplat.net import MaskNet, adam_of, adam_state, load_adam_state
@@ -230,6 +229,8 @@ def _fit(features: Features, photos: list[Tensor], data: TrainData) -> None:
     if not isinstance(features, SceneFeatures):
         features.fit(photos)
         return
+    from ambiguous_wild.methods.refinesplat.inputs import train_tracks  # wants SciPy
+
     point, photo, xy = train_tracks(data.scene)
     scale = photos[0].shape[1] / data.photos[0].shape[1]
     features.fit_scene(photos, (point, photo, xy * scale), data.cache_dir)

@@ -103,16 +103,9 @@ def _apart(pool: Pool) -> Tensor:
 
 
 def _literal(pool: Pool, w2: Tensor, floor: Tensor) -> Cut:
-    """The printed objective, on raw sums; it may cut below the smallest value."""
-    candidate = pool.above_previous.clone()
-    candidate[0] = True
-    candidate &= pool.order > floor
-    lower, upper = pool.logs
-    scores = ((1.0 - w2) * -upper + w2 * -lower).masked_fill(~candidate, -math.inf)
-    start = scores.argmax()
-    between = 0.5 * (pool.order.take(start) + pool.order.take((start - 1).clamp(min=0)))
-    lowest = torch.nextafter(pool.order[0], torch.full_like(pool.middle, -math.inf))
-    threshold = torch.where(start > 0, between, lowest)
+    """The printed objective, on raw sums; the value that gives the threshold is itself kept."""
+    candidate, scores, _ = _printed(pool, w2, floor)
+    threshold = pool.order.take(scores.argmax())
     return Cut(torch.where(candidate.any() & _apart(pool), threshold, math.inf), floor)
 
 
@@ -122,10 +115,20 @@ def _candidates(pool: Pool, w2: Tensor, floor: Tensor) -> tuple[Tensor, Tensor]:
     return candidate, torch.addcmul(pool.upper, pool.more_below, w2).masked_fill_(~candidate, -math.inf)
 
 
+def _printed(pool: Pool, w2: Tensor, floor: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The same of the printed objective, which may cut below the smallest value; and its slope in w2, [n]."""
+    candidate = pool.above_previous.clone()
+    candidate[0] = True
+    candidate &= pool.order > floor
+    lower, upper = pool.logs
+    slope = upper - lower
+    return candidate, (slope * w2 - upper).masked_fill(~candidate, -math.inf), slope
+
+
 def learnt(theta: Tensor, pool: Pool, areas: Tensor, floor: Tensor, config: MaskConfig) -> Tensor:
     """theta after one step of `threshold.LearntWeight.learn`, 0-d float64.
 
-    The gradient is written out: with p = softmax(scores / tau), dT/dw2 = sum p (x - T) (lower - upper) / tau.
+    The gradient is written out: with p = softmax(scores / tau), dT/dw2 = sum p (x - T) slope / tau.
 
     Args:
         theta: before.
@@ -135,13 +138,17 @@ def learnt(theta: Tensor, pool: Pool, areas: Tensor, floor: Tensor, config: Mask
         config: `disagree` decides the price of a masked pixel.
     """
     w2 = torch.sigmoid(theta)
-    candidate, scores = _candidates(pool, w2, floor)
+    if config.threshold == "literal":
+        candidate, scores, slope = _printed(pool, w2, floor)
+    else:
+        candidate, scores = _candidates(pool, w2, floor)
+        slope = pool.more_below
     weights = areas.take(pool.index).nan_to_num_(nan=0.0)
     there = weights > 0
     count = there.sum()
     p = torch.softmax(scores / TEMPERATURE, 0)
     away = pool.x - torch.dot(p, pool.x)  # from the soft threshold T
-    dt_dw2 = torch.dot(p * away, pool.more_below) / TEMPERATURE
+    dt_dw2 = torch.dot(p * away, slope) / TEMPERATURE
     centred = (pool.x - pool.total / count) * there
     variance = torch.dot(centred, centred) / count
     spread = variance.clamp_(min=1e-18).sqrt_() / 4

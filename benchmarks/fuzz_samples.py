@@ -242,15 +242,9 @@ def boards() -> list[bytes]:
 def board_images() -> list[bytes]:
     place = pictures._Place("tiny", "a, b", "1.png", "=m", "2000 iterations")
     kept = pictures.folder_of(workshop() / "board")
-    pictures._write(workshop() / "board", place, _one_png(), "0", 20.5, index := {})
+    pictures._write(workshop() / "board", place, encoded(".png", picture()), "0", 20.5, index := {})
     pictures._write_index(workshop() / "board", index.values())
     return [(kept / pictures.INDEX).read_bytes()]
-
-
-def _one_png() -> Path:
-    path = workshop() / "one.png"
-    path.write_bytes(encoded(".png", picture()))
-    return path
 
 
 @functools.cache

@@ -57,6 +57,7 @@ def test_what_was_not_simulated_has_no_commands(truth: object, tmp_path: Path) -
     assert preparation(scene_of(tmp_path / "s", truth)) == [] and preparation(None) == []
 
 
+@pytest.mark.slow
 def test_the_commands_give_the_same_psnr_in_an_empty_folder(tmp_path: Path) -> None:
     program = tmp_path / "bin" / "aw"
     program.parent.mkdir()

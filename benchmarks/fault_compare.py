@@ -21,7 +21,8 @@ from ambiguous_wild.splat import checkpoint
 # What a clock or the machine's load decides; everything else must be the same to the byte.
 _CLOCK = {
     "seconds", "train_s", "setup_s", "elapsed_s", "parts_s", "ms_per_iteration", "ms_parts", "fps",
-    "fps_low", "fps_high", "peak_rss_mb", "wall_s", "taken_s", "written", "created",
+    "fps_low", "fps_high", "peak_rss_mb", "wall_s", "taken_s", "written", "created", "cpu_s", "reference_s",
+    "timing", "meter",
 }  # fmt: skip
 _MACHINE = {"env.json"}  # says when and on what a run was made
 

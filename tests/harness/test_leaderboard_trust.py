@@ -16,6 +16,7 @@ from click.testing import CliRunner, Result
 
 from ambiguous_wild.cli.leaderboard import command
 from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.audit.table import REPORTED
 from ambiguous_wild.harness.leaderboard.board import read_board, write_board
 from ambiguous_wild.harness.leaderboard.check import check
 from ambiguous_wild.harness.leaderboard.publish import publish
@@ -273,6 +274,8 @@ def test_publish_says_where_it_looked_for_reported_numbers(board: Path, tmp_path
         words = ("publish", "--board", board, "-o", tmp_path / "site", *words)
         return CliRunner().invoke(command, [str(w) for w in words], catch_exceptions=False).stderr
 
+    assert f"reported numbers from {REPORTED}" in told("--reported")  # those that come with the package
+    (board / "reported").mkdir()
     assert f"0 reported numbers from {board / 'reported'}" in told("--reported")
     assert "reported" not in told()
     papers = tmp_path / "papers"

@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 # gsplat, Ray, viser and transformers are extras; a module of ours that needs one imports it late.
 CODE = """
-import importlib, json, pkgutil, sys
+import importlib, json, os, pkgutil, sys
 absent = json.loads(sys.argv[1])
 for name in absent:
     sys.modules[name] = None  # `import` of it raises ImportError
@@ -26,7 +26,8 @@ for module in pkgutil.walk_packages(ambiguous_wild.__path__, "ambiguous_wild."):
         importlib.import_module(module.name)
     except Exception as error:
         failed[module.name] = repr(error)
-print(json.dumps({"count": len(names), "failed": failed}))
+print(json.dumps({"count": len(names), "failed": failed}), flush=True)
+os._exit(0)  # some C++ libraries crash when Python takes them down without what was absent
 """
 
 

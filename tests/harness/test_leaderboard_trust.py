@@ -274,7 +274,9 @@ def test_publish_says_where_it_looked_for_reported_numbers(board: Path, tmp_path
         words = ("publish", "--board", board, "-o", tmp_path / "site", *words)
         return CliRunner().invoke(command, [str(w) for w in words], catch_exceptions=False).stderr
 
-    assert f"reported numbers from {REPORTED}" in told("--reported")
+    assert f"reported numbers from {REPORTED}" in told("--reported")  # those that come with the package
+    (board / "reported").mkdir()
+    assert f"0 reported numbers from {board / 'reported'}" in told("--reported")
     assert "reported" not in told()
     papers = tmp_path / "papers"
     papers.mkdir()

@@ -137,6 +137,19 @@ def test_the_state_of_a_meter_goes_on_after_a_kill(tmp_path, monkeypatch):
     assert [at for at, _ in other.samples] == [0.0, 20.0, 30.0, 40.0]
 
 
+def test_a_rollback_keeps_what_was_spent_and_seen(tmp_path, monkeypatch):
+    here, m = Machine(monkeypatch), meter(tmp_path)
+    before_the_run = m.state_dict()
+    m.begin(0.0)
+    here.work(20.0, others=2.0)
+    m.look(20.0)
+    m.load_state_dict(before_the_run)
+    assert not m.due(20.5, 0.5)
+    here.work(20.0)
+    m.look(40.0)
+    assert m.verdict(40.0) == ("contended", "other programs used 1.0 of 4 processors")
+
+
 def test_runs_count_each_other_and_forget_the_dead(tmp_path):
     one, two = Presence("cpu", tmp_path), Presence("cpu", tmp_path)
     other_gpu = Presence("GPU-1234", tmp_path)

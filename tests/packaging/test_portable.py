@@ -27,7 +27,7 @@ for module in pkgutil.walk_packages(ambiguous_wild.__path__, "ambiguous_wild."):
     except Exception as error:
         failed[module.name] = repr(error)
 print(json.dumps({"count": len(names), "failed": failed}), flush=True)
-os._exit(0)  # libraries that were imported in part may crash at their end
+os._exit(0)  # some C++ libraries crash when Python takes them down without what was absent
 """
 
 

@@ -106,13 +106,13 @@ class Meter:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        # a rollback to the start: the state is of before the first calibration
-        self.samples = [list(map(float, sample)) for sample in state["samples"]] or self.samples[:1]
+        """Go on from a checkpoint; a rollback in the middle of a training keeps what was spent and seen."""
+        if self._since is not None:
+            return
+        self.samples = [list(map(float, sample)) for sample in state["samples"]]
         self.clocks, self.loads = list(state["clocks"]), list(state["loads"])
         self.runs, self.blind = int(state["runs"]), bool(state["blind"])
         self.wall_s, self.others_s = float(state["wall_s"]), float(state["others_s"])
-        if self._since is not None:  # a rollback: the interval so far is in the state's past or undone
-            self._since = self._now()
 
     # -- what it found -----------------------------------------------------------------------------
 

@@ -219,7 +219,7 @@ def the_search_changes_no_rank(page: Browser) -> None:
 def scenes_are_ticked(page: Browser) -> None:
     tick(page, "yard")
     assert "–" not in column(page, 1) and "porch" in said(page, "said")
-    assert "±" in page.run("document.querySelector('#table tbody td').textContent")
+    assert "±" in page.run("document.querySelector('#table tbody').textContent")
     dots = "[...document.querySelectorAll('#table .dots')].map((d) => d.children.length)"
     assert 3 in page.run(dots)  # the line and two seeds
     tick(page, "porch")
@@ -316,7 +316,7 @@ def plot(page: Browser) -> None:
 
 
 def times_of_a_shared_machine_are_ranges(page: Browser) -> None:
-    at = heads(page).index("training s ↓")
+    at = heads(page).index("training s")
     assert ranks(page, at)["3dgs"] == "1" and "–" not in column(page, at)[0]
     page.run("DATA.runs.filter((r) => r.method === '3dgs').forEach((r) => { r.alone = false; }); draw()")
     row = names(page).index("3dgs")

@@ -35,10 +35,10 @@ class Size:
 
 
 # Reference machine of the CPU: 2 threads of an AMD EPYC virtual machine, nothing else running. That of a GPU
-# is nominal: the kernel takes a tenth of a second there.
+# is nominal: the kernel takes a twentieth of a second there.
 KERNELS = {
-    "cpu": Size("cpu-1", 0.25, 12_000, 240, 136, 12),
-    "cuda": Size("gpu-1", 0.10, 100_000, 960, 544, 24),
+    "cpu": Size("cpu-2", 0.083, 12_000, 240, 136, 4),
+    "cuda": Size("gpu-2", 0.05, 100_000, 960, 544, 12),
 }
 
 

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import time
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -82,9 +83,24 @@ def test_a_load_that_others_brought_once_is_not_forgotten(tmp_path, monkeypatch)
     assert m.verdict(40.0) == ("contended", "other programs used 0.5 of 4 processors")
 
 
+def sampled(m: Meter, here: Machine, seconds: int) -> tuple[str, str]:
+    m.begin(0.0)
+    for k in range(1, seconds + 1):
+        here.work(1.0)
+        m.look(float(k))
+    m.end(float(seconds))
+    return m.verdict(float(seconds))
+
+
 def test_a_speed_that_varies_is_contention(tmp_path, monkeypatch):
-    verdict, reason = measured(meter(tmp_path, kernel=[0.5, 0.8]), Machine(monkeypatch).work)
-    assert (verdict, reason) == ("contended", "the machine's speed varied 1.6 times between calibrations")
+    slower_later = meter(tmp_path, kernel=[0.5] * 10 + [0.8] * 11)
+    words = "the machine's speed varied 1.6 times during the training"
+    assert sampled(slower_later, Machine(monkeypatch), 20) == ("contended", words)
+
+
+def test_noise_of_single_calibrations_is_not_contention(tmp_path, monkeypatch):
+    noisy = meter(tmp_path, kernel=[0.4, 0.5, 0.6, 0.5, 0.5, 0.8, 0.5] * 3)
+    assert sampled(noisy, Machine(monkeypatch), 20) == ("alone", "")
 
 
 def test_a_run_that_was_calibrated_late_is_unknown(tmp_path, monkeypatch):
@@ -106,17 +122,19 @@ def test_reference_seconds_are_of_the_reference_machine(tmp_path, monkeypatch):
     assert again[0] == cost["reference_s"]
 
 
-def test_calibrations_come_at_quarters_and_every_fifteen_seconds(tmp_path, monkeypatch):
+def test_calibrations_come_often_at_first_and_every_fifteen_seconds_later(tmp_path, monkeypatch):
     Machine(monkeypatch)
-    for total, step, expected in ((1.0, 0.01, 2), (20.0, 0.5, 5), (300.0, 1.0, 21)):
+    for total, step, fewest, most in ((0.5, 0.01, 2, 2), (20.0, 0.1, 25, 30), (300.0, 0.5, 80, 100)):
         m = meter(tmp_path)
         m.begin(0.0)
         for k in range(1, round(total / step) + 1):
             if m.due(k * step, k * step / total):
                 m.look(k * step)
         m.end(total)
-        assert len(m.samples) == expected
-        assert m.samples[0][0] == 0.0 and m.samples[-1][0] == pytest.approx(total)
+        times = [at for at, _ in m.samples]
+        assert fewest <= len(times) <= most
+        assert times[0] == 0.0 and times[-1] == pytest.approx(total)
+        assert max(b - a for a, b in pairwise(times)) <= 15.0 + step
 
 
 def test_the_state_of_a_meter_goes_on_after_a_kill(tmp_path, monkeypatch):
@@ -237,7 +255,7 @@ def test_every_run_records_its_time(scene, tmp_path):
     )
     cost = report.result["cost"]
     record = cost["timing"]
-    assert record["kernel"] == "cpu-1" and record["runs"] >= 1
+    assert record["kernel"] == "cpu-2" and record["runs"] >= 1
     assert [at for at, _ in record["samples"]] == [0.0, pytest.approx(cost["train_s"])]
     again = in_reference_seconds(record["samples"], record["kernel_reference_s"], [cost["train_s"]])
     assert cost["reference_s"] == pytest.approx(again[0])

@@ -7,10 +7,11 @@ Each time a calibration kernel is timed. Its work and the record's are no part o
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import Any
 
+import numpy as np
 import torch
 
 from ambiguous_wild.harness.running import machine
@@ -18,11 +19,14 @@ from ambiguous_wild.harness.running.records import Cost, TimeRecord
 from ambiguous_wild.harness.running.timing import Verdict, in_reference_seconds
 from ambiguous_wild.splat.calibration import KERNELS, calibration
 
-EVERY_S = 15.0  # of training between two calibrations, which take about a fortieth of that
-SHARES = 4  # a shorter run has one at each quarter, where a quarter takes
-LEAST_S = 2.0  # at least so long
+# One calibration is off by a tenth, on a busy machine by a fifth: a run needs about 25 of them.
+LEAST_S = 0.7  # of training between two calibrations
+SHARE = 1 / 25  # of the training so far
+EVERY_S = 15.0  # at most
 OTHERS = 0.1  # a run is contended where others use more than this share of the processors that it needs
-VARIED = 1.3  # or where the slowest calibration takes this many times the fastest
+VARIED = 1.3  # or where the machine is this many times slower in one part of the training than in another
+PARTS = 5  # of the training that are compared
+PART_SAMPLES = 4  # that a part has at least
 COVERED = 0.9  # of the training must lie between the first and the last calibration
 
 
@@ -77,7 +81,7 @@ class Meter:
         ago = trained_s - self.samples[-1][0]
         if progress >= 1.0:
             return ago > 0.0
-        return ago >= EVERY_S or (ago >= LEAST_S and ago >= trained_s / max(progress, 1e-9) / SHARES)
+        return ago >= min(max(LEAST_S, SHARE * trained_s), EVERY_S)
 
     def look(self, trained_s: float) -> None:
         """Calibrate, and note what others did since the last time."""
@@ -149,10 +153,9 @@ class Meter:
         needed = min(self.threads, total)
         if others - (total - needed) > OTHERS * needed:
             return "contended", f"other programs used {others:.1f} of {total} processors"
-        seconds = [kernel for _, kernel in self.samples]
-        if seconds and max(seconds) > VARIED * min(seconds):
-            ratio = max(seconds) / min(seconds)
-            return "contended", f"the machine's speed varied {ratio:.1f} times between calibrations"
+        ratio = speed_ratio([kernel for _, kernel in self.samples])
+        if ratio > VARIED:
+            return "contended", f"the machine's speed varied {ratio:.1f} times during the training"
         span = self.samples[-1][0] - self.samples[0][0] if self.samples else 0.0
         if span < COVERED * trained_s:
             share = 100.0 * span / trained_s if trained_s > 0.0 else 0.0
@@ -189,3 +192,12 @@ class Meter:
             self.others_s + others,
             self.blind or blind,
         )
+
+
+def speed_ratio(kernel_s: Sequence[float]) -> float:
+    """Seconds of the slowest part of a training over those of the fastest; medians, for one sample says little."""
+    parts = min(PARTS, len(kernel_s) // PART_SAMPLES)
+    if parts < 2:
+        return 1.0
+    medians = [float(np.median(part)) for part in np.array_split(np.asarray(kernel_s), parts)]
+    return max(medians) / min(medians)

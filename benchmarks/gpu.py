@@ -24,7 +24,7 @@ from pathlib import Path
 
 from gpu_measure import DINO, random_dino, write
 from gpu_report import to_markdown
-from gpu_stages import STAGES, lacking, missing, needs
+from gpu_stages import STAGES, lacking, needs
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.atomic import write_text
@@ -75,7 +75,7 @@ def main(words: list[str] | None = None) -> int:
     if lack is not None:
         p.error(f"no GPU to measure: {lack}")
     if lacks := lacking(args.stages, args.methods):
-        able = [method for method in args.methods if not missing(method)]
+        able = [method for method in args.methods if not lacking([], [method])]
         rest = f"; the others: --methods {' '.join(able)}" if 0 < len(able) < len(args.methods) else ""
         p.error("; ".join(lacks) + rest)
     if args.device == "cuda" and "build" not in args.stages:

@@ -126,7 +126,7 @@ def test_reference_seconds_are_of_the_reference_machine(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("parallel_s", [0.0, 12.0, 30.0])
 def test_load_slows_what_is_serial_less_and_cancels_out(tmp_path, monkeypatch, parallel_s):
-    """30 s alone, `parallel_s` of them on both threads; busy, one thread gets 2/3 of a processor, two get 1."""
+    """30 s alone; busy, one thread gets 2/3 of a processor, two get one."""
     found = []
     kernel = KERNELS["cpu"]
     for one, two in ((1.0, 2.0), (2 / 3, 1.0)):

@@ -27,11 +27,18 @@ if TYPE_CHECKING:
     show_default=True,
 )
 @click.option(
+    "--sfm",
+    type=click.Choice(["auto", "fast", "thorough"]),
+    default="auto",
+    show_default=True,
+    help="Structure from motion; auto: fast, then thorough if photos are left out.",
+)
+@click.option(
     "--matcher",
     type=click.Choice(["auto", "exhaustive", "sequential", "retrieval"]),
     default="auto",
     show_default=True,
-    help="Pairs of photos: all, neighbours in order, or similar ones; auto: all up to 200 photos, else similar ones.",
+    help="Pairs of photos: all, neighbours in order, or similar ones; auto: all up to 25 (thorough: 200) photos, else similar ones.",
 )
 @click.option(
     "--mapper", type=click.Choice(["incremental", "global"]), default="incremental", show_default=True
@@ -63,6 +70,7 @@ def command(
     output: Path,
     factor: int | None,
     camera: str,
+    sfm: str,
     matcher: str,
     mapper: str,
     max_features: int,
@@ -95,6 +103,7 @@ def command(
         {
             "factor": factor,
             "camera": camera,
+            "sfm": sfm,
             "matcher": matcher,
             "mapper": mapper,
             "max_features": max_features,

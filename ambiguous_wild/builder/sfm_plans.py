@@ -14,11 +14,7 @@ FAST_SIDE = 800  # px; below it SIFT needs the doubled photo to find enough
 
 @dataclass(frozen=True)
 class SfmPlan:
-    """What an attempt does.
-
-    Fast takes 2.7 times less processor time than thorough on 40 photos of 1200 px, and places the same photos with
-    an error that is 2 % larger (`benchmarks/results/build-scene.md`).
-    """
+    """What an attempt does; `benchmarks/results/build-scene.md` compares them on real captures."""
 
     name: str  # "fast" or "thorough"
     first_octave: int  # of SIFT; -1 doubles each photo first, which takes three quarters of its time

@@ -94,6 +94,7 @@ def command(
     from ambiguous_wild.builder import report
     from ambiguous_wild.builder.pipeline import build_scene
     from ambiguous_wild.builder.settings import BuildSettings
+    from ambiguous_wild.cli.kernels import kernels_meanwhile
     from ambiguous_wild.core.config import from_plain
     from ambiguous_wild.core.names import check_name
     from ambiguous_wild.io.images import image_size
@@ -114,17 +115,19 @@ def command(
             "license": license_,
         },
     )
-    result = build_scene(
-        raw,
-        output,
-        settings,
-        masks=masks,
-        test_list=test_list,
-        overwrite=overwrite,
-        keep_work=keep_work,
-        jobs=jobs,
-        progress=True,
-    )
+    # One of the two cores is idle while photos are placed; training needs the kernels next.
+    with kernels_meanwhile():
+        result = build_scene(
+            raw,
+            output,
+            settings,
+            masks=masks,
+            test_list=test_list,
+            overwrite=overwrite,
+            keep_work=keep_work,
+            jobs=jobs,
+            progress=True,
+        )
     info = result.info
     first = next(iter(sorted((result.scene / info["images"]).iterdir())))
     size = image_size(first)

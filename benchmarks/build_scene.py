@@ -64,7 +64,7 @@ def measure(raw: Path, out: Path, iterations: int, turn: int) -> dict[str, Any]:
 def markdown(rows: list[dict[str, Any]]) -> str:
     """A row a capture; times of the whole build."""
     lines = [
-        "| capture | photos | placed | error, px | features s | matches s | mapping s | all s | faster | 3DGS dB |",
+        "| capture | photos | placed | error px | features s | matches s | mapping s | all s | faster | dB |",
         "|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]
     for row in rows:

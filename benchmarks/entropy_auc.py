@@ -12,7 +12,7 @@ It also gives the size of the gradients that L_id and L_cr send into the render,
 norm over all pixels, mean of the views.
 
 A scene and back end that is in the results with the same settings is not computed again. Writes
-benchmarks/results/entropy-auc.json and .md, after each scene.
+benchmarks/results/entropy-auc.json and .md, after each back end.
 """
 
 from __future__ import annotations
@@ -204,25 +204,32 @@ def main(words: Sequence[str] | None = None) -> int:
     if path.is_file():
         before = json.loads(path.read_text(encoding="utf-8"))
         rows = before["rows"] if all(before[k] == v for k, v in settings.items()) else []
-    wanted = []
-    for folder in find_scenes(args.captures):
-        scene = load_scene(folder)
-        wanted += [(scene.name, backend) for backend in args.backends]
+    scenes = {folder: load_scene(folder) for folder in find_scenes(args.captures)}
+    wanted = [(scene.name, backend) for scene in scenes.values() for backend in args.backends]
+
+    def save() -> list[tuple[str, str]]:
+        """Write the tables; what is missing."""
         known = {(row["scene"], row["features"]) for row in rows}
-        todo = [backend for backend in args.backends if (scene.name, backend) not in known]
-        if todo and not args.report_only:
-            with tempfile.TemporaryDirectory() as name:
-                data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=Path(name))
-                renders = renders_of(data, Path(name) / "run", args)
-                for backend in todo:
-                    row = judged(data, renders, backend, args.sigma)
-                    rows.append({"scene": scene.name, "features": backend, **row})
-                    print(scene.name, backend, json.dumps(row), flush=True)
-        known = {(row["scene"], row["features"]) for row in rows}
-        missing = [f"{backend} on {scene}" for scene, backend in wanted if (scene, backend) not in known]
-        data_out = {"environment": environment("cpu"), **settings, "rows": rows, "missing": missing}
-        write_json(path, data_out)
-        write_text(path.with_suffix(".md"), to_markdown(data_out))
+        todo = [pair for pair in wanted if pair not in known]
+        missing = [f"{backend} on {name}" for name, backend in todo]
+        found = {"environment": environment("cpu"), **settings, "rows": rows, "missing": missing}
+        write_json(path, found)
+        write_text(path.with_suffix(".md"), to_markdown(found))
+        return todo
+
+    missing = save()
+    for scene in scenes.values():
+        todo = [backend for name, backend in missing if name == scene.name]
+        if not todo or args.report_only:
+            continue
+        with tempfile.TemporaryDirectory() as name:
+            data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=Path(name))
+            renders = renders_of(data, Path(name) / "run", args)
+            for backend in todo:
+                row = judged(data, renders, backend, args.sigma)
+                rows.append({"scene": scene.name, "features": backend, **row})
+                print(scene.name, backend, json.dumps(row), flush=True)
+                save()
     print(path.with_suffix(".md").read_text(encoding="utf-8"))
     return 0
 

@@ -242,11 +242,6 @@ def test_the_papers_networks_are_the_default_where_their_weights_are(tmp_path, m
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "hub"))
     monkeypatch.setattr(paper.importlib.util, "find_spec", lambda name: object())
     assert (PaperConfig().features, PaperConfig().instances) == ("labhog", "graph")
-    for name in ("vgg16", "efficientnet-lite0"):
-        assert (PaperConfig().features, PaperConfig().instances) == ("labhog", "graph")
-        (tmp_path / name).mkdir()
-        (tmp_path / name / f"{name}.safetensors").write_bytes(b"")
-    assert (PaperConfig().features, PaperConfig().instances) == ("efficientnet-lite0", "efficientnet-lite0")
     for name in ("dinov2-small", "sam2.1-hiera-tiny"):
         (tmp_path / name).mkdir()
         for file in ("config.json", "model.safetensors"):
@@ -254,7 +249,7 @@ def test_the_papers_networks_are_the_default_where_their_weights_are(tmp_path, m
     assert (PaperConfig().features, PaperConfig().instances) == ("dinov2-small", "sam2")
     assert PrintedConfig().features == "dinov2-small@504"
     monkeypatch.setattr(paper.importlib.util, "find_spec", lambda name: None)
-    assert (PaperConfig().features, PaperConfig().instances) == ("efficientnet-lite0", "efficientnet-lite0")
+    assert (PaperConfig().features, PaperConfig().instances) == ("labhog", "graph")
 
 
 # -- instances beyond those that a tracker follows ----------------------------------------------------

@@ -19,8 +19,6 @@ from ambiguous_wild.methods.refinesplat.support import SupportConfig
 from ambiguous_wild.vision.backends import DINO, SAM
 from ambiguous_wild.vision.weights import find, named
 
-SECOND = "efficientnet-lite0"  # features and instances where the paper's networks are missing
-
 # Masks by entropy (Eqs. 3 to 7). Two forms are repaired: Kapur's for the additive objective of T_ent, and the
 # standard deviation for the variance in T_glb. No gate or limit of ours is on but `most`.
 MASK = MaskConfig(
@@ -58,35 +56,21 @@ PRINTED_DENSITY = dataclasses.replace(DENSITY, merge=MergeConfig(form="literal",
 
 
 def features(size: str = "") -> str:
-    """The paper's features, DINOv2 ViT-S/14, where their weights are on this machine.
-
-    Else those of EfficientNet-Lite0 where its weights are, else `labhog`. VGG-16 is not looked for: its
-    weights are there for LPIPS, and a metric is not to change what a method does.
+    """The paper's features, DINOv2 ViT-S/14, where their weights are on this machine; else `labhog`.
 
     Args:
-        size: of DINOv2's input as a back end has it, e.g. "@504".
+        size: of the net's input as a back end has it, e.g. "@504".
     """
-    if _ready(DINO["dinov2-small"]):
-        return f"dinov2-small{size}"
-    return SECOND if _here(SECOND) else "labhog"
+    return f"dinov2-small{size}" if _ready(DINO["dinov2-small"]) else "labhog"
 
 
 def instances() -> str:
-    """All masks of SAM 2, joined over photos by SfM tracks, where its weights are here.
-
-    Else segments that features of EfficientNet-Lite0 group, else `graph`.
-    """
-    if _ready(SAM["sam2"]):
-        return "sam2"
-    return SECOND if _here(SECOND) else "graph"
-
-
-def _here(weights: str) -> bool:
-    return find(named(weights))[0] is not None
+    """All masks of SAM 2, joined over photos by SfM tracks, where its weights are here; else `graph`."""
+    return "sam2" if _ready(SAM["sam2"]) else "graph"
 
 
 def _ready(weights: str) -> bool:
-    return _here(weights) and importlib.util.find_spec("transformers") is not None
+    return find(named(weights))[0] is not None and importlib.util.find_spec("transformers") is not None
 
 
 @dataclass(frozen=True)
@@ -101,7 +85,7 @@ class PaperConfig(RefineSplatConfig):
     density: EntropyDensityConfig = DENSITY
     lambda_id: float = 1.0
     lambda_cr: float = 0.2
-    entropy_limit: float = 0.1
+    entropy_limit: float = 0.1  # without, 7 dB below 3DGS (docs/fidelity.md)
     weigh_cr: bool = False
     entropy_every: int = 8  # PSNR is within 0.1 dB of the best interval's (docs/fidelity.md)
     per_pixel_short: float = 1.0

@@ -29,7 +29,7 @@ def _colours(means: Tensor, sh0: Tensor, sh_rest: Tensor, centre: Tensor, degree
 def _pull(
     means: Tensor, sh_rest: Tensor, centre: Tensor, cotangent: Tensor, degree: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    bands, pull = torch.func.vjp(lambda m: _bands(m, centre, degree), means)
+    bands, pull = torch.func.vjp(lambda m: _bands(m, centre, degree), means)[:2]  # types: also of `has_aux`
     used = bands.shape[1]
     d_rest = bands[:, :, None] * cotangent[:, None]
     d_rest = torch.nn.functional.pad(d_rest, (0, 0, 0, sh_rest.shape[1] - used))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import statistics
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from ambiguous_wild.builder.pairs import EXHAUSTIVE_LIMIT, FAST_EXHAUSTIVE_LIMIT
@@ -10,6 +11,9 @@ from ambiguous_wild.builder.records import PhotoRecord
 from ambiguous_wild.builder.settings import BuildSettings
 
 FAST_SIDE = 800  # px; below it SIFT needs the doubled photo to find enough
+FEW_FEATURES = (
+    1200  # a photo, in the middle; 560 place 16 of 66 photos of a smooth skull, 2100 a facade's 11 of 11
+)
 
 
 @dataclass(frozen=True)
@@ -32,6 +36,11 @@ def plans(photos: Sequence[PhotoRecord], settings: BuildSettings) -> list[SfmPla
         return [thorough]
     fast = _fast(photos, settings)
     return [fast] if settings.sfm == "fast" else [fast, thorough]
+
+
+def few_features(counts: Iterable[int]) -> bool:
+    """Whether photos at their own size show too little; the doubled ones have two to four times as many."""
+    return statistics.median(counts) < FEW_FEATURES
 
 
 def _fast(photos: Sequence[PhotoRecord], settings: BuildSettings) -> SfmPlan:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -35,7 +35,7 @@ from ambiguous_wild.builder.sfm import (
     map_scene,
     match,
 )
-from ambiguous_wild.builder.sfm_plans import SfmPlan, plans
+from ambiguous_wild.builder.sfm_plans import SfmPlan, few_features, plans
 from ambiguous_wild.builder.split import read_test_list, split_photos
 from ambiguous_wild.builder.versions import versions
 from ambiguous_wild.builder.workspace import StageResult, Workspace, content_key
@@ -226,14 +226,21 @@ class Stages:
         photos = screened.folder / "photos"
         camera = choose_camera(facts, settings.camera)
         mask_folder = masks.folder / "masks" if masks else None
-        found = [settings.max_features, settings.max_side, plan.first_octave]
-        features = work.run(
-            "features",
-            [screened.key, masks and masks.key, camera, found, settings.seed],
-            lambda f: extract_features(
-                f, photos, facts, settings, plan, self.jobs, camera, mask_folder, self.bar
-            ),
-        )
+
+        def features_of(plan: SfmPlan) -> StageResult[FeatureResult]:
+            found = [settings.max_features, settings.max_side, plan.first_octave]
+            return work.run(
+                "features",
+                [screened.key, masks and masks.key, camera, found, settings.seed],
+                lambda f: extract_features(
+                    f, photos, facts, settings, plan, self.jobs, camera, mask_folder, self.bar
+                ),
+            )
+
+        features = features_of(plan)
+        if plan.first_octave > -1 and few_features(features.facts["features"].values()):
+            plan = replace(plan, first_octave=-1)
+            features = features_of(plan)
         matches = work.run(
             "matches",
             [features.key, plan.matcher, plan.similar, plan.neighbours, settings.seed],

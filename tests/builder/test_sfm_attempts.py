@@ -53,8 +53,29 @@ def test_photos_that_fast_loses_are_placed_by_thorough(monkeypatch, tmp_path):
         fast, thorough = real(photos, settings)
         return [dataclasses.replace(fast, first_octave=3), thorough]
 
+    monkeypatch.setattr(stages, "few_features", lambda counts: False)
     monkeypatch.setattr(stages, "plans", blinded)
     settings = BuildSettings(factor=2, max_features=800)
     info = build_scene(tmp_path / "raw", tmp_path / "scene", settings, jobs=2).info
     assert info["counts"]["registered"] == 8 and info["chosen"]["sfm"] == "thorough"
     assert list(info["seconds"]).count("features") == 1
+
+
+def test_photos_with_few_features_are_doubled_at_once(monkeypatch, tmp_path):
+    write_capture(tmp_path / "raw", 8)
+    real = stages.plans
+
+    def large(photos: Any, settings: BuildSettings) -> list[Any]:  # as if the photos had 800 px
+        return [dataclasses.replace(plan, first_octave=0) for plan in real(photos, settings)[:1]]
+
+    monkeypatch.setattr(stages, "plans", large)
+    octaves: list[int] = []
+    extract = stages.extract_features
+
+    def noted(folder: Path, photos: Path, facts: Any, settings: Any, plan: Any, *rest: Any) -> Any:
+        octaves.append(plan.first_octave)
+        return extract(folder, photos, facts, settings, plan, *rest)
+
+    monkeypatch.setattr(stages, "extract_features", noted)
+    info = build_scene(tmp_path / "raw", tmp_path / "scene", BuildSettings(factor=2), jobs=2).info
+    assert octaves == [0, -1] and info["counts"]["registered"] == 8

@@ -3,7 +3,7 @@
     python benchmarks/trusted_time.py -o /tmp/trusted            # an otherwise idle machine; about 15 minutes
     python benchmarks/trusted_time.py -o /tmp/short --scene scene --iterations 60 --seeds 1 --methods 3dgs
 
-3 methods x 2 captures x 2 seeds, 300 iterations. The second grid runs beside two processes that never pause,
+3 methods x 2 captures x 2 seeds, 1000 iterations. The second grid runs beside two processes that never pause,
 one in its cache and one through memory. Passes where reference seconds of every cell agree within 10 %,
 every cell of the busy grid is contended, none of it is ranked, and every cell of the quiet grid is alone.
 """
@@ -137,7 +137,7 @@ def main() -> None:
         "--scene", type=Path, action="append", help="Instead of simulated captures; repeatable."
     )
     parser.add_argument("--methods", default=",".join(METHODS))
-    parser.add_argument("--iterations", type=int, default=300)
+    parser.add_argument("--iterations", type=int, default=1000)
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--width", type=int, default=480)
     parser.add_argument("--busy", type=int, default=2, help="Busy processes beside the second grid.")

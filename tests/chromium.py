@@ -100,6 +100,11 @@ class Browser:
         line, self._rest = self._rest.split(b"\0", 1)
         return json.loads(line)
 
+    def prefer(self, scheme: str) -> None:
+        """The person's system is "light" or "dark"."""
+        wanted = [{"name": "prefers-color-scheme", "value": scheme}]
+        self.call("Emulation.setEmulatedMedia", features=wanted)
+
     def open(self, url: str) -> None:
         """Go there and wait until everything is loaded."""
         self.events.clear()

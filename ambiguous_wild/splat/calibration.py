@@ -16,6 +16,7 @@ import torch
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.splat import device as devices
+from ambiguous_wild.splat.cpu.compile import one_thread
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.optim import SplatAdam
@@ -32,14 +33,29 @@ class Size:
     width: int
     height: int
     steps: int
+    serial_steps: int = 0  # on one thread; 0 = none, as on a GPU
+    serial_reference_s: float = 1.0
 
 
 # Reference machine of the CPU: 2 threads of an AMD EPYC virtual machine, nothing else running. That of a GPU
-# is nominal: the kernel takes a tenth of a second there.
+# is nominal: the kernel takes a twentieth of a second there.
 KERNELS = {
-    "cpu": Size("cpu-1", 0.25, 12_000, 240, 136, 12),
-    "cuda": Size("gpu-1", 0.10, 100_000, 960, 544, 24),
+    "cpu": Size("cpu-2", 0.0625, 12_000, 240, 136, 3, 2, 0.070),
+    "cuda": Size("gpu-2", 0.05, 100_000, 960, 544, 12),
 }
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One calibration.
+
+    Load slows work on one thread less than work on several: a training is compared with both.
+    """
+
+    seconds: float  # of the kernel
+    processors: float = 1.0  # that it got: processor seconds a second
+    serial_s: float | None = None  # of the steps on one thread
+    serial_processors: float = 1.0
 
 
 class Calibration:
@@ -71,6 +87,21 @@ class Calibration:
         last.record()
         last.synchronize()
         return first.elapsed_time(last) / 1e3
+
+    def read(self) -> Reading:
+        """Run the kernel with the threads of the training, and on a CPU on one thread too."""
+        if self.device.type == "cuda":
+            return Reading(self.seconds())
+        spent = time.process_time()
+        seconds = self.seconds()
+        processors = (time.process_time() - spent) / seconds
+        if not self.size.serial_steps:
+            return Reading(seconds, processors)
+        begin, spent = time.perf_counter(), time.process_time()
+        with one_thread():
+            self._steps(self.size.serial_steps)
+        serial_s = time.perf_counter() - begin
+        return Reading(seconds, processors, serial_s, (time.process_time() - spent) / serial_s)
 
     def _steps(self, count: int) -> None:
         for k in range(count):

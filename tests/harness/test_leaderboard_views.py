@@ -94,12 +94,16 @@ def test_removing_a_method_removes_its_masks(board: Path, tmp_path: Path) -> Non
 
 
 @needs_chromium
-def test_the_views_in_a_browser(board: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1300, 800, 400])
+def test_the_views_in_a_browser(board: Path, tmp_path: Path, width: int, scheme: str) -> None:
     publish(board, tmp_path / "site", reported=True)
     files = tmp_path / "files"
-    with Browser(tmp_path / "profile", width=1300) as page:
+    with Browser(tmp_path / "profile", width=width, mobile=width == 400) as page:
         page.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(files))
+        page.prefer(scheme)
         page.open((tmp_path / "site" / "index.html").as_uri())
+        fits_and_can_be_read(page, width, scheme)
         undefined_scenes_are_left_out(page)
         by_scene(page)
         drill_down(page)
@@ -109,6 +113,19 @@ def test_the_views_in_a_browser(board: Path, tmp_path: Path) -> None:
         findings_stand_at_their_cells(page)
         downloads(page, files)
         assert page.errors == []
+
+
+def fits_and_can_be_read(page: Browser, width: int, scheme: str) -> None:
+    assert page.run("document.documentElement.scrollWidth") <= width  # tables scroll in their own boxes
+    light = (
+        "(c) => { const [r, g, b] = c.match(/[\\d.]+/g).map((v) => v / 255)"
+        ".map((v) => v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4);"
+        "return 0.2126 * r + 0.7152 * g + 0.0722 * b; }"
+    )
+    of = "getComputedStyle(document.body)"
+    ground, text = (page.run(f"({light})({of}.{what})") for what in ("backgroundColor", "color"))
+    assert (ground > text) == (scheme == "light")
+    assert (max(ground, text) + 0.05) / (min(ground, text) + 0.05) > 7.0  # WCAG AAA
 
 
 def undefined_scenes_are_left_out(page: Browser) -> None:
@@ -174,8 +191,9 @@ def comparison(page: Browser) -> None:
     assert page.run(at) == "100%"
     choose(page, "layout", "side by side")
     boxes = page.run("['over', 'under'].map((i) => { const b = $(i).getBoundingClientRect();"
-                     "return [b.left, b.right]; })")  # fmt: skip
-    assert boxes[0][1] <= boxes[1][0]
+                     "return [b.left, b.right, b.top, b.bottom]; })")  # fmt: skip
+    beside, below = boxes[0][1] <= boxes[1][0], boxes[0][3] <= boxes[1][2]
+    assert beside if page.run("innerWidth") > 640 else below  # a narrow page has one above the other
     page.click("#zoom-in")
     page.click("#zoom-in")
     same = "[...document.querySelectorAll('#stage .layers')].map((l) => l.style.transform)"

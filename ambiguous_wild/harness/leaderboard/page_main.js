@@ -102,6 +102,9 @@ function start() {
   draw();
   let width = $("plot").clientWidth;
   new ResizeObserver(() => { if ($("plot").clientWidth !== width) { width = $("plot").clientWidth; drawPlot(); } }).observe($("plot"));
+  // What has the focus is scrolled to below the filters, whose height depends on how they wrap.
+  const sticky = () => getComputedStyle($("filters")).position === "sticky" ? $("filters").offsetHeight : 0;
+  new ResizeObserver(() => { document.documentElement.style.scrollPaddingTop = `${sticky() + 12}px`; }).observe($("filters"));
 }
 
 start();

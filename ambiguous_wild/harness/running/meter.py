@@ -6,23 +6,29 @@ Each time a calibration kernel is timed. Its work and the record's are no part o
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import Any
 
+import numpy as np
 import torch
 
 from ambiguous_wild.harness.running import machine
 from ambiguous_wild.harness.running.records import Cost, TimeRecord
 from ambiguous_wild.harness.running.timing import Verdict, in_reference_seconds
-from ambiguous_wild.splat.calibration import KERNELS, calibration
+from ambiguous_wild.splat.calibration import KERNELS, Reading, calibration
 
-EVERY_S = 15.0  # of training between two calibrations, which take about a fortieth of that
-SHARES = 4  # a shorter run has one at each quarter, where a quarter takes
-LEAST_S = 2.0  # at least so long
+# One calibration is off by a tenth, on a busy machine by a fifth: a run needs about 20 of them.
+LEAST_S = 1.0  # of training between two calibrations
+SHARE = 1 / 20  # of the training so far
+EVERY_S = 15.0  # at most
 OTHERS = 0.1  # a run is contended where others use more than this share of the processors that it needs
-VARIED = 1.3  # or where the slowest calibration takes this many times the fastest
+VARIED = 1.3  # or where the machine is this many times slower in one part of the training than in another
+LEAST_GAIN = 0.15  # processors that several threads get more than one, or they are not told apart
+PARTS = 5  # of the training that are compared
+PART_SAMPLES = 4  # that a part has at least
 COVERED = 0.9  # of the training must lie between the first and the last calibration
 
 
@@ -34,26 +40,27 @@ class Meter:
         device: str,
         threads: int,
         *,
-        kernel_s: Callable[[], float] | None = None,
+        read: Callable[[], Reading] | None = None,
         presence: machine.Presence | None = None,
     ) -> None:
         """
         Args:
             device: "cpu" or "cuda".
             threads: that the training uses.
-            kernel_s: times the calibration kernel once; None = the kernel of the device.
+            read: calibrates once; None = with the kernel of the device.
             presence: counts runs; None = those of this machine or GPU.
         """
         self.device, self.threads = device, threads
         self.kernel = KERNELS["cuda" if device.startswith("cuda") else "cpu"]
-        self._kernel_s = kernel_s or (lambda: calibration(torch.device(device)).seconds())
+        self._read = read or (lambda: calibration(torch.device(device)).read())
         self.presence = presence or machine.Presence(machine.unit(device))
         self._stack = ExitStack()
-        self.samples: list[list[float]] = []
+        self.samples: list[list[float]] = []  # trained seconds and the numbers of a Reading; NaN = none
         self.clocks: list[float] = []
         self.loads: list[float] = []
         self.runs = 1
-        self.wall_s = self.others_s = 0.0  # of the intervals so far; others' processor seconds in them
+        # of the intervals so far: seconds, processor seconds of this run, and of others
+        self.wall_s = self.own_s = self.others_s = 0.0
         self.blind = False  # others' work could not be measured
         self._since: tuple[float, float | None, float] | None = None
 
@@ -77,7 +84,7 @@ class Meter:
         ago = trained_s - self.samples[-1][0]
         if progress >= 1.0:
             return ago > 0.0
-        return ago >= EVERY_S or (ago >= LEAST_S and ago >= trained_s / max(progress, 1e-9) / SHARES)
+        return ago >= min(max(LEAST_S, SHARE * trained_s), EVERY_S)
 
     def look(self, trained_s: float) -> None:
         """Calibrate, and note what others did since the last time."""
@@ -94,13 +101,14 @@ class Meter:
 
     def state_dict(self) -> dict[str, Any]:
         """Plain values for a checkpoint, the open interval included."""
-        wall, others, blind = self._interval()
+        wall, own, others, blind = self._interval()
         return {
             "samples": [list(sample) for sample in self.samples],
             "clocks": list(self.clocks),
             "loads": list(self.loads),
             "runs": self.runs,
             "wall_s": self.wall_s + wall,
+            "own_s": self.own_s + own,
             "others_s": self.others_s + others,
             "blind": self.blind or blind,
         }
@@ -112,7 +120,7 @@ class Meter:
         self.samples = [list(map(float, sample)) for sample in state["samples"]]
         self.clocks, self.loads = list(state["clocks"]), list(state["loads"])
         self.runs, self.blind = int(state["runs"]), bool(state["blind"])
-        self.wall_s, self.others_s = float(state["wall_s"]), float(state["others_s"])
+        self.wall_s, self.own_s, self.others_s = (float(state[k]) for k in ("wall_s", "own_s", "others_s"))
 
     # -- what it found -----------------------------------------------------------------------------
 
@@ -124,9 +132,11 @@ class Meter:
             "reason": reason,
             "kernel": self.kernel.name,
             "kernel_reference_s": self.kernel.reference_s,
-            "samples": self.samples,
+            "samples": self.kernel_samples(),
             "runs": self.runs,
         }
+        if not math.isnan(self.parallel_share()):
+            record["parallel_share"] = self.parallel_share()
         if self.wall_s > 0.0 and not self.blind:
             record["others"] = self.others_s / self.wall_s
         if self.loads:
@@ -135,9 +145,34 @@ class Meter:
             record["clock_mhz"] = [min(self.clocks), max(self.clocks)]
         cost: Cost = {"timing": record}
         if self.samples:
-            found = in_reference_seconds(self.samples, self.kernel.reference_s, [trained_s])
+            found = in_reference_seconds(record["samples"], self.kernel.reference_s, [trained_s])
             cost["reference_s"] = float(found[0])
         return cost
+
+    def parallel_share(self) -> float:
+        """Share of the time in which several threads worked; NaN where it cannot be told.
+
+        From the processors that the training got, between those of the calibration on one thread and on all.
+        """
+        if not self.samples or self.wall_s <= 0.0:
+            return math.nan
+        _, _, many, serial_s, one = np.mean(np.array(self.samples), axis=0)
+        if math.isnan(serial_s) or many - one < LEAST_GAIN:
+            return math.nan
+        return float(np.clip((self.own_s / self.wall_s - one) / (many - one), 0.0, 1.0))
+
+    def kernel_samples(self) -> list[list[float]]:
+        """(seconds of training, seconds of the kernel were it as parallel as the training)."""
+        share = self.parallel_share()
+        if math.isnan(share):
+            return [sample[:2] for sample in self.samples]
+        kernel = self.kernel
+        found = []
+        for at, seconds, _, serial_s, _ in self.samples:
+            speed = share * kernel.reference_s / seconds
+            speed += (1.0 - share) * kernel.serial_reference_s / serial_s
+            found.append([at, kernel.reference_s / speed])
+        return found
 
     def verdict(self, trained_s: float) -> tuple[Verdict, str]:
         """Whether the run was alone, and why not."""
@@ -149,10 +184,9 @@ class Meter:
         needed = min(self.threads, total)
         if others - (total - needed) > OTHERS * needed:
             return "contended", f"other programs used {others:.1f} of {total} processors"
-        seconds = [kernel for _, kernel in self.samples]
-        if seconds and max(seconds) > VARIED * min(seconds):
-            ratio = max(seconds) / min(seconds)
-            return "contended", f"the machine's speed varied {ratio:.1f} times between calibrations"
+        ratio = speed_ratio([sample[1] for sample in self.samples])
+        if ratio > VARIED:
+            return "contended", f"the machine's speed varied {ratio:.1f} times during the training"
         span = self.samples[-1][0] - self.samples[0][0] if self.samples else 0.0
         if span < COVERED * trained_s:
             share = 100.0 * span / trained_s if trained_s > 0.0 else 0.0
@@ -164,7 +198,11 @@ class Meter:
     # -- inside ------------------------------------------------------------------------------------
 
     def _sample(self, trained_s: float) -> None:
-        self.samples.append([trained_s, self._kernel_s()])
+        reading = self._read()
+        serial_s = math.nan if reading.serial_s is None else reading.serial_s
+        self.samples.append(
+            [trained_s, reading.seconds, reading.processors, serial_s, reading.serial_processors]
+        )
         self.runs = max(self.runs, self.presence.count())
         for found, into in ((machine.load(), self.loads), (machine.gpu_clock_mhz(self.device), self.clocks)):
             if found is not None:
@@ -173,19 +211,26 @@ class Meter:
     def _now(self) -> tuple[float, float | None, float]:
         return time.monotonic(), machine.busy_s(), machine.own_s()
 
-    def _interval(self) -> tuple[float, float, bool]:
-        """(wall seconds, others' processor seconds, whether those are unknown) since the last calibration."""
+    def _interval(self) -> tuple[float, float, float, bool]:
+        """Since the last calibration: seconds, processor seconds of this run and of others, and whether
+        those of others are unknown."""
         if self._since is None:
-            return 0.0, 0.0, False
+            return 0.0, 0.0, 0.0, False
         (begin, busy, own), (now, busy_now, own_now) = self._since, self._now()
         if busy is None or busy_now is None:
-            return now - begin, 0.0, True
-        return now - begin, max(busy_now - busy - (own_now - own), 0.0), False
+            return now - begin, own_now - own, 0.0, True
+        return now - begin, own_now - own, max(busy_now - busy - (own_now - own), 0.0), False
 
     def _close(self) -> None:
-        wall, others, blind = self._interval()
-        self.wall_s, self.others_s, self.blind = (
-            self.wall_s + wall,
-            self.others_s + others,
-            self.blind or blind,
-        )
+        wall, own, others, blind = self._interval()
+        self.wall_s, self.own_s, self.others_s = self.wall_s + wall, self.own_s + own, self.others_s + others
+        self.blind = self.blind or blind
+
+
+def speed_ratio(kernel_s: Sequence[float]) -> float:
+    """Slowest over fastest part of a training, by the medians of their calibrations; 1 with too few."""
+    parts = min(PARTS, len(kernel_s) // PART_SAMPLES)
+    if parts < 2:
+        return 1.0
+    medians = [float(np.median(part)) for part in np.array_split(np.asarray(kernel_s), parts)]
+    return max(medians) / min(medians)

@@ -53,6 +53,7 @@ class TimeRecord(TypedDict, total=False):
     kernel: str  # of the calibration
     kernel_reference_s: float  # its seconds on the reference machine
     samples: list[list[float]]  # (seconds of training so far, seconds of the kernel)
+    parallel_share: float  # of the time in which several threads worked; the samples allow for it
     runs: int  # most runs of ours at once on this machine or GPU, this one included
     others: float  # processors that other programs used, mean over the run
     load: float  # load average of one minute, mean over the samples

@@ -8,9 +8,9 @@
 
 Each stage prints its results and writes benchmarks/results/gpu-STAGE.json; gpu.md is made from these files.
 A stage that was stopped goes on where it was if --work is the same. `cost` and `profile` begin with the final
-Gaussians of `3dgs` and train it where --work has no such training. `cost` compares at equal counts, without
-density control, alternating in blocks, so that machine load affects all loops alike. Exits with 1 if parity
-or a training fails.
+Gaussians of `3dgs`; a line says whether --work has that training, which is made first where it is absent.
+`cost` compares at equal counts, without density control, alternating in blocks, so that machine load affects
+all loops alike. Exits with 1 if parity or a training fails.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from pathlib import Path
 
 from gpu_measure import DINO, random_dino, write
 from gpu_report import to_markdown
-from gpu_stages import STAGES, lacking
+from gpu_stages import STAGES, lacking, needs
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.atomic import write_text
@@ -75,7 +75,11 @@ def main(words: list[str] | None = None) -> int:
     if lack is not None:
         p.error(f"no GPU to measure: {lack}")
     if lacks := lacking(args.stages, args.methods):
-        p.error("; ".join(lacks))
+        able = [method for method in args.methods if not lacking([], [method])]
+        rest = f"; the others: --methods {' '.join(able)}" if 0 < len(able) < len(args.methods) else ""
+        p.error("; ".join(lacks) + rest)
+    if args.device == "cuda" and "build" not in args.stages:
+        args.stages.insert(0, "build")  # loads the kernels; without them gsplat would compile all of its own
     args.work.mkdir(parents=True, exist_ok=True)
     try:
         if DINO in args.methods and not os.environ.get("AW_WEIGHTS"):
@@ -94,6 +98,9 @@ def main(words: list[str] | None = None) -> int:
 def _run(args: argparse.Namespace) -> int:
     failed = False
     for name in args.stages:
+        print(f"stage {name}", flush=True)
+        if line := needs(args, name):
+            print(line, flush=True)
         begin = time.perf_counter()
         found = STAGES[name](args)
         found["seconds_of_stage"] = time.perf_counter() - begin

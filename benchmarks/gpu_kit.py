@@ -19,6 +19,7 @@ from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
 SITE = HERE / ".site"
+BATCHED = ("3dgs-2-views", "3dgs-4-views")
 NAMES = {"pillow": "PIL"}  # what is imported, where it is not the name of the wheel
 
 
@@ -63,23 +64,34 @@ def fail(message: str) -> None:
 
 
 def rehearse(words: list[str]) -> int:
-    """Every stage that has what it needs, on the CPU, with stand-ins for the compiled kernels."""
+    """Every stage that has what it needs, on the CPU, with stand-ins for the compiled kernels.
+
+    Args:
+        words: arguments of gpu.py that go before the small ones used here; --call N rehearses one call.
+    """
     import fake_kernels
     import gpu
     import gpu_stages
 
     gpu_stages.BLOCK = 2
+    only = int(words[words.index("--call") + 1]) if "--call" in words[:-1] else None
     usual = ["--device", "cpu", "--iterations", "6", "--warm-up", "1", "--turns", "1", "--budget", "2"]
     place = ["--scene", str(HERE / "rehearsal"), "--work", str(HERE / "rehearsed")]
     code = 0
     with fake_kernels.in_place():
         for call, (stages, methods) in gpu.CALLS.items():
-            lacks = gpu_stages.lacking(list(stages), list(methods))
-            if lacks:
-                print(f"call {call} left out: {'; '.join(lacks)}", flush=True)
+            if only not in (None, call):
                 continue
-            print(f"call {call}", flush=True)
-            code |= gpu.main(["--call", str(call), *place, *usual, *words])
+            for line in gpu_stages.lacking(list(stages), list(methods)):
+                print(f"call {call}, left out: {line}", flush=True)
+            able = [method for method in methods if not gpu_stages.missing(method)]
+            if not able or gpu_stages.lacking(list(stages), []):
+                continue
+            print(f"call {call}: {' '.join(able)}", flush=True)
+            code |= gpu.main([*place, *usual, "--methods", *able, *words, "--call", str(call)])
+        if only is None:
+            print(f"call of variants: {' '.join(BATCHED)}", flush=True)
+            code |= gpu.main([*place, *usual, "--stages", "train", "cost", "--methods", *BATCHED, *words])
     return code
 
 

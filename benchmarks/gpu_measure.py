@@ -62,13 +62,19 @@ def trainer_of(args: argparse.Namespace, name: str, **config: Any) -> Trainer:
     data = load_train_data(
         load_scene(args.scene, verify=False), device=device, seed=args.seed, cache_dir=args.work / "cache"
     )
-    folder = args.work / f"{name}-{args.seed}-{args.device}-{args.iterations}"
+    folder = folder_of(args, name)
     if "budget_s" in config:
         folder = folder.with_name(f"{folder.name}-{config['budget_s']:g}s")
     views = BATCHES.get(name)
     if views is not None:
         return BatchTrainer(data, entry.build(chosen), TrainConfig(**config), views=views, folder=folder)
     return Trainer(data, entry.build(chosen), TrainConfig(**config), folder=folder)
+
+
+def folder_of(args: argparse.Namespace, name: str) -> Path:
+    """Checkpoint and timeline of the training of a method."""
+    place: Path = args.work / f"{name}-{args.seed}-{args.device}-{args.iterations}"
+    return place
 
 
 def ended(args: argparse.Namespace, name: str) -> Trainer:
@@ -158,6 +164,7 @@ class Notes:
             for name in ("scene", "iterations", "seed", "settings", "device", "warm_up", "turns", "budget")
         }
         key = json.dumps([stage, known, _code()], sort_keys=True)
+        self.stage = stage
         self.path = args.work / "notes" / f"{stage}-{hashlib.sha256(key.encode()).hexdigest()[:12]}.json"
         self.rows: dict[str, Any] = {}
         if self.path.is_file():
@@ -165,7 +172,10 @@ class Notes:
 
     def get(self, name: str, make: Callable[[], Any]) -> Any:
         """The row of that name, made and written unless it is there."""
-        if name not in self.rows:
+        if name in self.rows:
+            words = [Path(word).name for word in name.split()]  # of a row of `same` the first is a folder
+            print(f"{self.stage}: {' '.join(words)} was finished before", flush=True)
+        else:
             self.rows[name] = make()
             self.path.parent.mkdir(parents=True, exist_ok=True)
             write_json(self.path, self.rows)

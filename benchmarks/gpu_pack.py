@@ -34,6 +34,7 @@ from ambiguous_wild.splat.gpu.gsplat_seam import TESTED
 
 ROOT = Path(__file__).resolve().parents[1]
 LIMIT_MB = 60
+PHOTOS, WIDTH = 150, 582  # as many pixels a photo as NeRF On-the-go at factor 8
 PACKAGES = (
     "numpy",
     "pillow",
@@ -69,7 +70,14 @@ _BACKEND = '"""The compiled module, which the caller has put there."""\n\nfrom g
 
 
 def pack(
-    out: Path, *, python: str, gsplat: Path | None = None, scene: Path | None = None, wheels: bool = True
+    out: Path,
+    *,
+    python: str,
+    gsplat: Path | None = None,
+    scene: Path | None = None,
+    photos: int = PHOTOS,
+    width: int = WIDTH,
+    wheels: bool = True,
 ) -> Path:
     """Make the kit; returns its folder.
 
@@ -78,6 +86,7 @@ def pack(
         python: version of the other machine's interpreter, e.g. "3.12".
         gsplat: its package folder or wheel; None = the installed one, else pip downloads the wheel.
         scene: a scene folder to carry; None = simulated.
+        photos, width: of the simulated scene; train photos, and their width in px.
         wheels: whether to bring packages.
 
     Raises:
@@ -92,7 +101,12 @@ def pack(
             _wheels(kit / "wheels", python)
         if scene is None:
             make_scene(
-                kit / "scene", name="courtyard-colour", train=150, test=20, width=582, to_train_on=True
+                kit / "scene",
+                name="courtyard-colour",
+                train=photos,
+                test=max(photos * 2 // 15, 1),
+                width=width,
+                to_train_on=True,
             )
         else:
             shutil.copytree(scene, kit / "scene", ignore=shutil.ignore_patterns("truth", "images_*"))
@@ -194,10 +208,12 @@ def main(words: list[str] | None = None) -> int:
     p.add_argument("--python", default="3.12", help="version of the other machine's interpreter")
     p.add_argument("--gsplat", type=Path, help="gsplat's package folder or wheel")
     p.add_argument("--scene", type=Path, help="a scene to carry instead of the simulated one")
+    p.add_argument("--photos", type=int, default=PHOTOS, help="train photos of the simulated scene")
+    p.add_argument("--width", type=int, default=WIDTH, help="their width in px")
     p.add_argument("--no-wheels", dest="wheels", action="store_false")
     args = p.parse_args(words)
     try:
-        kit = pack(args.out, python=args.python, gsplat=args.gsplat, scene=args.scene, wheels=args.wheels)
+        kit = pack(**vars(args))
     except AwError as error:
         p.error(str(error))
     known = json.loads((kit / "kit.json").read_text(encoding="utf-8"))

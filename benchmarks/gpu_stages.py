@@ -17,10 +17,12 @@ import numpy as np
 import torch
 from gpu_graph import GraphLoop
 from gpu_measure import (
+    BATCHES,
     DINO,
     Notes,
     ended,
     facts_of,
+    folder_of,
     frames_per_second,
     late,
     method_of,
@@ -41,7 +43,11 @@ from ambiguous_wild.splat.render import render
 
 BLOCK = 50  # iterations
 MOST_PROFILED = 600  # steps
-OPTIONS = {"3dgs, tiles=last-visit": {"tiles": "last-visit"}}  # variants of a step, see splat/gpu/options.py
+OPTIONS = {  # variants of a step, see splat/gpu/options.py
+    "3dgs, tiles=last-visit": {"tiles": "last-visit"},
+    "3dgs, harmonics=split": {"harmonics": "split"},
+    "3dgs, both": {"tiles": "last-visit", "harmonics": "split"},
+}
 
 # What a stage needs beyond torch, gsplat, numpy, safetensors and a reader of images, by method or stage
 MODULES = {
@@ -53,7 +59,8 @@ MODULES = {
 
 
 def missing(name: str) -> list[str]:
-    """Modules that a method or a stage needs and that are not installed."""
+    """Modules that a stage, a method or a variant of one needs and that are not installed."""
+    name = name if name in MODULES else method_of(name)
     return [m for m in MODULES.get(name, ()) if importlib.util.find_spec(m) is None]
 
 
@@ -138,7 +145,8 @@ def _train_one(args: argparse.Namespace, method: str) -> dict[str, Any]:
 def budget(args: argparse.Namespace) -> dict[str, Any]:
     """Trainings of a number of seconds, with the defaults of `--budget`: coarse to fine, fewer Gaussians."""
     notes = Notes(args, "budget")
-    rows = [notes.get(method, lambda method=method: _budget_one(args, method)) for method in args.methods]
+    methods = [method for method in args.methods if method not in BATCHES]  # which count photos, not seconds
+    rows = [notes.get(method, lambda method=method: _budget_one(args, method)) for method in methods]
     for row in rows:
         print(row, flush=True)
     return {"scene": facts_of(args), "budget_s": args.budget, "rows": rows}
@@ -158,7 +166,7 @@ def _budget_one(args: argparse.Namespace, method: str) -> dict[str, Any]:
 
 
 def cost(args: argparse.Namespace) -> dict[str, Any]:
-    """ms per iteration of every loop, alternating, with the final Gaussians of `3dgs`.
+    """ms per iteration (a photo) of every loop, alternating, with the final Gaussians of `3dgs`.
 
     Needs the training of `3dgs`; makes it where it is absent. `3dgs` is always among the loops, and gsplat's
     own loop is measured twice: as it is, and without the host's wait that its `torch.inverse` makes.
@@ -190,7 +198,8 @@ def cost(args: argparse.Namespace) -> dict[str, Any]:
             for _ in range(BLOCK):
                 step()
             wait(device)
-            ms[name].append(1e3 * (time.perf_counter() - begin) / BLOCK)
+            photos = BLOCK * BATCHES.get(name, 1)
+            ms[name].append(1e3 * (time.perf_counter() - begin) / photos)
     # Totals: masks are made anew in clumps, a median turn has hardly any. TURNS * BLOCK steps are four epochs
     # of the benchmark's 150 photos, in which every mask is made once.
     mean = {name: float(np.mean(values)) for name, values in ms.items()}
@@ -286,11 +295,22 @@ STAGES: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
 }
 
 
+def needs(args: argparse.Namespace, stage: str) -> str:
+    """One line: what a stage needs of those before it, and whether it is there."""
+    if stage not in ("cost", "profile"):
+        return ""
+    said = f"{stage} needs 3dgs trained for {args.iterations} iterations"
+    if "3dgs" in Notes(args, "train").rows:
+        return f"{said}: found"
+    begun = (folder_of(args, "3dgs") / "checkpoint" / "last.safetensors").is_file()
+    return f"{said}: {'has a checkpoint, goes on from there' if begun else 'absent, trained first'}"
+
+
 def lacking(stages: list[str], methods: list[str]) -> list[str]:
     """One line for each stage or method that cannot run here; parity runs what it can."""
-    names = [*(m if m in MODULES else method_of(m) for m in methods), *(s for s in stages if s == "same")]
+    names = dict.fromkeys([*methods, *(s for s in stages if s == "same")])
     return [
         f"{name} needs {', '.join(lacks)}, which this machine lacks"
-        for name in dict.fromkeys(names)
+        for name in names
         if (lacks := missing(name))
     ]

@@ -107,6 +107,7 @@ class MappingResult(TypedDict):
     """Of the stage `mapping`."""
 
     models: list[ModelSummary]
+    plan: str  # "fast" or "thorough"
 
 
 class UndistortResult(TypedDict):
@@ -139,6 +140,7 @@ class ChosenMethods(TypedDict):
     """What the settings "auto" became, and the model that was taken."""
 
     camera: str
+    sfm: str  # "fast" or "thorough"
     matcher: str
     mapper: str
     model: int

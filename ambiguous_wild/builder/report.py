@@ -70,6 +70,7 @@ def scene_record(
         "settings": to_plain(settings),
         "chosen": {
             "camera": features["camera"],
+            "sfm": mapping["plan"],
             "matcher": matches["matcher"],
             "mapper": settings.mapper,
             "model": best,

@@ -13,8 +13,8 @@ import numpy as np
 WORDS = 64  # visual words
 SAMPLE = 20_000  # descriptors that the words are learnt from
 MOST = 1500  # descriptors of a photo that count: the largest features come first in COLMAP
-SIMILAR = 16  # photos that each is matched with
-NEIGHBOURS = 5  # next photos in the order of capture
+SIMILAR = 16  # photos that each is matched with, unless a plan says otherwise
+NEIGHBOURS = 5  # next photos in the order of capture, likewise
 _ROWS = 256  # photos compared at a time
 _ROUNDS = 12  # of k-means
 
@@ -98,21 +98,23 @@ def retrieval_pairs(
     vectors: np.ndarray,  # [N, D], of `embed`
     names: Sequence[str],  # in the order of capture
     test_names: set[str],
+    similar: int = SIMILAR,
+    neighbours: int = NEIGHBOURS,
 ) -> list[tuple[str, str]]:
     """Each photo with the most similar ones and, but for those of a separate test set, the next ones.
 
     Returns:
-        Each pair once, in a fixed order; fewer than SIMILAR + NEIGHBOURS a photo.
+        Each pair once, in a fixed order; fewer than `similar` + `neighbours` a photo.
     """
     everyone = list(range(len(names)))
     walk = [i for i in everyone if names[i] not in test_names]
     pairs = {
         (walk[i], walk[i + s])
         for i in range(len(walk))
-        for s in range(1, NEIGHBOURS + 1)
+        for s in range(1, neighbours + 1)
         if i + s < len(walk)
     }
-    pairs |= {(min(a, b), max(a, b)) for a, b in most_similar(vectors, everyone, everyone)}
+    pairs |= {(min(a, b), max(a, b)) for a, b in most_similar(vectors, everyone, everyone, similar)}
     return [(names[a], names[b]) for a, b in sorted(pairs)]
 
 

@@ -10,6 +10,7 @@ from ambiguous_wild.core.errors import AwError
 CameraMode = Literal["auto", "single", "per-device", "per-image"]
 Matcher = Literal["auto", "exhaustive", "sequential", "retrieval"]
 Mapper = Literal["incremental", "global"]
+Effort = Literal["auto", "fast", "thorough"]
 
 
 MOST_FEATURES = 100_000  # a photo; SIFT finds fewer in any
@@ -21,7 +22,8 @@ class BuildSettings:
 
     factor: int | None = None  # downsampling; None: of 1, 2, 4, 8 the largest that leaves 480 px
     camera: CameraMode = "auto"  # auto: one camera if EXIF and size agree, else one a device or a photo
-    matcher: Matcher = "auto"  # auto: exhaustive up to 200 photos, then retrieval
+    sfm: Effort = "auto"  # auto: fast, and thorough where fast leaves photos out
+    matcher: Matcher = "auto"  # auto: exhaustive up to 25 photos (thorough: 200), then retrieval
     mapper: Mapper = "incremental"  # global is faster on many photos, weaker on few
     max_features: int = 3000  # SIFT features a photo
     max_side: int = 1600  # px; photos are reduced to this for SIFT only

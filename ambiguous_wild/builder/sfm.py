@@ -13,7 +13,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from ambiguous_wild.builder.pairs import EXHAUSTIVE_LIMIT, PAIRS
+from ambiguous_wild.builder.pairs import PAIRS
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import (
     FeatureResult,
@@ -24,6 +24,7 @@ from ambiguous_wild.builder.records import (
 )
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.builder.sfm_jobs import FeatureJob, MappingJob, MatchJob, SfmJob
+from ambiguous_wild.builder.sfm_plans import SfmPlan
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.atomic import write_json
 
@@ -64,18 +65,12 @@ def camera_groups(photos: Sequence[PhotoRecord]) -> list[list[int]]:
     return list(groups.values())
 
 
-def choose_matcher(count: int, wanted: str) -> str:
-    """ "exhaustive", "retrieval" or "sequential"."""
-    if wanted != "auto":
-        return wanted
-    return "exhaustive" if count <= EXHAUSTIVE_LIMIT else "retrieval"
-
-
 def extract_features(
     folder: Path,
     photos: Path,
     facts: list[ScreenedPhoto],
     settings: BuildSettings,
+    plan: SfmPlan,
     jobs: int,
     camera: str,
     masks: Path | None,
@@ -96,6 +91,7 @@ def extract_features(
         "masks": str(masks) if masks else None,
         "max_features": settings.max_features,
         "max_side": settings.max_side,
+        "first_octave": plan.first_octave,
         "seed": settings.seed,
         "jobs": jobs,
     }
@@ -120,11 +116,12 @@ def match(
     features: Path,
     facts: list[ScreenedPhoto],
     settings: BuildSettings,
+    plan: SfmPlan,
     jobs: int,
-    matcher: str,
     bar: Bar,
 ) -> MatchResult:
     """Match and verify pairs, in a copy of the features' database."""
+    matcher = plan.matcher
     database = folder / DATABASE
     shutil.copyfile(features / DATABASE, database)
     names = [f["work_name"] for f in facts]
@@ -139,6 +136,8 @@ def match(
         "names": names,
         "test_names": test_names,
         "matcher": matcher,
+        "similar": plan.similar,
+        "neighbours": plan.neighbours,
         "seed": settings.seed,
         "jobs": jobs,
     }
@@ -151,7 +150,7 @@ def match(
 
 
 def map_scene(
-    folder: Path, matches: Path, photos: Path, count: int, settings: BuildSettings, bar: Bar
+    folder: Path, matches: Path, photos: Path, count: int, settings: BuildSettings, plan: SfmPlan, bar: Bar
 ) -> MappingResult:
     """Build the models into `folder/0`, `folder/1`, ..."""
     progress = folder / "progress"
@@ -165,6 +164,8 @@ def map_scene(
         "output": str(folder),
         "progress": str(progress),
         "mapper": settings.mapper,
+        "growth": plan.growth,
+        "refinements": plan.refinements,
         "seed": settings.seed,
     }
     run_job(job, folder, lambda: bar.at(_number(progress)))
@@ -172,7 +173,7 @@ def map_scene(
     database.unlink()
     progress.unlink(missing_ok=True)
     listing = json.loads((folder / "models.json").read_text(encoding="utf-8"))
-    return {"models": listing}
+    return {"models": listing, "plan": plan.name}
 
 
 def run_job(job: SfmJob, folder: Path, watch: Callable[[], None]) -> None:

@@ -17,6 +17,7 @@ class FeatureJob(TypedDict):
     masks: str | None  # folder
     max_features: int
     max_side: int  # px
+    first_octave: int  # of SIFT
     seed: int
     jobs: int
     parent: NotRequired[int]  # process id, added when the job is written
@@ -30,6 +31,8 @@ class MatchJob(TypedDict):
     names: list[str]
     test_names: list[str]
     matcher: str
+    similar: int
+    neighbours: int
     seed: int
     jobs: int
     parent: NotRequired[int]
@@ -44,6 +47,8 @@ class MappingJob(TypedDict):
     output: str  # folder
     progress: str  # file that holds the number of placed photos
     mapper: str
+    growth: float
+    refinements: int
     seed: int
     parent: NotRequired[int]
 

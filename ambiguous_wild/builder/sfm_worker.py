@@ -36,6 +36,7 @@ def run_features(job: FeatureJob) -> None:
     options.num_threads = job["jobs"]
     options.max_image_size = job["max_side"]
     options.sift.max_num_features = job["max_features"]
+    options.sift.first_octave = job["first_octave"]
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = "SIMPLE_RADIAL"
     if job["masks"]:
@@ -97,7 +98,7 @@ def _likely_pairs(job: MatchJob) -> list[tuple[str, str]]:
     if sequential:
         found = {*sequential_pairs(job["names"], tests), *pairs_of_tests(vectors, job["names"], tests)}
         return sorted(found)
-    return retrieval_pairs(vectors, job["names"], tests)
+    return retrieval_pairs(vectors, job["names"], tests, job["similar"], job["neighbours"])
 
 
 def run_mapping(job: MappingJob) -> None:
@@ -143,6 +144,8 @@ def _map_incrementally(job: MappingJob, output: Path) -> dict[int, Any]:
     options.ba_min_num_residuals_for_cpu_multi_threading = 10**9
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = job["seed"]
     options.min_model_size = _MIN_MODEL
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = job["growth"]
+    options.ba_global_max_refinements = job["refinements"]
     counter = Path(job["progress"])
     state = {"best": 0, "now": 0}
 

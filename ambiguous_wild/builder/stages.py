@@ -31,11 +31,11 @@ from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.builder.sfm import (
     DATABASE,
     choose_camera,
-    choose_matcher,
     extract_features,
     map_scene,
     match,
 )
+from ambiguous_wild.builder.sfm_plans import SfmPlan, plans
 from ambiguous_wild.builder.split import read_test_list, split_photos
 from ambiguous_wild.builder.versions import versions
 from ambiguous_wild.builder.workspace import StageResult, Workspace, content_key
@@ -44,6 +44,20 @@ from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.colmap_records import Model
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import read_png_rgb
+
+
+@dataclass(frozen=True)
+class SfmStages:
+    """One attempt at structure from motion."""
+
+    features: StageResult[FeatureResult]
+    matches: StageResult[MatchResult]
+    mapping: StageResult[MappingResult]
+
+    @property
+    def placed(self) -> int:
+        """Photos of the largest model."""
+        return max((model["images"] for model in self.mapping.facts["models"]), default=0)
 
 
 @dataclass
@@ -99,7 +113,8 @@ class Stages:
         facts = screened.facts["photos"]
         tests = read_test_list(self.test_list, facts) if self.test_list else None
         mask_stage = self._masks(work, screened)
-        mapping, features, matches = self._sfm(work, screened, mask_stage)
+        sfm = self._sfm(work, screened, mask_stage)
+        mapping, features, matches = sfm.mapping, sfm.features, sfm.matches
         best, model, others = _models(mapping)
         stems = {f["work_name"]: f["stem"] for f in facts}
         registered = {stems[i.name] for i in model.images.values()}
@@ -136,7 +151,7 @@ class Stages:
             **found,
             "build_key": self.build_key,
             "inputs": inputs,
-            "seconds": {"collect": round(collect_s, 3), **{r.name: r.seconds for r in work.results}},
+            "seconds": {"collect": round(collect_s, 3), **work.seconds()},
         }
         truth_files = [capture.truth / n for n in ("cameras.json", "capture.json")] if capture.truth else []
         parts = SceneParts(
@@ -176,54 +191,60 @@ class Stages:
         work: Workspace,
         screened: StageResult[ScreenResult],
         masks: StageResult[MaskResult] | None,
-    ) -> tuple[StageResult[MappingResult], StageResult[FeatureResult], StageResult[MatchResult]]:
+    ) -> SfmStages:
+        facts = screened.facts["photos"]
+        attempts: list[SfmStages] = []
+        for plan in plans(facts, self.settings):
+            if attempts:
+                self.bar.say(f"{attempts[-1].placed} of {len(facts)} photos placed: trying harder")
+            attempts.append(self._attempt(work, screened, masks, plan))
+            if attempts[-1].placed == len(facts):
+                break
+        # of equal ones the later, which is the more precise
+        best = max(reversed(attempts), key=lambda attempt: attempt.placed)
+        from ambiguous_wild.builder.select_model import check_registered
+
+        check_registered(
+            best.mapping.facts["models"],
+            len(facts),
+            len(screened.facts["skipped"]),
+            best.matches.folder / DATABASE,
+            best.matches.facts,
+            mask_warnings(masks.facts if masks else None)
+            or ["masks were used (white = keep): try without them"] * (masks is not None),
+        )
+        return best
+
+    def _attempt(
+        self,
+        work: Workspace,
+        screened: StageResult[ScreenResult],
+        masks: StageResult[MaskResult] | None,
+        plan: SfmPlan,
+    ) -> SfmStages:
         settings, facts = self.settings, screened.facts["photos"]
         photos = screened.folder / "photos"
         camera = choose_camera(facts, settings.camera)
-        matcher = choose_matcher(len(facts), settings.matcher)
+        mask_folder = masks.folder / "masks" if masks else None
+        found = [settings.max_features, settings.max_side, plan.first_octave]
         features = work.run(
             "features",
-            [
-                screened.key,
-                masks and masks.key,
-                camera,
-                settings.max_features,
-                settings.max_side,
-                settings.seed,
-            ],
+            [screened.key, masks and masks.key, camera, found, settings.seed],
             lambda f: extract_features(
-                f,
-                photos,
-                facts,
-                settings,
-                self.jobs,
-                camera,
-                masks.folder / "masks" if masks else None,
-                self.bar,
+                f, photos, facts, settings, plan, self.jobs, camera, mask_folder, self.bar
             ),
         )
         matches = work.run(
             "matches",
-            [features.key, matcher, settings.seed],
-            lambda f: match(f, features.folder, facts, settings, self.jobs, matcher, self.bar),
+            [features.key, plan.matcher, plan.similar, plan.neighbours, settings.seed],
+            lambda f: match(f, features.folder, facts, settings, plan, self.jobs, self.bar),
         )
         mapping = work.run(
             "mapping",
-            [matches.key, settings.mapper, settings.seed],
-            lambda f: map_scene(f, matches.folder, photos, len(facts), settings, self.bar),
+            [matches.key, settings.mapper, to_plain(plan), settings.seed],
+            lambda f: map_scene(f, matches.folder, photos, len(facts), settings, plan, self.bar),
         )
-        from ambiguous_wild.builder.select_model import check_registered
-
-        check_registered(
-            mapping.facts["models"],
-            len(facts),
-            len(screened.facts["skipped"]),
-            matches.folder / DATABASE,
-            matches.facts,
-            mask_warnings(masks.facts if masks else None)
-            or ["masks were used (white = keep): try without them"] * (masks is not None),
-        )
-        return mapping, features, matches
+        return SfmStages(features, matches, mapping)
 
     def _undistort(
         self,

@@ -27,11 +27,18 @@ if TYPE_CHECKING:
     show_default=True,
 )
 @click.option(
+    "--sfm",
+    type=click.Choice(["auto", "fast", "thorough"]),
+    default="auto",
+    show_default=True,
+    help="Structure from motion; auto: fast, then thorough if photos are left out.",
+)
+@click.option(
     "--matcher",
     type=click.Choice(["auto", "exhaustive", "sequential", "retrieval"]),
     default="auto",
     show_default=True,
-    help="Pairs of photos: all, neighbours in order, or similar ones; auto: all up to 200 photos, else similar ones.",
+    help="Pairs of photos: all, neighbours in order, or similar ones; auto: all up to 25 (thorough: 200) photos, else similar ones.",
 )
 @click.option(
     "--mapper", type=click.Choice(["incremental", "global"]), default="incremental", show_default=True
@@ -63,6 +70,7 @@ def command(
     output: Path,
     factor: int | None,
     camera: str,
+    sfm: str,
     matcher: str,
     mapper: str,
     max_features: int,
@@ -86,6 +94,7 @@ def command(
     from ambiguous_wild.builder import report
     from ambiguous_wild.builder.pipeline import build_scene
     from ambiguous_wild.builder.settings import BuildSettings
+    from ambiguous_wild.cli.kernels import kernels_meanwhile
     from ambiguous_wild.core.config import from_plain
     from ambiguous_wild.core.names import check_name
     from ambiguous_wild.io.images import image_size
@@ -95,6 +104,7 @@ def command(
         {
             "factor": factor,
             "camera": camera,
+            "sfm": sfm,
             "matcher": matcher,
             "mapper": mapper,
             "max_features": max_features,
@@ -105,17 +115,19 @@ def command(
             "license": license_,
         },
     )
-    result = build_scene(
-        raw,
-        output,
-        settings,
-        masks=masks,
-        test_list=test_list,
-        overwrite=overwrite,
-        keep_work=keep_work,
-        jobs=jobs,
-        progress=True,
-    )
+    # One of the two cores is idle while photos are placed; training needs the kernels next.
+    with kernels_meanwhile():
+        result = build_scene(
+            raw,
+            output,
+            settings,
+            masks=masks,
+            test_list=test_list,
+            overwrite=overwrite,
+            keep_work=keep_work,
+            jobs=jobs,
+            progress=True,
+        )
     info = result.info
     first = next(iter(sorted((result.scene / info["images"]).iterdir())))
     size = image_size(first)

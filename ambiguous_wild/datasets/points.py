@@ -14,8 +14,9 @@ import numpy as np
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import ScreenedPhoto
 from ambiguous_wild.builder.settings import BuildSettings
-from ambiguous_wild.builder.sfm import DATABASE, choose_matcher, extract_features, match, run_job
+from ambiguous_wild.builder.sfm import DATABASE, extract_features, match, run_job
 from ambiguous_wild.builder.sfm_jobs import TriangulationJob
+from ambiguous_wild.builder.sfm_plans import plans
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.scene import Split
 from ambiguous_wild.datasets.foreign import no_points, points_without_tracks
@@ -113,14 +114,14 @@ def triangulate(
     facts = [
         cast(ScreenedPhoto, {"work_name": name, "source": name, "side": split[name]}) for name in sorted(used)
     ]
-    settings = BuildSettings(seed=seed)
+    settings = BuildSettings(seed=seed, sfm="thorough")
     camera = "single" if len(model.cameras) == 1 else "per-image"
     for part in ("features", "matches", "known", "points"):
         (folder / part).mkdir(parents=True, exist_ok=True)
-    extract_features(folder / "features", photos, facts, settings, jobs, camera, None, bar)
+    plan = plans(facts, settings)[0]
+    extract_features(folder / "features", photos, facts, settings, plan, jobs, camera, None, bar)
     _set_cameras(folder / "features" / DATABASE, folder / "known", model, used)
-    matcher = choose_matcher(len(facts), "auto")
-    match(folder / "matches", folder / "features", facts, settings, jobs, matcher, bar)
+    match(folder / "matches", folder / "features", facts, settings, plan, jobs, bar)
     database = folder / "matches" / DATABASE
     colmap_binary.write_points(folder / "known" / "points3D.bin", no_points())
     job: TriangulationJob = {

@@ -113,7 +113,7 @@ def test_scene_json_keeps_its_keys_and_their_order(scene):
     ]  # fmt: skip
     assert set(info) == SceneRecord.__required_keys__
     assert list(info["inputs"]) == ["photos", "masks", "truth", "test_list", "settings", "versions"]
-    assert list(info["chosen"]) == ["camera", "matcher", "mapper", "model"]
+    assert list(info["chosen"]) == ["camera", "sfm", "matcher", "mapper", "model"]
     assert list(info["counts"]) == [
         "photos", "readable", "registered", "train", "test", "cameras", "points", "points_seen_in_test_only",
         "points_of_track_length_2", "pairs", "pairs_verified",

@@ -3,7 +3,9 @@ import pytest
 
 from ambiguous_wild.builder.masks import find_masks, lay_out_masks, mask_warnings
 from ambiguous_wild.builder.pairs import sequential_pairs
-from ambiguous_wild.builder.sfm import camera_groups, choose_camera, choose_matcher
+from ambiguous_wild.builder.settings import BuildSettings
+from ambiguous_wild.builder.sfm import camera_groups, choose_camera
+from ambiguous_wild.builder.sfm_plans import plans
 from ambiguous_wild.builder.split import read_test_list, split_photos
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.images import read_gray, write_png
@@ -139,10 +141,34 @@ def test_photos_without_exif_never_share_a_camera_with_others():
     assert camera_groups(internet) == [[0], [1, 3], [2]]
 
 
-def test_matcher_by_count():
-    assert choose_matcher(200, "auto") == "exhaustive"
-    assert choose_matcher(201, "auto") == "retrieval"
-    assert choose_matcher(500, "exhaustive") == "exhaustive"
+def photos_of(count, side=1000):
+    return [{"width": side, "height": side // 2}] * count
+
+
+def test_fast_comes_before_thorough_and_each_may_be_asked_for():
+    wanted = ("auto", "fast", "thorough")
+    names = {w: [p.name for p in plans(photos_of(40), BuildSettings(sfm=w))] for w in wanted}
+    assert names == {"auto": ["fast", "thorough"], "fast": ["fast"], "thorough": ["thorough"]}
+
+
+@pytest.mark.parametrize(
+    ("count", "wanted", "expected"),
+    [
+        (25, "auto", ["exhaustive", "exhaustive"]),
+        (26, "auto", ["retrieval", "exhaustive"]),
+        (200, "auto", ["retrieval", "exhaustive"]),
+        (201, "auto", ["retrieval", "retrieval"]),
+        (500, "exhaustive", ["exhaustive", "exhaustive"]),
+    ],
+)
+def test_matcher_by_count(count, wanted, expected):
+    assert [p.matcher for p in plans(photos_of(count), BuildSettings(matcher=wanted))] == expected
+
+
+def test_small_photos_are_doubled_for_sift():
+    octaves = {side: plans(photos_of(9, side), BuildSettings())[0].first_octave for side in (799, 800)}
+    assert octaves == {799: -1, 800: 0}
+    assert plans(photos_of(9, 4000), BuildSettings(max_side=640))[0].first_octave == -1
 
 
 def test_a_copy_in_a_test_list_stands_for_the_photo_that_is_used(tmp_path):

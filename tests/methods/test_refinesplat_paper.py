@@ -140,6 +140,22 @@ def test_the_entropy_terms_weigh_cells_as_they_are_defined(scene, config):
     assert not config.weigh_cr
 
 
+def test_the_entropy_terms_are_no_longer_than_their_limit(scene):
+    """By hand: the same direction, at most the limit times the gradient of L_GS under the same keep map."""
+    step = step_of(scene.data, 0, blurred(scene.clean[0], 0), iteration=102)
+    keep = torch.ones(HEIGHT, WIDTH)
+    keep[:, : WIDTH // 2] = 0.0
+    config = dataclasses.replace(PAPER, entropy_every=3)
+    free = policy_of(scene, dataclasses.replace(config, entropy_limit=0.0)).cotangent(step, keep)
+    length = float(photometric(step.rendered.image, step.photo, keep).d_image.norm())
+    assert float(free.norm()) / 3 > 0.1 * length  # the limit below does something
+    short = policy_of(scene, dataclasses.replace(config, entropy_limit=0.1)).cotangent(step, keep)
+    assert float(short.norm()) / 3 == pytest.approx(0.1 * length, rel=1e-5)
+    assert torch.allclose(short / short.norm(), free / free.norm(), atol=1e-6)
+    wide = policy_of(scene, dataclasses.replace(config, entropy_limit=1e9)).cotangent(step, keep)
+    assert torch.equal(wide, free)  # never lengthened
+
+
 def test_unweighted_losses_leave_out_what_the_capture_masks(scene):
     own = torch.ones(HEIGHT, WIDTH)
     own[:, : WIDTH // 2] = 0.0
@@ -195,6 +211,7 @@ def test_the_papers_parts_are_on_and_ours_are_off():
         assert config.mask.w2 is None and config.mask.dilation == 5 and config.mask.use_local
         assert config.density.decides == "total" and config.density.merge_every > 0
         assert not config.first_look.on and config.density.support.least_share == 0
+    assert (own.entropy_limit, printed.entropy_limit) == (0.1, 0.0)
     assert (own.mask.threshold, own.mask.spread, own.density.merge.form) == ("kapur", "std", "normalised")
     assert (printed.mask.threshold, printed.mask.spread, printed.density.merge.form) == (
         "literal", "var", "literal",

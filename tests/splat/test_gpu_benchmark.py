@@ -51,7 +51,7 @@ def test_training_cost_and_profile(gpu, tmp_path, monkeypatch, capsys):
     assert [r["method"] for r in rows] == ["3dgs", "refinesplat"]
     assert all(r["iterations"] == 6 and r["fps"] > 0 and r["psnr"] > 5 for r in rows)
     cost = results["gpu-cost"]
-    variants = {"3dgs, tiles=last-visit", "3dgs, CUDA graph"}
+    variants = {"3dgs, tiles=last-visit", "3dgs, harmonics=split", "3dgs, both", "3dgs, CUDA graph"}
     loops = {"3dgs", "refinesplat", "gsplat", "gsplat, no wait"} | variants
     assert cost["ms"].keys() == loops and all(cost["ms"].values()) and not cost["left_out"]
     against = {f"{name} / 3dgs" for name in variants | {"refinesplat"}}
@@ -181,8 +181,35 @@ def test_what_is_missing_is_one_line_before_anything_is_measured(gpu, tmp_path, 
     with pytest.raises(SystemExit) as end:
         run(gpu, tmp_path, "train", methods=["3dgs", "refinesplat"])
     assert end.value.code == 2
-    assert "refinesplat needs cv2, which this machine lacks" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "refinesplat needs cv2, which this machine lacks; the others: --methods 3dgs" in said
     assert not (tmp_path / "results").exists()
+
+
+def test_what_a_stage_needs_of_the_one_before_is_said(gpu, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("gpu_stages.BLOCK", 2)
+    said = "cost needs 3dgs trained for 6 iterations: "
+    run(gpu, tmp_path, "cost", methods=["3dgs"])
+    assert said + "absent, trained first" in capsys.readouterr().out
+    run(gpu, tmp_path, "cost", methods=["3dgs"])
+    assert said + "has a checkpoint, goes on from there" in capsys.readouterr().out
+    run(gpu, tmp_path, "train", "cost", methods=["3dgs"])
+    assert said + "found" in capsys.readouterr().out
+    run(gpu, tmp_path, "train", methods=["3dgs"])
+    assert "train: 3dgs was finished before" in capsys.readouterr().out
+
+
+def test_steps_of_several_photos_are_counted_by_the_photo(gpu, tmp_path, monkeypatch):
+    import itertools
+    from types import SimpleNamespace
+
+    seconds = itertools.count()
+    monkeypatch.setattr("gpu_stages.BLOCK", 2)
+    monkeypatch.setattr("gpu_stages.time", SimpleNamespace(perf_counter=lambda: float(next(seconds))))
+    code, results, _ = run(gpu, tmp_path, "budget", "cost", methods=["3dgs-4-views"])
+    ms = results["gpu-cost"]["ms"]
+    assert code == 0 and ms["3dgs"] == 500 and ms["3dgs-4-views"] == 125
+    assert results["gpu-budget"]["rows"] == []  # they count photos, a budget counts seconds
 
 
 def test_calls_write_files_of_their_own(gpu, tmp_path, monkeypatch):

@@ -145,3 +145,45 @@ def test_without_torch_it_says_so(modules, tmp_path):
     )
     done = subprocess.run([sys.executable, "-I", "-c", blocked], capture_output=True, text=True)
     assert done.returncode == 2 and done.stderr.startswith("error: ") and "has no torch" in done.stderr
+
+
+def test_the_log_of_a_rehearsal_has_stages_and_errors_and_neither_times_nor_folders(modules):
+    import gpu_rehearse
+
+    place = Path("/somewhere")
+    kept = {
+        "stage train": "stage train",
+        "train: 17 s": "train: done",
+        "cost needs 3dgs trained for 6 iterations: found": "cost needs 3dgs trained for 6 iterations: found",
+        "unpacked pillow into /somewhere/kit/.site": "unpacked pillow into ./kit/.site",
+        "AwError: /somewhere/kit/scene is empty": "AwError: ./kit/scene is empty",
+    }
+    assert [gpu_rehearse.shortened(line + "\n", place) for line in kept] == list(kept.values())
+    assert gpu_rehearse.shortened("{'method': '3dgs', 'fps': 812.3}\n", place) is None
+
+
+def test_a_rehearsal_names_what_it_leaves_out(modules, monkeypatch, capsys):
+    """Without scipy and OpenCV RobustSplat still runs; without Numba CPU and GPU are not compared."""
+    import contextlib
+    from types import SimpleNamespace
+
+    _, kit = modules
+    import gpu
+    import gpu_stages
+
+    stand_in = SimpleNamespace(in_place=contextlib.nullcontext)
+    monkeypatch.setitem(sys.modules, "fake_kernels", stand_in)
+    monkeypatch.setattr(gpu_stages, "BLOCK", 50)
+    monkeypatch.setattr(
+        gpu_stages.importlib.util, "find_spec", lambda name: None if name in ("scipy", "numba") else name
+    )
+    calls = []
+    monkeypatch.setattr(gpu, "main", lambda words: calls.append(words) or 0)
+    assert kit.rehearse(["--results", "there"]) == 0
+    said = capsys.readouterr().out
+    assert "call 2, left out: refinesplat needs scipy, which this machine lacks" in said
+    assert "call 4, left out: same needs scipy, numba, which this machine lacks" in said
+    methods = [words[words.index("--methods") + 1 :] for words in calls]
+    assert [m[: m.index("--results")] for m in methods] == [["3dgs"], ["robustsplat"], list(kit.BATCHED)]
+    calls.clear()
+    assert kit.rehearse(["--call", "1"]) == 0 and len(calls) == 1

@@ -128,6 +128,8 @@ class RefineSplatConfig:
     lambda_cr: float = 0.0  # alpha_1, of L_cr; 0.2 = printed, 0.1 to 0.3 tried in the paper
     weigh_id: bool = True  # L_id of kept cells only; false = printed
     weigh_cr: bool = True  # L_cr of kept cells only; false = printed
+    # their gradient to the image is no longer than this times that of L_GS (L2 norms); 0 = printed, no limit
+    entropy_limit: float = 0.0
     lambda_dssim: float = 0.2  # of D-SSIM in L_GS
     ssim: Literal["map", "images"] = "map"  # keep weighs the map of SSIM (printed), or both its pictures
     factor: Literal["keep", "transient"] = "keep"  # of L_GS; `transient` is M_final itself, as printed
@@ -146,8 +148,8 @@ class RefineSplatConfig:
             identity_tracks=(1, _ANY), identity_share=(0, 1), identity_similarity=(-1, 1),
             per_pixel_short=(1e-3, _ANY), lr_opacity=(0, _ANY),
             **dict.fromkeys(
-                ("mask_start", "min_mask_start", "reset_pause", "min_reset_pause", "lambda_id", "lambda_cr"),
-                (0, _ANY),
+                ("mask_start", "min_mask_start", "reset_pause", "min_reset_pause", "lambda_id", "lambda_cr",
+                 "entropy_limit"), (0, _ANY),
             ),
         )  # fmt: skip
         check_features(self.features)

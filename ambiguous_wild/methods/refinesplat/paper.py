@@ -85,6 +85,7 @@ class PaperConfig(RefineSplatConfig):
     density: EntropyDensityConfig = DENSITY
     lambda_id: float = 1.0
     lambda_cr: float = 0.2
+    entropy_limit: float = 0.1  # without, 7 dB below 3DGS (docs/fidelity.md)
     weigh_cr: bool = False
     entropy_every: int = 8  # PSNR is within 0.1 dB of the best interval's (docs/fidelity.md)
     per_pixel_short: float = 1.0
@@ -97,6 +98,7 @@ class PrintedConfig(PaperConfig):
     mask: MaskConfig = PRINTED_MASK
     features: str = field(default_factory=lambda: features("@504"))
     density: EntropyDensityConfig = PRINTED_DENSITY
+    entropy_limit: float = 0.0
     weigh_id: bool = False
     mask_every: int = 1
     entropy_every: int = 1

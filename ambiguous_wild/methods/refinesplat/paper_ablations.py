@@ -148,6 +148,7 @@ ABLATIONS = (
             Variant("spread-var", ("mask.spread=var",), "variance"),
             Variant("overlap-literal", ("density.merge.form=literal",), "a density, not a share"),
             Variant("id-everywhere", ("weigh_id=false",), "L_id asks for the distractor too"),
+            Variant("entropy-unlimited", ("entropy_limit=0",), "L_id and L_cr outweigh the photo"),
             Variant("nothing-limited", ("mask.most=1",), "a photo may be masked whole"),
             Variant("all", method="refinesplat-printed", text="to the letter"),
         ),

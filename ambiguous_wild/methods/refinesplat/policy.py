@@ -24,6 +24,7 @@ from ambiguous_wild.methods.refinesplat.on_host import HostMasks
 from ambiguous_wild.methods.refinesplat.pixels import PixelEvidence
 from ambiguous_wild.splat import device as devices
 from ambiguous_wild.splat.data import shrink_keep
+from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.parts import State
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.backends import make_features, make_instances
@@ -109,7 +110,19 @@ class RefineSplatMask(PausingMask):
         with torch.enable_grad():
             loss = self._entropy_terms(image, step, keep)
             (gradient,) = torch.autograd.grad(loss, image)
-        return gradient * config.entropy_every
+        return self._limited(gradient, step, keep) * config.entropy_every
+
+    def _limited(self, gradient: Tensor, step: Step, keep: Tensor | None) -> Tensor:
+        """The entropy terms' gradient, no longer than `entropy_limit` times that of L_GS (L2, all pixels)."""
+        config = self.config
+        if config.entropy_limit <= 0:
+            return gradient
+        photo = photometric(
+            step.rendered.image, step.photo, keep, lambda_dssim=config.lambda_dssim, weighting=config.ssim
+        )
+        longest = config.entropy_limit * torch.linalg.vector_norm(photo.d_image)
+        # a product, not a test: on an accelerator the host does not wait for it
+        return gradient * (longest / torch.linalg.vector_norm(gradient).clamp(min=1e-30)).clamp(max=1.0)
 
     def regularises(self) -> bool:
         return self.config.lambda_id > 0 or self.config.lambda_cr > 0

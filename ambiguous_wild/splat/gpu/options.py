@@ -23,12 +23,13 @@ class Options:
     """How a step is computed; no value changes what it computes, up to rounding."""
 
     tiles: str = "exact"  # exact: the host waits for the number of intersections; last-visit: see tiles.py
+    harmonics: str = "gsplat"  # gsplat: its kernel, of one tensor of coefficients; split: split_harmonics.py
 
     def __str__(self) -> str:
         return ",".join(f"{f.name}={getattr(self, f.name)}" for f in fields(self))
 
 
-CHOICES = {"tiles": ("exact", "last-visit")}
+CHOICES = {"tiles": ("exact", "last-visit"), "harmonics": ("gsplat", "split")}
 
 
 def parse(text: str) -> Options:

@@ -22,6 +22,7 @@ from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
 from ambiguous_wild.splat.gpu import gsplat_seam as seam
 from ambiguous_wild.splat.gpu import options
 from ambiguous_wild.splat.gpu.footprint import visible
+from ambiguous_wild.splat.gpu.split_harmonics import shade_split
 from ambiguous_wild.splat.gpu.tiles import Visits, list_within
 from ambiguous_wild.splat.rendered import (
     NOTHING,
@@ -272,6 +273,8 @@ def base_colours(leaves: dict[str, Tensor], splats: seam.Splats, cam: OnDevice, 
     """[N, 3], SH + 0.5, not clamped; rows that are not visible may hold anything."""
     if degree == 0:
         return leaves["sh0"] * SH_C0 + 0.5
+    if options.current().harmonics == "split":
+        return shade_split(degree, leaves["means"], leaves["sh0"], leaves["sh_rest"], cam.centre) + 0.5
     active = leaves["sh_rest"][:, : (degree + 1) ** 2 - 1]
     coefficients = torch.cat([leaves["sh0"][:, None], active], dim=1)
     drawn = (splats.radii > 0).all(dim=1)

@@ -1,0 +1,106 @@
+"""Time and result of structure from motion: `aw build-scene --sfm auto` against `--sfm thorough`.
+
+    python benchmarks/build_scene.py photos/ more-photos/ -o /tmp/builds [--iterations 700]
+
+Builds each capture both ways, the other way first for every second one; finished builds are kept. With
+--iterations plain 3DGS is trained on both, on the same test photos. Run it alone on the machine. Writes
+benchmarks/results/build-scene.json and .md; captures are named after their folders.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from ambiguous_wild.harness.running.result_file import RESULT, read_result
+from ambiguous_wild.harness.running.store import run_folders
+from ambiguous_wild.io.atomic import write_json, write_text
+
+RESULTS = Path(__file__).parent / "results" / "build-scene"
+WAYS = ("thorough", "auto")
+STAGES = ("features", "matches", "mapping")
+
+
+def aw(*words: object) -> None:
+    """One command of this package."""
+    subprocess.run([sys.executable, "-m", "ambiguous_wild.cli.main", *map(str, words)], check=True)
+
+
+def psnr_of(scene: Path, runs: Path, iterations: int) -> float:
+    """Test PSNR in dB of 3DGS."""
+    length = ("--iterations", iterations, "--effects", "none", "--device", "cpu", "--no-pictures")
+    aw("bench", "--method", "3dgs", "--scene", scene, *length, "-o", runs)
+    return float(read_result(run_folders(runs)[0] / RESULT)["metrics"]["psnr"])
+
+
+def measure(raw: Path, out: Path, iterations: int, turn: int) -> dict[str, Any]:
+    """Both builds of one capture."""
+    found: dict[str, Any] = {"capture": raw.name}
+    for way in WAYS if turn % 2 == 0 else WAYS[::-1]:
+        scene = out / raw.name / way
+        aw("build-scene", raw, "-o", scene, "--sfm", way, "--name", raw.name)
+        facts = json.loads((scene / "scene.json").read_text(encoding="utf-8"))
+        seconds = facts["seconds"]
+        found[way] = {
+            "chosen": facts["chosen"]["sfm"],
+            "seconds": {stage: seconds[stage] for stage in STAGES},
+            "total_s": sum(seconds.values()),
+            "photos": facts["counts"]["photos"],
+            "registered": facts["counts"]["registered"],
+            "pairs": facts["counts"]["pairs"],
+            "points": facts["counts"]["points"],
+            "error_px": facts["reprojection_error_px"],
+        }
+        if iterations:
+            found[way]["psnr"] = psnr_of(scene, out / raw.name / f"runs-{way}", iterations)
+    return found
+
+
+def markdown(rows: list[dict[str, Any]]) -> str:
+    """A row a capture; times of the whole build."""
+    lines = [
+        "| capture | photos | placed | error px | features s | matches s | mapping s | all s | faster | dB |",
+        "|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
+    ]
+    for row in rows:
+        both = [row[way] for way in WAYS]
+
+        def pair(text: str, values: list[float]) -> str:
+            return " → ".join(format(v, text) for v in values)
+
+        stages = [pair(".1f", [b["seconds"][s] for b in both]) for s in STAGES]
+        lines.append(
+            f"| {row['capture']} | {both[0]['photos']} | {pair('d', [b['registered'] for b in both])} | "
+            f"{pair('.3f', [b['error_px'] for b in both])} | {' | '.join(stages)} | "
+            f"{pair('.1f', [b['total_s'] for b in both])} | {both[0]['total_s'] / both[1]['total_s']:.2f} | "
+            f"{pair('.2f', [b['psnr'] for b in both]) if 'psnr' in both[0] else ''} |"
+        )
+    ratios = [row["thorough"]["total_s"] / row["auto"]["total_s"] for row in rows]
+    mean = math.exp(sum(map(math.log, ratios)) / len(ratios))
+    lines += ["", f"`thorough → auto`; geometric mean of how much faster: {mean:.2f}."]
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Build what is missing; write both files."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("captures", type=Path, nargs="+")
+    parser.add_argument("-o", "--output", type=Path, required=True)
+    parser.add_argument("--iterations", type=int, default=0)
+    wanted = parser.parse_args()
+    rows = [
+        measure(raw.resolve(), wanted.output, wanted.iterations, turn)
+        for turn, raw in enumerate(wanted.captures)
+    ]
+    write_json(RESULTS.with_suffix(".json"), rows)
+    write_text(RESULTS.with_suffix(".md"), markdown(rows))
+    print(markdown(rows))
+
+
+if __name__ == "__main__":
+    main()

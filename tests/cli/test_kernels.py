@@ -1,0 +1,45 @@
+"""Kernels that are compiled while photos are placed."""
+
+from __future__ import annotations
+
+import subprocess
+from typing import ClassVar
+
+import pytest
+
+from ambiguous_wild.cli import kernels
+
+
+class Process:
+    """Counts what is done to it."""
+
+    started: ClassVar[list[Process]] = []
+
+    def __init__(self, words: list[str], **how: object) -> None:
+        self.words, self.ended = words, False
+        self.started.append(self)
+
+    def kill(self) -> None:
+        self.ended = True
+
+    def wait(self) -> None:
+        assert self.ended
+
+
+def test_nothing_is_left_behind_even_after_an_error(monkeypatch, tmp_path):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(Process, "started", [])
+    monkeypatch.setattr(subprocess, "Popen", Process)
+    with pytest.raises(KeyError), kernels.kernels_meanwhile():
+        raise KeyError
+    assert [p.ended for p in Process.started] == [True]
+
+
+def test_what_is_compiled_already_is_left_alone(monkeypatch, tmp_path):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(Process, "started", [])
+    monkeypatch.setattr(subprocess, "Popen", Process)
+    (tmp_path / "adam_1").mkdir()
+    (tmp_path / "adam_1" / "adam.catch_up_all-128.py311.nbi").touch()
+    with kernels.kernels_meanwhile():
+        assert Process.started == []

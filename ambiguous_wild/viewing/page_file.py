@@ -26,6 +26,7 @@ PAGE = "index.html"
 GENERATOR = '<meta name="generator" content="aw view">'
 MOST_GAUSSIANS = 150_000  # a model in the page, by default: about 6 MB, and what a phone still turns smoothly
 MOST_PHOTO_BYTES = 1_000_000  # of text for all photos
+MOST_MASK_BYTES = 300_000  # of text for the masks of all models
 SCRIPTS = ("page_data.js", "page_camera.js", "page_panes.js", "page_main.js")
 _HERE = Path(__file__).resolve().parent / "page"
 
@@ -121,7 +122,7 @@ def page_text(
         elements.append(
             f'<script id="{element}" type="text/plain">{base64.b64encode(packed).decode("ascii")}</script>'
         )
-        facts.append(_model_facts(model, element, views, scene.train))
+        facts.append(_model_facts(model, element, views, scene.train, MOST_MASK_BYTES // len(models)))
     for line in told:
         say(line)
     space = space_of(scene)
@@ -137,7 +138,9 @@ def page_text(
     return _fill(title, data, "\n".join(elements)), sum(map(len, elements)), tuple(told)
 
 
-def _model_facts(model: Model, element: str, views: Sequence[View], train: Sequence[View]) -> dict[str, Any]:
+def _model_facts(
+    model: Model, element: str, views: Sequence[View], train: Sequence[View], most_mask_bytes: int
+) -> dict[str, Any]:
     psnr = {v.name: model.psnr[v.name] for v in views if np.isfinite(model.psnr.get(v.name, np.nan))}
     return {
         "label": model.label,
@@ -147,7 +150,7 @@ def _model_facts(model: Model, element: str, views: Sequence[View], train: Seque
         "background": list(model.look.background),
         "psnr": psnr,
         "mean": sum(psnr.values()) / len(psnr) if psnr else None,
-        "masks": {} if model.masks is None else mask_uris(model.masks, train),
+        "masks": {} if model.masks is None else mask_uris(model.masks, train, most_mask_bytes),
     }
 
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +15,6 @@ from ambiguous_wild.viewing.model import Model, Renderer
 
 _GAP = 4  # px between pictures
 _MOST_SIDE = 8192  # px of a frame
-_OPTIONS = "OPENCV_FFMPEG_WRITER_OPTIONS"  # how OpenCV is told the encoder's options
-_QUALITY = "crf;24|b;0|deadline;realtime|cpu-used;5|row-mt;1"  # constant quality
 _GIF_COLOURS = 128
 
 Frame = np.ndarray  # [H, W, 3] uint8
@@ -111,14 +107,14 @@ def write_mp4(path: Path, frames: Iterator[Frame], fps: float) -> int:
 def _open(temporary: Path, path: Path, frame: Frame, fps: float) -> Any:
     import cv2
 
-    with _environment(_OPTIONS, _QUALITY):
-        writer = cv2.VideoWriter(
-            str(temporary),
-            cv2.CAP_FFMPEG,
-            cv2.VideoWriter.fourcc(*"vp09"),
-            fps,
-            (frame.shape[1], frame.shape[0]),
-        )
+    # OpenCV chooses bit rate and speed of the encoder, and reads no options for them.
+    writer = cv2.VideoWriter(
+        str(temporary),
+        cv2.CAP_FFMPEG,
+        cv2.VideoWriter.fourcc(*"vp09"),
+        fps,
+        (frame.shape[1], frame.shape[0]),
+    )
     if not writer.isOpened():
         raise AwError(
             f"cannot write {path}: this OpenCV has no VP9 encoder: "
@@ -161,15 +157,3 @@ def narrowed(frame: Frame, width: int) -> Frame:
         return frame
     height = max(2, round(frame.shape[0] * width / frame.shape[1]))
     return cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA)
-
-
-@contextmanager
-def _environment(name: str, value: str) -> Iterator[None]:
-    before = os.environ.get(name)
-    if before is None:
-        os.environ[name] = value  # a user's own options stay
-    try:
-        yield
-    finally:
-        if before is None:
-            os.environ.pop(name, None)

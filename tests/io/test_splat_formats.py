@@ -46,6 +46,7 @@ LOOSE = {
     "sog": (0.002, 1e-3, 0.06, 0.005, 0.06, 0.45),
     "glb": (0.0, 1e-6, 1e-6, 1e-6, 0.0, 0.0),
 }
+OURS = {**LOOSE, "spz": (*LOOSE["spz"][:-1], 0.008)}  # we write SPZ's harmonics with 7 bits, others with 4
 TOOL = shutil.which("splat-transform")
 
 
@@ -98,7 +99,7 @@ def test_what_another_program_wrote_is_read(ending: str) -> None:
 def test_there_and_back(tmp_path: Path, ending: str, rest: int) -> None:
     given, path = model(rest=rest), tmp_path / f"model.{ending}"
     assert WRITE[ending](path, given) == 700
-    check_near(READ[ending](path), given, LOOSE[ending])
+    check_near(READ[ending](path), given, OURS[ending])
     first = path.read_bytes()
     WRITE[ending](path, given)
     assert path.read_bytes() == first  # the same model, the same bytes
@@ -222,7 +223,7 @@ def test_another_program_reads_what_we_wrote(tmp_path: Path, ending: str) -> Non
     back = read_splat_ply(tmp_path / "back.ply")
     assert len(back["means"]) == 500
     back["opacity_logits"] = np.clip(back["opacity_logits"], -15, 15)
-    check_near(finite(back), given, LOOSE[ending])
+    check_near(finite(back), given, OURS[ending])
     ours = READ[ending](tmp_path / f"m.{ending}")
     assert np.abs(finite(back)["means"] - ours["means"]).max() < 1e-5
     assert np.abs(back["sh_rest"] - ours["sh_rest"]).max() < 1e-5

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import gzip
 import json
 import re
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.showing.page import Viewer, view_runs
 from ambiguous_wild.harness.showing.read import read_look
+from ambiguous_wild.io.images import write_png
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.io.splat_formats.spz import read_spz
-from ambiguous_wild.viewing import page_file
+from ambiguous_wild.viewing import page_file, photos
 from ambiguous_wild.viewing.model import Look
 from ambiguous_wild.viewing.reduce import importance, reduced
 from tests.command_line import aw
@@ -192,7 +195,25 @@ def test_a_stranger_s_method_name_imports_no_file(runs: Path, tmp_path: Path) ->
     assert read_look({"method": "3dgs", "options": {"gone": 1}})[1] != ""
 
 
-def test_photos_stay_below_their_share_of_the_page(runs: Path) -> None:
-    views = load_scene(runs.parent / "porch").views
-    uris = page_file.photo_uris(views, 1)
-    assert len(uris) == len(views) and all(uri.startswith("data:image/jpeg;base64,") for uri in uris)
+def test_photos_and_masks_stay_below_their_share_of_the_page(runs: Path, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    views = []
+    for number, view in enumerate(load_scene(runs.parent / "porch").views):
+        photo, mask = tmp_path / f"{number}.png", tmp_path / "masks" / Path(view.name).with_suffix(".png")
+        write_png(photo, rng.integers(0, 256, (270, 480, 3), np.uint8))
+        mask.parent.mkdir(exist_ok=True)
+        write_png(mask, rng.integers(0, 2, (270, 480), np.uint8) * 255)
+        views.append(dataclasses.replace(view, image_path=photo))
+    pictures = photos.photo_uris(views, 200_000)
+    masks = photos.mask_uris(tmp_path / "masks", views, 60_000)
+    for uris, most in ((pictures, 200_000), (list(masks.values()), 60_000)):
+        assert len(uris) == len(views) and most / 4 < sum(map(len, uris)) <= most
+        assert len({image_of(uri).shape for uri in uris}) == 1  # all of one width
+    wide = photos.photo_uris(views, 10**9)
+    assert {image_of(uri).shape[:2] for uri in wide} == {(270, 480)}  # never enlarged
+    least = photos.photo_uris(views, 1)  # too little for any: the smallest
+    assert {image_of(uri).shape[1] for uri in least} == {photos.WIDTHS[-1]}
+
+
+def image_of(uri: str) -> np.ndarray:
+    return cv2.imdecode(np.frombuffer(base64.b64decode(uri.split(",", 1)[1]), np.uint8), cv2.IMREAD_UNCHANGED)

@@ -27,6 +27,7 @@ from ambiguous_wild.simulate.presets import preset
 
 SAMPLES = 2  # rays a pixel; it is the time of training that is measured
 EVERY_PX_SMALL = 48  # of a scene to be carried
+MOST_VIEWS = 12  # of a point in such a scene
 EVERY_PX = 24  # a point for so many px along rows and columns of every train photo
 SAME_DEPTH = 0.02  # relative: another photo shows a point whose depth there is its own
 
@@ -83,12 +84,17 @@ def make_scene(
             write_text(folder / f"{split}_list.txt", "\n".join(found) + "\n")
         if every is None:
             every = EVERY_PX_SMALL if to_train_on else EVERY_PX
-        _write_model(folder, raw, cameras, lists, every)
+        _write_model(folder, raw, cameras, lists, every, MOST_VIEWS if to_train_on else None)
     return out
 
 
 def _write_model(
-    folder: Path, raw: Path, cameras: dict[str, Any], lists: dict[str, list[str]], every: int
+    folder: Path,
+    raw: Path,
+    cameras: dict[str, Any],
+    lists: dict[str, list[str]],
+    every: int,
+    most: int | None,
 ) -> None:
     """Every photo's pose; points on a grid of every train photo, with the train photos that show them."""
     order = sorted(cameras)
@@ -111,6 +117,8 @@ def _write_model(
         same = np.abs(depths[k][at[:, 1], at[:, 0]] - local[:, 2]) < SAME_DEPTH * local[:, 2]
         rows = np.flatnonzero(inside & same)
         observed[k] = rows, uv[rows]
+    if most is not None:
+        observed = thinned(observed, most)
     images = []
     for k, name in enumerate(order):
         rows, uv = observed.get(k, (np.zeros(0, np.int64), np.zeros((0, 2))))
@@ -148,6 +156,27 @@ def _points(
         clean = read_png_rgb(raw / "truth" / "clean" / f"{Path(order[k]).stem}.png")
         rgb.append(clean[rows, columns])
     return np.concatenate(xyz), np.concatenate(rgb)
+
+
+def thinned(
+    observed: dict[int, tuple[np.ndarray, np.ndarray]], most: int
+) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+    """At most so many views of each point, evenly among those that show it."""
+    point = np.concatenate([rows for rows, _ in observed.values()])
+    view = np.repeat(list(observed), [len(rows) for rows, _ in observed.values()])
+    order = np.lexsort((view, point))
+    counts = np.bincount(point)
+    first = np.r_[0, np.cumsum(counts)[:-1]]
+    rank = np.arange(len(point)) - first[point[order]]
+    count = counts[point[order]]
+    kept = np.zeros(len(point), bool)
+    kept[order] = (count <= most) | (rank * most // count != (rank - 1) * most // count)
+    found, at = {}, 0
+    for k, (rows, uv) in observed.items():
+        here = kept[at : at + len(rows)]
+        found[k] = rows[here], uv[here]
+        at += len(rows)
+    return found
 
 
 def _tracked(

@@ -4,6 +4,7 @@ import json
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -295,3 +296,17 @@ def test_it_runs_where_little_is_installed(tmp_path):
     assert done.returncode == 0, done.stderr
     assert "code 0 []" in done.stdout and done.stdout.rstrip().endswith("refused 2")
     assert "refinesplat needs scipy, cv2, which this machine lacks" in done.stderr
+
+
+def test_a_carried_scene_keeps_a_dozen_views_of_a_point(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    from gpu_scene import thinned
+
+    seen = {k: (np.arange(0, 10 + k), np.full((10 + k, 2), float(k))) for k in range(30)}
+    found = thinned(seen, 12)
+    counts = np.bincount(np.concatenate([rows for rows, _ in found.values()]))
+    before = np.bincount(np.concatenate([rows for rows, _ in seen.values()]))
+    assert (counts == np.minimum(before, 12)).all()
+    assert all((uv == k).all() and len(uv) == len(rows) for k, (rows, uv) in found.items())
+    first = [k for k, (rows, _) in found.items() if 0 in rows]
+    assert first[0] == 0 and max(np.diff(first)) <= 3  # spread over all views

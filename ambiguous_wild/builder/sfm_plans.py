@@ -11,9 +11,8 @@ from ambiguous_wild.builder.records import PhotoRecord
 from ambiguous_wild.builder.settings import BuildSettings
 
 FAST_SIDE = 800  # px; below it SIFT needs the doubled photo to find enough
-FEW_FEATURES = (
-    1200  # a photo, in the middle; 560 place 16 of 66 photos of a smooth skull, 2100 a facade's 11 of 11
-)
+# Median over photos. 560 place 16 of the 66 photos of a smooth skull; 2100 all 11 of a facade.
+FEW_FEATURES = 1200
 
 
 @dataclass(frozen=True)

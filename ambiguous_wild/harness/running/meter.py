@@ -135,8 +135,9 @@ class Meter:
             "samples": self.kernel_samples(),
             "runs": self.runs,
         }
-        if not math.isnan(self.parallel_share()):
-            record["parallel_share"] = self.parallel_share()
+        share = self.parallel_share()
+        if not math.isnan(share):
+            record["parallel_share"] = share
         if self.wall_s > 0.0 and not self.blind:
             record["others"] = self.others_s / self.wall_s
         if self.loads:

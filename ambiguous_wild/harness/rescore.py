@@ -76,7 +76,10 @@ def rescore(
 def could_be_measured(results: Iterable[RunResult]) -> list[str]:
     """Metrics that these results lack and that can be measured now: weights that have come since."""
     now = {name for name, reason in lpips.available().items() if reason is None}
-    return sorted({name for result in results for name in result["missing"]} & now)
+    lacking = {
+        name for result in results for name, why in result["missing"].items() if lpips.TOO_SMALL not in why
+    }
+    return sorted(lacking & now)
 
 
 class _Scenes:
@@ -84,9 +87,11 @@ class _Scenes:
 
     def __init__(self, given: Path | None) -> None:
         self.given = given
-        self._open: dict[tuple[str, int | None], tuple[Scene, str, Measures]] = {}
+        self._open: dict[tuple[str, int | None, bool], tuple[Scene, str, Measures]] = {}
 
-    def find(self, run: Path, result: RunResult, settings: object) -> tuple[Scene, Measures]:
+    def find(
+        self, run: Path, result: RunResult, settings: object, *, half: bool
+    ) -> tuple[Scene, Measures]:
         """The run's scene, as it was when it was measured."""
         known = settings if isinstance(settings, dict) else {}
         path, factor = str(self.given or known.get("path") or ""), known.get("factor")
@@ -94,10 +99,11 @@ class _Scenes:
             raise AwError(
                 f"{run}: its scene {path or 'is not named in config.yaml'} is not there: name it with --scene"
             )
-        key = path, factor if isinstance(factor, int) else None
+        key = path, factor if isinstance(factor, int) else None, half
         if key not in self._open:
             scene = load_scene(path, factor=key[1])
-            self._open[key] = scene, scene_identity(scene), measures_of(scene)
+            sizes = [(view.camera.height, view.camera.width) for view in scene.test]
+            self._open[key] = scene, scene_identity(scene), measures_of(scene, sizes, half=half)
         scene, identity, measures = self._open[key]
         if identity != result["scene_hash"]:
             raise AwError(
@@ -120,9 +126,9 @@ def _rescore(run: Path, scenes: _Scenes) -> Rescored:
             raise AwError(f"{run}: config.yaml is absent, or not that of {RESULT}; restore both files")
         if not result["per_image"]:
             return Rescored(run, "complete", missing=tuple(sorted(result["missing"])))
-        scene, measures = scenes.find(run, result, config.get("scene"))
-        renders = _renders(run, result)
         half = config.get("protocol", "full") == "half"
+        scene, measures = scenes.find(run, result, config.get("scene"), half=half)
+        renders = _renders(run, result)
         check_photos(run, scene, result["per_image"], renders, half=half)
         added = _add(result, scene, measures, renders, half=half)
         missing = tuple(sorted(result["missing"]))

@@ -1,5 +1,6 @@
 """AsymGS in its EMA-GS form: the model agrees with a slow average of itself, under two masks in turn.
 
+Its form with two models is `asymgs_twin.py`.
 Source: arXiv 2506.03538 and its released code. Ours: features (Lab and HOG for DINOv2's patch embedding)
 and instances (graph segments for Semantic-SAM's) without weights, both options; masks weigh SSIM's map,
 not its gradient; the base is 3DGS without Mip-Splatting's filters and growth.
@@ -7,6 +8,7 @@ not its gradient; the base is 3DGS without Mip-Splatting's filters and growth.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -65,16 +67,29 @@ class AsymMask(MaskPolicy):
     def keep(self, step: Step) -> Tensor:
         keep = self.predict(step)
         if step.iteration % 2 and step.nominal > self.config.warm_up:
-            soft = self.soft[step.view]
-            share, wanted = torch.sigmoid(8 * soft.values[0]), 1.0 - unit_range(self._distance(step))
-            soft.step(0, (share - wanted).sign() * 8 * share * (1 - share) / share.numel(), 0.1)
+            self.learn_soft(step.view, step.rendered.image)
         return keep
 
     def predict(self, step: Step) -> Tensor:
-        size, soft = step.photo.shape[:2], self.soft[step.view].values[0]
         if step.iteration % 2:
-            return resized(torch.sigmoid(8 * soft), *size)
-        distance, error = resized(self._distance(step), *size), residual(step.photo, step.rendered.image)
+            return self.soft_keep(step.view, step.photo.shape[:2])
+        return self.hard_keep(step)
+
+    def learn_soft(self, view: int, image: Tensor) -> None:
+        """One step of Adam on |M - (1 - distance)| of a photo's learnt map."""
+        soft = self.soft[view]
+        share, wanted = torch.sigmoid(8 * soft.values[0]), 1.0 - unit_range(self._distance(view, image))
+        soft.step(0, (share - wanted).sign() * 8 * share * (1 - share) / share.numel(), 0.1)
+
+    def soft_keep(self, view: int, size: Sequence[int]) -> Tensor:
+        """The learnt map, [H, W]."""
+        return resized(torch.sigmoid(8 * self.soft[view].values[0]), *size)
+
+    def hard_keep(self, step: Step) -> Tensor:
+        """Without the instances that residual and features suspect, [H, W]."""
+        size = step.photo.shape[:2]
+        distance = resized(self._distance(step.view, step.rendered.image), *size)
+        error = residual(step.photo, step.rendered.image)
         suspect = error > torch.quantile(error, self.config.colour)
         suspect &= distance > torch.quantile(distance, self.config.feature)
         return standing(nearest(self.labels[step.view], *size), suspect)
@@ -86,11 +101,11 @@ class AsymMask(MaskPolicy):
         return Cotangents(image=apart.sign() * (self.config.consistency / apart.numel()))
 
     @torch.no_grad()
-    def _distance(self, step: Step) -> Tensor:
+    def _distance(self, view: int, image: Tensor) -> Tensor:
         """1 - cosine of the features of render and photo, [H, W] of the photo."""
-        size, chw = self.labels[step.view].shape, step.rendered.image.permute(2, 0, 1)
+        size, chw = self.labels[view].shape, image.permute(2, 0, 1)
         seen = self.features(F.interpolate(chw[None], size=size, mode="bilinear")[0].permute(1, 2, 0))
-        return resized(1.0 - F.cosine_similarity(self.phi[step.view], seen, dim=2), *size)
+        return resized(1.0 - F.cosine_similarity(self.phi[view], seen, dim=2), *size)
 
     def state_dict(self) -> State:
         return {str(view): soft.state_dict() for view, soft in enumerate(self.soft)}

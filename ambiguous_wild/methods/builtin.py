@@ -105,6 +105,13 @@ BUILTIN = (
         paper="AsymGS, NeurIPS 2025 (arXiv 2506.03538), its EMA-GS form",
     ),
     MethodEntry(
+        name="asymgs-twin",
+        summary="two models under different masks are to agree; one of them is the result",
+        recipe="ambiguous_wild.methods.asymgs_twin:build",
+        config="ambiguous_wild.methods.asymgs_twin:TwinConfig",
+        paper="AsymGS, NeurIPS 2025 (arXiv 2506.03538), its GS-GS form",
+    ),
+    MethodEntry(
         name="spotlesssplats",
         summary="a small net on frozen features, held between two bounds of the residual, finds outliers",
         recipe="ambiguous_wild.methods.spotlesssplats.recipe:build",

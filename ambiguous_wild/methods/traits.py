@@ -83,6 +83,10 @@ BUILTIN_TRAITS = {
         "instances and a learnt map in turn", "", "every 1000", "slow average of the model", source="code",
         published="DINOv2 patch embedding, Semantic-SAM",
     ),
+    "asymgs-twin": Traits(
+        "instances; a learnt map for the twin", "", "every 1000", "a second model", source="code",
+        published="DINOv2 patch embedding, Semantic-SAM",
+    ),
     "mip-splatting": Traits(density="resets the filtered opacity", state="filter size", source="code"),
     "absgs": Traits(density="absolute gradient splits", source="code"),
     "mcmc": Traits(density="fixed number, relocation, noise", source="code"),

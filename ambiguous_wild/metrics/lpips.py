@@ -31,6 +31,7 @@ Metric = Callable[[np.ndarray, np.ndarray], float]
 
 SHIFT = (-0.030, -0.088, -0.188)  # z = (x - SHIFT) / SCALE for x in [-1, 1]
 SCALE = (0.458, 0.448, 0.450)
+TOO_SMALL = "too small for LPIPS"
 EPS = 1e-10  # added to the norm over channels, as in the lpips package
 
 
@@ -87,6 +88,17 @@ def available() -> dict[str, str | None]:
     return {name: _reason(backbone) for name, (backbone, _) in VARIANTS.items()}
 
 
+def too_small(name: str, height: int, width: int) -> str | None:
+    """Why an image of this size in px has no value of a variant of `VARIANTS`; None if it has one."""
+    backbone = VARIANTS[name][0]
+    if min(height, width) >= backbone.smallest:
+        return None
+    return (
+        f"image of {width}x{height} px is {TOO_SMALL} with {backbone.name}: "
+        f"the shorter side must be at least {backbone.smallest} px"
+    )
+
+
 def missing_weights(name: str) -> list[str]:
     """Names of the weights (see `vision.weights`) that a variant of `VARIANTS` lacks."""
     return [weight for weight, files in _files(VARIANTS[name][0]) if find_file(weight, files) is None]
@@ -113,7 +125,15 @@ def load(name: str) -> Metric:
     paths = [find_file(*pair) for pair in _files(backbone)]
     stamps = tuple((str(p), p.stat().st_mtime_ns) for p in paths if p is not None)
     stack, heads = _network(backbone, stamps)
-    return lambda a, b: _distance(backbone, stack, heads, a, b, centred)
+
+    def measure(a: np.ndarray, b: np.ndarray) -> float:
+        left, right = checked_pair(a, b)
+        small = too_small(name, *left.shape[:2])
+        if small is not None:
+            raise AwError(small)
+        return _distance(backbone, stack, heads, left, right, centred)
+
+    return measure
 
 
 def lpips_alex(a: np.ndarray, b: np.ndarray) -> float:
@@ -146,18 +166,12 @@ def _distance(
     backbone: _Backbone,
     stack: nn.Sequential,
     heads: list[Tensor],
-    a: np.ndarray,
-    b: np.ndarray,
+    left: np.ndarray,
+    right: np.ndarray,
     centred: bool,
 ) -> float:
     import torch
 
-    left, right = checked_pair(a, b)
-    if min(left.shape[:2]) < backbone.smallest:
-        raise AwError(
-            f"image of {left.shape[1]}x{left.shape[0]} px is too small for LPIPS with {backbone.name}: "
-            f"the shorter side must be at least {backbone.smallest} px"
-        )
     with torch.inference_mode():
         total = 0.0
         # One image at a time: half the memory of a batch of two, same result.

@@ -12,7 +12,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.splat import device
 from ambiguous_wild.splat.effects.chain import Chain
 from ambiguous_wild.splat.field import Field
-from ambiguous_wild.splat.fields import STATIC, Composite, FieldStart
+from ambiguous_wild.splat.fields import STATIC, Composite, FieldStart, renders_of
 from ambiguous_wild.splat.gaussians import PARAMETERS, Gaussians
 from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.render import render
@@ -36,7 +36,7 @@ class Drawing:
         """
         self.parts, self.effects, self.static = parts, effects, static
         self.others: dict[str, Field] = {}
-        self._most: dict[str, int] = {}
+        self._most: dict[str, int | None] = {}
         if parts.fields is not None:
             for name, start in parts.fields.setup(data, static.gaussians, self._static_rates).items():
                 self._add(name, start, data)
@@ -127,9 +127,19 @@ class Drawing:
         """A step of every other field that has gradients, and its density control."""
         for name, own in gradients.items():
             field = self.others[name]
-            seen = replace(step, gaussians=field.gaussians, ceiling=self._most[name])
+            most = self._most[name]
             if called_off is not None and own.visible is not None:
                 own.visible = own.visible & (called_off == 0)
+            # density control reads who was seen of the field's own render
+            rendered = renders_of(step.rendered).get(name, step.rendered)
+            if own.visible is not None and rendered is not step.rendered:
+                rendered.visible = own.visible
+            seen = replace(
+                step,
+                gaussians=field.gaussians,
+                ceiling=step.ceiling if most is None else most,
+                rendered=rendered,
+            )
             field.learn(own, progress, called_off)
             field.refine(seen, own, None)
 

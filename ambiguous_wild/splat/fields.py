@@ -42,7 +42,7 @@ class FieldStart:
     gaussians: Gaussians
     rates: Rates
     density: DensityControl | None = None
-    most: int = 1_000_000  # its growth stops there
+    most: int | None = 1_000_000  # its growth stops there; None = where the static field's does
 
 
 class Fields(ABC):
@@ -106,7 +106,7 @@ class Composite:
         frames = {name: frame_of(rendered) for name, rendered in drawn.items()}
         frame, self._pull = fields.compose(frames, shot)
         self._own = fields.regularise(frames, shot)
-        self._drawn, self._needs, self._frame, self.frames = drawn, needs, frame, frames
+        self.renders, self._needs, self._frame, self.frames = drawn, needs, frame, frames
         self.image, self.alpha = frame.image, frame.alpha
         self.visible = drawn[STATIC].visible
 
@@ -116,7 +116,7 @@ class Composite:
 
     @property
     def radii(self) -> Tensor:
-        return self._drawn[STATIC].radii
+        return self.renders[STATIC].radii
 
     @torch.no_grad()
     def backward(self, cotangents: Cotangents | Tensor, needs: frozenset[str] = NOTHING) -> Gradients:
@@ -126,7 +126,7 @@ class Composite:
             given[name] = given[name] + more if name in given else more
         found = {
             name: rendered.backward(given[name], needs if name == STATIC else self._needs.get(name, NOTHING))
-            for name, rendered in self._drawn.items()
+            for name, rendered in self.renders.items()
             if name in given or name == STATIC
         }
         static = found.pop(STATIC)
@@ -141,6 +141,12 @@ class Composite:
 def frames_of(rendered: Rendered) -> Mapping[str, Frame]:
     """The fields' own pictures that a picture is made of, by field; empty where there is one field."""
     found: Mapping[str, Frame] = getattr(rendered, "frames", {})
+    return found
+
+
+def renders_of(rendered: Rendered) -> Mapping[str, Rendered]:
+    """The fields' own renders that a picture is made of, by field; empty where there is one field."""
+    found: Mapping[str, Rendered] = getattr(rendered, "renders", {})
     return found
 
 

@@ -15,6 +15,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.harness import bench as bench_module
 from ambiguous_wild.harness.bench import Callbacks, bench
 from ambiguous_wild.harness.rescore import could_be_measured, rescore
+from ambiguous_wild.harness.running.evaluate import measures_of
 from ambiguous_wild.harness.running.result_file import read_result
 from ambiguous_wild.io.images import read_png_rgb, write_png
 from ambiguous_wild.metrics import lpips
@@ -170,3 +171,21 @@ def test_bench_says_that_kept_runs_could_be_rescored(
     assert f"lack lpips_alex, which can be measured now: aw rescore {tmp_path / 'runs'}" in again.lines[-1]
     assert could_be_measured([report.runs[0].result]) == ["lpips_alex"]
     assert bench_module._rescorable(report)
+
+
+def test_photos_too_small_for_a_network_leave_it_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lpips, "available", lambda: dict.fromkeys(lpips.VARIANTS))
+    monkeypatch.setattr(lpips, "load", lambda name: lambda a, b: 0.5)
+    small = measures_of(None, [(40, 40), (12, 20)])
+    assert not small.networks and set(small.missing) == set(lpips.VARIANTS)
+    assert all(lpips.TOO_SMALL in why and "20x12 px" in why for why in small.missing.values())
+    whole, half = measures_of(None, [(40, 41)]), measures_of(None, [(40, 41)], half=True)
+    assert set(whole.networks) == set(lpips.VARIANTS)
+    assert set(half.networks) == {"lpips_vgg", "lpips_vgg_01"} and "21x40 px" in half.missing["lpips_alex"]
+
+
+def test_what_is_too_small_is_no_case_for_rescore(tmp_path: Path, scene: Path, weights: None) -> None:
+    result = read_result(write_run(tmp_path / "runs", scene) / "metrics.json")
+    assert "lpips_alex" in could_be_measured([result])
+    result["missing"]["lpips_alex"] = f"image of 20x12 px is {lpips.TOO_SMALL} with alexnet: ..."
+    assert "lpips_alex" not in could_be_measured([result])

@@ -25,12 +25,6 @@ SUITES = {
 }
 
 
-@pytest.fixture(autouse=True)
-def no_weights(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Photos of 20x12 px are too small for LPIPS, which this machine may have."""
-    monkeypatch.setenv("AW_WEIGHTS", str(tmp_path / "no-weights"))
-
-
 @pytest.fixture
 def large(monkeypatch):
     for name, value in SIZE.items():

@@ -94,7 +94,7 @@ def test_the_soft_mask_starts_open_and_closes_where_features_differ(seen):
     assert before.flatten().tolist() == pytest.approx([1 / (1 + np.exp(-8))] * before.numel())
     for k in range(1, 60):
         kept = mask.keep(step_of(data, 0, image, iteration=2 * k + 1))
-    distance = mask._distance(step)
+    distance = mask._distance(0, image)
     apart = (distance - distance.min()) / (distance.max() - distance.min())
     after = mask.predict(step)
     assert float((kept - after).abs().max()) < 0.5  # the map of before the last update

@@ -78,7 +78,8 @@ def render_and_measure(
         missing = {name: reason for name, reason in lpips.available().items() if reason is not None}
         missing |= dict.fromkeys(FULL_IMAGE, "the scene has no test views")
         return [], missing
-    measures = measures_of(getattr(trainer.data, "scene", None) if scene is None else scene)
+    sizes = [t.photo.shape[:2] for t in truth]
+    measures = measures_of(getattr(trainer.data, "scene", None) if scene is None else scene, sizes, half=half)
     rows: list[ImageRow] = []
     with atomic_dir(folder) as temporary:
         for t in truth:
@@ -115,10 +116,22 @@ class Measures:
         return values | {name: network(drawn, photo) for name, network in self.networks.items()}
 
 
-def measures_of(scene: Scene | None) -> Measures:
-    """The metrics of a scene's test images; without a scene, those of whole images."""
+def measures_of(scene: Scene | None, sizes: Iterable[tuple[int, int]], *, half: bool = False) -> Measures:
+    """The metrics of a scene's test images; without a scene, those of whole images.
+
+    A network is left out for all images if one is too small for it: a mean is over every image or none.
+
+    Args:
+        scene: None = no metrics of regions.
+        sizes: (height, width) of each test image in px.
+        half: the right half of each image is measured alone.
+    """
     regions = Regions({}, {}) if scene is None else find_regions(scene)
-    reasons = lpips.available()
+    measured = {(h, w - w // 2 if half else w) for h, w in sizes}
+    reasons = {
+        name: reason or next((why for h, w in sorted(measured) if (why := lpips.too_small(name, h, w))), None)
+        for name, reason in lpips.available().items()
+    }
     missing = {name: reason for name, reason in reasons.items() if reason is not None} | regions.missing
     networks = {name: lpips.load(name) for name in reasons if name not in missing}
     return Measures(networks, regions, missing)

@@ -1,0 +1,93 @@
+"""AsymGS with two models: the terms by hand, and what a run makes of them."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from ambiguous_wild.methods.asymgs_twin import TWIN, HardMask, Twin, TwinConfig
+from ambiguous_wild.splat.fields import STATIC
+from ambiguous_wild.splat.losses import photometric
+from ambiguous_wild.splat.rendered import Frame
+from tests.methods.baselines import data_of, parts_of, resumed_equals_whole, trained
+from tests.tiny_scene import write_tiny_scene
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
+
+
+@pytest.fixture
+def twin(scene, tmp_path):
+    data = data_of(scene, tmp_path / "cache")
+    masks = HardMask(TwinConfig())
+    masks.setup(data)
+    fields = Twin(TwinConfig(), masks)
+    fields.data = data
+    return fields
+
+
+def frames(first, second):
+    alpha = torch.ones(first.shape[:2])
+    return {STATIC: Frame(first, alpha, lambda: alpha), TWIN: Frame(second, alpha, lambda: alpha)}
+
+
+def test_pictures_are_drawn_to_each_other_after_the_warm_up(twin):
+    first = torch.full_like(twin.data.photos[0], 0.5)
+    second = first.clone()
+    second[:, :32] += 0.1
+    shot = SimpleNamespace(nominal=1001.0, camera=twin.data.cameras[0], divisor=1)
+    found = twin.regularise(frames(first, second), shot)
+    each = 1.0 / first.numel()
+    assert found[STATIC].image[:, :32].unique().tolist() == pytest.approx([-each])
+    assert found[TWIN].image[:, :32].unique().tolist() == pytest.approx([each])
+    assert not found[STATIC].image[:, 32:].any() and not found[TWIN].image[:, 32:].any()
+    early = twin.regularise(frames(first, second), SimpleNamespace(**vars(shot) | {"nominal": 1000.0}))
+    assert not early[STATIC].image.any() and not early[TWIN].image.any()
+
+
+def test_the_second_model_learns_its_own_photo_under_its_own_mask(twin):
+    view, first = 2, torch.full_like(twin.data.photos[0], 0.5)
+    soft = torch.sigmoid(8 * twin.masks.soft[view].values[0]).clone()
+    camera = twin.data.cameras[view]
+    twin._second = view, camera
+    shot = SimpleNamespace(nominal=500.0, camera=camera, divisor=1)
+    found = twin.regularise(frames(first, first), shot)
+    keep = torch.nn.functional.interpolate(soft[None, None], size=first.shape[:2], mode="bilinear")[0, 0]
+    wanted = photometric(first, twin.data.photos[view], keep).d_image
+    assert torch.allclose(found[TWIN].image, wanted, atol=1e-9) and wanted.abs().sum() > 0
+    assert not found[STATIC].image.any()
+    after = torch.sigmoid(8 * twin.masks.soft[view].values[0])
+    assert not torch.equal(after, soft)  # the map was learnt, after it was used
+
+
+def test_the_learnt_masks_weigh_the_second_model_alone(twin):
+    hard = twin.masks
+    step = SimpleNamespace(
+        iteration=1, view=0, photo=twin.data.photos[0],
+        rendered=SimpleNamespace(image=torch.full_like(twin.data.photos[0], 0.5)),
+    )  # fmt: skip
+    assert torch.equal(hard.keep(step), hard.hard_keep(step)) and hard.cotangent(step, None) is None
+
+
+def make():
+    growth = {"density.every": "2000", "density.min_every": "10", "density.grow_scale": "0.001"}
+    return parts_of("asymgs-twin", **growth)
+
+
+def test_both_models_learn_and_grow_and_differ(scene, tmp_path):
+    trainer = trained(scene, tmp_path, make())
+    other = trainer.drawing.others[TWIN]
+    assert sum(r.split for r in trainer.density.log.rounds) > 0
+    assert sum(r.split for r in other.density.log.rounds) > 0
+    assert len(other.gaussians) == other.density.log.rounds[-1].count
+    camera = trainer.data.cameras[0]
+    first = trainer.drawing._draw(trainer.gaussians, trainer.shot(camera), None).image
+    second = trainer.drawing._draw(other.gaussians, trainer.shot(camera), None).image
+    assert 0.0 < float((first - second).abs().mean()) < 0.1
+    assert torch.equal(trainer.render(camera).image, first)  # the result is the first model
+
+
+def test_it_resumes_to_the_same_bits(scene, tmp_path):
+    resumed_equals_whole(scene, tmp_path, make)

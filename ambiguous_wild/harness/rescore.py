@@ -89,9 +89,7 @@ class _Scenes:
         self.given = given
         self._open: dict[tuple[str, int | None, bool], tuple[Scene, str, Measures]] = {}
 
-    def find(
-        self, run: Path, result: RunResult, settings: object, *, half: bool
-    ) -> tuple[Scene, Measures]:
+    def find(self, run: Path, result: RunResult, settings: object, *, half: bool) -> tuple[Scene, Measures]:
         """The run's scene, as it was when it was measured."""
         known = settings if isinstance(settings, dict) else {}
         path, factor = str(self.given or known.get("path") or ""), known.get("factor")

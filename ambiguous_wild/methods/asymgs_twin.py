@@ -1,4 +1,4 @@
-"""AsymGS in its GS-GS form: two models under different masks, each drawn to the other; the first is the result.
+"""AsymGS in its GS-GS form: two models under different masks are to agree; the first is the result.
 
 Source: arXiv 2506.03538 and its released code. The first model sees a photo under the hard mask, the second
 another photo under the learnt one; in both views their pictures are to agree. Ours: what `asymgs.py` says,

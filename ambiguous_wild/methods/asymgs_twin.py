@@ -9,7 +9,7 @@ Cost: four pictures with gradients a step, and two models.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -65,7 +65,7 @@ class Twin(Fields):
 
     def setup(self, data: TrainData, static: Gaussians, rates: Rates) -> Mapping[str, FieldStart]:
         self.data = data
-        start = Gaussians(**{name: tensor.clone() for name, tensor in static.items()})
+        start = replace(static, extra={}).clone()
         density = DensityControl(self.config.density, data.scene.extent, data.seed + 1)
         return {TWIN: FieldStart(start, rates, density, most=None)}
 

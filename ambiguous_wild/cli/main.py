@@ -91,8 +91,10 @@ def main() -> None:
         _fail(str(error))
     except click.ClickException as error:
         _fail(_click_message(error))
-    except (click.Abort, KeyboardInterrupt):
-        click.secho("interrupted; run the same command again to continue", fg="yellow", err=True)
+    except (click.Abort, KeyboardInterrupt) as interrupt:
+        # click puts its own exception before the one that says what was kept
+        told = str(interrupt.__cause__ or interrupt) or "interrupted; run the same command again to continue"
+        click.secho(told, fg="yellow", err=True)
         sys.exit(130)
     except BrokenPipeError:
         # The reader closed our output (`aw table | head`); this is not an error.

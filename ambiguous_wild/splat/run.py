@@ -16,6 +16,7 @@ from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.clock import Clock, clock_for
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.gpu.sentinel import Sentinel
+from ambiguous_wild.splat.interrupt import Stopped, deferred
 from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.pace import Pace, TrainConfig
 from ambiguous_wild.splat.rendered import Rendered
@@ -117,6 +118,7 @@ class Run(ABC):
 
         Raises:
             NonFinite: names view, iteration and parameters.
+            Stopped: Ctrl-C, after the iteration was ended and saved.
         """
         if self.config.on_nonfinite == "rollback" and not self.checkpoint_path.exists():
             self.save()  # something to go back to, from the first iteration on
@@ -130,6 +132,10 @@ class Run(ABC):
             self.meter.end(self.clock.now())
 
     def _train(self, tick: Callable[[Any], None] | None) -> None:
+        with deferred() as interrupted:
+            self._loop(tick, interrupted)
+
+    def _loop(self, tick: Callable[[Any], None] | None, interrupted: Callable[[], bool]) -> None:
         last_save = time.monotonic()
         while True:
             if self.done:
@@ -137,6 +143,9 @@ class Run(ABC):
                     return
                 continue  # rolled back: there is more to do
             self._advance(tick)
+            if interrupted():
+                self._save_if_sound()
+                raise Stopped
             if time.monotonic() - last_save > self.config.checkpoint_every_s and not self.done:
                 self._save_if_sound()
                 last_save = time.monotonic()

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from ambiguous_wild.core import AwError, Camera
@@ -21,13 +23,16 @@ from ambiguous_wild.harness.running.multi_gpu import multi_gpu_cost, train_multi
 from ambiguous_wild.harness.running.passes import FirstPass, first_pass, of_one_pass
 from ambiguous_wild.harness.running.records import RunResult
 from ambiguous_wild.harness.running.result import finished_result
+from ambiguous_wild.io.atomic import atomic_dir, write_json
 from ambiguous_wild.io.ply import write_splat_ply
 from ambiguous_wild.methods.fixed_masks import FixedMasks
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.effects import with_effects
+from ambiguous_wild.splat.interrupt import Stopped
 from ambiguous_wild.splat.multi_gpu import shards
 from ambiguous_wild.splat.trainer import Trainer
 
+STOPPED = "stopped"  # folder of a run that Ctrl-C stopped: the model as it was then; gone when the run ends
 Tick = Callable[[Any], None]  # gets the `Trainer` after every iteration, with its clock stopped
 
 
@@ -108,7 +113,11 @@ def _train_and_measure(
             tick(trainer)
 
     if not ranks:
-        trainer.train(tick=after_iteration)
+        try:
+            trainer.train(tick=after_iteration)
+        except Stopped:
+            raise Stopped(_keep_stopped(cell, trainer, truth)) from None
+        shutil.rmtree(folder / STOPPED, ignore_errors=True)
     cost = cost_of(cell, trainer)  # now: what follows measures, and is no training
     if first is not None:
         cost = both_passes(first.cost, cost)
@@ -134,6 +143,28 @@ def _train_and_measure(
         facts=facts | _effect_facts(cell, trainer),
         cost=cost,
     )
+
+
+def _keep_stopped(cell: Cell, trainer: Trainer, truth: list[evaluate.TestPhoto]) -> str:
+    """The model as it stood when Ctrl-C came, measured; returns what to tell. Ctrl-C again leaves it out."""
+    folder, train = trainer.folder, cell.train
+    of = f" of {train.iterations}" if train.budget_s is None else f", {train.budget_s:g} s were asked for"
+    done = f"stopped after {trainer.iteration} iterations{of}"
+    end = "the same command goes on"
+    try:
+        with atomic_dir(folder / STOPPED) as kept:
+            model = {k: v.cpu().numpy() for k, v in trainer.neutral_model().items()}
+            write_splat_ply(kept / "point_cloud.ply", model)
+            half = cell.protocol == "half"
+            rows, missing = evaluate.render_and_measure(
+                trainer, truth, kept / "renders", half=half, scene=cell.scene
+            )
+            state = {"iteration": trainer.iteration, "train_s": trainer.clock.now()}
+            write_json(kept / "measured.json", {**state, "per_image": rows, "missing": missing})
+    except KeyboardInterrupt:
+        return f"{done}; {end}"
+    psnr = f": {np.mean([row['psnr'] for row in rows]):.2f} dB over {len(rows)} test views" if rows else ""
+    return f"{done}{psnr}; model and renders in {folder / STOPPED}; {end}"
 
 
 def _effect_facts(cell: Cell, trainer: Trainer) -> dict[str, Any]:

@@ -1,0 +1,54 @@
+"""The time that `aw bench` names before runs of the full length."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from ambiguous_wild.harness.bench import Callbacks, bench
+from ambiguous_wild.harness.running import expected
+from ambiguous_wild.splat import calibration
+from tests.tiny_scene import write_tiny_scene
+
+
+@pytest.mark.parametrize(
+    ("pixels", "gaussians", "measured_ms"),
+    [(240 * 135, 32_376, 18.0), (243 * 181, 43_980, 14.7), (480 * 270, 59_972, 43.3)],
+)  # reference milliseconds of runs that had the machine alone
+def test_measured_runs_lie_in_the_range(pixels: int, gaussians: int, measured_ms: float) -> None:
+    said = expected.expected_s(1000, pixels, gaussians)
+    assert expected.LEAST * said <= measured_ms <= expected.MOST * said
+
+
+class Heard(Callbacks):
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def say(self, text: str) -> None:
+        self.lines.append(text)
+
+    def planned(self, cells, one_by_one):
+        raise KeyboardInterrupt  # what is said before is said by now
+
+
+def said_by(scene: Path, out: Path, **length: object) -> str:
+    heard = Heard()
+    with pytest.raises(KeyboardInterrupt):
+        bench(["3dgs", "absgs"], scene, output=out, effects="none", callbacks=heard, **length)
+    return "\n".join(heard.lines)
+
+
+def test_only_runs_whose_length_nobody_chose_are_told_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = write_tiny_scene(tmp_path / "wall")
+    monkeypatch.setattr(calibration.Calibration, "seconds", lambda self: 1.0)  # 16 times slower
+    told = said_by(scene, tmp_path / "a")
+    assert "2 runs of 30000 iterations" in told and "--budget" in told
+    unit = {"min": 1.0, "h": 60.0}
+    low, high = (float(found) * unit[name] for found, name in re.findall(r"([\d.]+) (min|h)\b", told)[:2])
+    assert 0 < low < high
+    assert "no --iterations" not in said_by(scene, tmp_path / "b", iterations=5)
+    assert "no --iterations" not in said_by(scene, tmp_path / "c", budgets_s=[5.0])

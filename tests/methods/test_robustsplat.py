@@ -101,6 +101,13 @@ def test_the_calibrated_cosine_is_zero_at_normal_units():
     assert torch.allclose(supervision.cosine_target(got)[:3], torch.tensor([1.0, 0.5, 0.0]).double())
 
 
+def test_the_relative_target_is_one_up_to_the_usual_distance():
+    distance = torch.tensor([0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 9.0])
+    got = supervision.relative_target(0.004 * distance, 0.004, 3.0)
+    assert torch.allclose(got, torch.tensor([1.0, 1.0, 1.0, 0.75, 0.5, 0.0, 0.0]))
+    assert torch.equal(supervision.relative_target(torch.zeros(3), 0.0, 3.0), torch.ones(3))
+
+
 def test_the_mask_loss_is_the_printed_sum():
     rng = np.random.default_rng(2)
     m, t, low, up = rng.random((4, 6, 8))
@@ -159,6 +166,25 @@ def test_what_differs_from_the_render_is_learnt(scene, tmp_path, bootstrap):
         grown = cv2.dilate(truth(view).astype(np.uint8), np.ones((17, 17))).astype(bool)
         assert (masked & truth(view)).sum() > 0.8 * truth(view).sum()
         assert (masked & ~grown).mean() < 0.05
+
+
+def test_what_a_blurred_render_lacks_everywhere_is_usual(scene, tmp_path):
+    """The plain target of a render without detail is low all over; the relative one only where more is lost."""
+    policy = policy_on(scene, tmp_path, cosine="relative", bootstrap=0.0)
+    photo = policy.data.photos[0]
+    blurred = torch.nn.functional.avg_pool2d(photo.permute(2, 0, 1)[None], 9, 1, 4, count_include_pad=False)[
+        0
+    ].permute(1, 2, 0)
+    blurred[10:30, 20:44] = 1.0 - blurred[10:30, 20:44]
+    step = step_of(policy.data, 0, blurred.contiguous())
+    for _ in range(3):
+        target = policy._target(step, learning=True)
+    changed = torch.zeros(target.shape, dtype=torch.bool)
+    changed[12:28, 22:42] = True
+    assert float(target[changed].mean()) < 0.3 and float(target[~changed].mean()) > 0.7
+    before = [counts.clone() for counts in policy.distances]
+    policy.panels(step)
+    assert all(torch.equal(a, b) for a, b in zip(before, policy.distances))
 
 
 def test_nothing_is_masked_before_its_time_nor_learnt_by_looking(scene, tmp_path):

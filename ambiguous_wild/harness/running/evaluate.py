@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from ambiguous_wild.metrics import lpips
 from ambiguous_wild.metrics import masks as mask_metrics
 from ambiguous_wild.metrics.flip import flip
 from ambiguous_wild.splat import device
+from ambiguous_wild.splat.cpu.compile import threads
 from ambiguous_wild.splat.trainer import Trainer
 
 FPS_ROUNDS = 5
@@ -113,7 +115,19 @@ class Measures:
             drawn, photo = (np.ascontiguousarray(picture[:, right]) for picture in (drawn, photo))
         values = {name: metric(drawn, photo) for name, metric in FULL_IMAGE.items()}
         values |= self.regions.psnr(name, drawn, photo)
-        return values | {name: network(drawn, photo) for name, network in self.networks.items()}
+        with _kernel_threads():
+            return values | {name: network(drawn, photo) for name, network in self.networks.items()}
+
+
+@contextmanager
+def _kernel_threads() -> Iterator[None]:
+    """Let torch use as many threads as the CPU kernels: training keeps it to one, networks are slow on one."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads())
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def measures_of(scene: Scene | None, sizes: Iterable[tuple[int, int]], *, half: bool = False) -> Measures:

@@ -34,7 +34,10 @@ class RobustSplatConfig:
     features: str = "labhog"  # see vision/backends.py; published: dinov2-small-registers@504,normalise=raw
     coarse_features: str = ""  # of the coarse stage; "" = the same kind at 16/36 of the size, as published
     coarse_share: float = 16 / 36  # of the side of the pictures that coarse features see
-    cosine: Literal["auto", "calibrated", "plain"] = "auto"  # what the cosine target is made of
+    # what the cosine target is made of: the cosine; its distance in units of what blur makes; or in units of
+    # the distance that a share `lower` of all cells lately stayed below
+    cosine: Literal["auto", "calibrated", "plain", "relative"] = "auto"
+    reach: float = 3.0  # of those units, where the relative target is 0
     normal_units: float = (
         10.0  # of distance, where the calibrated cosine is 0; the target is 0 from half of it on
     )
@@ -75,6 +78,8 @@ class RobustSplatConfig:
             raise AwError(f"robustsplat.coarse_share is above 0, at most 1, got {self.coarse_share}")
         if not 0 <= self.decay < 1:
             raise AwError(f"robustsplat.decay is from 0 to below 1, got {self.decay}")
+        if self.reach <= 1:
+            raise AwError(f"robustsplat.reach must be above 1, got {self.reach}")
         if self.erosion < 1 or self.erosion % 2 == 0:
             raise AwError(f"robustsplat.erosion is an odd number of px, got {self.erosion}")
         if any(size < 1 or size % 2 == 0 for size in self.context or ()):

@@ -34,6 +34,8 @@ class RobustSplatMask(PausingMask):
         self.fine: Features = make_features(config.features)
         self.coarse: Features = make_features(config.coarse_features or coarse_spec(config))
         self.histogram = torch.zeros(config.bins, dtype=torch.float64)
+        # roots of feature distances, coarse and fine; where the cosine target is relative
+        self.distances = [torch.zeros_like(self.histogram) for _ in range(2)]
         self.shares = MaskedShares()
         self.loss_sum: float | Tensor = 0.0  # of the mask loss
         self.loss_count = 0.0
@@ -42,6 +44,7 @@ class RobustSplatMask(PausingMask):
     def setup(self, data: TrainData) -> None:
         self.data = data
         self.histogram = self.histogram.to(data.device)
+        self.distances = [counts.to(data.device) for counts in self.distances]
         _fit(self.fine, list(data.photos), data)
         self.phi = photo_features(self.fine, data.photos, data.cache_dir)
         small = [self._coarse_picture(photo) for photo in data.photos]
@@ -107,7 +110,7 @@ class RobustSplatMask(PausingMask):
         config = self.config
         with torch.no_grad():
             lower, upper = self._bounds(step)
-            target = self._target(step)
+            target = self._target(step, learning=True)
         return supervision.mask_loss(
             mask,
             target,
@@ -122,7 +125,7 @@ class RobustSplatMask(PausingMask):
 
     # -- supervision ------------------------------------------------------------------------------
 
-    def _target(self, step: Step) -> Tensor:
+    def _target(self, step: Step, *, learning: bool = False) -> Tensor:
         """T_cos [H, W] of the render, coarse before the switch and fine after."""
         early = step.nominal < self.config.bootstrap
         features, phi = (self.coarse, self.phi_coarse) if early else (self.fine, self.phi)
@@ -130,9 +133,23 @@ class RobustSplatMask(PausingMask):
         image = upsampled(step.rendered.image.detach(), full.height, full.width)
         seen = features(self._coarse_picture(image) if early else image)
         cosine = F.cosine_similarity(phi[step.view], seen, dim=2)
-        if self._calibrate:
-            cosine = supervision.calibrated(cosine, features.unit, self.config.normal_units)
-        return supervision.resized(supervision.cosine_target(cosine), *step.photo.shape[:2])
+        if self.config.cosine == "relative":
+            target = self._relative_target(cosine, 0 if early else 1, learning)
+        else:
+            if self._calibrate:
+                cosine = supervision.calibrated(cosine, features.unit, self.config.normal_units)
+            target = supervision.cosine_target(cosine)
+        return supervision.resized(target, *step.photo.shape[:2])
+
+    def _relative_target(self, cosine: Tensor, stage: int, learning: bool) -> Tensor:
+        """Against what the renders of this stage lately lacked."""
+        distance = 0.5 * (1.0 - cosine).clamp(0.0, 2.0)
+        # counted by the root, or small distances would share a bin
+        counts = supervision.update_histogram(self.distances[stage], distance.sqrt(), self.config.decay)
+        if learning:
+            self.distances[stage] = counts
+        usual = supervision.percentile(counts, self.config.lower) ** 2
+        return supervision.relative_target(distance, usual, self.config.reach)
 
     def _bounds(self, step: Step) -> tuple[Tensor, Tensor]:
         """Lower and upper bound [H, W]; this step's residuals enter the running histogram first."""
@@ -209,6 +226,7 @@ class RobustSplatMask(PausingMask):
             "net": {name.replace(".", "_"): value for name, value in self.net.state_dict().items()},
             "adam": adam_state(self.optimiser),
             "histogram": self.histogram,
+            "distances": self.distances,
             "last_reset": self.last_reset,
             "shares": self.shares.state_dict(),
             "losses": [float(self.loss_sum), self.loss_count],
@@ -219,6 +237,7 @@ class RobustSplatMask(PausingMask):
         self.net.load_state_dict({name: state["net"][name.replace(".", "_")] for name in names})
         load_adam_state(self.optimiser, state["adam"])
         self.histogram = state["histogram"].to(self.data.device)
+        self.distances = [counts.to(self.data.device) for counts in state["distances"]]
         self.last_reset = int(state["last_reset"])
         self.shares = MaskedShares.from_state(state["shares"])
         self.loss_sum, self.loss_count = state["losses"]

@@ -28,6 +28,15 @@ def calibrated(cosine: Tensor, unit: float, normal: float) -> Tensor:
     return 1.0 - ((1.0 - cosine) / (unit * normal)).clamp(0.0, 2.0)
 
 
+def relative_target(distance: Tensor, usual: float | Tensor, reach: float) -> Tensor:
+    """1 up to the `usual` distance of features, 0 from `reach` times that on, linear between.
+
+    What a render that is still blurred lacks everywhere is usual; what it lacks here alone is not.
+    """
+    usual = max(usual, 1e-6) if isinstance(usual, float) else usual.clamp(min=1e-6)
+    return 1.0 - ((distance / usual - 1.0) / (reach - 1.0)).clamp(0.0, 1.0)
+
+
 def residual(photo: Tensor, render: Tensor) -> Tensor:
     """Mean over channels of |photo - render|, [H, W], of pictures [H, W, 3]; at most 1."""
     return (photo - render).abs().mean(dim=2).clamp(max=1.0)

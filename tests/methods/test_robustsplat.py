@@ -169,7 +169,7 @@ def test_what_differs_from_the_render_is_learnt(scene, tmp_path, bootstrap):
 
 
 def test_what_a_blurred_render_lacks_everywhere_is_usual(scene, tmp_path):
-    """The plain target of a render without detail is low all over; the relative one only where more is lost."""
+    """The plain target is low all over such a render; the relative one only where more is lost."""
     policy = policy_on(scene, tmp_path, cosine="relative", bootstrap=0.0)
     photo = policy.data.photos[0]
     blurred = torch.nn.functional.avg_pool2d(photo.permute(2, 0, 1)[None], 9, 1, 4, count_include_pad=False)[

@@ -121,7 +121,7 @@ class Measures:
 
 @contextmanager
 def _kernel_threads() -> Iterator[None]:
-    """Let torch use as many threads as the CPU kernels: training keeps it to one, networks are slow on one."""
+    """Let torch use as many threads as the CPU kernels; training keeps it to one."""
     before = torch.get_num_threads()
     torch.set_num_threads(threads())
     try:

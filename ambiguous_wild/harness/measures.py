@@ -36,6 +36,7 @@ MEASURES: dict[str, Measure] = {
         Measure("psnr_valid", "PSNR valid", "higher", 2),
         Measure("psnr_covered", "PSNR covered", "higher", 2),
         Measure("psnr_uncovered", "PSNR uncovered", "higher", 2),
+        Measure("psnr_supported", "PSNR supported", "higher", 2),
         Measure("mask_iou", "mask IoU", "higher", 3, per_image=False),
         Measure("mask_precision", "mask precision", "higher", 3, per_image=False),
         Measure("mask_recall", "mask recall", "higher", 3, per_image=False),
@@ -55,7 +56,7 @@ MEASURES: dict[str, Measure] = {
     )
 }
 # Measured on part of a picture: one without such a pixel has no value, and is no gap in a mean.
-PARTIAL = ("psnr_valid", "psnr_covered", "psnr_uncovered")
+PARTIAL = ("psnr_valid", "psnr_covered", "psnr_uncovered", "psnr_supported")
 ALWAYS = ("psnr", "ssim", "lpips_alex")  # shown even where missing: the reason stands below the table
 COST = ("train_s", "reference_s", "ms_per_iteration", "fps", "gaussians", "model_mb")
 # A metric that is not listed takes its direction from its family: psnr_distractor is a PSNR.

@@ -45,9 +45,31 @@ def test_covered_is_what_was_hidden_in_at_least_half_of_the_views(tmp_path: Path
     assert list(regions.missing) == ["psnr_valid"]
 
 
+@pytest.mark.parametrize(("hidden", "supported"), [(3, True), (4, False)])
+def test_supported_is_what_three_train_views_show(tmp_path: Path, hidden: int, supported: bool) -> None:
+    """Of six train views that all look at a part of the wall."""
+    scene = load_scene(scene_with_part_hidden(tmp_path / "scene", hidden))
+    regions = find_regions(scene)
+    for view in scene.test:
+        part, got = part_of_wall(view.camera), regions.pixels["psnr_supported"][view.name]
+        inner = cv2.erode(part.astype(np.uint8), np.ones((7, 7))).astype(bool)
+        assert got[inner].mean() == pytest.approx(float(supported), abs=0.1)
+        assert got[~part].any()
+
+
+def test_without_masks_every_view_shows_what_it_looks_at(tmp_path: Path) -> None:
+    clean = write_tiny_scene(tmp_path / "clean", distractors=False)
+    with_masks = find_regions(load_scene(clean)).pixels["psnr_supported"]
+    for path in (clean / "truth/distractor").iterdir():
+        path.unlink()
+    without = find_regions(load_scene(clean)).pixels["psnr_supported"]
+    assert all(np.array_equal(with_masks[name], without[name]) for name in with_masks)
+
+
 def test_what_cannot_be_told_is_missing_with_its_reason(tmp_path: Path) -> None:
     rarely = find_regions(load_scene(scene_with_part_hidden(tmp_path / "rarely", 2)))
-    assert not rarely.pixels and "half of the train views" in rarely.missing["psnr_covered"]
+    assert list(rarely.pixels) == ["psnr_supported"]
+    assert "half of the train views" in rarely.missing["psnr_covered"]
     clean = load_scene(write_tiny_scene(tmp_path / "clean", distractors=False))
     assert find_regions(clean).missing["psnr_uncovered"] == "no train photo shows a distractor"
     for path in (tmp_path / "clean/truth/distractor").iterdir():
@@ -67,11 +89,11 @@ def test_a_users_mask_of_a_test_photo_is_what_psnr_valid_measures(tmp_path: Path
     cv2.imwrite(str(root / "masks" / "test" / TEST[0]), keep)
     regions = find_regions(load_scene(root))
     a, b = np.random.default_rng(0).integers(0, 256, (2, HEIGHT, WIDTH, 3), dtype=np.uint8)
-    assert regions.psnr(TEST[0], a, b) == {"psnr_valid": psnr_valid(a, b, keep)}
-    assert regions.psnr(TEST[1], a, b) == {}  # it has no mask, and no value to invent
+    assert regions.psnr(TEST[0], a, b)["psnr_valid"] == psnr_valid(a, b, keep)
+    assert "psnr_valid" not in regions.psnr(TEST[1], a, b)  # it has no mask, and no value to invent
     right = slice(WIDTH // 2, None)
     half = regions.psnr(TEST[0], a[:, right], b[:, right])
-    assert half == {"psnr_valid": psnr_valid(a[:, right], b[:, right], keep[:, right])}
+    assert half["psnr_valid"] == psnr_valid(a[:, right], b[:, right], keep[:, right])
     cv2.imwrite(str(root / "masks" / "test" / TEST[0]), keep[:-1])
     with pytest.raises(AwError, match="its photo is 64x48"):
         find_regions(load_scene(root))

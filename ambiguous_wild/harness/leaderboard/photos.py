@@ -21,7 +21,7 @@ from ambiguous_wild.metrics.flip import flip
 TOLERANCE = 1e-6  # the same arithmetic on the same 8-bit pixels; another CPU may round otherwise
 # dB. Which pixels are covered is itself computed: where rounding moves a pixel over the threshold, the mean
 # over thousands of them moves a little.
-REGION_TOLERANCE = {"psnr_covered": 1e-2, "psnr_uncovered": 1e-2}
+REGION_TOLERANCE = {"psnr_covered": 1e-2, "psnr_uncovered": 1e-2, "psnr_supported": 1e-2}
 FULL_IMAGE = image_metrics.METRICS | {"flip": flip}
 
 

@@ -1,6 +1,7 @@
-"""Which pixels of a clean test view show what distractors hid from the train views.
+"""Which pixels of a clean test view show what distractors hid from the train views, and what enough views saw.
 
-A pixel of a test view is *covered* where its static surface was behind a distractor in at least half of
+A pixel of a test view is *supported* where at least three train views show its static surface: elsewhere a
+method extrapolates. It is *covered* where its static surface was behind a distractor in at least half of
 the train views that look at it, and *uncovered* otherwise. It is a fact of the scene, not of a method's
 render, so that every method is measured on the same pixels: surfaces come from the sparse points (inverse
 depth, linear between them: exact on planes), distractors from the exact masks. A train view looks at a
@@ -10,6 +11,7 @@ surface that lies in its frame and not behind another static one.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -25,65 +27,81 @@ from ambiguous_wild.vision.sparse_surface import (
 )
 
 COVERED_FROM = 0.5  # share of the train views that look at it
+SUPPORTED_FROM = 3  # train views that show it
+MOST_VIEWS = 64  # looked at for a test view where there are no exact masks
 
 DistractorMask = Callable[[View], np.ndarray | None]  # [H, W] bool, True on distractors
 
 
-def covered_pixels(scene: Scene, distractor: DistractorMask) -> dict[str, np.ndarray] | str:
-    """Name of a test view -> [H, W] bool, True where covered; or why that cannot be told.
+@dataclass(frozen=True)
+class Looks:
+    """How the train views look at the surface of each pixel of a test view."""
+
+    shown: np.ndarray  # [H, W] float32: views that show it
+    hidden: np.ndarray  # [H, W] float32: share of the views that look at it, but show a distractor
+
+    @property
+    def covered(self) -> np.ndarray:
+        """[H, W] bool."""
+        return self.hidden >= COVERED_FROM
+
+    @property
+    def supported(self) -> np.ndarray:
+        """[H, W] bool."""
+        return self.shown >= SUPPORTED_FROM
+
+
+def train_looks(scene: Scene, distractor: DistractorMask) -> dict[str, Looks] | str:
+    """Of every test view by name; or why that cannot be told.
+
+    A train view without an exact mask shows no distractor, unless another has one: then it is left out.
 
     Args:
         scene: its sparse points say where surfaces are.
         distractor: the exact mask of a train view, None where there is none.
     """
     masks = [distractor(view) for view in scene.train]
-    known = [(view, mask) for view, mask in zip(scene.train, masks) if mask is not None]
+    exact = any(mask is not None for mask in masks)
+    known = [(view, mask) for view, mask in zip(scene.train, masks) if mask is not None or not exact]
     xyz = some_points(scene.points.xyz)
-    if not known:
-        return "no exact masks of the train photos (truth/distractor)"
-    if not any(mask.any() for _, mask in known):
-        return "no train photo shows a distractor"
     cameras = [view.camera for view, _ in known]
     depths = [inverse_depth(camera, xyz) for camera in cameras]
-    shares = {}
+    found = {}
     for view in scene.test:
-        share = _share(view.camera, xyz, cameras, depths, [mask for _, mask in known])
-        if share is None:
+        inverse = inverse_depth(view.camera, xyz)
+        if inverse is None:
             return f"too few sparse points lie in test view {view.name}"
+        world = world_points(view.camera, inverse)
+        looking, hidden = np.zeros((2, *inverse.shape), np.float32)
+        for k in range(len(known)) if exact else _nearest(view.camera, cameras):
+            sees, distracted = _seen(world, cameras[k], depths[k], known[k][1])
+            looking += sees
+            hidden += sees & distracted
         size = (view.camera.width, view.camera.height)
-        shares[view.name] = cv2.resize(share, size, interpolation=cv2.INTER_LINEAR) >= COVERED_FROM
-    return shares
+        maps = (looking - hidden, hidden / np.maximum(looking, 1.0))
+        found[view.name] = Looks(*(cv2.resize(m, size, interpolation=cv2.INTER_LINEAR) for m in maps))
+    return found
 
 
-def _share(
-    camera: Camera,
-    points: np.ndarray,
-    cameras: Sequence[Camera],
-    depths: Sequence[np.ndarray | None],
-    masks: Sequence[np.ndarray],
-) -> np.ndarray | None:
-    """Share of the train views that look at a pixel's surface and show a distractor, [h, w] float32.
+def hides_anything(scene: Scene, distractor: DistractorMask) -> str:
+    """Why nothing is covered whatever the surfaces are; empty where something may be."""
+    masks = [mask for view in scene.train if (mask := distractor(view)) is not None]
+    if not masks:
+        return "no exact masks of the train photos (truth/distractor)"
+    return "" if any(mask.any() for mask in masks) else "no train photo shows a distractor"
 
-    0 where no view looks at it, or the surface is not known.
-    """
-    inverse = inverse_depth(camera, points)
-    if inverse is None:
-        return None
-    world = world_points(camera, inverse)
-    looking = np.zeros(inverse.shape, np.float32)
-    hidden = np.zeros(inverse.shape, np.float32)
-    for other, depth, mask in zip(cameras, depths, masks):
-        sees, distracted = _seen(world, other, depth, mask)
-        looking += sees
-        hidden += sees & distracted
-    return hidden / np.maximum(looking, 1.0)
+
+def _nearest(camera: Camera, others: Sequence[Camera]) -> list[int]:
+    """The cameras nearest to it: those that see the same surfaces, where there are hundreds."""
+    distance = [float(np.linalg.norm(other.center - camera.center)) for other in others]
+    return sorted(range(len(others)), key=lambda k: (distance[k], k))[:MOST_VIEWS]
 
 
 def _seen(
     world: np.ndarray,  # [h, w, 3], NaN where not known
     camera: Camera,
     depth: np.ndarray | None,  # inverse, of the camera's static surface
-    mask: np.ndarray,  # [H, W] bool, distractors
+    mask: np.ndarray | None,  # [H, W] bool, distractors
 ) -> tuple[np.ndarray, np.ndarray]:
     """Where the camera looks at a surface, and where it shows a distractor instead, bool [h, w]."""
     local = world @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
@@ -94,8 +112,11 @@ def _seen(
         x, y = in_map(camera, local, depth.shape)
         nearest = _look_up(depth, x, y, ahead)
         sees &= ~(nearest * z > BEHIND)  # NaN: nothing is known to stand before it
-    x, y = in_map(camera, local, mask.shape)
-    held = inside(x, y, mask.shape)
+    shape = (camera.height, camera.width) if mask is None else mask.shape
+    x, y = in_map(camera, local, shape)
+    held = inside(x, y, shape)
+    if mask is None:
+        return sees & held, np.zeros(held.shape, bool)
     return sees & held, _look_up(mask.astype(np.uint8), x, y, ahead & held) > 0
 
 

@@ -21,9 +21,10 @@ class ImageRow(TypedDict, total=False):
     lpips_alex: float | None
     lpips_vgg: float | None
     lpips_vgg_01: float | None
-    psnr_valid: float | None  # this and the next two: absent where the image has no such pixel
+    psnr_valid: float | None  # this and the next three: absent where the image has no such pixel
     psnr_covered: float | None
     psnr_uncovered: float | None
+    psnr_supported: float | None
 
 
 def image_row(name: str, metrics: dict[str, float]) -> ImageRow:

@@ -1,4 +1,4 @@
-"""PSNR on parts of a test view: pixels in a user's mask, and pixels covered by distractors in train views."""
+"""PSNR on parts of a test view: pixels in a user's mask, covered by distractors in train views, well seen."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from ambiguous_wild.core import AwError, Scene, View
-from ambiguous_wild.harness.running.covered import covered_pixels
+from ambiguous_wild.harness.running.covered import hides_anything, train_looks
 from ambiguous_wild.io.images import read_gray, read_keep_map
 from ambiguous_wild.metrics.masks import psnr_valid
 
 VALID, COVERED, UNCOVERED = "psnr_valid", "psnr_covered", "psnr_uncovered"
+SUPPORTED = "psnr_supported"
 
 
 @dataclass(frozen=True)
@@ -76,15 +77,21 @@ def _find_regions(key: _Same) -> Regions:
         pixels[VALID] = kept
     else:
         missing[VALID] = "no test photo has a mask (masks/test/<stem>.png, white = measured)"
-    covered = covered_pixels(scene, lambda view: true_distractor(scene, view))
-    if isinstance(covered, str):
-        return Regions(pixels, missing | dict.fromkeys((COVERED, UNCOVERED), covered))
-    if any(mask.any() for mask in covered.values()):
-        pixels[COVERED] = covered
-        pixels[UNCOVERED] = {name: ~mask for name, mask in covered.items()}
-    else:
-        reason = "nothing that a test view shows was hidden in half of the train views that look at it"
-        missing |= dict.fromkeys((COVERED, UNCOVERED), reason)
+    looks = train_looks(scene, lambda view: true_distractor(scene, view))
+    if isinstance(looks, str):
+        return Regions(pixels, missing | dict.fromkeys((COVERED, UNCOVERED, SUPPORTED), looks))
+    pixels[SUPPORTED] = {name: found.supported for name, found in looks.items()}
+    if not any(mask.any() for mask in pixels[SUPPORTED].values()):
+        missing[SUPPORTED] = "no surface in a test view is shown by three train views"
+        del pixels[SUPPORTED]
+    nothing = hides_anything(scene, lambda view: true_distractor(scene, view))
+    covered = {name: found.covered for name, found in looks.items()}
+    if not nothing and not any(mask.any() for mask in covered.values()):
+        nothing = "nothing that a test view shows was hidden in half of the train views that look at it"
+    if nothing:
+        return Regions(pixels, missing | dict.fromkeys((COVERED, UNCOVERED), nothing))
+    pixels[COVERED] = covered
+    pixels[UNCOVERED] = {name: ~mask for name, mask in covered.items()}
     return Regions(pixels, missing)
 
 

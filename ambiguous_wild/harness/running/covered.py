@@ -1,4 +1,4 @@
-"""Which pixels of a clean test view show what distractors hid from the train views, and what enough views saw.
+"""Which pixels of a clean test view distractors hid from the train views, and which enough views show.
 
 A pixel of a test view is *supported* where at least three train views show its static surface: elsewhere a
 method extrapolates. It is *covered* where its static surface was behind a distractor in at least half of

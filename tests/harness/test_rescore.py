@@ -15,6 +15,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.harness import bench as bench_module
 from ambiguous_wild.harness.bench import Callbacks, bench
 from ambiguous_wild.harness.rescore import could_be_measured, rescore
+from ambiguous_wild.harness.running import evaluate
 from ambiguous_wild.harness.running.evaluate import measures_of
 from ambiguous_wild.harness.running.result_file import read_result
 from ambiguous_wild.io.images import read_png_rgb, write_png
@@ -189,3 +190,20 @@ def test_what_is_too_small_is_no_case_for_rescore(tmp_path: Path, scene: Path, w
     assert "lpips_alex" in could_be_measured([result])
     result["missing"]["lpips_alex"] = f"image of 20x12 px is {lpips.TOO_SMALL} with alexnet: ..."
     assert "lpips_alex" not in could_be_measured([result])
+
+
+def test_networks_use_the_threads_of_the_kernels_and_give_them_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    import torch
+
+    used: list[int] = []
+    monkeypatch.setattr(lpips, "available", lambda: {"lpips_alex": None})
+    monkeypatch.setattr(lpips, "load", lambda name: lambda a, b: used.append(torch.get_num_threads()) or 0.5)
+    monkeypatch.setattr(evaluate, "threads", lambda: 2)
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        image = np.zeros((40, 40, 3), np.uint8)
+        assert measures_of(None, [(40, 40)])("a", image, image)["lpips_alex"] == 0.5
+        assert used == [2] and torch.get_num_threads() == 1
+    finally:
+        torch.set_num_threads(before)

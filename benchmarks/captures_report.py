@@ -27,6 +27,7 @@ Row = dict[str, Any]
 # key, label, digits
 COLUMNS = (
     ("psnr", "PSNR dB", 2),
+    ("psnr_supported", "supported dB", 2),
     ("ssim", "SSIM", 3),
     ("iou", "IoU", 3),
     ("precision", "precision", 3),
@@ -38,6 +39,7 @@ COLUMNS = (
     ("setup_s", "setup s", 1),
     ("ms_per_iteration", "ms/it", 1),
 )
+IMAGES = ("psnr", "psnr_supported", "ssim")  # means over the test photos
 TIMES = ("train_s", "setup_s", "ms_per_iteration")
 
 BOOK = ["capture", "method", "seed", "config_hash", "threads", *(key for key, _, _ in COLUMNS)]
@@ -66,7 +68,7 @@ def masked_share(run: Path) -> float:
 def run_numbers(run: pd.Series, images: pd.DataFrame) -> dict[str, float]:
     """The columns of one run; image metrics are means over the test photos."""
     mine = images[(images.scene == run.scene) & (images.method == run.method) & (images.seed == run.seed)]
-    means = {m: stats.mean(mine[mine.metric == m]["value"].to_numpy()) for m in ("psnr", "ssim")}
+    means = {m: stats.mean(mine[mine.metric == m]["value"].to_numpy()) for m in IMAGES}
     return means | {
         "iou": float(run.mask_iou),
         "precision": float(run.mask_precision),
@@ -98,8 +100,10 @@ def book_of(runs: Runs) -> pd.DataFrame:
 
 
 def read_book(path: Path) -> pd.DataFrame:
-    """The recorded runs; empty if there is no file."""
-    return pd.read_csv(path, dtype={"config_hash": str}) if path.is_file() else pd.DataFrame(columns=BOOK)
+    """The recorded runs, without what older records lack; empty if there is no file."""
+    if not path.is_file():
+        return pd.DataFrame(columns=BOOK)
+    return pd.read_csv(path, dtype={"config_hash": str}).reindex(columns=BOOK)
 
 
 def merged(old: pd.DataFrame, new: pd.DataFrame) -> pd.DataFrame:

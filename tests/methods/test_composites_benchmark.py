@@ -1,0 +1,64 @@
+"""The benchmark of composites: which photos test, and what it makes of a base."""
+
+import importlib
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.io.scene_folder import load_scene
+from tests.tiny_scene import TEST, TRAIN, write_tiny_scene
+
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+
+
+@pytest.fixture(scope="module")
+def composites():
+    sys.path.insert(0, str(BENCHMARKS))
+    try:
+        yield importlib.import_module("composites")
+    finally:
+        sys.path.remove(str(BENCHMARKS))
+
+
+def test_the_best_supported_views_test_none_beside_another(composites):
+    shares = {"a": 0.9, "b": 0.8, "c": 0.7, "d": 0.1, "e": 0.6, "f": 0.65}
+    assert composites.best_supported(shares, 3) == ["a", "c", "f"]
+    assert composites.best_supported(shares, 2) == ["a", "c"]
+    assert composites.best_supported({"a": 1.0, "b": 1.0}, 2) == ["a"]
+
+
+def test_a_view_that_nobody_shares_is_not_supported(composites, tmp_path):
+    shares = composites.support(load_scene(write_tiny_scene(tmp_path / "wall")))
+    assert set(shares) == {*TRAIN, *TEST} and all(share > 0.5 for share in shares.values())
+
+
+def test_a_base_is_split_once_and_gets_its_placements(composites, tmp_path, monkeypatch):
+    asked = []
+
+    def aw(*words):
+        asked.append(words)
+        root = Path(words[words.index("-o") + 1])
+        if words[0] == "build-scene":
+            write_tiny_scene(root, distractors=False)
+        else:
+            shutil.copytree(words[1], root)
+
+    monkeypatch.setattr(composites, "aw", aw)
+    (tmp_path / "data" / "wall" / "images").mkdir(parents=True)
+    given = ["--data", str(tmp_path / "data"), "--out", str(tmp_path / "out"), "--bases", "wall=1"]
+    for _ in range(2):
+        assert composites.main([*given, "--placements", "3", "--prepare-only"]) == 0
+    assert [words[0] for words in asked] == ["build-scene", "composite", "composite", "composite"]
+    assert ["--patches" in words for words in asked[1:]] == [False, True, False]
+    scene = load_scene(tmp_path / "out" / "scenes" / "wall-cutouts-1")
+    assert len(scene.test) == 3 and len(scene.train) == len(TRAIN) + len(TEST) - 3
+    with pytest.raises(SystemExit):
+        composites.main([*given[:-1], "wall"])
+
+
+def test_what_a_command_says_is_told(composites):
+    with pytest.raises(AwError, match="nowhere"):
+        composites.aw("build-scene", "/nowhere/at/all", "-o", "/tmp/never")

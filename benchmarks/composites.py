@@ -5,8 +5,8 @@
 
 --data holds a folder a base: its photos, or images/ with them; cut-outs lie in --data/cutouts. Each base is
 built once (`aw build-scene`). Its test photos are those that the others support best: a surface counts as
-supported where three of them see it. Odd placements paste cut-outs, even ones the scene's own texture. Training and
-tables are those of captures.py, in benchmarks/results/placements*. Everything resumes.
+supported where three of them see it. Odd placements paste cut-outs, even ones the scene's own texture.
+Training and tables are those of captures.py, in benchmarks/results/placements*. Everything resumes.
 """
 
 from __future__ import annotations

@@ -17,16 +17,16 @@ from ambiguous_wild.methods.ablation import Group
 
 
 @click.command(name="ablate")
-@click.option("--method", default="refinesplat", show_default=True, help="A method that declares ablations.")
+@click.option("--method", default="refinesplat", show_default=True, help="Method whose parts are varied.")
 @click.option("--scene", "scenes", multiple=True, type=PathName(), help="A scene folder; repeatable.")
 @click.option("--group", "groups", multiple=True, help="Only this group; repeatable.  [default: all]")
 @training_options
-@click.option("--budget", help="Training time instead: 90s, 10m, 1.5h. Schedules scale with it.")
+@click.option("--budget", help="Training time instead of --iterations: 90s, 10m, 1.5h.")
 @click.option(
-    "--set", "settings", multiple=True, metavar="KEY=VALUE", help="An option in every row; repeatable."
+    "--set", "settings", multiple=True, metavar="KEY=VALUE", help="Option for every variant; repeatable."
 )
 @click.option("-o", "--output", type=PathName(), default=Path("ablation"), show_default=True)
-@click.option("--pictures/--no-pictures", default=False, show_default=True, help="Draw every run's pictures.")
+@click.option("--pictures/--no-pictures", default=False, show_default=True, help="Save every run's pictures.")
 @click.option("--list", "listing", is_flag=True, help="Show groups and variants, train nothing.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
 def command(
@@ -49,10 +49,10 @@ def command(
     listing: bool,
     as_json: bool,
 ) -> None:
-    """Train the variants of METHOD's ablations on SCENEs and write ablation.csv, .json, .md and .png to OUTPUT.
+    """Train the variants of METHOD on SCENEs. Write ablation.csv, .json, .md and .png to OUTPUT.
 
-    What is finished is kept: after an interruption the same command goes on, and another group of the same
-    scenes, seeds and length joins what OUTPUT holds.
+    Finished runs are kept: after an interruption the same command continues. Another --group of the same
+    scenes, seeds and length is added to what OUTPUT holds.
 
     \b
     aw ablate --list

@@ -15,7 +15,8 @@ from ambiguous_wild.cli.paths import PathName
 @click.option("-o", "--out", type=PathName(), help="Folder for the report.  [default: SCENE-ambiguity]")
 @click.option(
     "--masks",
-    help="truth, scene (build-scene's masks), run, or a folder of <stem>.png, white = distractor.  [default: the first available]",
+    help="truth, scene (build-scene's masks), run, or a folder of <stem>.png, white = distractor.  "
+    "[default: the first available]",
 )
 @click.option(
     "--masks-white",
@@ -27,7 +28,8 @@ from ambiguous_wild.cli.paths import PathName
 @click.option(
     "--background",
     type=click.Choice(["clean", "run", "none"]),
-    help="Background to compare distractors with: clean versions of the photos, or the run's render.  [default: the first available]",
+    help="Background that distractors are compared with: clean photos, the renders of --run, or none.  "
+    "[default: the first available]",
 )
 @click.option(
     "--run",
@@ -38,12 +40,13 @@ from ambiguous_wild.cli.paths import PathName
     "--features",
     default="labhog",
     show_default=True,
-    help="Back end of the semantic score: labhog, dinov2-small, ... (docs/foundation-models.md).",
+    help="Features of the semantic score: labhog, dinov2-small, ... (docs/foundation-models.md).",
 )
 @click.option(
     "--objects",
     type=PathName(file_okay=False),
-    help="Folder with masks of static objects to compare with, <stem>.png, white = object.  [default: every static segment]",
+    help="Folder of masks of the static objects to compare with, <stem>.png, white = object.  "
+    "[default: every static segment]",
 )
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the bootstrap.")
 @click.option("--record/--no-record", default=True, show_default=True, help="Save the scores in scene.json.")
@@ -61,7 +64,10 @@ def command(
     record: bool,
     as_json: bool,
 ) -> None:
-    """Measure SCENE: colour ambiguity, semantic ambiguity, occlusion; write an HTML page, a CSV and an image."""
+    """Measure how similar the distractors of SCENE are to it, in colour and semantically, and their share.
+
+    Writes an HTML page, a CSV and an image.
+    """
     from tqdm import tqdm
 
     from ambiguous_wild.core.errors import AwError

@@ -21,14 +21,14 @@ from ambiguous_wild.cli.paths import PathName
     default="text",
     show_default=True,
 )
-@click.option("-o", "--output", type=PathName(dir_okay=False), help="Write to a file instead.")
+@click.option("-o", "--output", type=PathName(dir_okay=False), help="Write to this file.")
 @click.option("--strict", is_flag=True, help="Exit with code 1 if anything is found.")
 def command(tables: tuple[Path, ...], style: str, output: Path | None, strict: bool) -> None:
     """Check TABLES (CSV, or folders of them; default: the paper's tables, which come with the package).
 
-    Finds suspiciously equal numbers, contradictions between tables, exchanged numbers, means that do not match
-    their values, implausible SSIM and LPIPS, and wrong ranks. The correct values are not known: a finding is a
-    question to the authors of the table.
+    Finds suspiciously equal numbers, contradictions between tables, swapped numbers, means that do not match
+    their values, implausible SSIM and LPIPS, and wrong ranks. The correct values are not known, so a finding
+    is a question to the authors of the table.
     """
     from ambiguous_wild.harness.audit.run import audit, to_csv, to_markdown, to_text
     from ambiguous_wild.harness.audit.table import REPORTED, read_tables

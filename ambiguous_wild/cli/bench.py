@@ -62,14 +62,14 @@ def parse_budget(text: str) -> float:
     help="All scenes of a published table instead of --scene; prints the table beside the reported numbers.",
 )
 @click.option(
-    "--root", type=PathName(), help="Folder with a folder a scene of the suite, in any layout of 'aw import'."
+    "--root", type=PathName(), help="One folder per scene of the suite, in any layout of 'aw import'."
 )
 @training_options
 @click.option(
     "--budget",
     "budgets",
     multiple=True,
-    help="Training time instead: 90s, 10m, 1.5h. Schedules scale with it. Repeatable: every length, for 'aw cost'.",
+    help="Training time instead of --iterations: 90s, 10m, 1.5h. Repeatable: trains each, for 'aw cost'.",
 )
 @click.option(
     "--resolution",
@@ -78,11 +78,11 @@ def parse_budget(text: str) -> float:
     show_default=True,
     help="auto: coarse-to-fine under a budget, else full.",
 )
-@click.option("--mask", metavar="METHOD", help="Masks of another method, none, or truth (exact ones).")
+@click.option("--mask", metavar="METHOD", help="Masks of another method; none; or truth: exact masks.")
 @click.option("--density", metavar="METHOD", help="Density control of another method.")
-@click.option("--regulariser", metavar="METHOD", help="Loss on the render of another method.")
+@click.option("--regulariser", metavar="METHOD", help="Another method's losses on the render.")
 @click.option("--passes", type=click.IntRange(1, 2), default=1, show_default=True,
-              help="2: train again from the start with the final masks; both trainings count as its cost.")  # fmt: skip
+              help="2: train again with the final masks; the cost counts both trainings.")  # fmt: skip
 @click.option(
     "--set", "settings", multiple=True, metavar="METHOD.KEY=VALUE", help="An option of a method; repeatable."
 )
@@ -91,18 +91,20 @@ def parse_budget(text: str) -> float:
     metavar="auto|none|all|LIST",
     multiple=True,
     default=("default",),
-    help="Optional effects, see 'aw plan'; LIST: names with commas. Repeatable: every choice, for 'aw cost'.  [default: auto where the method allows it, else none]",
+    help="Optional effects ('aw plan' explains them); LIST: names with commas. Repeatable: trains each.  "
+    "[default: auto for methods that choose effects (refinesplat), else none]",
 )
 @click.option(
     "--plan",
     "plan_file",
     type=PathName(dir_okay=False),
-    help="A plan of 'aw plan' instead of a new one.",
+    help="Use this plan of 'aw plan' instead of making a new one.",
 )
 @click.option(
     "--protocol",
     type=click.Choice(["full", "half"]),
-    help="half: colour effects see the left half of a test photo, the right one is measured (NeRF-W).  [default: as scene.json says, else full]",
+    help="full: measure whole test photos; half: fit colours on the left half, measure the right (NeRF-W).  "
+    "[default: as scene.json says, else full]",
 )
 @click.option("-o", "--output", type=PathName(), default=Path("runs"), show_default=True)
 @click.option(
@@ -110,7 +112,7 @@ def parse_budget(text: str) -> float:
     type=click.IntRange(0, 100),
     default=8,
     show_default=True,
-    help="Times the test PSNR is measured on the way, the clock standing still; does not change the result.",
+    help="Measurements of the test PSNR during training; they change neither result nor training time.",
 )
 @click.option(
     "--checkpoint-every",
@@ -124,20 +126,20 @@ def parse_budget(text: str) -> float:
     type=click.Choice(["stop", "rollback"]),
     default="stop",
     show_default=True,
-    help="A value that is no finite number: stop and say where, or go back and leave that photo out.",
+    help="On a NaN or infinite value: stop and say where, or go back and skip that photo.",
 )
 @click.option(
     "--gpus",
     type=click.IntRange(1, 9),
     default=1,
     show_default=True,
-    help="GPUs that share one model, for a scene too large for one; iterations count photos.",
+    help="Number of GPUs that share one model too large for one; each photo is one iteration.",
 )
 @click.option(
     "--pictures/--no-pictures",
     default=True,
     show_default=True,
-    help="Draw what the method saw into RUN/pictures; changes nothing else.",
+    help="Save pictures of masks and training in RUN/pictures.",
 )
 @engine_options
 @click.option("--json", "as_json", is_flag=True, help="Print the outcome of every run as JSON.")
@@ -178,18 +180,20 @@ def command(
 
     \b
     aw bench --method 3dgs --method refinesplat --scene scene -o runs
-    aw bench --method refinesplat --scene scene --budget 10m --set refinesplat.lambda_cr=0.1
+    aw bench --method refinesplat --scene scene --budget 10m --set refinesplat.mask_every=8
     aw bench --method 3dgs --method refinesplat --scene scene --budget 1m --budget 3m --budget 10m -o runs
     aw bench --method 3dgs --method robustsplat --mask refinesplat --scene scene -o runs
     aw bench --suite on-the-go --root datasets/on-the-go -o runs
 
-    With --jobs 4 four cells run at a time, with --engine ray as many as a cluster has room for.
-    --mask, --density and --regulariser plug parts of one method into every METHOD: the runs are called
+    A run ("cell") is one method on one scene with one seed. --jobs 4 trains four runs at a time, --engine ray
+    as many as a cluster has room for.
+
+    --mask, --density and --regulariser take a part of one method into every METHOD. The runs are called
     3dgs@mask=refinesplat, which is also a METHOD.
 
-    Several --budget or --effects train every combination, each into a folder of its own:
-    runs/budget-60s/effects-exposure/SCENE/METHOD/seed0. 'aw cost runs' compares them all, 'aw table' those of
-    one folder.
+    Several --budget or --effects train every combination, each into its own folder:
+    runs/budget-60s/effects-exposure/SCENE/METHOD/seed0. 'aw cost runs' compares all of them, 'aw table' the
+    runs of one folder.
     """
     if iterations is not None and budgets:
         raise AwError("--iterations and --budget exclude each other: a run is as long as one of them says")

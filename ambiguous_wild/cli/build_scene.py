@@ -18,32 +18,38 @@ if TYPE_CHECKING:
 @click.argument("raw", type=PathName())
 @click.option("-o", "--output", required=True, type=PathName(), help="Scene folder to make.")
 @click.option(
-    "--factor", type=int, help="Downsampling; default: of 1, 2, 4, 8 the largest that leaves 480 px."
+    "--factor", type=int, help="Downsampling.  [default: the largest of 1, 2, 4, 8 that leaves 480 px]"
 )
 @click.option(
     "--camera",
     type=click.Choice(["auto", "single", "per-device", "per-image"]),
     default="auto",
     show_default=True,
+    help="Which photos share one camera model; auto: decided by EXIF and photo size.",
 )
 @click.option(
     "--sfm",
     type=click.Choice(["auto", "fast", "thorough"]),
     default="auto",
     show_default=True,
-    help="Structure from motion; auto: fast, then thorough if photos are left out.",
+    help="Structure from motion; auto: fast, and thorough if fast leaves photos out.",
 )
 @click.option(
     "--matcher",
     type=click.Choice(["auto", "exhaustive", "sequential", "retrieval"]),
     default="auto",
     show_default=True,
-    help="Pairs of photos: all, neighbours in order, or similar ones; auto: all up to 25 (thorough: 200) photos, else similar ones.",
+    help="Pairs of photos to match: all, neighbours in order, or similar ones; auto: all up to 25 photos "
+    "(thorough: 200), else similar ones.",
 )
 @click.option(
-    "--mapper", type=click.Choice(["incremental", "global"]), default="incremental", show_default=True
+    "--mapper",
+    type=click.Choice(["incremental", "global"]),
+    default="incremental",
+    show_default=True,
+    help="COLMAP's mapper; global is faster on many photos, weaker on few.",
 )
-@click.option("--max-features", type=int, default=3000, show_default=True, help="SIFT features a photo.")
+@click.option("--max-features", type=int, default=3000, show_default=True, help="SIFT features per photo.")
 @click.option(
     "--masks",
     type=PathName(),
@@ -54,16 +60,16 @@ if TYPE_CHECKING:
     type=click.Choice(["error", "keep"]),
     default="error",
     show_default=True,
-    help="A photo without a mask: refuse the capture, or use the whole photo.",
+    help="A photo without a mask: error refuses the capture, keep uses the whole photo.",
 )
-@click.option("--test-list", type=PathName(), help="File naming the test photos, one a line.")
+@click.option("--test-list", type=PathName(), help="File with the names of the test photos, one per line.")
 @click.option("--strict", is_flag=True, help="Refuse the capture if one photo cannot be read.")
 @click.option("--jobs", type=click.IntRange(min=1), help="Threads; the result does not depend on it.")
-@click.option("--seed", type=int, default=0, show_default=True)
-@click.option("--name", help="Name of the scene; default: the output folder's.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Seed of COLMAP's random choices.")
+@click.option("--name", help="Name of the scene.  [default: the name of the output folder]")
 @click.option("--license", "license_", default="", help="Licence of the photos, recorded in scene.json.")
 @click.option("--overwrite", is_flag=True, help="Replace a scene built from other photos or settings.")
-@click.option("--keep-work", is_flag=True, help="Leave the work folder with every stage and COLMAP's log.")
+@click.option("--keep-work", is_flag=True, help="Keep the work folder with every stage and COLMAP's log.")
 @click.option("--json", "as_json", is_flag=True, help="Print the same facts as JSON.")
 def command(
     raw: Path,

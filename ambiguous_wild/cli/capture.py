@@ -22,7 +22,7 @@ BROKEN_BELOW = 0.9  # of the frames in a video's header, which is often wrong by
     type=click.IntRange(3, 5000),
     default=60,
     show_default=True,
-    help="Photos to take from a video or a camera; a short video gives as many as it has.",
+    help="Photos to take from a video or camera; a short video gives all its frames.",
 )
 @click.option(
     "--every",

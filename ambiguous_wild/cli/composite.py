@@ -14,9 +14,9 @@ from ambiguous_wild.cli.paths import PathName
 @click.command("composite")
 @click.argument("scene", type=PathName())
 @click.option("-o", "--output", required=True, type=PathName(), help="Scene folder to make.")
-@click.option("--cutouts", type=PathName(), help="Folder of PNG files; alpha is the mask.")
+@click.option("--cutouts", type=PathName(), help="Folder of PNG files with alpha as the mask.")
 @click.option("--patches", is_flag=True, help="Fill the shapes with the scene's own texture.")
-@click.option("--coverage", type=float, default=0.15, show_default=True, help="Mean share of a train photo.")
+@click.option("--coverage", type=float, default=0.15, show_default=True, help="Mean covered share of photos.")
 @click.option(
     "--presence",
     type=float,
@@ -48,7 +48,7 @@ def command(
     seed: int,
     as_json: bool,
 ) -> None:
-    """Add distractors to the train photos of SCENE, at other places in each; test photos do not change.
+    """Add distractors to the train photos of SCENE, in each photo at other places. Test photos do not change.
 
     --patches without --cutouts draws rounded shapes.
     """

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 @click.argument("runs", nargs=-1, required=True, type=PathName())
 @click.option(
     "-o", "--output", type=PathName(file_okay=False), default=Path("cost"), show_default=True,
-    help="For plots, CSV and JSON.",
+    help="Folder for plots, CSV and JSON.",
 )  # fmt: skip
 @click.option(
     "--target", "targets", multiple=True, type=float, metavar="DB",
@@ -32,13 +32,13 @@ if TYPE_CHECKING:
 @click.option(
     "--with-setup",
     is_flag=True,
-    help="Count features and masks made before the first step as time too; a cache makes them short.",
+    help="Add the set-up (features and masks made before the first step) to the time; short if cached.",
 )
 @click.option(
     "--recommend", "recommended", type=PathName(file_okay=False), metavar="SCENE",
-    help="Say which measured setting to train this scene with, for the time that --budget gives.",
+    help="Name the best measured setting for this scene within the time of --budget.",
 )  # fmt: skip
-@click.option("--budget", metavar="TIME", help="For --recommend: training time here, e.g. 90s, 5m.")
+@click.option("--budget", metavar="TIME", help="With --recommend: training time here, e.g. 90s, 5m.")
 @click.option("--plots/--no-plots", default=True, show_default=True, help="Draw SVG and PNG.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
 def command(
@@ -52,8 +52,8 @@ def command(
     plots: bool,
     as_json: bool,
 ) -> None:
-    """Show what accuracy costs: time to reach a PSNR, dB per extra minute of each effect and refresh
-    interval, and which method to pay for, from the runs below the folders RUNS.
+    """Compare accuracy and cost of the runs below the folders RUNS: time to reach a PSNR, dB per extra
+    minute of each effect and refresh interval, and the Pareto front.
 
     Runs of the same method may differ in length, effects and options, in one folder or in several.
 

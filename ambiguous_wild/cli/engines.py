@@ -10,15 +10,24 @@ import click
 from ambiguous_wild.harness.running.engines.session import Engine
 
 _OPTIONS = (
-    click.option("--engine", type=click.Choice(["local", "ray"]), default="local", show_default=True, help="ray: a cluster, see docs/cluster.md."),
-    click.option("--jobs", type=click.IntRange(1), help="Cells at a time on this machine; cores and GPUs are divided.  [default: 1; on cuda one a GPU]"),
-    click.option("--address", help="Ray: auto, HOST:PORT or ray://HOST:10001.  [default: $RAY_ADDRESS, else this machine]"),
-    click.option("--cpus-per-cell", type=click.FloatRange(min=0, min_open=True), help="Ray: CPUs, also the threads.  [default: --threads, else 1]"),
-    click.option("--gpus-per-cell", type=click.FloatRange(min=0), help="Ray: GPUs; 0.5 lets two cells share one.  [default: 1 on cuda]"),
-    click.option("--memory-per-cell", type=click.FloatRange(min=0), metavar="GB", help="Ray: memory in GB."),
-    click.option("--retries", type=click.IntRange(0), default=3, show_default=True, help="How often a cell is run again whose process or node was lost."),
-    click.option("--transfer", type=click.Choice(["shared", "store"]), default="shared", show_default=True, help="Ray: -o and scenes lie on shared storage, or travel through Ray's object store."),
-    click.option("--transfer-limit", type=click.FloatRange(min=0, min_open=True), default=4000.0, show_default=True, metavar="MB", help="Ray: largest scene or run that travels."),
+    click.option("--engine", type=click.Choice(["local", "ray"]), default="local", show_default=True,
+                 help="local: this machine; ray: Ray, also on a cluster (docs/cluster.md)."),
+    click.option("--jobs", type=click.IntRange(1),
+                 help="Runs at a time on this machine; they share cores.  [default: 1; on cuda one per GPU]"),
+    click.option("--address",
+                 help="Ray: auto, HOST:PORT, ray://HOST:10001.  [default: $RAY_ADDRESS, else this machine]"),
+    click.option("--cpus-per-cell", type=click.FloatRange(min=0, min_open=True),
+                 help="Ray: CPUs per run, also its threads.  [default: --threads, else 1]"),
+    click.option("--gpus-per-cell", type=click.FloatRange(min=0),
+                 help="Ray: GPUs per run; with 0.5 two runs share one.  [default: 1 on cuda]"),
+    click.option("--memory-per-cell", type=click.FloatRange(min=0), metavar="GB",
+                 help="Ray: memory per run."),
+    click.option("--retries", type=click.IntRange(0), default=3, show_default=True,
+                 help="How often to repeat a run whose process or node was lost."),
+    click.option("--transfer", type=click.Choice(["shared", "store"]), default="shared", show_default=True,
+                 help="Ray: shared: -o and scenes are on shared storage; store: they are sent through Ray."),
+    click.option("--transfer-limit", type=click.FloatRange(min=0, min_open=True), default=4000.0,
+                 show_default=True, metavar="MB", help="Ray: largest scene or run that is sent through Ray."),
 )  # fmt: skip
 
 

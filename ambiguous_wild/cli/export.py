@@ -32,7 +32,7 @@ FORMATS = ("compressed-ply", "spz", "sog", "gltf")
     "--loss/--no-loss", default=True, show_default=True, help="Render the test views to measure the loss."
 )
 @click.option(
-    "--scene-folder", type=PathName(file_okay=False), help="The scene.  [default: where the runs say]"
+    "--scene-folder", type=PathName(file_okay=False), help="The scene folder.  [default: as the runs say]"
 )
 @click.option(
     "--plugin",
@@ -55,8 +55,8 @@ def command(
 ) -> None:
     """Write the models of RUNS (run folders, or folders of them) as compressed PLY, SPZ, SOG and glTF.
 
-    Prints each file's size and what its rounding costs: PSNR against the model's own renders, and dB lost against
-    the test photos. The plain point_cloud.ply stays.
+    Prints the size of each file and the loss from its rounding: PSNR against the renders of the model, and dB
+    lost against the test photos. The plain point_cloud.ply stays.
 
     \b
     aw export runs

@@ -23,7 +23,7 @@ from ambiguous_wild.cli.paths import PathName
 @click.option("--copy", is_flag=True, help="Copy photos instead of linking them.")
 @click.option("--json", "as_json", is_flag=True, help="Print the same facts as JSON.")
 def command(scene: Path, form: str, output: Path, copy: bool, as_json: bool) -> None:
-    """Write SCENE in another tool's layout: photos at the size they are trained at, cameras, split, points, masks."""
+    """Write SCENE in another tool's layout: photos at their training size, cameras, split, points, masks."""
     from ambiguous_wild.datasets.export import export_scene
 
     done = export_scene(scene, form, output, copy=copy)

@@ -20,12 +20,12 @@ from ambiguous_wild.core.errors import AwError
     "-o", "--output", type=PathName(), default=Path("datasets"), show_default=True, help="Folder of datasets."
 )
 @click.option("--list", "listing", is_flag=True, help="List what can be fetched: licence, size, page.")
-@click.option("--unpack/--no-unpack", default=True, show_default=True)
+@click.option("--unpack/--no-unpack", default=True, show_default=True, help="Unpack the archive.")
 @click.option("--json", "as_json", is_flag=True, help="Print the same facts as JSON.")
 def command(name: str | None, output: Path, listing: bool, unpack: bool, as_json: bool) -> None:
-    """Download the dataset NAME, resumed where it broke off, and unpack it.
+    """Download the dataset NAME and unpack it. An interrupted download continues.
 
-    The hash of the first download is recorded in OUTPUT/archives/downloads.json; later ones must have it.
+    The hash of the first download is stored in OUTPUT/archives/downloads.json; later downloads must match it.
     """
     from ambiguous_wild.datasets.catalogue import find_public, public_data
 

@@ -20,15 +20,15 @@ KINDS = (
 @click.command("import")
 @click.argument("source", type=PathName())
 @click.option("-o", "--output", required=True, type=PathName(), help="Scene folder to make.")
-@click.option("--as", "kind", type=click.Choice(KINDS), help="The layout.  [default: recognised]")
-@click.option("--factor", type=int, help="Downsampling.  [default: as the dataset's papers]")
+@click.option("--as", "kind", type=click.Choice(KINDS), help="Layout of SOURCE.  [default: recognised]")
+@click.option("--factor", type=int, help="Downsampling.  [default: as in the papers]")
 @click.option("--name", default="", help="Name of the scene.  [default: the output folder's]")
 @click.option("--license", "license_", default="", help="Licence of the photos, recorded in scene.json.")
 @click.option("--dataset", default="", help="Name of the dataset in tables.  [default: the layout's]")
 @click.option(
     "--drop-test-only-points",
     is_flag=True,
-    help="Drop points that no training photo sees: they leak clean geometry. Published code keeps them.",
+    help="Drop points that only test photos see: they leak clean geometry. Published code keeps them.",
 )
 @click.option("--jobs", type=click.IntRange(min=1), help="Threads; the result does not depend on it.")
 @click.option(
@@ -36,7 +36,7 @@ KINDS = (
     type=click.IntRange(0),
     default=0,
     show_default=True,
-    help="Of points, where the dataset has none.",
+    help="Seed of random points, for a dataset without points.",
 )
 @click.option("--overwrite", is_flag=True, help="Replace a scene imported from other files or settings.")
 @click.option("--json", "as_json", is_flag=True, help="Print the same facts as JSON.")

@@ -27,13 +27,13 @@ _json = click.option("--json", "as_json", is_flag=True, help="Print the same fac
 
 @click.group("leaderboard")
 def command() -> None:
-    """Numbers that others can trust, as CSVs and a page.
+    """Leaderboard: check runs, collect them in CSV files, publish them as a page.
 
     \b
-    aw leaderboard add runs                 check finished runs and take them in
-    aw leaderboard remove --method NAME     take runs down again
+    aw leaderboard add runs                 check finished runs and add them
+    aw leaderboard remove --method NAME     remove runs
     aw leaderboard publish -o site          CSVs and a page that opens from a file
-    aw leaderboard check                    what is wrong with what is there
+    aw leaderboard check                    check the board again
     """
 
 
@@ -41,23 +41,23 @@ def command() -> None:
 @click.argument("runs", nargs=-1, required=True, type=PathName())
 @_board
 @click.option(
-    "--dataset", help="Of these runs.  [default: what their scene says; of 'aw simulate': simulated]"
+    "--dataset", help="Dataset of these runs.  [default: as scene.json says; of 'aw simulate': simulated]"
 )
 @click.option(
     "--scenes",
     type=PathName(file_okay=False),
-    help="Where the scenes lie (a scene, or a folder of them).  [default: where the runs say]",
+    help="Scene folder, or a folder of scenes.  [default: as the runs say]",
 )
 @click.option(
     "--images",
     type=click.IntRange(0, 20),
     default=3,
     show_default=True,
-    help="Test images, and train photos with masks, a scene of which copies are kept for the page.",
+    help="Copies to keep per scene for the page: N test images and N train photos with masks.",
 )
-@click.option("--replace", is_flag=True, help="A run with other numbers replaces the one on the board.")
-@click.option("--quick", is_flag=True, help="Recompute PSNR alone, not every metric.")
-@click.option("--dry-run", is_flag=True, help="Check, and write nothing.")
+@click.option("--replace", is_flag=True, help="Replace a run on the board that has other numbers.")
+@click.option("--quick", is_flag=True, help="Recompute only PSNR.")
+@click.option("--dry-run", is_flag=True, help="Check only; write nothing.")
 @_json
 def add_command(
     runs: tuple[Path, ...],
@@ -134,12 +134,12 @@ class _bar:
 
 @command.command("remove")
 @_board
-@click.option("--method", required=True, help="Whose runs.")
-@click.option("--dataset", help="Only these.")
-@click.option("--scene", help="Only these.")
-@click.option("--setting", help="Only these, as the board has it.")
-@click.option("--seed", type=click.IntRange(0), help="Only these.")
-@click.option("--dry-run", is_flag=True, help="Say what would go, and change nothing.")
+@click.option("--method", required=True, help="Remove runs of this method.")
+@click.option("--dataset", help="Only runs of this dataset.")
+@click.option("--scene", help="Only runs of this scene.")
+@click.option("--setting", help="Only runs of this setting, as written on the board.")
+@click.option("--seed", type=click.IntRange(0), help="Only runs of this seed.")
+@click.option("--dry-run", is_flag=True, help="List the runs; remove nothing.")
 def remove_command(
     board: Path,
     method: str,
@@ -161,19 +161,19 @@ def remove_command(
 @command.command("publish")
 @_board
 @click.option("-o", "--out", required=True, type=PathName(), help="Folder of the page.")
-@click.option("--reported", is_flag=True, help="Show what papers print beside the measured numbers, marked.")
+@click.option("--reported", is_flag=True, help="Also show numbers from papers, in a table of their own.")
 @click.option(
     "--reported-from",
     type=PathName(file_okay=False),
-    help="Show those of the *.csv in this folder.  [default: BOARD/reported, with --reported]",
+    help="Folder of *.csv with them.  [default: BOARD/reported, else those of this package]",
 )
-@click.option("--title", default="Leaderboard", show_default=True, help="Of the page.")
+@click.option("--title", default="Leaderboard", show_default=True, help="Title of the page.")
 @click.option(
     "--models",
     multiple=True,
     type=PathName(),
     metavar="RUNS",
-    help="Run folders, or folders of them: their models go into pages behind the entries; repeatable.",
+    help="Run folders, or folders of them, whose models get pages; repeatable.",
 )
 @_json
 def publish_command(
@@ -185,9 +185,9 @@ def publish_command(
     models: tuple[Path, ...],
     as_json: bool,
 ) -> None:
-    """Write CSVs and a page that works from a file, from the board's CSVs alone.
+    """Write CSVs and an offline page from the CSVs of the board.
 
-    OUT holds index.html, data/, images/ and with --models models/ afterwards; an earlier page there is replaced.
+    OUT then holds index.html, data/, images/ and, with --models, models/. An earlier page there is replaced.
     """
     import dataclasses
 
@@ -214,12 +214,12 @@ def publish_command(
 
 @command.command("check")
 @_board
-@click.option("--strict", is_flag=True, help="Exit with 1 where the audit asks anything.")
+@click.option("--strict", is_flag=True, help="Exit with code 1 if the audit finds anything.")
 @_json
 def check_command(board: Path, strict: bool, as_json: bool) -> None:
-    """Read the board again: hashes, duplicates, files that do not follow; then audit its numbers.
+    """Check the board: hashes, duplicates, files that do not match; then audit its numbers.
 
-    What is wrong ends with exit code 2. What the audit finds are questions, as with 'aw audit'.
+    A damaged board ends with exit code 2. Findings of the audit are questions, as with 'aw audit'.
     """
     import dataclasses
 

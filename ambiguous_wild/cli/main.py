@@ -16,7 +16,7 @@ COMMANDS = {
     "doctor": ("doctor", "Check this machine: missing dependencies and the commands that install them."),
     "simulate": (
         "simulate",
-        "Make a synthetic capture with ground truth: poses, distractor masks, clean views.",
+        "Simulate a capture with exact truth: poses, distractor masks, clean photos.",
     ),
     "composite": ("composite", "Add distractors with exact masks to a scene of real photos."),
     "capture": ("capture", "Select sharp, evenly spaced photos from a video, a folder or a camera."),
@@ -34,18 +34,18 @@ COMMANDS = {
     "plan": ("plan", "Recommend optional effects for a scene, with their cost."),
     "bench": ("bench", "Train methods on scenes and evaluate them."),
     "ablate": ("ablate", "Measure the gain and cost of each part of a method."),
-    "table": ("table", "Compare runs: Markdown, CSV, LaTeX."),
-    "rescore": ("rescore", "Measure what was missing when runs ended, from their saved pictures."),
+    "table": ("table", "Compare runs in tables: terminal, Markdown, CSV, LaTeX, HTML."),
+    "rescore": ("rescore", "Add metrics that were missing when runs ended, from their saved renders."),
     "cost": ("cost", "Accuracy against training time: tables and plots."),
     "audit": ("audit", "Find errors in tables of results."),
-    "view": ("view", "Write a page to fly through models and compare them; watch a training."),
+    "view": ("view", "Write a page to fly through models and compare them; or watch a training."),
     "video": ("video", "Film models side by side along one camera path: mp4, GIF."),
     "export": ("export", "Write models as compressed PLY, SPZ, SOG and glTF, with the loss in dB."),
-    "leaderboard": ("leaderboard", "Add checked runs to CSV files and publish them as a page."),
+    "leaderboard": ("leaderboard", "Check runs, collect them in CSV files and publish them as a page."),
     "study": ("study", "Blind user study: which distractor is hard to see, which render is better."),
     "stress": ("stress", "Numerical stress tests against float64; replay of a training that met a NaN."),
     "weights": ("weights", "Pretrained networks: list, download, check."),
-    "methods": ("methods", "List the available methods."),
+    "methods": ("methods", "List the methods; with a name, show one in full."),
 }
 
 
@@ -76,7 +76,7 @@ def cli() -> None:
     """Distractor-free 3D Gaussian Splatting where the distractor looks like the scene.
 
     \b
-    aw simulate courtyard -o raw        a synthetic capture; or use your own photos
+    aw simulate courtyard -o raw        a simulated capture; or use your own photos
     aw build-scene raw -o scene         check, COLMAP, downsample, split
     aw bench --method 3dgs --method refinesplat --scene scene -o runs
     aw table runs                       compare the methods

@@ -20,15 +20,15 @@ WIDTH = 100
 
 @click.command(name="methods")
 @click.argument("names", nargs=-1, metavar="[NAME]...")
-@click.option("--table", is_flag=True, help="What each method consists of: masks, appearance, density, ...")
+@click.option("--table", is_flag=True, help="Table of the parts of each method: masks, density, ...")
 @click.option("--plugin", "plugins", multiple=True, type=PathName(),
               help="A Python file that registers your methods; repeatable.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print the same as JSON.")
 def command(names: tuple[str, ...], table: bool, plugins: tuple[Path, ...], as_json: bool) -> None:
-    """List the methods: name, summary, paper, requirements beyond the core.
+    """List the methods: name, summary, paper, extra requirements.
 
-    With NAME: what differs from its release and why, with what features it was published and runs here, its
-    options with their defaults, and its ablations.
+    With NAME: what differs from its release and why, its features there and here, its options with their
+    defaults, and its ablations.
     """
     from ambiguous_wild.methods.registry import all_methods, get_method, load_plugin
 

@@ -20,7 +20,7 @@ from ambiguous_wild.core.errors import AwError, shortlist
     "--info",
     "info_file",
     type=PathName(dir_okay=False),
-    help="Licence, consent, creators: YAML, see --template.",
+    help="YAML file with licence, consent, creators; see --template.",
 )
 @click.option("--template", type=PathName(dir_okay=False), help="Write an empty --info file and stop.")
 @click.option("--keep-metadata", is_flag=True, help="Leave EXIF (places, serial numbers) in the photos.")
@@ -28,7 +28,7 @@ from ambiguous_wild.core.errors import AwError, shortlist
     "--people/--no-people",
     default=True,
     show_default=True,
-    help="List photos in which a person may be seen; weak.",
+    help="List photos in which a detector sees a person; it misses most people.",
 )
 @click.option("--jobs", type=click.IntRange(min=1), help="Threads; the result does not depend on it.")
 @click.option("--json", "as_json", is_flag=True, help="Print the same facts as JSON.")
@@ -42,7 +42,7 @@ def command(
     jobs: int | None,
     as_json: bool,
 ) -> None:
-    """Pack SCENES for release: a zip a scene, croissant.json, a data card, checksums.
+    """Pack SCENES for release: one zip per scene, croissant.json, a data card, checksums.
 
     \b
     aw package --template release.yaml          fill it in

@@ -24,13 +24,13 @@ MASKS = (
 @click.command("plan")
 @click.argument("scene", type=PathName())
 @click.option(
-    "--factor", type=click.IntRange(1), help="Use images_N.  [default: what the scene was built for]"
+    "--factor", type=click.IntRange(1), help="Use the photos in images_N.  [default: as the scene was built]"
 )
 @click.option(
     "--probe/--no-probe",
     default=True,
     show_default=True,
-    help="Train 3DGS on small photos, to decide on masks; other effects do not need it.",
+    help="Train 3DGS on small photos to decide about masks; other effects do not need it.",
 )
 @click.option(
     "--costs/--no-costs",
@@ -45,7 +45,7 @@ MASKS = (
 def command(
     scene: Path, factor: int | None, probe: bool, costs: bool, out: Path | None, as_json: bool
 ) -> None:
-    """Measure SCENE and decide on each effect: evidence, threshold, decision, cost.
+    """Measure SCENE and decide which effects it needs: evidence, threshold, decision and (--costs) cost.
 
     'aw bench --effects auto' makes the same decisions, but without the probe.
     """

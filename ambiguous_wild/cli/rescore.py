@@ -18,15 +18,15 @@ from ambiguous_wild.core.errors import AwError
 @click.option(
     "--scene",
     type=PathName(file_okay=False),
-    help="Where the scene lies now.  [default: where each run says]",
+    help="Scene folder, if it was moved.  [default: as each run says]",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print what became of every run as JSON.")
 def command(runs: tuple[Path, ...], scene: Path | None, as_json: bool) -> None:
-    """Measure what was missing when the runs below RUNS ended, e.g. LPIPS whose weights came later.
+    """Add metrics that were missing when the runs below RUNS ended, e.g. LPIPS before its weights were there.
 
-    Nothing is trained: metrics are computed from the saved renders and the scene's test photos. First every number
-    of a result is computed again; a run whose renders, photos or settings were changed is refused. metrics.json
-    notes what was added, and by which version.
+    Nothing is trained: the saved renders are compared with the scene's test photos. First every number of a
+    result is computed again; a run whose renders, photos or settings were changed is refused. metrics.json
+    records what was added, and by which version.
 
     \b
     aw rescore runs

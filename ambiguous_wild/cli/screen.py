@@ -24,7 +24,7 @@ _WORDS = {"ok": ("ok", "green"), "warning": ("WARNING", "red"), "unknown": ("unk
 @click.option("--json", "as_json", is_flag=True, help="Print the same facts as JSON.")
 def command(raw: Path, strict: bool, jobs: int | None, as_json: bool) -> None:
     """Check the photos in RAW before building: exposure, white balance, ISO, focus, focal length, blur,
-    near-duplicates, overlap. Nothing is written."""
+    near-duplicates, overlap, motion. Nothing is written."""
     import os
 
     from ambiguous_wild.builder.capture_report import check_capture, refuse_failed

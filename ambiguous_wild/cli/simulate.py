@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 @click.argument("name", metavar="NAME|SPEC.yaml", required=False)
 @click.option("-o", "--out", type=PathName(file_okay=False), help="Folder to write.")
 @click.option(
-    "--seed", type=click.IntRange(0), default=0, show_default=True, help="World, walk and distractors."
+    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of world, walk, distractors."
 )
-@click.option("--views", type=int, help="Train photos; test photos in proportion.")
-@click.option("--width", type=int, help="Width of a photo in px; the aspect ratio stays.")
+@click.option("--views", type=int, help="Number of train photos; test photos in proportion.")
+@click.option("--width", type=int, help="Width of a photo in px; keeps the aspect ratio.")
 @click.option("--depth", is_flag=True, help="Also write depth maps of the static scene.")
 @click.option("--overwrite", is_flag=True, help="Replace an earlier capture in this folder.")
 @click.option(
@@ -48,8 +48,8 @@ def command(
 ) -> None:
     """Simulate a capture: photos with distractors, clean test photos, and the exact truth.
 
-    NAME is a preset of --list. SPEC.yaml holds world, walk, distractors and effects (docs/simulation.md);
-    what it leaves out is as in the preset courtyard.
+    NAME is a preset of --list. SPEC.yaml describes world, walk, distractors and effects (docs/simulation.md).
+    Missing keys are as in the preset courtyard.
     """
     from ambiguous_wild.core.errors import AwError, counted
     from ambiguous_wild.simulate.presets import PRESETS, preset, resized

@@ -13,7 +13,7 @@ from ambiguous_wild.cli.paths import PathName
 
 @click.command("stress")
 @click.option(
-    "--only", multiple=True, metavar="CASE", help="A row (4), a name or a part of a name; repeatable."
+    "--only", multiple=True, metavar="CASE", help="Number (4), name or part of a name of a case; repeatable."
 )
 @click.option("--list", "listing", is_flag=True, help="Only print the names of the cases.")
 @click.option(
@@ -31,12 +31,12 @@ from ambiguous_wild.cli.paths import PathName
     show_default=True,
 )
 @click.option("--json", "as_json", is_flag=True, help="Same as --format json.")
-@click.option("-o", "--output", type=PathName(dir_okay=False), help="Write to a file instead.")
+@click.option("-o", "--output", type=PathName(dir_okay=False), help="Write to this file.")
 @click.option(
     "--replay",
     "run",
     type=PathName(file_okay=False),
-    help="A run folder whose training met a value that is not finite: repeat the training up to it.",
+    help="Run folder whose training met a NaN or infinite value: repeat the training up to it.",
 )
 def command(
     only: tuple[str, ...],
@@ -47,7 +47,7 @@ def command(
     output: Path | None,
     run: Path | None,
 ) -> None:
-    """Numerical stress tests: error against float64 and the allowed error of each case.
+    """Run numerical stress tests: the error of each case against float64, and the allowed error.
 
     \b
     aw stress                     every case

@@ -12,10 +12,10 @@ from ambiguous_wild.cli.paths import PathName
 
 @click.group("study")
 def command() -> None:
-    """Blind user study: is the distractor hard to see, and which render is better?
+    """Blind user study: how hard are distractors to see, and which render is better?
 
     \b
-    aw study make --runs runs --scene scene -o study.html    a page for raters, and study.key.json to keep private
+    aw study make --runs runs --scene scene -o study.html    page for raters, and the private study.key.json
     aw study score answers/ --key study.key.json             shares, ranking, agreement
     """
 
@@ -54,7 +54,7 @@ def command() -> None:
     type=click.IntRange(1, 1000),
     default=40,
     show_default=True,
-    help="Most questions of each kind; spread evenly.",
+    help="Largest number of questions of each kind.",
 )
 @click.option(
     "--truth/--no-truth", default=True, show_default=True, help="Show the test photo next to the two renders."
@@ -70,7 +70,7 @@ def command() -> None:
     type=click.IntRange(64, 4000),
     default=1000,
     show_default=True,
-    help="Most pixels of an image's longer side.",
+    help="Largest longer side of an image, px.",
 )
 @click.option(
     "--quality",

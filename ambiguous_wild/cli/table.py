@@ -27,27 +27,28 @@ LAYOUTS = ("blocks", "paper", "means", "memory", "ablation")
 @click.option("--format", "style", type=click.Choice(STYLES), default="text", show_default=True)
 @click.option(
     "--layout", type=click.Choice(LAYOUTS), default="blocks", show_default=True,
-    help="blocks: a table a scene; paper: scenes side by side; means: over each dataset; memory: MB by scene; ablation: of 'aw ablate -o RUNS'.",
+    help="blocks: a table per scene; paper: scenes side by side; means: datasets side by side; "
+    "memory: MB per scene; ablation: RUNS is the output of 'aw ablate'.",
 )  # fmt: skip
-@click.option("-o", "--output", type=PathName(dir_okay=False), help="Write to a file instead.")
+@click.option("-o", "--output", type=PathName(dir_okay=False), help="Write to this file.")
 @click.option(
     "--metric", "metrics", multiple=True, help="Only this column; repeatable.  [default: all measured]"
 )
 @click.option("--scene", "scenes", multiple=True, help="Only this scene; repeatable.  [default: all]")
 @click.option(
     "--dataset", "datasets", multiple=True, metavar="NAME=SCENE,SCENE",
-    help="Scenes that have tables and a mean of their own; repeatable.  [default: as the reported tables have them]",
+    help="Group these scenes as dataset NAME; repeatable.  [default: as in the papers' tables]",
 )  # fmt: skip
-@click.option("--all", "everything", is_flag=True, help="As text: every column side by side, however wide.")
-@click.option("--reported", is_flag=True, help="Show what papers print below, in rows of their own.")
+@click.option("--all", "everything", is_flag=True, help="Text tables with every column, however wide.")
+@click.option("--reported", is_flag=True, help="Also show numbers from papers, in separate rows.")
 @click.option(
     "--reported-from", type=PathName(exists=True),
-    help="Their tables, as 'aw audit' reads them.  [default: those that come with the package]",
+    help="Tables of the papers (CSV, as for 'aw audit').  [default: those that come with the package]",
 )  # fmt: skip
 @click.option(
     "--sheet",
     type=PathName(dir_okay=False),
-    help="Also write a PNG or JPG: test renders side by side, and what each method masks.",
+    help="Also write this PNG or JPG: test renders side by side, and what each method masks.",
 )
 def command(
     runs: Path,
@@ -64,14 +65,14 @@ def command(
 ) -> None:
     """Compare the runs below the folder RUNS: quality, cost and masks, method by method.
 
-    Means are over images, then seeds, then scenes. What is missing, failed or not comparable stands below
+    Means are over images, then seeds, then scenes. What is missing, failed or not comparable is named below
     the table (for CSV: on standard error).
 
     \b
     aw table runs
     aw table runs --layout paper --format latex -o table.tex
     aw table runs --layout means --format html --reported -o means.html
-    aw table runs --format tidy -o results.csv    one row a method, scene, seed, image and metric
+    aw table runs --format tidy -o results.csv    one row per method, scene, seed, image and metric
     """
     if sheet is not None and sheet.suffix.lower() not in SHEETS:
         raise AwError(f"--sheet {sheet}: it is a picture, give a name that ends in .png or .jpg")

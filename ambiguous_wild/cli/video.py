@@ -23,24 +23,22 @@ from ambiguous_wild.cli.paths import PathName
 )
 @click.option(
     "--path", "path", default="test", show_default=True, metavar="test|orbit|FILE",
-    help="Through the test cameras, around the scene, or a path saved by 'aw view', nerfstudio or a 3DGS viewer.",
+    help="Along the test cameras, around the scene, or FILE saved by 'aw view', nerfstudio or a 3DGS viewer.",
 )  # fmt: skip
 @click.option("--seconds", type=click.FloatRange(0.1, 600), default=8.0, show_default=True)
 @click.option(
     "--fps", type=click.FloatRange(1, 120), default=24.0, show_default=True, help="Frames per second."
 )
 @click.option(
-    "--width", type=click.IntRange(16, 4096), help="Of each method's picture, px.  [default: the photos']"
+    "--width", type=click.IntRange(16, 4096), help="Width of each render, px.  [default: as the photos]"
 )
-@click.option("--columns", type=click.IntRange(1), help="Pictures in a row.  [default: up to three]")
-@click.option(
-    "--gif", type=PathName(dir_okay=False), help="Also an animation of the whole path, for a README."
-)
+@click.option("--columns", type=click.IntRange(1), help="Renders in a row.  [default: up to three]")
+@click.option("--gif", type=PathName(dir_okay=False), help="Also write this GIF of the whole path.")
 @click.option("--gif-seconds", type=click.FloatRange(0.5, 30), default=4.0, show_default=True)
-@click.option("--gif-width", type=click.IntRange(16, 2048), default=640, show_default=True, help="px.")
-@click.option("--scene", help="Name of the scene, where the runs are of several.")
+@click.option("--gif-width", type=click.IntRange(16, 2048), default=640, show_default=True, help="Width, px.")
+@click.option("--scene", help="Name of the scene, if the runs have several.")
 @click.option(
-    "--scene-folder", type=PathName(file_okay=False), help="Where it lies.  [default: where the runs say]"
+    "--scene-folder", type=PathName(file_okay=False), help="The scene folder.  [default: as the runs say]"
 )
 @click.option(
     "--plugin",
@@ -53,7 +51,7 @@ from ambiguous_wild.cli.paths import PathName
 def command(
     runs: tuple[Path, ...], output: Path, path: str, plugins: tuple[Path, ...], **options: Any
 ) -> None:
-    """Film the models of RUNS (run folders, or folders of them), side by side with labels, along one camera path.
+    """Film the models of RUNS (run folders, or folders of them) side by side along one camera path.
 
     \b
     aw video runs -o video.mp4

@@ -16,15 +16,15 @@ MOST_GAUSSIANS = 150_000
 @click.argument("runs", nargs=-1, type=PathName())
 @click.option(
     "-o", "--output", type=PathName(file_okay=False), default=Path("view"), show_default=True,
-    help="Folder of the page; with --live of the run  [default with --live: runs].",
+    help="Folder of the page; with --live, of the run (default then: runs).",
 )  # fmt: skip
-@click.option("--scene", help="Name of the scene, where the runs are of several.")
+@click.option("--scene", help="Name of the scene, if the runs have several.")
 @click.option(
-    "--scene-folder", type=PathName(file_okay=False), help="Where it lies.  [default: where the runs say]"
+    "--scene-folder", type=PathName(file_okay=False), help="The scene folder.  [default: as the runs say]"
 )
 @click.option(
     "--max-gaussians", type=click.IntRange(1), default=MOST_GAUSSIANS, show_default=True,
-    help="In the page, a larger model is reduced to so many, with a note.",
+    help="A larger model is reduced to this number of Gaussians in the page, with a note.",
 )  # fmt: skip
 @click.option(
     "--plugin",
@@ -33,28 +33,28 @@ MOST_GAUSSIANS = 150_000
     type=PathName(),
     help="A Python file that registers your methods; repeatable.",
 )
-@click.option("--title", help="Of the page.  [default: the scene's name]")
+@click.option("--title", help="Title of the page.  [default: the scene's name]")
 @click.option(
     "--live",
     type=PathName(file_okay=False),
     metavar="SCENE",
     help="Train on SCENE and watch it in a browser.",
 )
-@click.option("--method", default="refinesplat", show_default=True, help="With --live: what is trained.")
-@click.option("--iterations", type=click.IntRange(1), help="With --live: length.  [default: 30000]")
+@click.option("--method", default="refinesplat", show_default=True, help="With --live: method to train.")
+@click.option("--iterations", type=click.IntRange(1), help="With --live: iterations.  [default: 30000]")
 @click.option(
     "--max-train-gaussians",
     type=click.IntRange(4),
-    help="With --live: most Gaussians.  [default: the method's]",
+    help="With --live: largest number of Gaussians.  [default: the method's]",
 )
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="With --live.")
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="With --live: seed.")
 @click.option("--threads", type=click.IntRange(1), help="With --live: CPU threads.")
 @click.option(
     "--device",
     type=click.Choice(["auto", "cpu", "cuda"]),
     default="auto",
     show_default=True,
-    help="With --live.",
+    help="With --live: auto is the GPU if torch and gsplat can use one, else the CPU.",
 )
 @click.option("--host", default="127.0.0.1", show_default=True, help="With --live: address to listen on.")
 @click.option(
@@ -62,9 +62,9 @@ MOST_GAUSSIANS = 150_000
     type=click.IntRange(0, 65535),
     default=8080,
     show_default=True,
-    help="With --live; 0 = any free one.",
+    help="With --live: port; 0 = any free one.",
 )
-@click.option("--paused", is_flag=True, help="With --live: wait before the first step.")
+@click.option("--paused", is_flag=True, help="With --live: pause after the first step.")
 @click.pass_context
 def command(
     ctx: click.Context,
@@ -88,8 +88,8 @@ def command(
 ) -> None:
     """Write a page that shows the models of RUNS (run folders, or folders of them), all of one scene.
 
-    The page is one file that needs no server and no network: models side by side or under a slider with the same
-    camera, the photos' cameras, masks over photos, PSNR of each test view.
+    The page is one file that needs no server and no network. It shows models side by side or under a slider
+    with the same camera, the cameras of the photos, masks over photos, and the PSNR of each test view.
 
     \b
     aw view runs -o view                       then open view/index.html

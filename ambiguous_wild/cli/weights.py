@@ -12,7 +12,7 @@ from ambiguous_wild.core.errors import AwError, counted
 
 @click.group(name="weights")
 def command() -> None:
-    """Pretrained networks: for LPIPS, features and instance masks. Nothing needs them by default.
+    """Pretrained networks for LPIPS, features and instance masks. No method needs them by default.
 
     \b
     aw weights list                           all networks, their size, licence and source
@@ -84,7 +84,7 @@ def get_command(names: tuple[str, ...], as_json: bool) -> None:
 def check_command(names: tuple[str, ...], as_json: bool) -> None:
     """Load networks completely and compare hashes; without NAMES all that are on this machine.
 
-    Exit code 2 if one is missing, damaged or another network than its name says.
+    Exit code 2 if one is missing, damaged, or not the network that its name says.
     """
     from ambiguous_wild.vision import weights
     from ambiguous_wild.vision.verify import verify

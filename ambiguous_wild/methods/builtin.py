@@ -38,12 +38,12 @@ BUILTIN = (
     ),
     MethodEntry(
         name="refinesplat-printed",
-        summary="RefineSplat to the letter of its paper, degenerate forms included",
+        summary="RefineSplat as its paper prints it, except two formulas with errors",
         recipe="ambiguous_wild.methods.refinesplat.recipe:build",
         config="ambiguous_wild.methods.refinesplat.paper:PrintedConfig",
         paper="Rectifying Mask via Entropy for Distractor-Free 3DGS in Ambiguous Scenarios",
         needs=PAPER_NETWORKS,
-        note="to the letter of the paper, degenerate forms included (docs/fidelity.md); features {features}, "
+        note="as printed, except two formulas with errors (docs/fidelity.md); features {features}, "
         "instances {instances}",
     ),
     MethodEntry(

@@ -20,7 +20,7 @@ from ambiguous_wild.simulate.presets import preset, resized
 from ambiguous_wild.simulate.spec_file import parse_spec, plain_spec
 from tests.tiny_scene import write_tiny_scene
 
-SETTINGS = {"factor": 2, "camera": "auto", "matcher": "auto", "seed": 0, "strict": False}
+SETTINGS = {"factor": 2, "camera": "auto", "matcher": "auto", "seed": 0, "strict": False, "sfm": "auto"}
 
 
 def scene_of(root: Path, truth: object, settings: object = SETTINGS) -> Scene:
@@ -41,6 +41,12 @@ def test_a_preset_is_named_with_what_differs_from_it(tmp_path: Path) -> None:
     assert preparation(more)[1] == (
         "aw build-scene 'raw/b c' -o 'b c' --factor 2 --mapper global --max-features 500 --strict"
     )
+    fast = scene_of(tmp_path / "fast", {"preset": "courtyard", "seed": 0, "spec": spec},
+                    {**SETTINGS, "sfm": "fast"})  # fmt: skip
+    assert preparation(fast)[1] == "aw build-scene raw/fast -o fast --factor 2 --sfm fast"
+    older = {key: value for key, value in SETTINGS.items() if key != "sfm"}
+    old = scene_of(tmp_path / "old", {"preset": "courtyard", "seed": 0, "spec": spec}, older)
+    assert preparation(old)[1] == "aw build-scene raw/old -o old --factor 2 --sfm thorough"
 
 
 def test_another_spec_is_written_out(tmp_path: Path) -> None:

@@ -14,7 +14,15 @@ from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.simulate.presets import PRESETS, resized
 from ambiguous_wild.simulate.spec_file import plain_spec
 
-FLAGS = ("camera", "matcher", "mapper", "max_features", "seed", "masks_missing")  # `aw build-scene --...`
+FLAGS = (
+    "camera",
+    "matcher",
+    "mapper",
+    "max_features",
+    "seed",
+    "masks_missing",
+    "sfm",
+)  # `aw build-scene --...`
 
 
 def preparation(scene: Scene | None) -> list[str]:
@@ -67,6 +75,7 @@ def _simulate(truth: Mapping[str, Any], name: str) -> list[str]:
 
 def _build(raw: str, name: str, settings: Mapping[str, Any]) -> list[str]:
     usual = {f.name: f.default for f in fields(BuildSettings)}
+    settings = {"sfm": "thorough", **settings}  # the only way there was before scenes recorded it
     words = ["aw", "build-scene", raw, "-o", name]
     if settings.get("factor") is not None:
         words += ["--factor", str(settings["factor"])]

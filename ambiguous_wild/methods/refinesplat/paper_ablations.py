@@ -150,7 +150,7 @@ ABLATIONS = (
             Variant("id-everywhere", ("weigh_id=false",), "L_id asks for the distractor too"),
             Variant("entropy-unlimited", ("entropy_limit=0",), "L_id and L_cr outweigh the photo"),
             Variant("nothing-limited", ("mask.most=1",), "a photo may be masked whole"),
-            Variant("all", method="refinesplat-printed", text="to the letter"),
+            Variant("all", method="refinesplat-printed", text="as printed"),
         ),
     ),
 )

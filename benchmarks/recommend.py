@@ -1,0 +1,83 @@
+"""How far `aw cost --recommend` is from the best of a measured grid on captures that it has not seen.
+
+    python benchmarks/recommend.py RUNS... --held-back SCENE SCENE [--budgets 6 10 18 30] [--scenes SCENE ...]
+
+RUNS are folders of `aw bench`: settings at several lengths on several captures. The captures held back are
+judged by the curves of the others; every pair of captures is held back in turn as well. Budgets are seconds
+of the reference machine. Writes benchmarks/results/recommend.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.cost.read import CostRun, read_cost_runs
+from ambiguous_wild.harness.cost.recommend import CLOSE_DB, leave_out
+from ambiguous_wild.harness.running.environment import environment
+from ambiguous_wild.io.atomic import write_json
+
+RESULTS = Path(__file__).parent / "results" / "recommend.json"
+
+
+def judge(runs: Sequence[CostRun], held_back: Sequence[str], budget_s: float) -> dict[str, Any]:
+    """The choice for the captures held back, and how far behind it is for all pairs."""
+
+    def choices(scenes: Sequence[str]) -> dict[str, dict[str, Any]]:
+        found = leave_out(runs, scenes, budget_s)
+        return {scene: {"setting": name, "behind_db": behind} for scene, (name, behind) in found.items()}
+
+    scenes = sorted({run.scene for run in runs})
+    pairs = [choices(pair) for pair in itertools.combinations(scenes, 2)]
+    behind = [choice["behind_db"] for pair in pairs for choice in pair.values()]
+    return {
+        "budget_s": budget_s,
+        "held_back": choices(held_back),
+        "pairs": len(pairs),
+        "share_within": sum(db <= CLOSE_DB for db in behind) / len(behind),
+        "worst_db": max(behind),
+    }
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("runs", nargs="+", type=Path)
+    parser.add_argument("--held-back", nargs="+", required=True, metavar="SCENE")
+    parser.add_argument("--scenes", nargs="+", help="captures to use; by default all")
+    parser.add_argument("--budgets", nargs="+", type=float, default=[6.0, 10.0, 18.0, 30.0])
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    args = parser.parse_args(words)
+    found = read_cost_runs(args.runs)
+    runs = [run for run in found.runs if args.scenes is None or run.scene in args.scenes]
+    data = {
+        "environment": environment("cpu"),
+        "runs": len(runs),
+        "contended": sum(run.timing.verdict != "alone" for run in runs),
+        "scenes": sorted({run.scene for run in runs}),
+        "methods": sorted({run.method for run in runs}),
+        "within_db": CLOSE_DB,
+        "budgets": [judge(runs, args.held_back, budget) for budget in args.budgets],
+    }
+    write_json(args.results, data)
+    for row in data["budgets"]:
+        told = ", ".join(
+            f"{scene}: {choice['setting']}, {choice['behind_db']:.2f} dB behind the best"
+            for scene, choice in row["held_back"].items()
+        )
+        print(
+            f"{row['budget_s']:g} s: {told}; all pairs: {row['share_within']:.0%} within {CLOSE_DB} dB, "
+            f"worst {row['worst_db']:.2f} dB"
+        )
+    return 0
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main())
+    except AwError as error:
+        sys.exit(f"error: {error}")

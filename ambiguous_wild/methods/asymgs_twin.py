@@ -59,8 +59,8 @@ class HardMask(AsymMask):
 class Twin(Fields):
     """The second model. Drawn beside the first, it is in no picture; what both draw is to agree."""
 
-    def __init__(self, config: TwinConfig, masks: AsymMask, lambda_dssim: float = 0.2) -> None:
-        self.config, self.masks, self.lambda_dssim = config, masks, lambda_dssim
+    def __init__(self, config: TwinConfig, masks: AsymMask) -> None:
+        self.config, self.masks = config, masks
         self._second: tuple[int, Camera] | None = None  # photo of the second model in this step
 
     def setup(self, data: TrainData, static: Gaussians, rates: Rates) -> Mapping[str, FieldStart]:
@@ -99,4 +99,4 @@ class Twin(Fields):
             keep = keep * shrink_keep(user, divisor)
         self.masks.learn_soft(view, image)
         photo = shrink(self.data.photos[view], divisor)
-        return photometric(image, photo, keep, lambda_dssim=self.lambda_dssim).d_image
+        return photometric(image, photo, keep).d_image

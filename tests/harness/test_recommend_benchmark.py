@@ -1,25 +1,19 @@
 """The benchmark of recommendations: choices for captures held back, and over all pairs."""
 
-import importlib
 import json
-import sys
 from pathlib import Path
 
 import pytest
 
 from ambiguous_wild.core import AwError
+from tests.benchmark_scripts import benchmark
 from tests.harness.fake_cost import cost_run
-
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 
 
 @pytest.fixture
 def recommend():
-    sys.path.insert(0, str(BENCHMARKS))
-    try:
-        yield importlib.import_module("recommend")
-    finally:
-        sys.path.remove(str(BENCHMARKS))
+    with benchmark("recommend") as module:
+        yield module
 
 
 def test_choices_are_judged_by_what_was_held_back(recommend, tmp_path: Path, capsys) -> None:

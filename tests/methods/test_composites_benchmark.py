@@ -1,26 +1,20 @@
 """The benchmark of composites: which photos test, and what it makes of a base."""
 
-import importlib
 import shutil
-import sys
 from pathlib import Path
 
 import pytest
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.scene_folder import load_scene
+from tests.benchmark_scripts import benchmark
 from tests.tiny_scene import TEST, TRAIN, write_tiny_scene
-
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 
 
 @pytest.fixture(scope="module")
 def composites():
-    sys.path.insert(0, str(BENCHMARKS))
-    try:
-        yield importlib.import_module("composites")
-    finally:
-        sys.path.remove(str(BENCHMARKS))
+    with benchmark("composites") as module:
+        yield module
 
 
 def test_the_best_supported_views_test_none_beside_another(composites):

@@ -14,15 +14,8 @@ from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.simulate.presets import PRESETS, resized
 from ambiguous_wild.simulate.spec_file import plain_spec
 
-FLAGS = (
-    "camera",
-    "matcher",
-    "mapper",
-    "max_features",
-    "seed",
-    "masks_missing",
-    "sfm",
-)  # `aw build-scene --...`
+# options of `aw build-scene`
+FLAGS = ("camera", "matcher", "mapper", "max_features", "seed", "masks_missing", "sfm")
 
 
 def preparation(scene: Scene | None) -> list[str]:

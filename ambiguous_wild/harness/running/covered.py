@@ -10,7 +10,7 @@ surface that lies in its frame and not behind another static one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -83,12 +83,12 @@ def train_looks(scene: Scene, distractor: DistractorMask) -> dict[str, Looks] | 
     return found
 
 
-def hides_anything(scene: Scene, distractor: DistractorMask) -> str:
-    """Why nothing is covered whatever the surfaces are; empty where something may be."""
-    masks = [mask for view in scene.train if (mask := distractor(view)) is not None]
-    if not masks:
+def hides_anything(masks: Iterable[np.ndarray | None]) -> str:
+    """Why no pixel can be covered, from the exact masks of the train views; empty where one may be."""
+    known = [mask for mask in masks if mask is not None]
+    if not known:
         return "no exact masks of the train photos (truth/distractor)"
-    return "" if any(mask.any() for mask in masks) else "no train photo shows a distractor"
+    return "" if any(mask.any() for mask in known) else "no train photo shows a distractor"
 
 
 def _nearest(camera: Camera, others: Sequence[Camera]) -> list[int]:

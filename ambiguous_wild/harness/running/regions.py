@@ -77,14 +77,15 @@ def _find_regions(key: _Same) -> Regions:
         pixels[VALID] = kept
     else:
         missing[VALID] = "no test photo has a mask (masks/test/<stem>.png, white = measured)"
-    looks = train_looks(scene, lambda view: true_distractor(scene, view))
+    exact = {view.name: true_distractor(scene, view) for view in scene.train}
+    looks = train_looks(scene, lambda view: exact[view.name])
     if isinstance(looks, str):
         return Regions(pixels, missing | dict.fromkeys((COVERED, UNCOVERED, SUPPORTED), looks))
     pixels[SUPPORTED] = {name: found.supported for name, found in looks.items()}
     if not any(mask.any() for mask in pixels[SUPPORTED].values()):
         missing[SUPPORTED] = "no surface in a test view is shown by three train views"
         del pixels[SUPPORTED]
-    nothing = hides_anything(scene, lambda view: true_distractor(scene, view))
+    nothing = hides_anything(exact.values())
     covered = {name: found.covered for name, found in looks.items()}
     if not nothing and not any(mask.any() for mask in covered.values()):
         nothing = "nothing that a test view shows was hidden in half of the train views that look at it"

@@ -16,11 +16,8 @@ resolution   dB above 3dgs at a quarter, half, once and twice the size that was 
 from __future__ import annotations
 
 import argparse
-import os
-import subprocess
 import sys
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean, stdev
@@ -30,6 +27,7 @@ import cv2
 import numpy as np
 import torch
 from captures import find_scenes
+from job_queue import Run, run_all
 
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.harness.running.environment import environment
@@ -90,13 +88,14 @@ class Job:
         group = f"{'half' if self.half else 'full'}-{self.most}"
         return out / group / load_name(self.scene) / self.method / f"seed{self.seed}"
 
-    def command(self, out: Path, iterations: int) -> list[str]:
+    def run(self, out: Path, iterations: int) -> Run:
         words = ["bench", "--method", self.method, "--scene", str(self.scene), "--seed", str(self.seed)]
         words += ["--iterations", str(iterations), "--max-gaussians", str(self.most), "--device", "cpu"]
         words += ["--threads", "1", "--no-pictures", "--effects", "none", "--probes", "0"]
         words += ["--protocol", "half" if self.half else "full"]
         words += ["-o", str(out / f"{'half' if self.half else 'full'}-{self.most}")]
-        return [sys.executable, "-m", "ambiguous_wild.cli.main", *words]
+        name = f"{self.method} on {load_name(self.scene)}, seed {self.seed}"
+        return Run(name, self.folder(out), tuple(words))
 
 
 _names: dict[Path, str] = {}
@@ -127,29 +126,6 @@ def plan(args: argparse.Namespace, scenes: Sequence[Path]) -> dict[str, list[Job
             ]
         planned[name] = jobs
     return planned
-
-
-def run_all(jobs: Sequence[Job], args: argparse.Namespace) -> list[str]:
-    """Run what has no result; returns a line for each failure."""
-    todo = [job for job in jobs if not (job.folder(args.out) / RESULT).is_file()]
-    print(f"{len(jobs)} runs: {len(jobs) - len(todo)} finished before, {len(todo)} to go", flush=True)
-    env = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    failed = []
-    with ThreadPoolExecutor(args.jobs) as pool:
-        waiting = {
-            pool.submit(subprocess.run, job.command(args.out, args.iterations), env=env, capture_output=True,
-                        text=True): job
-            for job in todo
-        }  # fmt: skip
-        for number, done in enumerate(as_completed(waiting), start=1):
-            job, process = waiting[done], done.result()
-            lines = [line.strip() for line in process.stderr.splitlines() if line.strip()] or ["no output"]
-            told = lines[-1] if process.returncode else next((x for x in lines if "PSNR" in x), lines[-1])
-            name = f"{job.method} on {load_name(job.scene)}, seed {job.seed}"
-            print(f"[{number}/{len(todo)}] {name}: {told}", flush=True)
-            if process.returncode:
-                failed.append(f"{name}: {lines[-1]}")
-    return failed
 
 
 # -- what came out ----------------------------------------------------------------------------------
@@ -330,7 +306,8 @@ def main(words: Sequence[str] | None = None) -> int:
         raise AwError(
             f"no scene for {', '.join(args.sections)}: their names hold none of the sections' words"
         )
-    failed = [] if args.report_only else run_all(jobs, args)
+    runs = [job.run(args.out, args.iterations) for job in jobs]
+    failed = [] if args.report_only else run_all(runs, args.jobs)
     data = report(planned, args)
     write_json(args.results.with_name(args.results.name + ".json"), data)
     write_text(args.results.with_name(args.results.name + ".md"), to_markdown(data))

@@ -1,7 +1,8 @@
 """The paper's method and learnt masks with hand-made and with pretrained features, against 3dgs.
 
     python benchmarks/paper_features.py --captures DIR... --out DIR [--methods ...] [--backends ...]
-        [--seeds 0 1 2] [--iterations 700] [--max-gaussians 12000] [--most N] [--results STEM] [--report-only]
+        [--seeds 0 1 2] [--iterations 700] [--max-gaussians 12000] [--jobs 1] [--most N] [--results STEM]
+        [--report-only]
 
 A DIR is a scene folder or a folder of them. A back end gives features and instances (hand-made features:
 graph segments); methods without either run once. `default` is what a method takes by itself. Each run is one
@@ -15,8 +16,6 @@ over that of 3dgs. Missing runs are listed.
 from __future__ import annotations
 
 import argparse
-import os
-import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,6 +25,7 @@ from typing import Any
 
 import pandas as pd
 from captures import find_scenes
+from job_queue import Run, run_all
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.running.environment import environment
@@ -62,14 +62,15 @@ class Job:
     def folder(self, out: Path) -> Path:
         return out / (self.backend or "none") / self.name / self.method / f"seed{self.seed}"
 
-    def command(self, args: argparse.Namespace) -> list[str]:
+    def run(self, args: argparse.Namespace) -> Run:
         words = ["bench", "--method", self.method, "--scene", str(self.scene), "--seed", str(self.seed)]
         words += ["--iterations", str(args.iterations), "--max-gaussians", str(args.max_gaussians)]
         words += ["--device", "cpu", "--threads", "1", "--no-pictures", "--effects", "none", "--probes", "0"]
         for key, value in settings_of(self.method, self.backend).items():
             words += ["--set", f"{self.method}.{key}={value}"]
         words += ["-o", str(args.out / (self.backend or "none"))]
-        return [sys.executable, "-m", "ambiguous_wild.cli.main", *words]
+        name = f"{self.method} {self.backend} on {self.name}, seed {self.seed}"
+        return Run(name, self.folder(args.out), tuple(words))
 
 
 def settings_of(method: str, backend: str) -> dict[str, str]:
@@ -100,23 +101,6 @@ def plan(args: argparse.Namespace) -> list[Job]:
         for rank, backend in enumerate(backends_of(method, args.backends))
     ]
     return [job for _, _, job in sorted(jobs, key=lambda row: row[:2])]
-
-
-def run_all(jobs: Sequence[Job], args: argparse.Namespace) -> list[str]:
-    """Run what has no result; a line for each failure."""
-    todo = [job for job in jobs if not (job.folder(args.out) / RESULT).is_file()]
-    print(f"{len(jobs)} runs: {len(jobs) - len(todo)} finished before, {len(todo)} to go", flush=True)
-    env = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    failed = []
-    for job in todo[: args.most]:
-        process = subprocess.run(job.command(args), env=env, capture_output=True, text=True, check=False)
-        lines = [line.strip() for line in process.stderr.splitlines() if line.strip()] or ["no output"]
-        told = lines[-1] if process.returncode else next((x for x in lines if "PSNR" in x), lines[-1])
-        name = f"{job.method} {job.backend} on {job.name}, seed {job.seed}"
-        print(f"{name}: {told}", flush=True)
-        if process.returncode:
-            failed.append(f"{name}: {lines[-1]}")
-    return failed
 
 
 def row_of(job: Job, out: Path) -> dict[str, Any] | None:
@@ -240,19 +224,21 @@ def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--iterations", type=int, default=700)
     parser.add_argument("--max-gaussians", type=int, default=12_000)
+    parser.add_argument("--jobs", type=int, default=1, help="runs at a time")
     parser.add_argument("--most", type=int, help="runs of this call at most")
     parser.add_argument("--results", type=Path, default=RESULTS, help="where .json, .csv and .md go")
     parser.add_argument("--report-only", action="store_true", help="train nothing, tabulate what is there")
     args = parser.parse_args(words)
-    if args.iterations < 1 or args.max_gaussians < 1 or (args.most is not None and args.most < 1):
-        parser.error("--iterations, --max-gaussians and --most count from 1")
+    counts = (args.iterations, args.max_gaussians, args.jobs, 1 if args.most is None else args.most)
+    if min(counts) < 1:
+        parser.error("--iterations, --max-gaussians, --jobs and --most count from 1")
     return args
 
 
 def main(words: Sequence[str] | None = None) -> int:
     args = arguments(words)
     jobs = plan(args)
-    failed = [] if args.report_only else run_all(jobs, args)
+    failed = [] if args.report_only else run_all([job.run(args) for job in jobs], args.jobs, args.most)
     data = report(jobs, args)
     stem = args.results
     write_json(stem.with_name(stem.name + ".json"), data)

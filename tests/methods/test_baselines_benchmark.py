@@ -39,7 +39,7 @@ def test_scenes_are_taken_by_their_names_and_runs_once(baselines, scene, tmp_pat
     assert len(planned["transient"]) == 6 and planned["density"] == []
     job = planned["transient"][0]
     assert job.folder(tmp_path) == tmp_path / "full-12000" / "wall-plain" / "3dgs" / "seed0"
-    words = job.command(tmp_path, 7)
+    words = job.run(tmp_path, 7).words
     assert words[words.index("--iterations") + 1] == "7" and words[words.index("--threads") + 1] == "1"
     assert words[words.index("-o") + 1] == str(tmp_path / "full-12000")
 

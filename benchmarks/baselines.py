@@ -1,14 +1,17 @@
 """The trait that each method exists for, against 3dgs: a queue of `aw bench` runs that stops and goes on.
 
     python benchmarks/baselines.py --captures DIR... --out DIR [--sections transient appearance ...]
-        [--seeds 0 1 2] [--iterations 1500] [--max-gaussians 12000] [--only METHOD...] [--report-only]
+        [--seeds 0 1 2] [--iterations 1500] [--max-gaussians 12000] [--only METHOD...] [--jobs 1] [--most N]
+        [--report-only]
 
 A DIR is a scene folder or a folder of them; sections take the scenes whose names hold their words (SECTIONS).
 Each run has one thread; --jobs run at the same time. Finished runs are kept, stopped ones resume. Writes
-benchmarks/results/baselines.json and .md:
+benchmarks/results/baselines.json, .md and -runs.tar.xz (from which it goes on elsewhere), and
+baselines-paper.md, the paper's main table with the runs of section main:
 
 transient    share of the gap between 3dgs and exact masks (3dgs+truth) that a method closes, in dB of PSNR
 appearance   dB above 3dgs on the right half of test photos, the left half fitted
+main         dB above 3dgs, every method of the paper's main table; nothing is fitted to test photos
 density      dB above 3dgs at an equal number of Gaussians; pup-3dgs at a fifth of them
 resolution   dB above 3dgs at a quarter, half, once and twice the size that was trained at
 """
@@ -16,6 +19,7 @@ resolution   dB above 3dgs at a quarter, half, once and twice the size that was 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -27,11 +31,14 @@ import cv2
 import numpy as np
 import torch
 from captures import find_scenes
-from job_queue import Run, run_all
+from job_queue import Run, keep, restore, run_all
 
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.harness.running.environment import environment
 from ambiguous_wild.harness.running.result_file import RESULT, read_result
+from ambiguous_wild.harness.running.store import read_runs
+from ambiguous_wild.harness.tables.layouts.build import paper
+from ambiguous_wild.harness.tables.layouts.plain_formats import to_markdown as to_layout
 from ambiguous_wild.io.atomic import write_json, write_text
 from ambiguous_wild.io.images import read_png_rgb, to_uint8
 from ambiguous_wild.io.ply import read_splat_ply
@@ -67,6 +74,14 @@ SECTIONS = {
         ("3dgs",),
         ("wildgaussians", "gs-w", "splatfacto-w", "swag", "nexussplats"),
         half=True,
+    ),
+    "main": Section(
+        ("courtyard", "seneca", "monstree"),
+        ("3dgs",),
+        ("mip-splatting", "gs-w", "wildgaussians", "splatfacto-w", "swag", "nexussplats", "spotlesssplats",
+         "spotlesssplats-cluster", "desplat", "hybridgs", "t-3dgs", "forestsplats", "asymgs", "asymgs-twin",
+         "absgs", "mcmc", "pup-3dgs", "uad", "robustsplat", "dronesplat", "refinesplat-paper",
+         "refinesplat"),
     ),
     "density": Section(("clean",), ("3dgs",), ("absgs", "mcmc", "uad", "pup-3dgs")),
     "resolution": Section(("clean",), ("3dgs",), ("mip-splatting",)),
@@ -178,12 +193,18 @@ def row_of(
 
 def resolution_rows(jobs: Sequence[Job], args: argparse.Namespace) -> list[dict[str, Any]]:
     """PSNR of every run at other sizes than it was trained at, from its splats."""
-    rows = []
+    rows: list[dict[str, Any]] = []
+    written = args.results.with_name(args.results.name + ".json")
+    before = json.loads(written.read_text(encoding="utf-8"))["resolutions"] if written.is_file() else []
     for job in jobs:
         if result_of(job, args.out) is None:
             continue
+        path = job.folder(args.out) / "point_cloud.ply"
+        if not path.is_file():  # trained elsewhere: its texts were kept, and its row
+            rows += [row for row in before if row_key(row) == (job.method, load_name(job.scene), job.seed)]
+            continue
         scene = load_scene(job.scene)
-        known = read_splat_ply(job.folder(args.out) / "point_cloud.ply")
+        known = read_splat_ply(path)
         model = Gaussians(**{name: torch.from_numpy(values) for name, values in known.items()})  # type: ignore[arg-type]
         parts = get_method(job.method).build(get_method(job.method).options())
         row: dict[str, Any] = {"method": job.method, "scene": scene.name, "seed": job.seed}
@@ -198,6 +219,20 @@ def resolution_rows(jobs: Sequence[Job], args: argparse.Namespace) -> list[dict[
             row[f"psnr_{size:g}"] = fmean(values) if values else None
         rows.append(row)
     return rows
+
+
+def row_key(row: dict[str, Any]) -> tuple[str, str, int]:
+    return row["method"], row["scene"], row["seed"]
+
+
+def main_table(planned: dict[str, list[Job]], args: argparse.Namespace) -> str:
+    """The paper's table of the finished runs of section main; empty without one."""
+    jobs = [job for job in planned.get("main", []) if result_of(job, args.out) is not None]
+    if not jobs:
+        return ""
+    runs = read_runs(args.out / f"full-{args.max_gaussians}")
+    scenes = list(dict.fromkeys(load_name(job.scene) for job in jobs))
+    return to_layout(paper(runs, metrics=("psnr", "ssim", "lpips_alex"), scenes=scenes, per_table=5))
 
 
 def truth_at(scene: Scene, size: float) -> list[tuple[Any, np.ndarray]]:
@@ -289,12 +324,14 @@ def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--iterations", type=int, default=1500)
     parser.add_argument("--max-gaussians", type=int, default=12_000)
-    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--jobs", type=int, default=1, help="runs at a time")
+    parser.add_argument("--most", type=int, help="runs of this call at most")
     parser.add_argument("--results", type=Path, default=RESULTS, help="where .json and .md go")
     parser.add_argument("--report-only", action="store_true", help="train nothing, tabulate what is there")
     args = parser.parse_args(words)
-    if args.jobs < 1 or args.iterations < 1 or args.max_gaussians < 1:
-        parser.error("--jobs, --iterations and --max-gaussians count from 1")
+    counts = (args.iterations, args.max_gaussians, args.jobs, 1 if args.most is None else args.most)
+    if min(counts) < 1:
+        parser.error("--iterations, --max-gaussians, --jobs and --most count from 1")
     return args
 
 
@@ -307,10 +344,15 @@ def main(words: Sequence[str] | None = None) -> int:
             f"no scene for {', '.join(args.sections)}: their names hold none of the sections' words"
         )
     runs = [job.run(args.out, args.iterations) for job in jobs]
-    failed = [] if args.report_only else run_all(runs, args.jobs)
+    archive = args.results.with_name(args.results.name + "-runs.tar.xz")
+    restore(args.out, archive)
+    failed = [] if args.report_only else run_all(runs, args.jobs, args.most)
+    keep(runs, args.out, archive)
     data = report(planned, args)
     write_json(args.results.with_name(args.results.name + ".json"), data)
     write_text(args.results.with_name(args.results.name + ".md"), to_markdown(data))
+    if table := main_table(planned, args):
+        write_text(args.results.with_name(args.results.name + "-paper.md"), table)
     print(to_markdown(data))
     for line in failed:
         print(f"failed: {line}", file=sys.stderr)

@@ -1,16 +1,27 @@
-"""A queue of `aw bench` runs that stops and goes on: finished runs are kept, stopped ones resume."""
+"""A queue of `aw bench` runs that stops and goes on: finished runs are kept, stopped ones resume.
+
+The texts of finished runs (settings, metrics, machine; no models, no pictures) go into an archive beside the
+tables, so that the queue goes on at another machine and every figure can be traced.
+"""
 
 from __future__ import annotations
 
+import io
+import lzma
 import os
 import subprocess
 import sys
+import tarfile
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
+from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.running.result_file import RESULT
+from ambiguous_wild.io.atomic import atomic_path
+
+TEXTS = ("config.yaml", "env.json", RESULT)
 
 
 @dataclass(frozen=True)
@@ -52,3 +63,34 @@ def run_all(runs: Sequence[Run], at_once: int = 1, most: int | None = None) -> l
             if process.returncode:
                 failed.append(f"{run.name}: {lines[-1]}")
     return failed
+
+
+def keep(runs: Sequence[Run], root: Path, archive: Path) -> None:
+    """Write the texts of the finished runs below root into an archive; the same runs give the same bytes."""
+    with atomic_path(archive) as temporary, tarfile.open(temporary, "w:xz", preset=9) as tar:
+        for run in sorted({run.folder for run in runs if run.finished}):
+            for name in TEXTS:
+                info = tarfile.TarInfo(str((run / name).relative_to(root)))
+                data = (run / name).read_bytes()
+                info.size = len(data)
+                tar.addfile(info, io.BytesIO(data))
+
+
+def restore(root: Path, archive: Path) -> int:
+    """Put archived runs below root where none lies; returns how many.
+
+    Raises:
+        AwError: a damaged archive, or a path that leaves root.
+    """
+    if not archive.is_file():
+        return 0
+    root.mkdir(parents=True, exist_ok=True)
+    try:
+        with tarfile.open(archive, "r:xz") as tar:
+            members = [m for m in tar if not (root / m.name).parent.joinpath(RESULT).is_file()]
+            tar.extractall(root, members=members, filter="data")
+    except (OSError, tarfile.TarError, lzma.LZMAError, EOFError) as error:
+        raise AwError(
+            f"cannot read the kept runs {archive}: {error}; remove it to train them again"
+        ) from error
+    return sum(Path(m.name).name == RESULT for m in members)

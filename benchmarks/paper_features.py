@@ -10,7 +10,8 @@ graph segments); methods without either run once. `default` is what a method tak
 then writes the tables. Runs of the first seed come first, and among them the back ends in their order.
 
 Writes benchmarks/results/paper-features.json, .csv and .md: PSNR, mask IoU, and processor time per iteration
-over that of 3dgs. Missing runs are listed.
+over that of 3dgs; missing runs are listed. The texts of the runs go into paper-features-runs.tar.xz, from
+which the queue goes on at another machine.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from typing import Any
 
 import pandas as pd
 from captures import find_scenes
-from job_queue import Run, run_all
+from job_queue import Run, keep, restore, run_all
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.running.environment import environment
@@ -238,9 +239,12 @@ def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
 def main(words: Sequence[str] | None = None) -> int:
     args = arguments(words)
     jobs = plan(args)
-    failed = [] if args.report_only else run_all([job.run(args) for job in jobs], args.jobs, args.most)
+    stem, runs = args.results, [job.run(args) for job in jobs]
+    archive = stem.with_name(stem.name + "-runs.tar.xz")
+    restore(args.out, archive)
+    failed = [] if args.report_only else run_all(runs, args.jobs, args.most)
+    keep(runs, args.out, archive)
     data = report(jobs, args)
-    stem = args.results
     write_json(stem.with_name(stem.name + ".json"), data)
     write_text(stem.with_name(stem.name + ".csv"), pd.DataFrame(data["runs"]).to_csv(index=False))
     write_text(stem.with_name(stem.name + ".md"), to_markdown(data))

@@ -1,0 +1,77 @@
+"""benchmarks/job_queue.py: finished runs are not run again, also after a way through the archive."""
+
+import io
+import sys
+import tarfile
+from pathlib import Path
+
+import pytest
+
+from ambiguous_wild.core import AwError
+
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+
+
+@pytest.fixture
+def queue(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    import job_queue
+
+    yield job_queue
+    sys.modules.pop("job_queue", None)
+
+
+def finish(folder, text):
+    folder.mkdir(parents=True)
+    for name in ("config.yaml", "env.json", "metrics.json"):
+        (folder / name).write_text(text + name)
+    (folder / "point_cloud.ply").write_bytes(b"large")
+
+
+def runs_of(queue, root):
+    return [queue.Run(f"seed {s}", root / "a" / f"seed{s}", ("methods",)) for s in (0, 1)]
+
+
+def test_texts_of_finished_runs_come_back_and_are_not_run_again(queue, tmp_path, capsys):
+    runs = runs_of(queue, tmp_path / "here")
+    finish(runs[1].folder, "one ")
+    archive = tmp_path / "kept.tar.xz"
+    queue.keep(runs, tmp_path / "here", archive)
+    first = archive.read_bytes()
+    queue.keep(list(reversed(runs)), tmp_path / "here", archive)
+    assert archive.read_bytes() == first
+
+    there = tmp_path / "there"
+    assert queue.restore(there, archive) == 1
+    again = runs_of(queue, there)
+    assert [run.finished for run in again] == [False, True]
+    assert sorted(p.name for p in again[1].folder.iterdir()) == ["config.yaml", "env.json", "metrics.json"]
+    assert (again[1].folder / "metrics.json").read_text() == "one metrics.json"
+    (again[1].folder / "metrics.json").write_text("newer")
+    assert queue.restore(there, archive) == 0  # what lies there stays
+    assert (again[1].folder / "metrics.json").read_text() == "newer"
+    assert queue.run_all(again[1:]) == []
+    assert "1 runs: 1 finished before, 0 to go" in capsys.readouterr().out
+
+
+def test_a_failed_run_is_told_and_the_others_go_on(queue, tmp_path, capsys):
+    bad = queue.Run("bad", tmp_path / "bad", ("methods", "no-such-method"))
+    good = queue.Run("good", tmp_path / "good", ("--version",))
+    (failed,) = queue.run_all([bad, good])
+    assert failed.startswith("bad: ") and "no-such-method" in failed
+    assert "[2/2]" in capsys.readouterr().out
+
+
+def test_damaged_archives_and_paths_that_leave_are_refused(queue, tmp_path):
+    assert queue.restore(tmp_path / "out", tmp_path / "none.tar.xz") == 0
+    archive = tmp_path / "kept.tar.xz"
+    archive.write_bytes(b"no archive")
+    with pytest.raises(AwError, match="cannot read the kept runs"):
+        queue.restore(tmp_path / "out", archive)
+    with tarfile.open(archive, "w:xz") as tar:
+        info = tarfile.TarInfo("../outside/metrics.json")
+        info.size = 1
+        tar.addfile(info, io.BytesIO(b"x"))
+    with pytest.raises(AwError, match="cannot read the kept runs"):
+        queue.restore(tmp_path / "out", archive)
+    assert not (tmp_path / "outside").exists()

@@ -198,7 +198,7 @@ def bench(
         raise AwError("iterations and budgets_s exclude each other: a run is as long as one of them says")
     out = Path(output)
     with Session(where, threads, told) as session:
-        from ambiguous_wild.harness.running.expected import expected_line
+        from ambiguous_wild.harness.running.expected import expected_line, unfinished
         from ambiguous_wild.harness.running.grid import plan_cells, run_cells
         from ambiguous_wild.harness.running.groups import grouped
         from ambiguous_wild.harness.running.passes import check_passes
@@ -238,8 +238,9 @@ def bench(
         check_output(out / "run")  # before half a minute of compiling
         if chosen == "cpu" and not where.remote and any(cell.method.program is None for cell in cells):
             prepare_cpu(threads, told.say)
-            if iterations is None and not budgets_s:
-                told.say(expected_line([cell for cell in cells if cell.method.program is None]))
+            to_train = unfinished(cells, out, overwrite)
+            if to_train and iterations is None and not budgets_s:
+                told.say(expected_line(to_train))
         one_by_one = gpus > 1 or session.in_process(cells)
         told.planned(cells, one_by_one)
         place = out / ".cache" if cache is None else Path(cache)

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Sequence
+from pathlib import Path
 
-from ambiguous_wild.harness.running.cell import Cell
+from ambiguous_wild.harness.running.cell import Cell, Overwrite
+from ambiguous_wild.harness.running.grid import cell_folder
+from ambiguous_wild.harness.running.run_folder import is_finished
 
 # ms of a step of 3dgs on the reference machine (splat/calibration.py): a constant, a part for every 1000 px
 # and one for every 1000 Gaussians. Of captures of 240x135 to 480x270 with 32 000 to 60 000 Gaussians; a
@@ -17,6 +20,16 @@ LEAST, MOST = 0.67, 1.5
 def expected_s(iterations: int, pixels: int, gaussians: int) -> float:
     """Seconds of so many iterations of 3dgs on the reference machine, to within `LEAST` and `MOST`."""
     return 1e-3 * iterations * (STEP_MS + 1e-3 * (PIXELS_MS * pixels + GAUSSIANS_MS * gaussians))
+
+
+def unfinished(cells: Sequence[Cell], output: Path, overwrite: Overwrite) -> list[Cell]:
+    """The cells that our trainer will train: not those of other programs, nor those that are kept."""
+    return [
+        cell
+        for cell in cells
+        if cell.method.program is None
+        and (overwrite == "always" or not is_finished(cell_folder(output, cell)))
+    ]
 
 
 def expected_line(cells: Sequence[Cell]) -> str:

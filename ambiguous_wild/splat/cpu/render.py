@@ -64,6 +64,7 @@ class _Lists:
     tile_slots: np.ndarray
     tile_instances: np.ndarray
     kept: np.ndarray
+    touched: np.ndarray
     shaded: _Shaded | None
 
 
@@ -118,7 +119,7 @@ class RenderedCpu:
         sums = _pool.take("sums", (int(s.starts[-1]) * blend.ROW,), slack=0.25)
         blend.backward(
             s.records, s.tile_slots, s.tile_instances, s.starts, s.tile_order, threads(),
-            self._camera.width, self._camera.height, s.background, s.kept,
+            self._camera.width, self._camera.height, s.background, s.kept, s.touched,
             d_image, d_alpha, d_depth, d_extra, absolute, tally, sums,
         )  # fmt: skip
         return sums
@@ -242,12 +243,14 @@ def render_cpu(
     depth = _pool.take("depth", (height, width))
     kept = _pool.take("kept", (columns * rows, 2, blend.PIXELS))
     behind = np.asarray(background, np.float32)
+    touched = _pool.take("touched", (int(starts[-1]),), np.uint16, slack=0.25)
     blend.forward(
-        records, tile_slots, starts, tile_order, threads(), width, height, behind, image, alpha, depth, kept
-    )
+        records, tile_slots, starts, tile_order, threads(), width, height, behind, image, alpha, depth, kept,
+        touched,
+    )  # fmt: skip
     lists = _Lists(
         cam, centre, sh_degree, antialias, behind, records, ids, counts, offsets, instances, starts,
-        tile_order, tile_slots, tile_instances, kept, shaded,
+        tile_order, tile_slots, tile_instances, kept, touched, shaded,
     )  # fmt: skip
     return RenderedCpu(gaussians, camera, (image, alpha, depth, radii > 0, radii), lists)
 

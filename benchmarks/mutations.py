@@ -118,7 +118,7 @@ MUTATIONS = (
         "self.close / self.known if self.known else math.nan",
         "self.close / self.known if self.known else 0.0", (23,),
     ),
-    Mutation("near-plane cull", "splat.cpu.project", "z >= NEAR and z < _HUGE", "z < _HUGE", (1,), True),
+    Mutation("near-plane cull", "splat.cpu.project", "(z >= NEAR) & (z < _HUGE)", "z < _HUGE", (1,), True),
     Mutation("quaternions are normalised", "splat.cpu.project", "inv = 1.0 / norm", "inv = 1.0", (3,), True),
     Mutation(
         "alpha kept at 0.99", "splat.cpu.blend",

@@ -102,14 +102,18 @@ def measure(n: int, width: int, height: int, runs: int) -> dict[str, Any]:
         image = np.empty((height, width, 3), np.float32)
         alpha, depth = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
         lists = (s.tile_slots, s.starts, s.tile_order, threads(), width, height, s.background)
-        watch("blend forward", lambda: blend.forward(s.records, *lists, image, alpha, depth, s.kept))
+        watch(
+            "blend forward", lambda: blend.forward(s.records, *lists, image, alpha, depth, s.kept, s.touched)
+        )
         sums = np.empty(int(s.starts[-1]) * blend.ROW, np.float32)
         sums[:] = 0.0  # touches the pages, as in training, where the array is used again
         lists = (s.tile_slots, s.tile_instances, *lists[1:])
         d_image = photo.numpy()
         watch(
             "blend backward",
-            lambda: blend.backward(s.records, *lists, s.kept, d_image, None, None, None, None, None, sums),
+            lambda: blend.backward(
+                s.records, *lists, s.kept, s.touched, d_image, None, None, None, None, None, sums
+            ),
         )
 
     for warm in range(runs + 3):

@@ -21,13 +21,18 @@ from ambiguous_wild.splat.cpu.project import (
     HALF_WIDTH,
     MX,
     MY,
+    RECORD,
     SLANT,
     VARIANCE_X,
     VARIANCE_Y,
 )
+from ambiguous_wild.splat.cpu.simd import prefetch
 
 TILE = 16  # px, both ways; a row of a tile is one vector
 PARTS = 16  # work items of the parallel loops over ranks
+SPAN_ROWS = 3  # rows of tiles whose spans are kept between the two passes; most Gaussians reach fewer
+SPANS = 2 + 2 * SPAN_ROWS  # int16 a Gaussian: first and last row, first and last column in each
+_AHEAD = 8  # ranks; records lie in another order and are asked for before they are read
 _SLACK = 1e-3  # px; float32 rounding never loses a pixel, the alpha test decides
 
 
@@ -140,17 +145,31 @@ def tile_span(record, row, width):
 
 
 @parallel_kernel
-def count_tiles(order, records, width, height, columns, instances, histogram):
-    """Per slot the number of tiles, per part and tile the number of ranks."""
+def count_tiles(order, records, width, height, columns, instances, histogram, spans):
+    """Per slot the number of tiles, per part and tile the number of ranks.
+
+    Args:
+        order: [M] int32 slots by depth.
+        instances: [N] int32 out.
+        histogram: [PARTS, tiles] int32 out.
+        spans: [M, SPANS] int16 out, of each rank.
+    """
     n = order.shape[0]
     for part in numba.prange(PARTS):
         histogram[part, :] = 0
         for rank in range(part * n // PARTS, (part + 1) * n // PARTS):
+            prefetch(records, order[min(rank + _AHEAD, n - 1)] * RECORD)
             record = records[order[rank]]
             first, last = tile_rows(record, height)
+            spans[rank, 0] = first
+            spans[rank, 1] = last
             total = 0
             for row in range(first, last + 1):
                 low, high = tile_span(record, row, width)
+                at = 2 + 2 * (row - first)
+                if at < SPANS:
+                    spans[rank, at] = low
+                    spans[rank, at + 1] = high
                 total += max(high - low + 1, 0)
                 for column in range(low, high + 1):
                     histogram[part, row * columns + column] += 1
@@ -175,7 +194,7 @@ def prefix(slots, instances, offsets, histogram, starts):
 
 
 @parallel_kernel
-def scatter(order, records, width, height, columns, offsets, histogram, tile_slots, tile_instances):
+def scatter(order, records, width, columns, spans, offsets, histogram, tile_slots, tile_instances):
     """Write each tile's list: the record's slot, and the number of the instance.
 
     Instances are numbered in the order of the slots, so that `reverse` reads its rows one after the other.
@@ -183,15 +202,19 @@ def scatter(order, records, width, height, columns, offsets, histogram, tile_slo
     n = order.shape[0]
     for part in numba.prange(PARTS):
         for rank in range(part * n // PARTS, (part + 1) * n // PARTS):
-            record = records[order[rank]]
-            first, last = tile_rows(record, height)
-            instance = offsets[order[rank]]
+            slot = order[rank]
+            instance = offsets[slot]
+            first, last = spans[rank, 0], spans[rank, 1]
             for row in range(first, last + 1):
-                low, high = tile_span(record, row, width)
+                at = 2 + 2 * (row - first)
+                if at < SPANS:
+                    low, high = np.int64(spans[rank, at]), np.int64(spans[rank, at + 1])
+                else:
+                    low, high = tile_span(records[slot], row, width)
                 for column in range(low, high + 1):
                     tile = row * columns + column
                     at = histogram[part, tile]
                     histogram[part, tile] = at + 1
-                    tile_slots[at] = order[rank]
+                    tile_slots[at] = slot
                     tile_instances[at] = instance
                     instance += 1

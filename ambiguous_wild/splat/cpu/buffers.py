@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import threading
 from typing import Any
@@ -11,9 +12,8 @@ import numpy as np
 _LINE = 64  # bytes of a cache line; what starts on one is read and written in whole lines
 
 
-def _carve(block: np.ndarray, size: int, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
-    start = -block.ctypes.data % _LINE
-    return block[start : start + size * np.dtype(dtype).itemsize].view(dtype).reshape(shape)
+def _carve(block: np.ndarray, start: int, room: int, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+    return block[start : start + room].view(dtype).reshape(shape)
 
 
 class Pool:
@@ -25,7 +25,7 @@ class Pool:
 
     def __init__(self, keep: int = 3) -> None:
         self._keep = keep
-        self._blocks: dict[str, list[np.ndarray]] = {}
+        self._blocks: dict[str, list[tuple[np.ndarray, int]]] = {}  # with the byte where a line starts
         self._pairs: dict[tuple[Any, ...], list[tuple[np.ndarray, np.ndarray]]] = {}
         self._lock = threading.Lock()
 
@@ -33,18 +33,18 @@ class Pool:
         self, name: str, shape: tuple[int, ...], dtype: Any = np.float32, slack: float = 0.0
     ) -> np.ndarray:
         """An array of that shape with any content; `slack` is room for a somewhat larger need next time."""
-        size = int(np.prod(shape))
-        room = np.dtype(dtype).itemsize * size
+        room = np.dtype(dtype).itemsize * math.prod(shape)
         with self._lock:
             blocks = self._blocks.setdefault(name, [])
-            for k in range(len(blocks)):
-                # References: the list's, and the argument of getrefcount.
-                if sys.getrefcount(blocks[k]) <= 2 and room + _LINE <= len(blocks[k]) <= 2 * room + 1024:
-                    return _carve(blocks[k], size, shape, dtype)
+            for block, start in blocks:
+                # References: the pair's, the loop's and the argument of getrefcount.
+                if sys.getrefcount(block) <= 3 and room + _LINE <= len(block) <= 2 * room + 1024:
+                    return _carve(block, start, room, shape, dtype)
             block = np.empty(int(room * (1 + slack)) + _LINE, np.uint8)
-            blocks[:] = [b for b in blocks if sys.getrefcount(b) > 3][: self._keep - 1]
-            blocks.append(block)
-            return _carve(block, size, shape, dtype)
+            start = -block.ctypes.data % _LINE
+            blocks[:] = [pair for pair in blocks if sys.getrefcount(pair[0]) > 2][: self._keep - 1]
+            blocks.append((block, start))
+            return _carve(block, start, room, shape, dtype)
 
     def take_rows(self, name: str, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
         """A float32 array whose rows are zero but where the mask given with it, [rows] bool, is set.

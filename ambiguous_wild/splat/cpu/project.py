@@ -18,11 +18,26 @@ import numba
 import numpy as np
 
 from ambiguous_wild.splat.cpu.compile import fused_kernel, parallel_kernel
+from ambiguous_wild.splat.cpu.simd64 import (
+    LANES,
+    at_least,
+    at_most,
+    bits_of,
+    ceiling,
+    exp,
+    floor,
+    load,
+    log,
+    magnitude,
+    square_root,
+    store,
+)
 
 BLUR = 0.3  # px^2 added to both variances unless a method says otherwise
 NEAR = 0.01  # smallest depth that is drawn
 MIN_ALPHA = 1.0 / 255.0
 CHUNK = 1024  # Gaussians a work item; records of a chunk are contiguous
+GROUP = 64  # Gaussians whose values are brought side by side before eight at a time are computed
 RECORD = 16  # floats a record: one cache line
 
 # Fields of a record.
@@ -30,34 +45,29 @@ MX, MY, SLANT, CURVE_X, CURVE_Y, LOG2_OPACITY, RED, GREEN, BLUE, DEPTH = range(1
 EXTENT_X, EXTENT_Y, VARIANCE_Y, VARIANCE_X, HALF_WIDTH, OPACITY = range(10, 16)
 
 _LOG2E = 1.4426950408889634
+_LOG_255 = math.log(255.0)
 _FAR_PX = 1e15  # a centre so far out is no place in float32 any more
 _HUGE = 1e30
 _SHORT = 1e-30  # norm of a quaternion: its gradient is divided by it, and float32 ends at 3e38
 
 
 @fused_kernel
-def sigmoid(x: float) -> float:
-    """1 / (1 + exp(-x)) without overflow."""
-    if x >= 0.0:
-        return 1.0 / (1.0 + math.exp(-x))
-    e = math.exp(x)
-    return e / (1.0 + e)
+def footprint(quat, cam, x, y, z):
+    """Rows p, q of J W R, its rows without R, and R: what S and its gradient are made of.
 
-
-@fused_kernel
-def footprint(mean, quat, scale, cam, x, y, z):
-    """Rows f1, f2 of J W R diag(s), the clamped ray and the rotation: what S and its gradient are made of."""
-    w_, qx, qy, qz = quat[0], quat[1], quat[2], quat[3]
-    rx = min(max(x / z, cam[18]), cam[19])
-    ry = min(max(y / z, cam[20]), cam[21])
-    gx = cam[12] / z
-    gy = cam[13] / z
-    a0 = gx * (cam[0] - rx * cam[8])
-    a1 = gx * (cam[1] - rx * cam[9])
-    a2 = gx * (cam[2] - rx * cam[10])
-    b0 = gy * (cam[4] - ry * cam[8])
-    b1 = gy * (cam[5] - ry * cam[9])
-    b2 = gy * (cam[6] - ry * cam[10])
+    Args:
+        quat: w, x, y, z of norm 1, a vector each.
+        cam: as in `project`.
+        x, y, z: the centre as the camera sees it.
+    """
+    w_, qx, qy, qz = quat
+    near = 1.0 / z
+    rx = at_most(at_least(x * near, cam[18]), cam[19])
+    ry = at_most(at_least(y * near, cam[20]), cam[21])
+    gx = cam[12] * near
+    gy = cam[13] * near
+    a = (gx * (cam[0] - rx * cam[8]), gx * (cam[1] - rx * cam[9]), gx * (cam[2] - rx * cam[10]))
+    b = (gy * (cam[4] - ry * cam[8]), gy * (cam[5] - ry * cam[9]), gy * (cam[6] - ry * cam[10]))
     r00 = 1.0 - 2.0 * (qy * qy + qz * qz)
     r01 = 2.0 * (qx * qy - w_ * qz)
     r02 = 2.0 * (qx * qz + w_ * qy)
@@ -67,98 +77,156 @@ def footprint(mean, quat, scale, cam, x, y, z):
     r20 = 2.0 * (qx * qz - w_ * qy)
     r21 = 2.0 * (qy * qz + w_ * qx)
     r22 = 1.0 - 2.0 * (qx * qx + qy * qy)
-    p0 = a0 * r00 + a1 * r10 + a2 * r20
-    p1 = a0 * r01 + a1 * r11 + a2 * r21
-    p2 = a0 * r02 + a1 * r12 + a2 * r22
-    q0 = b0 * r00 + b1 * r10 + b2 * r20
-    q1 = b0 * r01 + b1 * r11 + b2 * r21
-    q2 = b0 * r02 + b1 * r12 + b2 * r22
-    rot = (r00, r01, r02, r10, r11, r12, r20, r21, r22)
-    return (p0, p1, p2), (q0, q1, q2), (a0, a1, a2), (b0, b1, b2), rot, rx, ry
+    p = (
+        a[0] * r00 + a[1] * r10 + a[2] * r20,
+        a[0] * r01 + a[1] * r11 + a[2] * r21,
+        a[0] * r02 + a[1] * r12 + a[2] * r22,
+    )
+    q = (
+        b[0] * r00 + b[1] * r10 + b[2] * r20,
+        b[0] * r01 + b[1] * r11 + b[2] * r21,
+        b[0] * r02 + b[1] * r12 + b[2] * r22,
+    )
+    return p, q, a, b, (r00, r01, r02, r10, r11, r12, r20, r21, r22)
+
+
+@fused_kernel
+def take(given, k, i, means, quats, log_scales, opacity_logits):
+    """Put Gaussian i into column k of `given` [>= 11, GROUP]."""
+    given[0, k] = means[i, 0]
+    given[1, k] = means[i, 1]
+    given[2, k] = means[i, 2]
+    given[3, k] = quats[i, 0]
+    given[4, k] = quats[i, 1]
+    given[5, k] = quats[i, 2]
+    given[6, k] = quats[i, 3]
+    given[7, k] = log_scales[i, 0]
+    given[8, k] = log_scales[i, 1]
+    given[9, k] = log_scales[i, 2]
+    given[10, k] = opacity_logits[i]
+
+
+@fused_kernel
+def in_camera(given, at, cam):
+    """The centres of columns at .. at + 7 as the camera sees them."""
+    m0 = load(given, at)
+    m1 = load(given, GROUP + at)
+    m2 = load(given, 2 * GROUP + at)
+    return (
+        cam[0] * m0 + cam[1] * m1 + cam[2] * m2 + cam[3],
+        cam[4] * m0 + cam[5] * m1 + cam[6] * m2 + cam[7],
+        cam[8] * m0 + cam[9] * m1 + cam[10] * m2 + cam[11],
+    )
+
+
+@fused_kernel
+def shape_of(given, at):
+    """Unit quaternion, the norm it had, and the scales of columns at .. at + 7."""
+    w_ = load(given, 3 * GROUP + at)
+    qx = load(given, 4 * GROUP + at)
+    qy = load(given, 5 * GROUP + at)
+    qz = load(given, 6 * GROUP + at)
+    norm = square_root(w_ * w_ + qx * qx + qy * qy + qz * qz)
+    inv = 1.0 / norm
+    scales = (
+        exp(load(given, 7 * GROUP + at)),
+        exp(load(given, 8 * GROUP + at)),
+        exp(load(given, 9 * GROUP + at)),
+    )
+    return (w_ * inv, qx * inv, qy * inv, qz * inv), norm, scales
+
+
+@fused_kernel
+def _project_eight(given, at, cam, antialias, found):
+    """Project columns at .. at + 7 into `found` [14, GROUP]; returns which pass the culls, as bits."""
+    blur = cam[22]
+    x, y, z = in_camera(given, at, cam)
+    # Comparisons are written so that NaN fails them: a broken Gaussian is culled.
+    seen = (z >= NEAR) & (z < _HUGE)
+    logit = load(given, 10 * GROUP + at)
+    seen = seen & (logit > -5.6)  # sigmoid below 1/255
+    quat, norm, scales = shape_of(given, at)
+    seen = seen & (norm > _SHORT) & (norm < _HUGE)
+    p, q, _, _, _ = footprint(quat, cam, x, y, z)
+    p0, p1, p2 = p[0] * scales[0], p[1] * scales[1], p[2] * scales[2]
+    q0, q1, q2 = q[0] * scales[0], q[1] * scales[1], q[2] * scales[2]
+    sxx = p0 * p0 + p1 * p1 + p2 * p2
+    syy = q0 * q0 + q1 * q1 + q2 * q2
+    sxy = p0 * q0 + p1 * q1 + p2 * q2
+    n0 = p1 * q2 - p2 * q1
+    n1 = p2 * q0 - p0 * q2
+    n2 = p0 * q1 - p1 * q0
+    det0 = n0 * n0 + n1 * n1 + n2 * n2
+    det = det0 + blur * (sxx + syy) + cam[23]
+    sxx = sxx + blur
+    syy = syy + blur
+    seen = seen & (sxx < _HUGE) & (syy < _HUGE) & (det < _HUGE)
+    opacity = 1.0 / (1.0 + exp(0.0 - logit))
+    if antialias:
+        opacity = opacity * square_root(det0 / det)
+    seen = seen & (opacity >= MIN_ALPHA)
+    strength = log(opacity)
+    tau = 2.0 * (strength + _LOG_255)
+    ex = square_root(tau * sxx)
+    ey = square_root(tau * syy)
+    u = cam[12] * x / z + cam[14]
+    v = cam[13] * y / z + cam[15]
+    seen = seen & (magnitude(u) < _FAR_PX) & (magnitude(v) < _FAR_PX)
+    seen = seen & (u - ex < cam[16]) & (u + ex > 0.0) & (v - ey < cam[17]) & (v + ey > 0.0)
+    seen = seen & (ceiling(at_least(u - ex - 0.5, 0.0)) <= floor(at_most(u + ex, cam[16]) - 0.5))
+    seen = seen & (ceiling(at_least(v - ey - 0.5, 0.0)) <= floor(at_most(v + ey, cam[17]) - 0.5))
+    half = 0.5 * (sxx - syy)
+    store(found, at, u)
+    store(found, GROUP + at, v)
+    store(found, 2 * GROUP + at, sxy / syy)
+    store(found, 3 * GROUP + at, -0.5 * _LOG2E * syy / det)
+    store(found, 4 * GROUP + at, -0.5 * _LOG2E / syy)
+    store(found, 5 * GROUP + at, strength * _LOG2E)
+    store(found, 6 * GROUP + at, z)
+    store(found, 7 * GROUP + at, ex)
+    store(found, 8 * GROUP + at, ey)
+    store(found, 9 * GROUP + at, syy)
+    store(found, 10 * GROUP + at, sxx)
+    store(found, 11 * GROUP + at, square_root(tau * det / syy))
+    store(found, 12 * GROUP + at, opacity)
+    widest = 0.5 * (sxx + syy) + square_root(half * half + sxy * sxy)  # variance along the long axis
+    store(found, 13 * GROUP + at, square_root(tau * widest))
+    return bits_of(seen)
 
 
 @fused_kernel
 def _project_chunk(first, means, quats, log_scales, opacity_logits, cam, antialias, records, ids, radii):
     slot = first
-    blur = cam[22]
-    for i in range(first, min(first + CHUNK, means.shape[0])):
-        radii[i] = np.float32(0.0)
-        m0 = np.float64(means[i, 0])
-        m1 = np.float64(means[i, 1])
-        m2 = np.float64(means[i, 2])
-        z = cam[8] * m0 + cam[9] * m1 + cam[10] * m2 + cam[11]
-        # Comparisons are written so that NaN fails them: a broken Gaussian is culled.
-        if not (z >= NEAR and z < _HUGE):
-            continue
-        x = cam[0] * m0 + cam[1] * m1 + cam[2] * m2 + cam[3]
-        y = cam[4] * m0 + cam[5] * m1 + cam[6] * m2 + cam[7]
-        logit = np.float64(opacity_logits[i])
-        if not (logit > -5.6):  # sigmoid below 1/255
-            continue
-        u = cam[12] * x / z + cam[14]
-        v = cam[13] * y / z + cam[15]
-        w_ = np.float64(quats[i, 0])
-        qx = np.float64(quats[i, 1])
-        qy = np.float64(quats[i, 2])
-        qz = np.float64(quats[i, 3])
-        norm = math.sqrt(w_ * w_ + qx * qx + qy * qy + qz * qz)
-        if not (norm > _SHORT and norm < _HUGE):
-            continue
-        inv = 1.0 / norm
-        s0 = math.exp(np.float64(log_scales[i, 0]))
-        s1 = math.exp(np.float64(log_scales[i, 1]))
-        s2 = math.exp(np.float64(log_scales[i, 2]))
-        quat = (w_ * inv, qx * inv, qy * inv, qz * inv)
-        p, q, _, _, _, _, _ = footprint((m0, m1, m2), quat, (s0, s1, s2), cam, x, y, z)
-        p0, p1, p2 = p[0] * s0, p[1] * s1, p[2] * s2
-        q0, q1, q2 = q[0] * s0, q[1] * s1, q[2] * s2
-        sxx = p0 * p0 + p1 * p1 + p2 * p2
-        syy = q0 * q0 + q1 * q1 + q2 * q2
-        sxy = p0 * q0 + p1 * q1 + p2 * q2
-        n0 = p1 * q2 - p2 * q1
-        n1 = p2 * q0 - p0 * q2
-        n2 = p0 * q1 - p1 * q0
-        det0 = n0 * n0 + n1 * n1 + n2 * n2
-        det = det0 + blur * (sxx + syy) + cam[23]
-        sxx += blur
-        syy += blur
-        if not (sxx < _HUGE and syy < _HUGE and det < _HUGE):
-            continue
-        opacity = sigmoid(logit)
-        if antialias:
-            opacity *= math.sqrt(det0 / det)
-        if not (opacity >= MIN_ALPHA):
-            continue
-        tau = 2.0 * math.log(255.0 * opacity)
-        ex = math.sqrt(tau * sxx)
-        ey = math.sqrt(tau * syy)
-        # in floats first: a pixel far out has no whole number (compiled ceil and floor give int64)
-        if not (abs(u) < _FAR_PX and abs(v) < _FAR_PX):
-            continue
-        if not (u - ex < cam[16] and u + ex > 0.0 and v - ey < cam[17] and v + ey > 0.0):
-            continue
-        if not (
-            math.ceil(max(u - ex - 0.5, 0.0)) <= math.floor(min(u + ex, cam[16]) - 0.5)
-            and math.ceil(max(v - ey - 0.5, 0.0)) <= math.floor(min(v + ey, cam[17]) - 0.5)
-        ):
-            continue
-        half = 0.5 * (sxx - syy)
-        radii[i] = math.sqrt(tau * (0.5 * (sxx + syy) + math.sqrt(half * half + sxy * sxy)))
-        ids[slot] = i
-        records[slot, MX] = u
-        records[slot, MY] = v
-        records[slot, SLANT] = sxy / syy
-        records[slot, CURVE_X] = -0.5 * _LOG2E * syy / det
-        records[slot, CURVE_Y] = -0.5 * _LOG2E / syy
-        records[slot, LOG2_OPACITY] = math.log(opacity) * _LOG2E
-        records[slot, DEPTH] = z
-        records[slot, EXTENT_X] = ex
-        records[slot, EXTENT_Y] = ey
-        records[slot, VARIANCE_Y] = syy
-        records[slot, VARIANCE_X] = sxx
-        records[slot, HALF_WIDTH] = math.sqrt(tau * det / syy)
-        records[slot, OPACITY] = opacity
-        slot += 1
+    stop = min(first + CHUNK, means.shape[0])
+    given = np.zeros((11, GROUP), np.float32)
+    found = np.empty((14, GROUP), np.float32)
+    for begin in range(first, stop, GROUP):
+        count = min(GROUP, stop - begin)
+        for k in range(count):
+            take(given, k, begin + k, means, quats, log_scales, opacity_logits)
+        for at in range(0, count, LANES):
+            seen = _project_eight(given, at, cam, antialias, found)
+            for k in range(at, min(at + LANES, count)):
+                if not (seen >> (k - at)) & 1:
+                    radii[begin + k] = np.float32(0.0)
+                    continue
+                ids[slot] = begin + k
+                record = records[slot]
+                record[MX] = found[0, k]
+                record[MY] = found[1, k]
+                record[SLANT] = found[2, k]
+                record[CURVE_X] = found[3, k]
+                record[CURVE_Y] = found[4, k]
+                record[LOG2_OPACITY] = found[5, k]
+                record[DEPTH] = found[6, k]
+                record[EXTENT_X] = found[7, k]
+                record[EXTENT_Y] = found[8, k]
+                record[VARIANCE_Y] = found[9, k]
+                record[VARIANCE_X] = found[10, k]
+                record[HALF_WIDTH] = found[11, k]
+                record[OPACITY] = found[12, k]
+                radii[begin + k] = found[13, k]
+                slot += 1
     return slot - first
 
 

@@ -64,6 +64,7 @@ class _Lists:
     tile_slots: np.ndarray
     tile_instances: np.ndarray
     kept: np.ndarray
+    touched: np.ndarray
     shaded: _Shaded | None
 
 
@@ -118,7 +119,7 @@ class RenderedCpu:
         sums = _pool.take("sums", (int(s.starts[-1]) * blend.ROW,), slack=0.25)
         blend.backward(
             s.records, s.tile_slots, s.tile_instances, s.starts, s.tile_order, threads(),
-            self._camera.width, self._camera.height, s.background, s.kept,
+            self._camera.width, self._camera.height, s.background, s.kept, s.touched,
             d_image, d_alpha, d_depth, d_extra, absolute, tally, sums,
         )  # fmt: skip
         return sums
@@ -228,13 +229,14 @@ def render_cpu(
     columns, rows = -(-width // bins.TILE), -(-height // bins.TILE)
     instances = _pool.take("instances", (n,), np.int32)
     histogram = np.empty((bins.PARTS, columns * rows), np.int32)
-    bins.count_tiles(order, records, width, height, columns, instances, histogram)
+    spans = _pool.take("spans", (len(order), bins.SPANS), np.int16, slack=0.25)
+    bins.count_tiles(order, records, width, height, columns, instances, histogram, spans)
     offsets = _pool.take("offsets", (n,), np.int64)
     starts = np.empty(columns * rows + 1, np.int64)
     bins.prefix(slots, instances, offsets, histogram, starts)
     tile_slots = _pool.take("tile_slots", (int(starts[-1]),), np.int32, slack=0.25)
     tile_instances = _pool.take("tile_instances", (int(starts[-1]),), np.int32, slack=0.25)
-    bins.scatter(order, records, width, height, columns, offsets, histogram, tile_slots, tile_instances)
+    bins.scatter(order, records, width, columns, spans, offsets, histogram, tile_slots, tile_instances)
 
     tile_order = np.argsort(-np.diff(starts), kind="stable").astype(np.int32)
     image = _pool.take("image", (height, width, 3))
@@ -242,12 +244,14 @@ def render_cpu(
     depth = _pool.take("depth", (height, width))
     kept = _pool.take("kept", (columns * rows, 2, blend.PIXELS))
     behind = np.asarray(background, np.float32)
+    touched = _pool.take("touched", (int(starts[-1]),), np.uint16, slack=0.25)
     blend.forward(
-        records, tile_slots, starts, tile_order, threads(), width, height, behind, image, alpha, depth, kept
-    )
+        records, tile_slots, starts, tile_order, threads(), width, height, behind, image, alpha, depth, kept,
+        touched,
+    )  # fmt: skip
     lists = _Lists(
         cam, centre, sh_degree, antialias, behind, records, ids, counts, offsets, instances, starts,
-        tile_order, tile_slots, tile_instances, kept, shaded,
+        tile_order, tile_slots, tile_instances, kept, touched, shaded,
     )  # fmt: skip
     return RenderedCpu(gaussians, camera, (image, alpha, depth, radii > 0, radii), lists)
 

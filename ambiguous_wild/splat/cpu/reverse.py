@@ -1,4 +1,4 @@
-"""From the rows of sums of the tiles to gradients of the raw parameters, one Gaussian after the other."""
+"""From the rows of sums of the tiles to gradients of the raw parameters, eight Gaussians at a time."""
 
 from __future__ import annotations
 
@@ -20,16 +20,24 @@ from ambiguous_wild.splat.cpu.blend import (
     SUM_H,
     SUM_RED,
     SUM_SQUARED,
-    SUM_U,
-    SUM_UU,
-    SUM_UY,
-    SUM_Y,
-    SUM_YY,
 )
 from ambiguous_wild.splat.cpu.compile import fused_kernel, parallel_kernel
 from ambiguous_wild.splat.cpu.harmonics import C0, basis, direction_gradient
-from ambiguous_wild.splat.cpu.project import BLUE, CHUNK, GREEN, RED, footprint, sigmoid
-from ambiguous_wild.splat.cpu.simd import load, splat, store
+from ambiguous_wild.splat.cpu.project import (
+    BLUE,
+    CHUNK,
+    GREEN,
+    GROUP,
+    RED,
+    footprint,
+    in_camera,
+    shape_of,
+    take,
+)
+from ambiguous_wild.splat.cpu.simd import load as load_row
+from ambiguous_wild.splat.cpu.simd import splat
+from ambiguous_wild.splat.cpu.simd import store as store_row
+from ambiguous_wild.splat.cpu.simd64 import LANES, exp, load, select, store
 
 _PER_LOG2 = 1.3862943611198906  # 2 / log2(e): curvatures of the records are of 2 to the power
 
@@ -41,7 +49,8 @@ def _cross(a, b):
 
 @fused_kernel
 def _covariance_gradient(sums, f1, f2, antialias, blur, squared_blur):
-    """dL/d(u, v) and dL/d(rows f1, f2 of J W R diag(s)) from the sums over pixels."""
+    """dL/d(u, v) and dL/d(rows f1, f2 of J W R diag(s)) from the sums h to yy over pixels."""
+    s_h, s_u, s_uu, s_y, s_uy, s_yy = sums
     sxx = f1[0] * f1[0] + f1[1] * f1[1] + f1[2] * f1[2] + blur
     syy = f2[0] * f2[0] + f2[1] * f2[1] + f2[2] * f2[2] + blur
     sxy = f1[0] * f2[0] + f1[1] * f2[1] + f1[2] * f2[2]
@@ -51,20 +60,20 @@ def _covariance_gradient(sums, f1, f2, antialias, blur, squared_blur):
     a = syy / det
     q = 1.0 / syy
     k = sxy * q
-    du = a * sums[SUM_U]
-    dv = q * sums[SUM_Y] - k * du
-    dk = a * sums[SUM_UY]
-    gxx = 0.5 * a * a * sums[SUM_UU]
+    du = a * s_u
+    dv = q * s_y - k * du
+    dk = a * s_uy
+    gxx = 0.5 * a * a * s_uu
     gxy = dk * q - 2.0 * gxx * k
-    gyy = 0.5 * q * q * sums[SUM_YY] - dk * k * q + gxx * k * k
+    gyy = 0.5 * q * q * s_yy - dk * k * q + gxx * k * k
     d1 = (2.0 * gxx * f1[0] + gxy * f2[0], 2.0 * gxx * f1[1] + gxy * f2[1], 2.0 * gxx * f1[2] + gxy * f2[2])
     d2 = (2.0 * gyy * f2[0] + gxy * f1[0], 2.0 * gyy * f2[1] + gxy * f1[1], 2.0 * gyy * f2[2] + gxy * f1[2])
     if antialias:
         # ln(opacity) holds (ln det0 - ln det) / 2, and d det0 = 2 (f2 x n) df1 + 2 (n x f1) df2.
         e1 = _cross(f2, n)
         e2 = _cross(n, f1)
-        near = sums[SUM_H] * (1.0 / det0 - 1.0 / det)
-        far = sums[SUM_H] * blur / det
+        near = s_h * (1.0 / det0 - 1.0 / det)
+        far = s_h * blur / det
         d1 = (
             d1[0] + near * e1[0] - far * f1[0],
             d1[1] + near * e1[1] - far * f1[1],
@@ -91,161 +100,224 @@ def _quaternion_gradient(quat, norm, g):
 
 
 @fused_kernel
+def _reverse_eight(given, at, cam, antialias, found):
+    """Chain the sums of columns at .. at + 7 of `given` [18, GROUP] to parameters, into `found` [16, GROUP].
+
+    Rows of `given`: as `take` fills them, then the sums h to yy and that of depth. Rows of `found`: means
+    without what colours add, quats, log scales, opacity logit, screen u and v, 1 / v, 1 / Syy, slant.
+    """
+    x, y, z = in_camera(given, at, cam)
+    quat, norm, s = shape_of(given, at)
+    p, q, a, b, rot = footprint(quat, cam, x, y, z)
+    f1 = (p[0] * s[0], p[1] * s[1], p[2] * s[2])
+    f2 = (q[0] * s[0], q[1] * s[1], q[2] * s[2])
+    s_h = load(given, 11 * GROUP + at)
+    sums = (
+        s_h,
+        load(given, 12 * GROUP + at),
+        load(given, 13 * GROUP + at),
+        load(given, 14 * GROUP + at),
+        load(given, 15 * GROUP + at),
+        load(given, 16 * GROUP + at),
+    )
+    du, dv, g1, g2, inv_v, inv_y, slant = _covariance_gradient(sums, f1, f2, antialias, cam[22], cam[23])
+    opacity = 1.0 / (1.0 + exp(0.0 - load(given, 10 * GROUP + at)))
+    store(found, 7 * GROUP + at, g1[0] * f1[0] + g2[0] * f2[0])
+    store(found, 8 * GROUP + at, g1[1] * f1[1] + g2[1] * f2[1])
+    store(found, 9 * GROUP + at, g1[2] * f1[2] + g2[2] * f2[2])
+    store(found, 10 * GROUP + at, s_h * (1.0 - opacity))
+    store(found, 11 * GROUP + at, du)
+    store(found, 12 * GROUP + at, dv)
+    store(found, 13 * GROUP + at, inv_v)
+    store(found, 14 * GROUP + at, inv_y)
+    store(found, 15 * GROUP + at, slant)
+
+    gp = (g1[0] * s[0], g1[1] * s[1], g1[2] * s[2])
+    gq = (g2[0] * s[0], g2[1] * s[1], g2[2] * s[2])
+    gr = (
+        a[0] * gp[0] + b[0] * gq[0], a[0] * gp[1] + b[0] * gq[1], a[0] * gp[2] + b[0] * gq[2],
+        a[1] * gp[0] + b[1] * gq[0], a[1] * gp[1] + b[1] * gq[1], a[1] * gp[2] + b[1] * gq[2],
+        a[2] * gp[0] + b[2] * gq[0], a[2] * gp[1] + b[2] * gq[1], a[2] * gp[2] + b[2] * gq[2],
+    )  # fmt: skip
+    dw, dx, dy, dz = _quaternion_gradient(quat, norm, gr)
+    store(found, 3 * GROUP + at, dw)
+    store(found, 4 * GROUP + at, dx)
+    store(found, 5 * GROUP + at, dy)
+    store(found, 6 * GROUP + at, dz)
+
+    # a = (fx / z) (W0 - rx W2), b likewise; rx is constant where the frustum clamp holds it.
+    ga0 = gp[0] * rot[0] + gp[1] * rot[1] + gp[2] * rot[2]
+    ga1 = gp[0] * rot[3] + gp[1] * rot[4] + gp[2] * rot[5]
+    ga2 = gp[0] * rot[6] + gp[1] * rot[7] + gp[2] * rot[8]
+    gb0 = gq[0] * rot[0] + gq[1] * rot[1] + gq[2] * rot[2]
+    gb1 = gq[0] * rot[3] + gq[1] * rot[4] + gq[2] * rot[5]
+    gb2 = gq[0] * rot[6] + gq[1] * rot[7] + gq[2] * rot[8]
+    near = 1.0 / z
+    rx = x * near
+    ry = y * near
+    cx = du * cam[12] * near
+    cy = dv * cam[13] * near
+    cz = load(given, 17 * GROUP + at) - (cx * x + cy * y) * near
+    cz = cz - (ga0 * a[0] + ga1 * a[1] + ga2 * a[2] + gb0 * b[0] + gb1 * b[1] + gb2 * b[2]) * near
+    slope = -cam[12] * near * near * (ga0 * cam[8] + ga1 * cam[9] + ga2 * cam[10])
+    slope = select((rx >= cam[18]) & (rx <= cam[19]), slope, 0.0)
+    cx = cx + slope
+    cz = cz - slope * rx
+    slope = -cam[13] * near * near * (gb0 * cam[8] + gb1 * cam[9] + gb2 * cam[10])
+    slope = select((ry >= cam[20]) & (ry <= cam[21]), slope, 0.0)
+    cy = cy + slope
+    cz = cz - slope * ry
+    store(found, at, cam[0] * cx + cam[4] * cy + cam[8] * cz)
+    store(found, GROUP + at, cam[1] * cx + cam[5] * cy + cam[9] * cz)
+    store(found, 2 * GROUP + at, cam[2] * cx + cam[6] * cy + cam[10] * cz)
+
+
+@fused_kernel
+def _reverse_harmonics(i, colour, means, sh_rest, degree, centre, values, weights, d_sh_rest):
+    """Chain dL/d(red, green, blue) to the harmonics of Gaussian i; returns what its mean gets of them."""
+    terms = (degree + 1) * (degree + 1) - 1
+    red, green, blue = colour
+    for j in range(terms, d_sh_rest.shape[1]):
+        d_sh_rest[i, j] = 0.0
+    if degree == 0:
+        return 0.0, 0.0, 0.0
+    x = means[i, 0] - centre[0]
+    y = means[i, 1] - centre[1]
+    z = means[i, 2] - centre[2]
+    inv = 1.0 / math.sqrt(x * x + y * y + z * z)
+    x *= inv
+    y *= inv
+    z *= inv
+    basis(x, y, z, degree, values)
+    for j in range(terms):
+        weights[j] = red * sh_rest[i, j, 0] + green * sh_rest[i, j, 1] + blue * sh_rest[i, j, 2]
+        d_sh_rest[i, j, 0] = values[j] * red
+        d_sh_rest[i, j, 1] = values[j] * green
+        d_sh_rest[i, j, 2] = values[j] * blue
+    wx, wy, wz = direction_gradient(x, y, z, degree, weights)
+    along = wx * x + wy * y + wz * z
+    return (wx - along * x) * inv, (wy - along * y) * inv, (wz - along * z) * inv
+
+
+@fused_kernel
+def _mark(first, stop, n, ids, sh, dirty):
+    """Zero the harmonics' gradients of Gaussians of a chunk that were seen before and are not now."""
+    seen = np.zeros(CHUNK, np.bool_)
+    for slot in range(first, stop):
+        if ids[slot] >= 0:
+            seen[ids[slot] - first] = True
+    for i in range(first, min(first + CHUNK, n)):
+        if dirty[i] and not seen[i - first]:
+            sh[i] = 0.0
+        dirty[i] = seen[i - first]
+
+
+@fused_kernel
+def _write(
+    i, k, total, found, colour, screen, screen_extra, screen_abs, tally, d_means, d_quats, d_log_scales,
+    d_opacity_logits, d_sh0,
+):  # fmt: skip
+    """Column k of `found` and the rest of the sums to the row of Gaussian i, but for the harmonics."""
+    d_means[i, 0] = found[0, k]
+    d_means[i, 1] = found[1, k]
+    d_means[i, 2] = found[2, k]
+    d_quats[i, 0] = found[3, k]
+    d_quats[i, 1] = found[4, k]
+    d_quats[i, 2] = found[5, k]
+    d_quats[i, 3] = found[6, k]
+    d_log_scales[i, 0] = found[7, k]
+    d_log_scales[i, 1] = found[8, k]
+    d_log_scales[i, 2] = found[9, k]
+    d_opacity_logits[i] = found[10, k]
+    d_sh0[i, 0] = np.float32(C0) * colour[0]
+    d_sh0[i, 1] = np.float32(C0) * colour[1]
+    d_sh0[i, 2] = np.float32(C0) * colour[2]
+    du = found[11, k]
+    dv = found[12, k]
+    if screen_extra is not None:
+        eu = found[13, k] * total[EXTRA_U]
+        ev = found[14, k] * total[EXTRA_Y] - found[15, k] * eu
+        screen_extra[i, 0] = eu
+        screen_extra[i, 1] = ev
+        du -= eu
+        dv -= ev
+    screen[i, 0] = du
+    screen[i, 1] = dv
+    if screen_abs is not None:
+        screen_abs[i, 0] = found[13, k] * total[ABS_U]
+        screen_abs[i, 1] = _PER_LOG2 * total[ABS_V]
+    if tally is not None:
+        tally[i, 0] = _PER_LOG2 * _PER_LOG2 * total[SUM_SQUARED]
+        tally[i, 1] = total[SUM_COUNT]
+
+
+@fused_kernel
 def _reverse_chunk(
     first, stop, means, quats, log_scales, opacity_logits, sh_rest, degree, cam, centre, antialias,
     records, ids, offsets, instances, sums, d_means, d_quats, d_log_scales, d_opacity_logits, d_sh0,
     d_sh_rest, dirty, screen, screen_extra, screen_abs, tally, d_base,
 ):  # fmt: skip
     n = means.shape[0]
-    terms = (degree + 1) * (degree + 1) - 1
+    end = min(first + CHUNK, n)
+    _mark(first, stop, n, ids, d_sh_rest, dirty)
+    d_means[first:end] = 0.0
+    d_quats[first:end] = 0.0
+    d_log_scales[first:end] = 0.0
+    d_opacity_logits[first:end] = 0.0
+    d_sh0[first:end] = 0.0
+    screen[first:end] = 0.0
+    if screen_extra is not None:
+        screen_extra[first:end] = 0.0
+    if screen_abs is not None:
+        screen_abs[first:end] = 0.0
+    if tally is not None:
+        tally[first:end] = 0.0
     values = np.zeros(15, np.float32)
     weights = np.zeros(15, np.float32)
-    total = np.zeros(ROW, np.float32)
+    given = np.zeros((18, GROUP), np.float32)
+    found = np.empty((16, GROUP), np.float32)
+    totals = np.empty((GROUP, ROW), np.float32)
+    slots = np.empty(GROUP, np.int64)
     slot = first
-    for i in range(first, min(first + CHUNK, n)):
-        while slot < stop and ids[slot] < 0:
+    while slot < stop:
+        count = 0
+        while slot < stop and count < GROUP:
+            if ids[slot] >= 0:
+                row = splat(np.float32(0.0))
+                for at in range(offsets[slot], offsets[slot] + instances[slot]):
+                    row = row + load_row(sums, at * ROW)
+                store_row(totals, count * ROW, row)
+                take(given, count, ids[slot], means, quats, log_scales, opacity_logits)
+                for k in range(6):
+                    given[11 + k, count] = totals[count, SUM_H + k]
+                given[17, count] = totals[count, SUM_DEPTH]
+                slots[count] = slot
+                count += 1
             slot += 1
-        screen[i, 0] = 0.0
-        screen[i, 1] = 0.0
-        if screen_extra is not None:
-            screen_extra[i, 0] = 0.0
-            screen_extra[i, 1] = 0.0
-        if screen_abs is not None:
-            screen_abs[i, 0] = 0.0
-            screen_abs[i, 1] = 0.0
-        if tally is not None:
-            tally[i, 0] = 0.0
-            tally[i, 1] = 0.0
-        seen = slot < stop and ids[slot] == i
-        if dirty[i] and not seen:
-            d_sh_rest[i] = 0.0
-        dirty[i] = seen
-        if not seen:
-            d_means[i] = 0.0
-            d_quats[i] = 0.0
-            d_log_scales[i] = 0.0
-            d_opacity_logits[i] = 0.0
-            d_sh0[i] = 0.0
-            continue
-        record = records[slot]
-        row = splat(np.float32(0.0))
-        for at in range(offsets[slot], offsets[slot] + instances[slot]):
-            row = row + load(sums, at * ROW)
-        store(total, 0, row)
-        slot += 1
-
-        m0 = np.float64(means[i, 0])
-        m1 = np.float64(means[i, 1])
-        m2 = np.float64(means[i, 2])
-        x = cam[0] * m0 + cam[1] * m1 + cam[2] * m2 + cam[3]
-        y = cam[4] * m0 + cam[5] * m1 + cam[6] * m2 + cam[7]
-        z = cam[8] * m0 + cam[9] * m1 + cam[10] * m2 + cam[11]
-        qw = np.float64(quats[i, 0])
-        qx = np.float64(quats[i, 1])
-        qy = np.float64(quats[i, 2])
-        qz = np.float64(quats[i, 3])
-        norm = math.sqrt(qw * qw + qx * qx + qy * qy + qz * qz)
-        quat = (qw / norm, qx / norm, qy / norm, qz / norm)
-        s0 = math.exp(np.float64(log_scales[i, 0]))
-        s1 = math.exp(np.float64(log_scales[i, 1]))
-        s2 = math.exp(np.float64(log_scales[i, 2]))
-        p, q, a, b, rot, _, _ = footprint((m0, m1, m2), quat, (s0, s1, s2), cam, x, y, z)
-        f1 = (p[0] * s0, p[1] * s1, p[2] * s2)
-        f2 = (q[0] * s0, q[1] * s1, q[2] * s2)
-        du, dv, g1, g2, inv_v, inv_y, slant = _covariance_gradient(total, f1, f2, antialias, cam[22], cam[23])
-
-        d_opacity_logits[i] = total[SUM_H] * (1.0 - sigmoid(np.float64(opacity_logits[i])))
-        d_log_scales[i, 0] = g1[0] * f1[0] + g2[0] * f2[0]
-        d_log_scales[i, 1] = g1[1] * f1[1] + g2[1] * f2[1]
-        d_log_scales[i, 2] = g1[2] * f1[2] + g2[2] * f2[2]
-
-        gp0, gp1, gp2 = g1[0] * s0, g1[1] * s1, g1[2] * s2
-        gq0, gq1, gq2 = g2[0] * s0, g2[1] * s1, g2[2] * s2
-        gr = (
-            a[0] * gp0 + b[0] * gq0, a[0] * gp1 + b[0] * gq1, a[0] * gp2 + b[0] * gq2,
-            a[1] * gp0 + b[1] * gq0, a[1] * gp1 + b[1] * gq1, a[1] * gp2 + b[1] * gq2,
-            a[2] * gp0 + b[2] * gq0, a[2] * gp1 + b[2] * gq1, a[2] * gp2 + b[2] * gq2,
-        )  # fmt: skip
-        dw, dx, dy, dz = _quaternion_gradient(quat, norm, gr)
-        d_quats[i, 0] = dw
-        d_quats[i, 1] = dx
-        d_quats[i, 2] = dy
-        d_quats[i, 3] = dz
-
-        # a = (fx / z) (W0 - rx W2), b likewise; rx is constant where the frustum clamp holds it.
-        ga0 = gp0 * rot[0] + gp1 * rot[1] + gp2 * rot[2]
-        ga1 = gp0 * rot[3] + gp1 * rot[4] + gp2 * rot[5]
-        ga2 = gp0 * rot[6] + gp1 * rot[7] + gp2 * rot[8]
-        gb0 = gq0 * rot[0] + gq1 * rot[1] + gq2 * rot[2]
-        gb1 = gq0 * rot[3] + gq1 * rot[4] + gq2 * rot[5]
-        gb2 = gq0 * rot[6] + gq1 * rot[7] + gq2 * rot[8]
-        cx = du * cam[12] / z
-        cy = dv * cam[13] / z
-        cz = total[SUM_DEPTH] - (cx * x + cy * y) / z
-        cz -= (ga0 * a[0] + ga1 * a[1] + ga2 * a[2] + gb0 * b[0] + gb1 * b[1] + gb2 * b[2]) / z
-        if cam[18] <= x / z <= cam[19]:
-            slope = -cam[12] / z * (ga0 * cam[8] + ga1 * cam[9] + ga2 * cam[10])
-            cx += slope / z
-            cz -= slope * x / (z * z)
-        if cam[20] <= y / z <= cam[21]:
-            slope = -cam[13] / z * (gb0 * cam[8] + gb1 * cam[9] + gb2 * cam[10])
-            cy += slope / z
-            cz -= slope * y / (z * z)
-
-        if d_base is None:
-            red = total[SUM_RED] if record[RED] > 0.0 else 0.0
-            green = total[SUM_GREEN] if record[GREEN] > 0.0 else 0.0
-            blue = total[SUM_BLUE] if record[BLUE] > 0.0 else 0.0
-        else:  # through the shading function, clamp included
-            red = np.float64(d_base[slot - 1, 0])
-            green = np.float64(d_base[slot - 1, 1])
-            blue = np.float64(d_base[slot - 1, 2])
-        d_sh0[i, 0] = C0 * red
-        d_sh0[i, 1] = C0 * green
-        d_sh0[i, 2] = C0 * blue
-        wx = 0.0
-        wy = 0.0
-        wz = 0.0
-        if degree > 0:
-            ox = m0 - centre[0]
-            oy = m1 - centre[1]
-            oz = m2 - centre[2]
-            inv = 1.0 / math.sqrt(ox * ox + oy * oy + oz * oz)
-            ox *= inv
-            oy *= inv
-            oz *= inv
-            basis(ox, oy, oz, degree, values)
-            for j in range(terms):
-                weights[j] = red * sh_rest[i, j, 0] + green * sh_rest[i, j, 1] + blue * sh_rest[i, j, 2]
-                d_sh_rest[i, j, 0] = values[j] * red
-                d_sh_rest[i, j, 1] = values[j] * green
-                d_sh_rest[i, j, 2] = values[j] * blue
-            wx, wy, wz = direction_gradient(ox, oy, oz, degree, weights)
-            along = wx * ox + wy * oy + wz * oz
-            wx = (wx - along * ox) * inv
-            wy = (wy - along * oy) * inv
-            wz = (wz - along * oz) * inv
-        for j in range(terms, d_sh_rest.shape[1]):
-            d_sh_rest[i, j] = 0.0
-        d_means[i, 0] = wx + cam[0] * cx + cam[4] * cy + cam[8] * cz
-        d_means[i, 1] = wy + cam[1] * cx + cam[5] * cy + cam[9] * cz
-        d_means[i, 2] = wz + cam[2] * cx + cam[6] * cy + cam[10] * cz
-
-        if screen_extra is not None:
-            eu = inv_v * total[EXTRA_U]
-            ev = inv_y * total[EXTRA_Y] - slant * eu
-            screen_extra[i, 0] = eu
-            screen_extra[i, 1] = ev
-            du -= eu
-            dv -= ev
-        screen[i, 0] = du
-        screen[i, 1] = dv
-        if screen_abs is not None:
-            screen_abs[i, 0] = inv_v * total[ABS_U]
-            screen_abs[i, 1] = _PER_LOG2 * total[ABS_V]
-        if tally is not None:
-            tally[i, 0] = _PER_LOG2 * _PER_LOG2 * total[SUM_SQUARED]
-            tally[i, 1] = total[SUM_COUNT]
+        for at in range(0, count, LANES):
+            _reverse_eight(given, at, cam, antialias, found)
+        for k in range(count):
+            i = ids[slots[k]]
+            total = totals[k]
+            if d_base is None:
+                record = records[slots[k]]
+                colour = (
+                    total[SUM_RED] if record[RED] > 0.0 else np.float32(0.0),
+                    total[SUM_GREEN] if record[GREEN] > 0.0 else np.float32(0.0),
+                    total[SUM_BLUE] if record[BLUE] > 0.0 else np.float32(0.0),
+                )
+            else:  # through the shading function, clamp included
+                colour = (d_base[slots[k], 0], d_base[slots[k], 1], d_base[slots[k], 2])
+            _write(
+                i, k, total, found, colour, screen, screen_extra, screen_abs, tally, d_means, d_quats,
+                d_log_scales, d_opacity_logits, d_sh0,
+            )  # fmt: skip
+            wx, wy, wz = _reverse_harmonics(
+                i, colour, means, sh_rest, degree, centre, values, weights, d_sh_rest
+            )
+            d_means[i, 0] += wx
+            d_means[i, 1] += wy
+            d_means[i, 2] += wz
 
 
 @parallel_kernel

@@ -130,13 +130,13 @@ def splat(typingctx: Any, value: Any) -> Any:
 
 
 @intrinsic
-def lane_centres(typingctx: Any) -> Any:
-    """0.5, 1.5, ..., 15.5: pixel centres of a tile row, relative to the tile."""
+def trailing_zeros(typingctx: Any, bits: Any) -> Any:
+    """Number of the lowest set bit of an int64 that is not 0."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return ir.Constant(_VECTOR, [i + 0.5 for i in range(LANES)])
+        return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
 
-    return f32x16(), codegen
+    return types.int64(types.int64), codegen
 
 
 @intrinsic
@@ -217,6 +217,23 @@ def store(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(array, types.intp, f32x16), codegen
+
+
+@intrinsic
+def prefetch(typingctx: Any, array: Any, index: Any) -> Any:
+    """Ask for the cache line at a flat element index of a contiguous array; any index will do."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        data = make_array(sig.args[0])(context, builder, args[0]).data
+        pointer = builder.bitcast(builder.gep(data, [args[1]]), ir.IntType(8).as_pointer())
+        function = _masked_function(
+            builder, "llvm.prefetch.p0", ir.VoidType(), [pointer.type, _I32, _I32, _I32]
+        )
+        hints = [ir.Constant(_I32, hint) for hint in (0, 3, 1)]  # to read, into every level, data
+        builder.call(function, [pointer, *hints])
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp), codegen
 
 
 # 2^f on [-0.5, 0.5], least largest relative error with 2^0 exact: 9e-8 before rounding.

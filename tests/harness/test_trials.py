@@ -277,11 +277,29 @@ def test_a_plan_goes_on_where_it_was_interrupted(scene, tmp_path, monkeypatch):
     again = make()
     assert len(Counted.trained) == 3
     assert again.decisions == plan.decisions
-    next(tmp_path.iterdir()).write_text("{half")  # a file that cannot be read is made again
+    (file,) = tmp_path.iterdir()
+    file.write_text("{half")  # a file that cannot be read is made again
     assert make().decisions == plan.decisions and len(Counted.trained) == 6
     short = make(iterations=500)
     assert short.effects() == ("exposure",) and short.cost is None and len(Counted.trained) == 6
     assert len(prepared) == 5
+
+
+def test_a_run_under_a_budget_goes_on_with_the_probes_it_began(scene, tmp_path, monkeypatch):
+    Counted.trained = ()
+    monkeypatch.setattr(probed.trials, "Trials", Counted)
+    monkeypatch.setattr(probed, "plan_without_training", lambda _: plan_of(exposure=0.2))
+    monkeypatch.setattr(probed, "step_costs", lambda data, names, folder: dict.fromkeys(names, 2.0))
+
+    def make(slower):
+        monkeypatch.setattr("ambiguous_wild.harness.planning.allowance.slowness", lambda: slower)
+        config = TrainConfig(budget_s=60.0)
+        return probed.plan_with_probes(scene, config, tmp_path, masks=False, prepare=lambda: None)
+
+    first = make(1.0)
+    assert len(Counted.trained) == 2
+    later = make(1000.0)  # a machine that is busy now: no reason to decide otherwise
+    assert len(Counted.trained) == 2 and later.decisions == first.decisions
 
 
 def test_a_scene_that_calls_for_nothing_costs_nothing(scene, tmp_path, monkeypatch):

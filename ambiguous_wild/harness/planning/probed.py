@@ -7,7 +7,7 @@ import dataclasses
 import json
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from types import SimpleNamespace
@@ -50,29 +50,41 @@ def no_bar(total: int) -> Iterator[Any]:
 class Kept:
     """Probes of one scene in a file, so that a plan that was interrupted or is made again goes on."""
 
-    def __init__(self, scene: Scene, iterations: int, folder: Path) -> None:
+    def __init__(self, scene: Scene, length: Mapping[str, float], folder: Path) -> None:
+        """
+        Args:
+            scene: the scene.
+            length: what says how long the probes are.
+            folder: of the file.
+        """
         self.key = config_hash(
             {
                 "scene": scene_identity(scene),
-                "iterations": iterations,
+                "length": dict(length),
                 "version": VERSION,
                 "photos": trials.MOST_PHOTOS,
                 "blocks": [trials.HELD_BACK, trials.BLOCKS, trials.MEASURED_FROM],
             }
         )
         self.path = folder / f"{scene.name}-{self.key[:12]}.json"
+        self.iterations: int | None = None  # of a probe
         self.arms: dict[str, Arm] = {}
         self.costs: dict[str, float] = {}  # ms an iteration
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
             rows = json.loads(self.path.read_text(encoding="utf-8"))
             if rows["key"] == self.key:
-                self.arms = {name: Arm(_numbers(psnr)) for name, psnr in rows["arms"].items()}
-                self.costs = _numbers(rows["costs"])
+                arms = {name: Arm(_numbers(psnr)) for name, psnr in rows["arms"].items()}
+                self.iterations, self.costs, self.arms = (
+                    int(rows["iterations"]),
+                    _numbers(rows["costs"]),
+                    arms,
+                )
 
     def write(self) -> None:
         """Keep what there is."""
         arms = {name: dict(arm.psnr) for name, arm in self.arms.items()}
-        write_json(self.path, {"key": self.key, "costs": self.costs, "arms": arms})
+        rows = {"key": self.key, "iterations": self.iterations, "costs": self.costs, "arms": arms}
+        write_json(self.path, rows)
 
 
 def _numbers(row: Mapping[str, Any]) -> dict[str, float]:
@@ -113,33 +125,47 @@ def plan_with_probes(
     if masks and not room.masks_fit:
         say(f"{scene.name}: masks not tried: {TOO_SHORT}")
     masks = masks and room.masks_fit
-    length = room.arm_iterations(len(names) + 1, room.masks_s if masks else 0.0) if names else 0
+    spent_s = room.masks_s if masks else 0.0
     paired = grown = 0
     with tempfile.TemporaryDirectory(prefix="aw-plan-") as name:
         bench = _Bench(scene, Path(name), bar)
-        if length:
-            kept = Kept(scene, length, folder)
-
-            def arm(effects: tuple[str, ...]) -> Arm:
-                key = "+".join(effects)
-                if key not in kept.arms:
-                    kept.arms[key] = bench.train(effects, length)
-                    kept.write()
-                return kept.arms[key]
-
-            if not kept.costs:
-                kept.costs = step_costs(bench.trials.data, names, Path(name))
-                kept.write()
-            plan = try_effects(plan, names, arm, kept.costs, say)
-            paired = length * len(kept.arms) + TIMED * (len(names) + 1)
-        elif names:
-            plan = untried(plan, TOO_SHORT)
-            say(f"{scene.name}: {', '.join(names)} not tried: {TOO_SHORT}")
+        if names:
+            length = room.arm_iterations(len(names) + 1, spent_s)
+            # how fast the machine is now must not decide when a run under a budget goes on
+            known = {"iterations": length} if train.budget_s is None else {"budget_s": train.budget_s}
+            kept = Kept(scene, known, folder)
+            if kept.iterations is None:
+                kept.iterations = length
+            plan, paired = _with_effects(plan, names, kept, bench, say)
         if masks:
             plan, more, grown = _with_masks(plan, scene, bench, say, bar)
             paired += more
     share = room.share(paired, grown)
     return dataclasses.replace(plan, cost=_cost(paired + grown, begin, share) if paired + grown else None)
+
+
+def _with_effects(
+    plan: Plan, names: Sequence[str], kept: Kept, bench: _Bench, say: Callable[[str], None]
+) -> tuple[Plan, int]:
+    """The plan with what the probes said of effects, and the iterations of all of them."""
+    length = kept.iterations
+    if not length:
+        kept.write()
+        say(f"{plan.scene}: {', '.join(names)} not tried: {TOO_SHORT}")
+        return untried(plan, TOO_SHORT), 0
+
+    def arm(effects: tuple[str, ...]) -> Arm:
+        key = "+".join(effects)
+        if key not in kept.arms:
+            kept.arms[key] = bench.train(effects, length)
+            kept.write()
+        return kept.arms[key]
+
+    if not kept.costs:
+        kept.costs = step_costs(bench.trials.data, names, bench.folder)
+        kept.write()
+    plan = try_effects(plan, names, arm, kept.costs, say)
+    return plan, length * len(kept.arms) + TIMED * (len(names) + 1)
 
 
 def _cost(iterations: int, begin: float, share: float) -> Cost:

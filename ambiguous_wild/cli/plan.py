@@ -67,6 +67,7 @@ def command(
     """
     from ambiguous_wild.core.errors import AwError
     from ambiguous_wild.harness.planning.decide import plan_without_training
+    from ambiguous_wild.harness.planning.tried import untried
     from ambiguous_wild.io.atomic import check_output, write_json
     from ambiguous_wild.io.scene_folder import load_scene
 
@@ -80,7 +81,10 @@ def command(
         from ambiguous_wild.cli.devices import prepare_cpu
 
         prepare_cpu(None)
-    plan = _probed(loaded, iterations, path, as_json) if probe else plan_without_training(loaded)
+    if probe:
+        plan = _probed(loaded, iterations, path, as_json)
+    else:
+        plan = untried(plan_without_training(loaded), "--no-probe")
     if costs:
         from ambiguous_wild.harness.planning.probe import effect_costs
 

@@ -1,13 +1,16 @@
 """Paired probes: what they leave out, what they measure, what is decided from them."""
 
 import dataclasses
+import json
 import math
+from typing import ClassVar
 
 import cv2
 import numpy as np
 import pytest
 import torch
 
+from ambiguous_wild.harness.bench import Callbacks, bench
 from ambiguous_wild.harness.planning import probed, tried
 from ambiguous_wild.harness.planning.allowance import LONGEST_ARM, SHARE, SHORTEST_ARM, TIMED, allowance
 from ambiguous_wild.harness.planning.decide import Decision, Plan, decide
@@ -64,6 +67,8 @@ def test_limits_are_the_first_guess():
         "exposure",
         "appearance",
     )  # the cheaper one beside it
+    assert tried.candidates(plan_of(appearance=0.03)) == ("exposure", "appearance")
+    assert tried.candidates(plan_of(appearance=0.01, exposure=0.03)) == ()
     assert tried.candidates(plan_of(exposure=math.nan, reprojection_px=2.0)) == ("poses",)
 
 
@@ -311,3 +316,27 @@ def test_a_scene_that_calls_for_nothing_costs_nothing(scene, tmp_path, monkeypat
     plan = probed.plan_with_probes(scene, TrainConfig(), tmp_path, masks=False, prepare=never)
     assert plan == plan_of() and isinstance(plan, Plan) and isinstance(plan.decisions[0], Decision)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_bench_tries_within_its_own_length_and_keeps_what_it_tried(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        probed,
+        "plan_without_training",
+        lambda found: dataclasses.replace(plan_of(sampling=3.0), scene=found.name),
+    )
+
+    class Heard(Callbacks):
+        lines: ClassVar[list[str]] = []
+
+        def say(self, text):
+            self.lines.append(text)
+
+    more = {"output": tmp_path, "effects": "auto", "pictures": False, "device": "cpu"}
+    report = bench("3dgs", scene.root, iterations=20, callbacks=Heard(), **more)
+    (run,) = report.runs
+    assert run.outcome == "trained" and run.effects == ()
+    said = json.loads((run.folder / "effects.json").read_text())
+    why = {d["effect"]: d["why"] for d in said["plan"]["decisions"]}
+    assert why["antialiasing"].endswith(probed.TOO_SHORT)
+    assert f"scene: antialias not tried: {probed.TOO_SHORT}" in Heard.lines
+    assert list((tmp_path / ".cache" / "plans").glob("scene-*.json"))

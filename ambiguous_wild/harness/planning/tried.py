@@ -17,10 +17,11 @@ from ambiguous_wild.harness.planning.decide import (
 from ambiguous_wild.harness.planning.gain import LEAST_DB_MASKS, Arm, Gain, compare
 from ambiguous_wild.splat.effects import check_effects
 
-# The limits are the first guess: an effect is tried from there on.
+# The limits are the first guess: an effect is tried from there on. What appearance is compared with depends
+# on the size of the photos (`time-of-day`: 0.027 at 256 px, above 0.043 at 480 px): it is tried earlier.
 TRIED_FROM = {
     "exposure": EXPOSURE,
-    "appearance": APPEARANCE,
+    "appearance": APPEARANCE / 2,
     "antialias": SAMPLING,
     "poses": REPROJECTION_PX,
 }

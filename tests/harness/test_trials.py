@@ -112,6 +112,21 @@ def test_the_embedding_must_pay_beyond_exposure(appearance, on):
         assert {d.effect: d.why for d in found.decisions}["affine exposure"] == tried.COVERED
 
 
+def test_within_noise_the_limit_decides_on_colour():
+    plan = plan_of(sampling=3.0, exposure=0.2, appearance=0.1)
+    names = tried.candidates(plan)
+
+    def train(effects):  # each effect: +0.2 +- 0.2 dB
+        return arm(*(20.0 + len(effects) * (0.2 + 0.5 * (-1) ** k) for k in range(6)))
+
+    found = tried.try_effects(plan, names, train, dict.fromkeys(names, 1.0), print)
+    assert found.effects() == ("exposure",)  # neither antialiasing nor appearance beyond it
+    assert {d.effect: d.why for d in found.decisions}["affine exposure"] == tried.GUESSED
+    below = plan_of(appearance=0.03, exposure=0.01)  # both are tried, no limit is reached
+    found = tried.try_effects(below, tried.candidates(below), train, dict.fromkeys(names, 1.0), print)
+    assert found.effects() == ()
+
+
 def test_too_few_photos_leave_the_limits():
     names = ("exposure", "antialias")
     plan = plan_of(sampling=3.0, exposure=0.2)

@@ -14,7 +14,7 @@ from ambiguous_wild.harness.planning.decide import (
     Decision,
     Plan,
 )
-from ambiguous_wild.harness.planning.gain import LEAST_DB_MASKS, Arm, Gain, compare
+from ambiguous_wild.harness.planning.gain import LEAST_DB, LEAST_DB_MASKS, Arm, Gain, compare
 from ambiguous_wild.splat.effects import check_effects
 
 # The limits are the first guess: an effect is tried from there on. What appearance is compared with depends
@@ -29,6 +29,7 @@ TRIED_FROM = {
 ONLY_IF_TRIED = ("antialias", "poses")
 MASK_LINES = ("masks", "masks, local", "masks, global", "entropy density")
 PAYS, PAYS_NOT = "pays on held-back pixels", "does not pay on held-back pixels"
+GUESSED = "gains no more than noise; the limit decides"
 COVERED = "the embedding covers it"
 STATIC = "static: leaving the patches out does not pay"
 # Share of the pixels: static captures have 0.0 to 1.1 %, captures with distractors from 0.9 % on.
@@ -81,6 +82,7 @@ def try_effects(
     """
     on: tuple[str, ...] = ()
     gains: dict[str, Gain] = {}
+    lines = {name_of(decision): decision for decision in plan.decisions}
     covered = False
     for name in names:
         beside = tuple(e for e in on if name != "appearance" or e != "exposure")
@@ -89,19 +91,32 @@ def try_effects(
         if gain is None:
             return untried(plan, "too few photos to hold pixels back")
         gains[name] = gain
-        if gain.pays():
+        accepted = gain.pays() or (beside == on and guessed(lines[name], gain))
+        if accepted:
             covered = covered or beside != on
             on = check_effects([*beside, name])
-        say(f"{plan.scene}: {name} {'on' if gain.pays() else 'off'}: {told(gain)}, {costs[name]:+.1f} ms")
-    lines = tuple(_line(d, gains.get(name_of(d)), on, covered) for d in plan.decisions)
-    return replace(plan, decisions=lines).with_costs(dict(costs))
+        say(f"{plan.scene}: {name} {'on' if accepted else 'off'}: {told(gain)}, {costs[name]:+.1f} ms")
+    found = tuple(_line(d, gains.get(name_of(d)), on, covered) for d in plan.decisions)
+    return replace(plan, decisions=found).with_costs(dict(costs))
+
+
+def guessed(decision: Decision, gain: Gain) -> bool:
+    """Whether the limit switches on what gains something, but no more than its noise: few photos.
+
+    Nine photos of a real capture: +0.08 +- 0.14 dB in the probe, +1.7 dB on test photos.
+    """
+    allowed = name_of(decision) not in ONLY_IF_TRIED and decision.value >= decision.threshold
+    return allowed and gain.db >= LEAST_DB
 
 
 def _line(decision: Decision, gain: Gain | None, on: Iterable[str], covered: bool) -> Decision:
     name = name_of(decision)
     if gain is None:
         return replace(decision, decision="off") if name and decision.decision == "on" else decision
-    why = PAYS if name in on else COVERED if covered and name == "exposure" else PAYS_NOT
+    if name in on:
+        why = PAYS if gain.pays() else GUESSED
+    else:
+        why = COVERED if covered and name == "exposure" else PAYS_NOT
     return with_gain(replace(decision, decision="on" if name in on else "off", why=why), gain)
 
 

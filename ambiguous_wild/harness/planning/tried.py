@@ -32,7 +32,7 @@ PAYS, PAYS_NOT = "pays on held-back pixels", "does not pay on held-back pixels"
 GUESSED = "gains no more than noise; the limit decides"
 COVERED = "the embedding covers it"
 STATIC = "static: leaving the patches out does not pay"
-# Share of the pixels: static captures have 0.0 to 1.1 %, captures with distractors from 0.9 % on.
+# Share of the pixels: static captures have 0.0 to 0.9 %, captures with distractors from 0.6 % on.
 CERTAIN = 0.03
 
 Train = Callable[[tuple[str, ...]], Arm]  # a probe with these effects

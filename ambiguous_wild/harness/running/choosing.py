@@ -115,9 +115,12 @@ def _make_plan(scene: Scene, probing: Probing | None) -> Plan:
         return untried(plan_without_training(scene), "no probes were asked for")
     from ambiguous_wild.harness.planning.probed import plan_with_probes
 
-    return plan_with_probes(
+    plan = plan_with_probes(
         scene, probing.train, probing.folder, masks=False, prepare=probing.prepare, say=probing.say
     )
+    if plan.cost is not None:
+        probing.say(f"{scene.name}: {plan.cost.line()}")
+    return plan
 
 
 def describe(effects: Sequence[str]) -> str:

@@ -6,8 +6,8 @@ Uses the scenes of benchmarks/presets.py (its --work DIR/scenes). On each, Refin
 with the effects the preset was designed for (colour per photo once as exposure, once as appearance), with
 none and with all. A lower SH degree is left out (its cost is in docs/effects.md). Writes
 benchmarks/results/auto.json and .md: test PSNR and training seconds of each set, and auto against the best
-other one: by PSNR, or by time within 0.02 dB. If both are the same set, times are not compared. The time of
-the decision (SfM points, no training) is in the results of presets.py.
+other one: by PSNR, or by time within 0.02 dB. If both are the same set, times are not compared. What `auto`
+tried before it decided, and the seconds of that, are in a column of their own.
 """
 
 from __future__ import annotations
@@ -56,12 +56,17 @@ def train(scene: Path, effects: str, out: Path, args: argparse.Namespace) -> dic
     run = out / scene.name / METHOD / "seed0"
     result = read_result(run / RESULT)
     told = run / "effects.json"
-    chosen = json.loads(told.read_text(encoding="utf-8")).get("effects", []) if told.is_file() else None
+    said = json.loads(told.read_text(encoding="utf-8")) if told.is_file() else {}
+    plan = said.get("plan") or {"decisions": [], "cost": None}
     return {
         "psnr": mean_psnr(result),
         "train_s": result["cost"]["train_s"],
         "setup_s": result["cost"].get("setup_s"),
-        "effects": chosen,
+        "effects": said.get("effects"),
+        "tried": {
+            d["effect"]: [d["gain_db"], d["error_db"]] for d in plan["decisions"] if d["gain_db"] is not None
+        },
+        "deciding": plan["cost"],
     }
 
 
@@ -96,22 +101,29 @@ def to_markdown(data: dict[str, Any]) -> str:
         "",
         f"{METHOD}, {data['iterations']} iterations, --factor {data['factor']}, seed 0; dB / s of training",
         "",
-        "| preset | auto chose | auto | none | all | designed for | best | auto - best, dB | time |",
-        "|---|---|---:|---:|---:|---|---|---:|---:|",
+        "| preset | auto chose | tried | auto | none | all | designed for | best | auto - best, dB | time |",
+        "|---|---|---|---:|---:|---:|---|---|---:|---:|",
     ]
     for row in data["presets"]:
         if "error" in row:
-            lines.append(f"| {row['preset']} | {row['error']} |" + " |" * 7)
+            lines.append(f"| {row['preset']} | {row['error']} |" + " |" * 8)
             continue
         shown = {name: f"{run['psnr']:.2f} / {run['train_s']:.0f}" for name, run in row["runs"].items()}
         chosen = row["runs"]["auto"]["effects"]
         hand = "; ".join(f"{k}: {v}" for k, v in shown.items() if k not in ("auto", "none", "all"))
         lines.append(
-            f"| {row['preset']} | {', '.join(chosen or []) or 'none'} | {shown['auto']} | {shown['none']} "
+            f"| {row['preset']} | {', '.join(chosen or []) or 'none'} | {_tried(row['runs']['auto'])} "
+            f"| {shown['auto']} | {shown['none']} "
             f"| {shown['all']} | {hand or 'none'} | {row['best']} | {row['auto_minus_best_db']:+.2f} "
             f"| {'same set' if row['same_set'] else format(row['auto_over_best_time'], '.2f')} |"
         )
     return "\n".join(lines) + "\n"
+
+
+def _tried(run: dict[str, Any]) -> str:
+    found = [f"{effect} {gain:+.2f} ± {error:.2f} dB" for effect, (gain, error) in run["tried"].items()]
+    cost = run["deciding"]
+    return f"{'; '.join(found)} ({cost['seconds']:.0f} s)" if found and cost else "nothing"
 
 
 def main(argv: Sequence[str] | None = None) -> int:

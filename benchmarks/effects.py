@@ -19,8 +19,10 @@ from typing import Any
 
 import numpy as np
 
-from ambiguous_wild.harness.planning.decide import plan_without_training
-from ambiguous_wild.harness.planning.probe import occlusion, small_data, with_occlusion
+from ambiguous_wild.core import Scene
+from ambiguous_wild.harness.planning.decide import Plan, plan_without_training
+from ambiguous_wild.harness.planning.probe import small_data
+from ambiguous_wild.harness.planning.probed import plan_with_probes
 from ambiguous_wild.io.atomic import write_json
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.cpu.warmup import warm_up
@@ -81,15 +83,21 @@ def costs(path: Path, rounds: int, steps: int = 5) -> dict[str, Any]:
         }
 
 
+def _probed(scene: Scene) -> Plan:
+    """The plan of `aw plan`, for a run of the full length."""
+    with tempfile.TemporaryDirectory() as name:
+        return plan_with_probes(
+            scene, TrainConfig(), Path(name), masks=True, prepare=lambda: warm_up(print), say=print
+        )
+
+
 def confusion(wanted: dict[Path, set[str]], probe: bool) -> dict[str, Any]:
     """Confusion counts per effect, and all decisions."""
     table: dict[str, Counter[str]] = {name: Counter() for name in LINES}
     details = {}
     for path, needs in wanted.items():
         scene = load_scene(path)
-        plan = plan_without_training(scene)
-        if probe:
-            plan = with_occlusion(plan, occlusion(scene, plan.effects(("exposure", "appearance"))))
+        plan = _probed(scene) if probe else plan_without_training(scene)
         found = {d.effect: d for d in plan.decisions}
         details[str(path)] = plan.plain()
         for name, line in LINES.items():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import math
+import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,7 @@ import click
 from ambiguous_wild.cli.paths import PathName
 
 if TYPE_CHECKING:
+    from ambiguous_wild.core import Scene
     from ambiguous_wild.harness.planning.decide import Decision, Plan
 
 MASKS = (
@@ -30,7 +32,14 @@ MASKS = (
     "--probe/--no-probe",
     default=True,
     show_default=True,
-    help="Train 3DGS on small photos to decide about masks; other effects do not need it.",
+    help="Try effects and masks in short trainings on small photos; without, the limits decide alone.",
+)
+@click.option(
+    "--iterations",
+    type=click.IntRange(1),
+    default=30_000,
+    show_default=True,
+    help="Length of the run that the plan is for: probes take a tenth of it at most.",
 )
 @click.option(
     "--costs/--no-costs",
@@ -43,14 +52,22 @@ MASKS = (
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the plan as JSON.")
 def command(
-    scene: Path, factor: int | None, probe: bool, costs: bool, out: Path | None, as_json: bool
+    scene: Path,
+    factor: int | None,
+    probe: bool,
+    iterations: int,
+    costs: bool,
+    out: Path | None,
+    as_json: bool,
 ) -> None:
-    """Measure SCENE and decide which effects it needs: evidence, threshold, decision and (--costs) cost.
+    """Measure SCENE and decide which effects it needs: evidence, limit, gain of a probe, decision and cost.
 
-    'aw bench --effects auto' makes the same decisions, but without the probe.
+    An effect from its limit on is tried: two short trainings with and without it, measured on pixels that
+    both leave out. 'aw bench --effects auto' decides the same way, but not about masks.
     """
     from ambiguous_wild.core.errors import AwError
     from ambiguous_wild.harness.planning.decide import plan_without_training
+    from ambiguous_wild.harness.planning.tried import untried
     from ambiguous_wild.io.atomic import check_output, write_json
     from ambiguous_wild.io.scene_folder import load_scene
 
@@ -60,19 +77,14 @@ def command(
         raise AwError(f"{path} is inside {scene} and would change the scene; choose another -o")
     check_output(path)
     _check_overwrite(path, probe)
-    plan = plan_without_training(loaded)
     if probe or costs:
         from ambiguous_wild.cli.devices import prepare_cpu
 
         prepare_cpu(None)
     if probe:
-        from tqdm import tqdm
-
-        from ambiguous_wild.harness.planning.probe import stays, with_occlusion
-
-        colour = tuple(e for e in plan.effects(("exposure", "appearance")))
-        bar = functools.partial(tqdm, unit="it", desc="probe", disable=as_json or None)
-        plan = with_occlusion(plan, stays(loaded, colour, bar=bar))
+        plan = _probed(loaded, iterations, path, as_json)
+    else:
+        plan = untried(plan_without_training(loaded), "--no-probe")
     if costs:
         from ambiguous_wild.harness.planning.probe import effect_costs
 
@@ -83,7 +95,30 @@ def command(
         return
     for line in table(plan):
         click.echo(line)
+    if plan.cost is not None:
+        click.echo(plan.cost.line())
     click.echo(f"wrote {path}")
+
+
+def _probed(scene: Scene, iterations: int, path: Path, quiet: bool) -> Plan:
+    """The plan from probes; those of effects are kept beside its file until it is written."""
+    from tqdm import tqdm
+
+    from ambiguous_wild.harness.planning.probed import plan_with_probes
+    from ambiguous_wild.splat.pace import TrainConfig
+
+    folder = path.parent / f".{path.name}.probes"
+    plan = plan_with_probes(
+        scene,
+        TrainConfig(iterations=iterations),
+        folder,
+        masks=True,
+        prepare=lambda: None,  # done
+        say=lambda text: None if quiet else click.echo(text),
+        bar=functools.partial(tqdm, unit="it", desc="probe", disable=quiet or None),
+    )
+    shutil.rmtree(folder, ignore_errors=True)
+    return plan
 
 
 def _check_overwrite(path: Path, probe: bool) -> None:
@@ -105,7 +140,7 @@ def _check_overwrite(path: Path, probe: bool) -> None:
 
 def table(plan: Plan) -> list[str]:
     """The plan as text lines for a terminal."""
-    head = ("effect", "evidence", "found", "from", "decision", "ms/iteration", "why")
+    head = ("effect", "evidence", "found", "from", "gain", "decision", "ms/iteration", "why")
     rows = [head, *(_row(d) for d in plan.decisions)]
     widths = [max(len(row[k]) for row in rows) for k in range(len(head) - 1)]
     lines = ["  ".join([*(cell.ljust(w) for cell, w in zip(row, widths)), row[-1]]).rstrip() for row in rows]
@@ -116,5 +151,6 @@ def table(plan: Plan) -> list[str]:
 
 def _row(d: Decision) -> tuple[str, ...]:
     found = "—" if math.isnan(d.value) else f"{d.value:.3g} {d.unit}"
+    gain = "—" if d.gain_db is None else f"{d.gain_db:+.2f} ± {d.error_db:.2f} dB"
     cost = "—" if d.cost_ms is None else f"{d.cost_ms:+.2f}"
-    return d.effect, d.evidence, found, f"{d.threshold:g}", d.decision, cost, d.why
+    return d.effect, d.evidence, found, f"{d.threshold:g}", gain, d.decision, cost, d.why

@@ -198,6 +198,7 @@ def bench(
         raise AwError("iterations and budgets_s exclude each other: a run is as long as one of them says")
     out = Path(output)
     with Session(where, threads, told) as session:
+        from ambiguous_wild.harness.running.choosing import Probing
         from ambiguous_wild.harness.running.expected import expected_line, unfinished
         from ambiguous_wild.harness.running.grid import plan_cells, run_cells
         from ambiguous_wild.harness.running.groups import grouped
@@ -213,6 +214,9 @@ def bench(
             **(train or {}),
         )
         read = _read_plan(plan)
+        place = out / ".cache" if cache is None else Path(cache)
+        shortest = dataclasses.replace(config, budget_s=min(budgets_s, default=None))
+        probing = Probing(shortest, place / "plans", lambda: prepare_cpu(threads, told.say), told.say)
         planned = {
             wanted: plan_cells(
                 names,
@@ -225,6 +229,7 @@ def bench(
                 effects=wanted,
                 plan=read,
                 protocol=protocol,
+                probing=probing,
             )
             for wanted in dict.fromkeys(choices)
         }
@@ -243,7 +248,6 @@ def bench(
                 told.say(expected_line(to_train))
         one_by_one = gpus > 1 or session.in_process(cells)
         told.planned(cells, one_by_one)
-        place = out / ".cache" if cache is None else Path(cache)
         if one_by_one:
             reports = run_cells(
                 cells,

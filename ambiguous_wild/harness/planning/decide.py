@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 from ambiguous_wild.core import Scene
@@ -38,6 +38,8 @@ class Decision:
     why: str
     how: str  # what switches it
     cost_ms: float | None = None  # an iteration more; None: not measured
+    gain_db: float | None = None  # on pixels left out of training; None: not tried
+    error_db: float | None = None  # standard error of that over the photos
 
     def plain(self) -> dict[str, Any]:
         """For JSON, which has no NaN."""
@@ -46,12 +48,29 @@ class Decision:
 
 
 @dataclass(frozen=True)
+class Cost:
+    """What the probes of a plan cost."""
+
+    iterations: int  # of all probes, on their small photos
+    seconds: float  # of the process that made the plan; probes that were kept cost nothing again
+    share: float  # expected, of the run that the plan is for
+
+    def line(self) -> str:
+        """For a terminal."""
+        return (
+            f"probes: {self.iterations} iterations on small photos, {self.seconds:.0f} s; "
+            f"about {100 * self.share:.1f} % of the run (at most 10 %)"
+        )
+
+
+@dataclass(frozen=True)
 class Plan:
     """The effects that a scene needs, with the evidence for each."""
 
     scene: str
     decisions: tuple[Decision, ...]
-    probed: bool = False
+    probed: bool = False  # masks were decided on too
+    cost: Cost | None = None  # None: nothing was tried
 
     def effects(self, among: Iterable[str] | None = None) -> tuple[str, ...]:
         """Names for `--effects`: effects that were decided on, among those allowed.
@@ -68,6 +87,7 @@ class Plan:
             "schema": SCHEMA,
             "scene": self.scene,
             "probed": self.probed,
+            "cost": None if self.cost is None else asdict(self.cost),
             "effects": list(self.effects()),
             "decisions": [d.plain() for d in self.decisions],
         }

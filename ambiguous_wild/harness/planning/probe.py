@@ -9,9 +9,9 @@ from __future__ import annotations
 import dataclasses
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,7 @@ ITERATIONS = 300
 SETTLED = 1200  # iterations after which fine texture is learnt and a distractor in one photo still is not
 WINDOW = 1 / 20  # of the longest side: side of the window
 STANDS_OUT = 0.12  # code values of a window's mean residual, in the worst channel
+TIMED_ROUNDS, TIMED_STEPS = 12, 3  # of timing an effect, after a first round
 LARGE = 0.05  # of a photo: a patch above it is more than an instance
 
 # Shares of the photos' pixels, see benchmarks/results/presets.md for what the presets give.
@@ -46,6 +47,8 @@ class Occlusion:
     share: float  # of all pixels
     compact: float  # in patches below LARGE
     worst: float  # in the tenth of the photos that have most of it
+    # [H, W] bool of every train photo: where the probe cannot explain it, points or not
+    patches: tuple[np.ndarray, ...] = field(default=(), repr=False, compare=False)
 
 
 def small_data(scene: Scene, folder: Path, seed: int = 0) -> TrainData:
@@ -157,7 +160,7 @@ def occlusion(
                 tick()
 
         trainer.train(tick=after)
-        patches = []
+        patches, counted = [], []
         places = [i for i, v in enumerate(scene.views) if v.split == "train"]
         for view, photo in enumerate(data.photos):
             rendered = trainer.make_step(trainer.iteration, view, divisor=1).rendered
@@ -166,8 +169,9 @@ def occlusion(
             seen &= founded(scene, places[view], (photo.shape[0], photo.shape[1]))
             seen &= True if keep is None else keep.numpy() > 0.5
             patch = unexplained(photo.numpy(), np.clip(rendered.image.numpy(), 0, 1), seen)
-            patches.append(patch & ~supported(scene, places[view], patch.shape))
-        return summarise(patches)
+            patches.append(patch)
+            counted.append(patch & ~supported(scene, places[view], patch.shape))
+        return dataclasses.replace(summarise(counted), patches=tuple(patches))
 
 
 def stays(
@@ -195,27 +199,30 @@ def stays(
     return found
 
 
-def effect_costs(scene: Scene, *, rounds: int = 12, steps: int = 3) -> dict[str, float]:
-    """ms an iteration that each effect adds on this machine, on the probe's photos.
+def effect_costs(scene: Scene) -> dict[str, float]:
+    """ms of CPU time an iteration that each effect adds on this machine, on the probe's photos."""
+    with tempfile.TemporaryDirectory(prefix="aw-plan-") as name:
+        return step_costs(small_data(scene, Path(name)), ALL, Path(name))
+
+
+def step_costs(data: TrainData, effects: Sequence[str], folder: Path) -> dict[str, float]:
+    """ms of CPU time an iteration that each of the effects adds, alone.
 
     All take turns within every round, so that they meet the same machine; the median round counts.
     """
-    with tempfile.TemporaryDirectory(prefix="aw-plan-") as name:
-        folder = Path(name)
-        data = small_data(scene, folder)
-        config = TrainConfig(iterations=10_000, probes=0)
-        trainers = {
-            e: Trainer(data, with_effects(Parts(), (e,) if e else ()), config, folder=folder / e)
-            for e in ("", *ALL)
-        }
-        times: dict[str, list[float]] = {e: [] for e in trainers}
-        for turn in range(rounds + 1):
-            for effect, trainer in trainers.items():
-                begin = time.perf_counter()
-                for _ in range(steps):
-                    trainer.step()
-                if turn:  # the first round compiles and allocates
-                    times[effect].append(1e3 * (time.perf_counter() - begin) / steps)
+    config = TrainConfig(iterations=10_000, probes=0)
+    trainers = {
+        e: Trainer(data, with_effects(Parts(), (e,) if e else ()), config, folder=folder / e)
+        for e in ("", *effects)
+    }
+    times: dict[str, list[float]] = {e: [] for e in trainers}
+    for turn in range(TIMED_ROUNDS + 1):
+        for effect, trainer in trainers.items():
+            begin = time.process_time()  # of the process: other programs do not count
+            for _ in range(TIMED_STEPS):
+                trainer.step()
+            if turn:  # the first round compiles and allocates
+                times[effect].append(1e3 * (time.process_time() - begin) / TIMED_STEPS)
     plain = np.array(times[""])
     return {e: round(float(np.median(np.array(t) - plain)), 2) for e, t in times.items() if e}
 

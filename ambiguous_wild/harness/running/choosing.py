@@ -5,7 +5,7 @@ Imports no torch before a plan is needed: a misspelt name is answered at once.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,6 +17,7 @@ from ambiguous_wild.splat.effects import ALL, DEGREES, check_effects
 
 if TYPE_CHECKING:
     from ambiguous_wild.harness.planning.decide import Plan
+    from ambiguous_wild.splat.pace import TrainConfig
 
 WORDS = ("default", "auto", "none", "all")
 
@@ -39,6 +40,16 @@ class Chosen:
         write_json(path, {"schema": 1, "asked": self.asked, "effects": list(self.effects), "plan": plan})
 
 
+@dataclass(frozen=True)
+class Probing:
+    """How a plan is made from probes: for which run, and where they are kept."""
+
+    train: TrainConfig  # length of the runs
+    folder: Path
+    prepare: Callable[[], None]  # makes the CPU kernels ready
+    say: Callable[[str], None]  # told every decision
+
+
 def check_wanted(wanted: str) -> tuple[str, ...]:
     """The names in a list of effects, in the order in which they act; none for a word such as "auto".
 
@@ -57,7 +68,11 @@ def check_wanted(wanted: str) -> tuple[str, ...]:
 
 
 def choose(
-    wanted: str, scene: Scene, methods: Sequence[MethodEntry], plan: Plan | None = None
+    wanted: str,
+    scene: Scene,
+    methods: Sequence[MethodEntry],
+    plan: Plan | None = None,
+    probing: Probing | None = None,
 ) -> dict[str, Chosen]:
     """What every method trains with on this scene, by its name.
 
@@ -66,6 +81,7 @@ def choose(
         scene: the scene.
         methods: the methods.
         plan: made before; None = made now if any method needs it.
+        probing: for a plan that is made now; None = the limits decide alone.
 
     Raises:
         AwError: unknown effect, or a plan of another scene.
@@ -79,9 +95,7 @@ def choose(
     # a graft takes none: its name says all that it is made of
     allowed = {m.name: None if wanted == "auto" else m.auto_effects for m in methods}
     if plan is None and any(names is None or names for names in allowed.values()):
-        from ambiguous_wild.harness.planning.decide import plan_without_training
-
-        plan = plan_without_training(scene)
+        plan = _make_plan(scene, probing)
     out = {}
     published = published_effects(scene)
     for name, among in allowed.items():
@@ -91,6 +105,22 @@ def choose(
             found = [*plan.effects(among), *(e for e in published if among is None or e in among)]
             out[name] = Chosen(check_effects(found), "auto", plan)
     return out
+
+
+def _make_plan(scene: Scene, probing: Probing | None) -> Plan:
+    if probing is None:
+        from ambiguous_wild.harness.planning.decide import plan_without_training
+        from ambiguous_wild.harness.planning.tried import untried
+
+        return untried(plan_without_training(scene), "no probes were asked for")
+    from ambiguous_wild.harness.planning.probed import plan_with_probes
+
+    plan = plan_with_probes(
+        scene, probing.train, probing.folder, masks=False, prepare=probing.prepare, say=probing.say
+    )
+    if plan.cost is not None:
+        probing.say(f"{scene.name}: {plan.cost.line()}")
+    return plan
 
 
 def describe(effects: Sequence[str]) -> str:

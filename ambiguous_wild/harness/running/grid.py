@@ -11,7 +11,7 @@ from ambiguous_wild.core.config import with_options
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.harness.planning.decide import Plan
 from ambiguous_wild.harness.running.cell import Cell, CellReport, Overwrite, Protocol
-from ambiguous_wild.harness.running.choosing import choose
+from ambiguous_wild.harness.running.choosing import Probing, choose
 from ambiguous_wild.harness.running.identity import scene_identity
 from ambiguous_wild.harness.running.published import scene_protocol
 from ambiguous_wild.harness.running.run import run_isolated
@@ -35,6 +35,7 @@ def plan_cells(
     effects: str = "none",
     plan: Plan | None = None,
     protocol: Protocol | None = None,
+    probing: Probing | None = None,
 ) -> list[Cell]:
     """Every method on every scene with every seed; all names and options are checked before any training.
 
@@ -49,6 +50,7 @@ def plan_cells(
         effects: "none", "all", "auto", "default" (auto where the method lets it), or names of effects.
         plan: of the one scene, where it was made before; None = made where one is needed.
         protocol: "full" measures whole test photos, "half" the right half; None = what scene.json says.
+        probing: for plans that are made; None = the limits decide alone.
 
     Raises:
         AwError: unknown method, option or scene; two scenes of the same name.
@@ -68,7 +70,7 @@ def plan_cells(
     cells = []
     for scene in loaded:
         identity = scene_identity(scene)
-        chosen = choose(effects, scene, [entry for entry, _ in entries], plan)
+        chosen = choose(effects, scene, [entry for entry, _ in entries], plan, probing)
         measured = protocol or scene_protocol(scene)
         for entry, options in entries:
             resolved = with_options(entry.options(), options, f"option of {entry.name}")

@@ -1,0 +1,213 @@
+"""A plan from evidence: limits as the first guess, then paired probes within a tenth of the run."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+
+from ambiguous_wild.core import Scene
+from ambiguous_wild.core.config import config_hash
+from ambiguous_wild.harness.planning import trials
+from ambiguous_wild.harness.planning.allowance import ARMS_OF_MASKS, LONGEST_ARM, TIMED, allowance
+from ambiguous_wild.harness.planning.decide import Cost, Plan, plan_without_training
+from ambiguous_wild.harness.planning.gain import Arm, compare
+from ambiguous_wild.harness.planning.probe import (
+    ITERATIONS,
+    OCCLUSION,
+    SETTLED,
+    stays,
+    step_costs,
+    with_occlusion,
+)
+from ambiguous_wild.harness.planning.tried import candidates, told, try_effects, untried, with_masks_tried
+from ambiguous_wild.harness.running.identity import scene_identity
+from ambiguous_wild.io.atomic import write_json
+from ambiguous_wild.splat.pace import TrainConfig
+
+VERSION = 1  # of the probes: another one does not read what an earlier one kept
+SEED = 0  # a decision is the scene's: all seeds of a grid train with the same effects
+TOO_SHORT = "a tenth of the run is too short for probes"
+
+Bar = Callable[..., AbstractContextManager[Any]]
+
+
+@contextlib.contextmanager
+def no_bar(total: int) -> Iterator[Any]:
+    """For those who show no progress."""
+    yield SimpleNamespace(update=lambda: None)
+
+
+class Kept:
+    """Probes of one scene in a file, so that a plan that was interrupted or is made again goes on."""
+
+    def __init__(self, scene: Scene, length: Mapping[str, float], folder: Path) -> None:
+        """
+        Args:
+            scene: the scene.
+            length: what says how long the probes are.
+            folder: of the file.
+        """
+        self.key = config_hash(
+            {
+                "scene": scene_identity(scene),
+                "length": dict(length),
+                "version": VERSION,
+                "photos": trials.MOST_PHOTOS,
+                "blocks": [trials.HELD_BACK, trials.BLOCKS, trials.MEASURED_FROM],
+            }
+        )
+        self.path = folder / f"{scene.name}-{self.key[:12]}.json"
+        self.iterations: int | None = None  # of a probe
+        self.arms: dict[str, Arm] = {}
+        self.costs: dict[str, float] = {}  # ms an iteration
+        with contextlib.suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
+            rows = json.loads(self.path.read_text(encoding="utf-8"))
+            if rows["key"] == self.key:
+                arms = {name: Arm(_numbers(psnr)) for name, psnr in rows["arms"].items()}
+                self.iterations, self.costs, self.arms = (
+                    int(rows["iterations"]),
+                    _numbers(rows["costs"]),
+                    arms,
+                )
+
+    def write(self) -> None:
+        """Keep what there is."""
+        arms = {name: dict(arm.psnr) for name, arm in self.arms.items()}
+        rows = {"key": self.key, "iterations": self.iterations, "costs": self.costs, "arms": arms}
+        write_json(self.path, rows)
+
+
+def _numbers(row: Mapping[str, Any]) -> dict[str, float]:
+    return {name: float(value) for name, value in row.items()}
+
+
+def plan_with_probes(
+    scene: Scene,
+    train: TrainConfig,
+    folder: Path,
+    *,
+    masks: bool,
+    prepare: Callable[[], None],
+    say: Callable[[str], None] = lambda text: None,
+    bar: Bar = no_bar,
+) -> Plan:
+    """The limits' decisions, tried where they call for something and the run is long enough.
+
+    Args:
+        scene: the scene.
+        train: length of the run that the plan is for.
+        folder: where probes are kept.
+        masks: decide about masks too.
+        prepare: makes the CPU kernels ready; called if anything is probed.
+        say: told every decision.
+        bar: called with total=iterations, a context whose `update` counts one; tqdm is one.
+
+    Raises:
+        AwError: a photo cannot be read.
+    """
+    plan = plan_without_training(scene)
+    names = candidates(plan)
+    if not names and not masks:
+        return plan
+    prepare()
+    begin = time.perf_counter()
+    room = allowance(scene, train)
+    if masks and not room.masks_fit:
+        say(f"{scene.name}: masks not tried: {TOO_SHORT}")
+    masks = masks and room.masks_fit
+    spent_s = room.masks_s if masks else 0.0
+    paired = grown = 0
+    with tempfile.TemporaryDirectory(prefix="aw-plan-") as name:
+        bench = _Bench(scene, Path(name), bar)
+        if names:
+            length = room.arm_iterations(len(names) + 1, spent_s)
+            # how fast the machine is now must not decide when a run under a budget goes on
+            known = {"iterations": length} if train.budget_s is None else {"budget_s": train.budget_s}
+            kept = Kept(scene, known, folder)
+            if kept.iterations is None:
+                kept.iterations = length
+            plan, paired = _with_effects(plan, names, kept, bench, say)
+        if masks:
+            plan, more, grown = _with_masks(plan, scene, bench, say, bar)
+            paired += more
+    share = room.share(paired, grown)
+    return dataclasses.replace(plan, cost=_cost(paired + grown, begin, share) if paired + grown else None)
+
+
+def _with_effects(
+    plan: Plan, names: Sequence[str], kept: Kept, bench: _Bench, say: Callable[[str], None]
+) -> tuple[Plan, int]:
+    """The plan with what the probes said of effects, and the iterations of all of them."""
+    length = kept.iterations
+    if not length:
+        kept.write()
+        say(f"{plan.scene}: {', '.join(names)} not tried: {TOO_SHORT}")
+        return untried(plan, TOO_SHORT), 0
+
+    def arm(effects: tuple[str, ...]) -> Arm:
+        key = "+".join(effects)
+        if key not in kept.arms:
+            kept.arms[key] = bench.train(effects, length)
+            kept.write()
+        return kept.arms[key]
+
+    if not kept.costs:
+        kept.costs = step_costs(bench.trials.data, names, bench.folder)
+        kept.write()
+    plan = try_effects(plan, names, arm, kept.costs, say)
+    return plan, length * len(kept.arms) + TIMED * (len(names) + 1)
+
+
+def _cost(iterations: int, begin: float, share: float) -> Cost:
+    return Cost(iterations, round(time.perf_counter() - begin, 1), round(share, 4))
+
+
+class _Bench:
+    """Reads the photos when the first probe needs them."""
+
+    def __init__(self, scene: Scene, folder: Path, bar: Bar) -> None:
+        self.scene, self.folder, self.bar = scene, folder, bar
+        self._trials: trials.Trials | None = None
+
+    @property
+    def trials(self) -> trials.Trials:
+        if self._trials is None:
+            self._trials = trials.Trials(self.scene, self.folder, seed=SEED)
+        return self._trials
+
+    def train(self, effects: tuple[str, ...], length: int, **more: Any) -> Arm:
+        with self.bar(total=length) as shown:
+            return self.trials.train(effects, length, tick=shown.update, **more)
+
+
+def _with_masks(
+    plan: Plan, scene: Scene, bench: _Bench, say: Callable[[str], None], bar: Bar
+) -> tuple[Plan, int, int]:
+    """The plan with the lines of masks, and the iterations of paired and of other probes."""
+    colour = plan.effects(("exposure", "appearance"))
+    found = stays(scene, colour, bar=bar)
+    plan = with_occlusion(plan, found)
+    if found.share < OCCLUSION:
+        say(f"{scene.name}: masks off: {100 * found.share:.1f} % of the pixels unexplained")
+        return plan, 0, ITERATIONS
+    chosen = bench.trials.chosen
+    patches = [torch.from_numpy(found.patches[place]) for place in chosen]
+    base, without = (
+        bench.train(colour, LONGEST_ARM, patches=patches, masked=masked) for masked in (False, True)
+    )
+    gain = compare(without, base)
+    plan = with_masks_tried(plan, gain)
+    answer = next(d.decision for d in plan.decisions if d.effect == "masks")
+    said = "too few photos to try" if gain is None else told(gain)
+    say(f"{scene.name}: masks {answer}: {100 * found.share:.1f} % of the pixels unexplained, {said}")
+    return plan, ARMS_OF_MASKS * LONGEST_ARM, ITERATIONS + SETTLED

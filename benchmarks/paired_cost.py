@@ -1,11 +1,12 @@
 """What an iteration of each method costs now against an earlier state of the code, in turns on one machine.
 
     git worktree add /tmp/before COMMIT
-    python benchmarks/paired_cost.py --before /tmp/before --scene SCENE [--methods 3dgs ...] [--json PATH]
+    python benchmarks/paired_cost.py --before /tmp/before --scene SCENE... [--methods 3dgs ...] [--threads 1]
+        [--iterations 1000] [--gaussians 20000] [--json PATH]
 
 Two processes train the same method from the same start, one with each state of the package, in turns of
-50 iterations, one thread each; who goes first alternates. Times are of the processor. Prints the ratio of
-sums and of the medians, and peak memory; writes benchmarks/results/paired-cost.json.
+50 iterations; who goes first alternates. Times are of the processor, with several threads of the clock.
+Prints the ratio of sums and of the medians, and peak memory; writes benchmarks/results/paired-cost.json.
 """
 
 from __future__ import annotations
@@ -38,19 +39,20 @@ from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
 
-root, method, iterations, gaussians, block = sys.argv[1], sys.argv[2], *map(int, sys.argv[3:])
+root, method, iterations, gaussians, block, threads = sys.argv[1], sys.argv[2], *map(int, sys.argv[3:])
 warm_up()
-set_threads(1)
+set_threads(threads)
+now = time.process_time if threads == 1 else time.perf_counter
 with tempfile.TemporaryDirectory() as name:
     data = load_train_data(load_scene(Path(root)), device=torch.device("cpu"), seed=0, cache_dir=Path(name))
     config = TrainConfig(iterations=iterations, seed=0, max_gaussians=gaussians, probes=0)
     entry = get_method(method)
     trainer = Trainer(data, entry.build(entry.options()), config, folder=Path(name))
     for _ in sys.stdin:
-        begin = time.process_time()
+        begin = now()
         for _ in range(block):
             trainer.step()
-        spent = 1e3 * (time.process_time() - begin) / block
+        spent = 1e3 * (now() - begin) / block
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         print(spent, len(trainer.gaussians), peak, flush=True)
 """
@@ -58,7 +60,7 @@ with tempfile.TemporaryDirectory() as name:
 
 def start(tree: Path, words: list[str]) -> subprocess.Popen[str]:
     """A worker with the package of that tree."""
-    environment = os.environ | {"PYTHONPATH": str(tree), "NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    environment = os.environ | {"PYTHONPATH": str(tree), "OMP_NUM_THREADS": words[-1]}
     return subprocess.Popen(
         [sys.executable, "-c", WORKER, *words],
         env=environment, cwd=tree, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
@@ -77,9 +79,10 @@ def turn(worker: subprocess.Popen[str]) -> tuple[float, int, float]:
     return float(ms), int(gaussians), float(peak)
 
 
-def compare(trees: dict[str, Path], method: str, args: argparse.Namespace) -> dict[str, Any]:
+def compare(trees: dict[str, Path], scene: Path, method: str, args: argparse.Namespace) -> dict[str, Any]:
     """Both states of one method, in turns."""
-    words = [str(args.scene.resolve()), method, str(args.iterations), str(args.gaussians), str(BLOCK)]
+    words = [str(scene.resolve()), method]
+    words += [str(n) for n in (args.iterations, args.gaussians, BLOCK, args.threads)]
     workers = {name: start(tree, words) for name, tree in trees.items()}
     blocks: dict[str, list[tuple[float, int, float]]] = {name: [] for name in trees}
     for number in range(args.iterations // BLOCK):
@@ -90,6 +93,7 @@ def compare(trees: dict[str, Path], method: str, args: argparse.Namespace) -> di
     ms = {name: np.array([block[0] for block in rows]) for name, rows in blocks.items()}
     before, now = ms["before"], ms["now"]
     return {
+        "scene": scene.name,
         "method": method,
         "ms_before": round(float(before.mean()), 3),
         "ms_now": round(float(now.mean()), 3),
@@ -104,18 +108,22 @@ def compare(trees: dict[str, Path], method: str, args: argparse.Namespace) -> di
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--before", type=Path, required=True, help="root of the earlier state")
-    parser.add_argument("--scene", type=Path, required=True)
+    parser.add_argument("--scene", type=Path, nargs="+", required=True)
     parser.add_argument("--methods", nargs="+", default=METHODS)
     parser.add_argument("--iterations", type=int, default=1000)
     parser.add_argument("--gaussians", type=int, default=20_000)
+    parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--json", type=Path, default=RESULTS)
     args = parser.parse_args()
     trees = {"before": args.before.resolve(), "now": ROOT}
     rows = []
-    for method in args.methods:
-        rows.append(compare(trees, method, args))
-        print({key: value for key, value in rows[-1].items() if key != "blocks"}, flush=True)
-    facts = {"scene": args.scene.name, "iterations": args.iterations, "ceiling": args.gaussians, "rows": rows}
+    for scene in args.scene:
+        for method in args.methods:
+            rows.append(compare(trees, scene, method, args))
+            print({key: value for key, value in rows[-1].items() if key != "blocks"}, flush=True)
+    facts = {
+        "iterations": args.iterations, "ceiling": args.gaussians, "threads": args.threads, "rows": rows,
+    }  # fmt: skip
     args.json.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
 
 

@@ -41,7 +41,7 @@ def pytest_runtest_setup(item):
     """
     calibration = sys.modules.get("ambiguous_wild.splat.calibration")
     if calibration is not None:
-        calibration.KERNELS["cpu"] = calibration.Size("cpu-2", 0.0625, 300, 32, 32, 1)
+        calibration.KERNELS["cpu"] = calibration.Size("cpu-3", 0.0625, 300, 32, 32, 1)
     numba = sys.modules.get("numba")
     if numba is not None and "PYTEST_XDIST_WORKER" in os.environ:
         numba.set_num_threads(1)

@@ -40,7 +40,7 @@ class Size:
 # Reference machine of the CPU: 2 threads of an AMD EPYC virtual machine, nothing else running. That of a GPU
 # is nominal: the kernel takes a twentieth of a second there.
 KERNELS = {
-    "cpu": Size("cpu-2", 0.0625, 12_000, 240, 136, 3, 2, 0.070),
+    "cpu": Size("cpu-3", 0.040, 12_000, 240, 136, 3, 2, 0.050),
     "cuda": Size("gpu-2", 0.05, 100_000, 960, 544, 12),
 }
 

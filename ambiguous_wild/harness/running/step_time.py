@@ -5,9 +5,9 @@ from __future__ import annotations
 import statistics
 
 # ms of a step of 3dgs on the reference machine (splat/calibration.py): a constant, a part for every 1000 px
-# and one for every 1000 Gaussians. Of captures of 240x135 to 480x270 with 32 000 to 60 000 Gaussians; a
+# and one for every 1000 Gaussians. Of captures of 240x134 to 480x268 with 32 000 to 102 000 Gaussians; a
 # capture's own share is between these:
-STEP_MS, PIXELS_MS, GAUSSIANS_MS = 3.0, 0.12, 0.3
+STEP_MS, PIXELS_MS, GAUSSIANS_MS = 2.2, 0.09, 0.22
 LEAST, MOST = 0.67, 1.5
 
 

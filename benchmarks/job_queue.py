@@ -66,12 +66,19 @@ def run_all(runs: Sequence[Run], at_once: int = 1, most: int | None = None) -> l
 
 
 def keep(runs: Sequence[Run], root: Path, archive: Path) -> None:
-    """Write the texts of the finished runs below root into an archive; the same runs give the same bytes."""
+    """Write the texts of the finished runs below root into an archive; the same runs give the same bytes.
+
+    Folders of this machine are left out: a scene goes by its name.
+    """
     with atomic_path(archive) as temporary, tarfile.open(temporary, "w:xz", preset=9) as tar:
-        for run in sorted({run.folder for run in runs if run.finished}):
+        for run in sorted({run.folder: run for run in runs if run.finished}.values(), key=lambda r: r.folder):
+            paths = [word for word in run.words if Path(word).is_absolute()]
             for name in TEXTS:
-                info = tarfile.TarInfo(str((run / name).relative_to(root)))
-                data = (run / name).read_bytes()
+                info = tarfile.TarInfo(str((run.folder / name).relative_to(root)))
+                text = (run.folder / name).read_text(encoding="utf-8")
+                for path in sorted(paths, key=len, reverse=True):
+                    text = text.replace(path, Path(path).name)
+                data = text.encode()
                 info.size = len(data)
                 tar.addfile(info, io.BytesIO(data))
 

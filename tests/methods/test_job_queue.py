@@ -29,12 +29,13 @@ def finish(folder, text):
 
 
 def runs_of(queue, root):
-    return [queue.Run(f"seed {s}", root / "a" / f"seed{s}", ("methods",)) for s in (0, 1)]
+    words = ("methods", "--scene", "/data/mine/yard")
+    return [queue.Run(f"seed {s}", root / "a" / f"seed{s}", words) for s in (0, 1)]
 
 
 def test_texts_of_finished_runs_come_back_and_are_not_run_again(queue, tmp_path, capsys):
     runs = runs_of(queue, tmp_path / "here")
-    finish(runs[1].folder, "one ")
+    finish(runs[1].folder, "one of /data/mine/yard ")
     archive = tmp_path / "kept.tar.xz"
     queue.keep(runs, tmp_path / "here", archive)
     first = archive.read_bytes()
@@ -46,7 +47,7 @@ def test_texts_of_finished_runs_come_back_and_are_not_run_again(queue, tmp_path,
     again = runs_of(queue, there)
     assert [run.finished for run in again] == [False, True]
     assert sorted(p.name for p in again[1].folder.iterdir()) == ["config.yaml", "env.json", "metrics.json"]
-    assert (again[1].folder / "metrics.json").read_text() == "one metrics.json"
+    assert (again[1].folder / "metrics.json").read_text() == "one of yard metrics.json"
     (again[1].folder / "metrics.json").write_text("newer")
     assert queue.restore(there, archive) == 0  # what lies there stays
     assert (again[1].folder / "metrics.json").read_text() == "newer"

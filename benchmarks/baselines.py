@@ -31,7 +31,7 @@ import cv2
 import numpy as np
 import torch
 from captures import find_scenes
-from job_queue import Run, keep, restore, run_all
+from job_queue import Run, archive_of, check_settings, keep, restore, run_all
 
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.harness.running.environment import environment
@@ -344,10 +344,10 @@ def main(words: Sequence[str] | None = None) -> int:
             f"no scene for {', '.join(args.sections)}: their names hold none of the sections' words"
         )
     runs = [job.run(args.out, args.iterations) for job in jobs]
-    archive = args.results.with_name(args.results.name + "-runs.tar.xz")
-    restore(args.out, archive)
+    check_settings(args.results, iterations=args.iterations, max_gaussians=args.max_gaussians)
+    restore(args.out, archive_of(args.results))
     failed = [] if args.report_only else run_all(runs, args.jobs, args.most)
-    keep(runs, args.out, archive)
+    keep(args.out, archive_of(args.results))
     data = report(planned, args)
     write_json(args.results.with_name(args.results.name + ".json"), data)
     write_text(args.results.with_name(args.results.name + ".md"), to_markdown(data))

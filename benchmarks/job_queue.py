@@ -7,6 +7,7 @@ tables, so that the queue goes on at another machine and every figure can be tra
 from __future__ import annotations
 
 import io
+import json
 import lzma
 import os
 import subprocess
@@ -19,6 +20,7 @@ from pathlib import Path
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.running.result_file import RESULT
+from ambiguous_wild.harness.running.store import read_config, run_folders
 from ambiguous_wild.io.atomic import atomic_path
 
 TEXTS = ("config.yaml", "env.json", RESULT)
@@ -65,22 +67,42 @@ def run_all(runs: Sequence[Run], at_once: int = 1, most: int | None = None) -> l
     return failed
 
 
-def keep(runs: Sequence[Run], root: Path, archive: Path) -> None:
-    """Write the texts of the finished runs below root into an archive; the same runs give the same bytes.
+def keep(root: Path, archive: Path) -> None:
+    """Write the texts of all finished runs below root into an archive; the same runs give the same bytes.
 
     Folders of this machine are left out: a scene goes by its name.
     """
     with atomic_path(archive) as temporary, tarfile.open(temporary, "w:xz", preset=9) as tar:
-        for run in sorted({run.folder: run for run in runs if run.finished}.values(), key=lambda r: r.folder):
-            paths = [word for word in run.words if Path(word).is_absolute()]
+        for run in run_folders(root):
+            if not (run / RESULT).is_file():
+                continue
+            place = str((read_config(run).get("scene") or {}).get("path", ""))
             for name in TEXTS:
-                info = tarfile.TarInfo(str((run.folder / name).relative_to(root)))
-                text = (run.folder / name).read_text(encoding="utf-8")
-                for path in sorted(paths, key=len, reverse=True):
-                    text = text.replace(path, Path(path).name)
-                data = text.encode()
+                text = (run / name).read_text(encoding="utf-8")
+                if Path(place).is_absolute():
+                    text = text.replace(place, Path(place).name)
+                info, data = tarfile.TarInfo(str((run / name).relative_to(root))), text.encode()
                 info.size = len(data)
                 tar.addfile(info, io.BytesIO(data))
+
+
+def archive_of(stem: Path) -> Path:
+    """The archive beside the tables stem.json and stem.md."""
+    return stem.with_name(stem.name + "-runs.tar.xz")
+
+
+def check_settings(stem: Path, **settings: object) -> None:
+    """Refuse to mix runs of other settings with those of stem.json.
+
+    Raises:
+        AwError: a setting differs from the one that the tables were made with.
+    """
+    path = stem.with_name(stem.name + ".json")
+    known = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    for name, value in settings.items():
+        if known.get(name, value) != value:
+            told = f"{path} is of {name} {known[name]}, not {value}: give --results another name"
+            raise AwError(told)
 
 
 def restore(root: Path, archive: Path) -> int:

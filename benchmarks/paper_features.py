@@ -26,7 +26,7 @@ from typing import Any
 
 import pandas as pd
 from captures import find_scenes
-from job_queue import Run, keep, restore, run_all
+from job_queue import Run, archive_of, check_settings, keep, restore, run_all
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.running.environment import environment
@@ -240,10 +240,10 @@ def main(words: Sequence[str] | None = None) -> int:
     args = arguments(words)
     jobs = plan(args)
     stem, runs = args.results, [job.run(args) for job in jobs]
-    archive = stem.with_name(stem.name + "-runs.tar.xz")
-    restore(args.out, archive)
+    check_settings(stem, iterations=args.iterations, max_gaussians=args.max_gaussians)
+    restore(args.out, archive_of(stem))
     failed = [] if args.report_only else run_all(runs, args.jobs, args.most)
-    keep(runs, args.out, archive)
+    keep(args.out, archive_of(stem))
     data = report(jobs, args)
     write_json(stem.with_name(stem.name + ".json"), data)
     write_text(stem.with_name(stem.name + ".csv"), pd.DataFrame(data["runs"]).to_csv(index=False))

@@ -1,45 +1,40 @@
 """benchmarks/job_queue.py: finished runs are not run again, also after a way through the archive."""
 
 import io
-import sys
+import json
 import tarfile
-from pathlib import Path
 
 import pytest
 
 from ambiguous_wild.core import AwError
+from tests.benchmark_scripts import benchmark
 
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 
-
-@pytest.fixture
-def queue(monkeypatch):
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    import job_queue
-
-    yield job_queue
-    sys.modules.pop("job_queue", None)
+@pytest.fixture(scope="module")
+def queue():
+    with benchmark("job_queue") as module:
+        yield module
 
 
 def finish(folder, text):
     folder.mkdir(parents=True)
-    for name in ("config.yaml", "env.json", "metrics.json"):
+    for name in ("env.json", "metrics.json"):
         (folder / name).write_text(text + name)
+    (folder / "config.yaml").write_text("scene: {path: /data/mine/yard}\n")
     (folder / "point_cloud.ply").write_bytes(b"large")
 
 
 def runs_of(queue, root):
-    words = ("methods", "--scene", "/data/mine/yard")
-    return [queue.Run(f"seed {s}", root / "a" / f"seed{s}", words) for s in (0, 1)]
+    return [queue.Run(f"seed {s}", root / "a" / f"seed{s}", ("methods",)) for s in (0, 1)]
 
 
 def test_texts_of_finished_runs_come_back_and_are_not_run_again(queue, tmp_path, capsys):
     runs = runs_of(queue, tmp_path / "here")
     finish(runs[1].folder, "one of /data/mine/yard ")
     archive = tmp_path / "kept.tar.xz"
-    queue.keep(runs, tmp_path / "here", archive)
+    queue.keep(tmp_path / "here", archive)
     first = archive.read_bytes()
-    queue.keep(list(reversed(runs)), tmp_path / "here", archive)
+    queue.keep(tmp_path / "here", archive)
     assert archive.read_bytes() == first
 
     there = tmp_path / "there"
@@ -53,6 +48,14 @@ def test_texts_of_finished_runs_come_back_and_are_not_run_again(queue, tmp_path,
     assert (again[1].folder / "metrics.json").read_text() == "newer"
     assert queue.run_all(again[1:]) == []
     assert "1 runs: 1 finished before, 0 to go" in capsys.readouterr().out
+
+
+def test_runs_of_other_settings_are_not_mixed(queue, tmp_path):
+    queue.check_settings(tmp_path / "table", iterations=7)
+    (tmp_path / "table.json").write_text(json.dumps({"iterations": 7}))
+    queue.check_settings(tmp_path / "table", iterations=7, max_gaussians=9)
+    with pytest.raises(AwError, match="iterations 7, not 8: give --results"):
+        queue.check_settings(tmp_path / "table", iterations=8)
 
 
 def test_a_failed_run_is_told_and_the_others_go_on(queue, tmp_path, capsys):

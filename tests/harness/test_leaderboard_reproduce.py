@@ -13,9 +13,12 @@ from pathlib import Path
 import pytest
 
 from ambiguous_wild.core import Scene
+from ambiguous_wild.core.config import to_plain
 from ambiguous_wild.harness.leaderboard.board import read_board
 from ambiguous_wild.harness.leaderboard.reproduce import preparation
+from ambiguous_wild.harness.leaderboard.settings import command
 from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.methods.registry import get_method
 from ambiguous_wild.simulate.presets import preset, resized
 from ambiguous_wild.simulate.spec_file import parse_spec, plain_spec
 from tests.tiny_scene import write_tiny_scene
@@ -47,6 +50,22 @@ def test_a_preset_is_named_with_what_differs_from_it(tmp_path: Path) -> None:
     older = {key: value for key, value in SETTINGS.items() if key != "sfm"}
     old = scene_of(tmp_path / "old", {"preset": "courtyard", "seed": 0, "spec": spec}, older)
     assert preparation(old)[1] == "aw build-scene raw/old -o old --factor 2 --sfm thorough"
+
+
+@pytest.mark.parametrize(("method", "named"), [("robustsplat", {"features"}),
+                                               ("refinesplat-paper", {"features", "instances"}),
+                                               ("dronesplat", set())])  # fmt: skip
+def test_a_default_that_depends_on_the_machine_is_named(method: str, named: set[str]) -> None:
+    config = {
+        "method": method,
+        "scene": {"name": "yard"},
+        "source": None,
+        "options": to_plain(get_method(method).options()),
+        "train": {"seed": 0, "iterations": 100},
+    }
+    words = shlex.split(command(config))
+    given = {words[i + 1] for i, word in enumerate(words) if word == "--set"}
+    assert given == {f"{method}.{key}={config['options'][key]}" for key in named}
 
 
 def test_another_spec_is_written_out(tmp_path: Path) -> None:

@@ -11,7 +11,6 @@ import torch
 
 from ambiguous_wild.core.config import flatten, from_plain, to_plain, with_options
 from ambiguous_wild.methods import get_method
-from ambiguous_wild.methods.refinesplat import paper
 from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.identity import PsiConfig
 from ambiguous_wild.methods.refinesplat.inputs import untracked
@@ -20,6 +19,7 @@ from ambiguous_wild.methods.refinesplat.paper import PaperConfig, PrintedConfig
 from ambiguous_wild.methods.refinesplat.policy import RefineSplatMask
 from ambiguous_wild.methods.refinesplat.recipe import build
 from ambiguous_wild.splat.losses import photometric
+from ambiguous_wild.vision import chosen
 from tests.methods.test_refinesplat_policy import (
     HEIGHT,
     VIEWS,
@@ -240,7 +240,7 @@ def test_what_is_not_stated_is_as_in_refinesplat():
 def test_the_papers_networks_are_the_default_where_their_weights_are(tmp_path, monkeypatch):
     monkeypatch.setenv("AW_WEIGHTS", str(tmp_path))
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "hub"))
-    monkeypatch.setattr(paper.importlib.util, "find_spec", lambda name: object())
+    monkeypatch.setattr(chosen.importlib.util, "find_spec", lambda name: object())
     assert (PaperConfig().features, PaperConfig().instances) == ("labhog", "graph")
     for name in ("dinov2-small", "sam2.1-hiera-tiny"):
         (tmp_path / name).mkdir()
@@ -248,7 +248,7 @@ def test_the_papers_networks_are_the_default_where_their_weights_are(tmp_path, m
             (tmp_path / name / file).write_bytes(b"{}")
     assert (PaperConfig().features, PaperConfig().instances) == ("dinov2-small", "sam2")
     assert PrintedConfig().features == "dinov2-small@504"
-    monkeypatch.setattr(paper.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(chosen.importlib.util, "find_spec", lambda name: None)
     assert (PaperConfig().features, PaperConfig().instances) == ("labhog", "graph")
 
 

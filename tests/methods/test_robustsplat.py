@@ -15,6 +15,7 @@ from ambiguous_wild.methods.robustsplat.config import RobustSplatConfig
 from ambiguous_wild.methods.robustsplat.net import MaskNet
 from ambiguous_wild.methods.robustsplat.policy import RobustSplatMask, _fit, coarse_spec
 from ambiguous_wild.methods.robustsplat.recipe import build
+from ambiguous_wild.vision import chosen
 from ambiguous_wild.vision.labhog import LabHog
 from tests.methods.baselines import data_of, parts_of, resumed_equals_whole, step_of, trained
 from tests.tiny_scene import SQUARE, TRAIN, wall_colour, write_tiny_scene
@@ -254,6 +255,19 @@ def test_the_coarse_stage_has_features_of_its_own():
         assert coarse_spec(config) == coarse and config.local and config.net_context == (5, 15)
     published = RobustSplatConfig(features="dinov2-small-registers@504,normalise=raw")
     assert coarse_spec(published) == "dinov2-small-registers@224,normalise=raw"
+
+
+def test_its_features_are_the_best_whose_weights_are_here(tmp_path, monkeypatch):
+    monkeypatch.setenv("AW_WEIGHTS", str(tmp_path))
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "hub"))
+    monkeypatch.setattr(chosen.importlib.util, "find_spec", lambda name: object())
+    found = [RobustSplatConfig().features]
+    for name in ("efficientnet-lite0", "dinov2-with-registers-small"):
+        (tmp_path / name).mkdir()
+        for file in ("efficientnet-lite0.safetensors", "config.json", "model.safetensors"):
+            (tmp_path / name / file).write_bytes(b"{}")
+        found.append(RobustSplatConfig().features)
+    assert found == ["labhog", "efficientnet-lite0", "dinov2-small-registers@504,normalise=raw"]
 
 
 def test_features_trained_on_the_scene_get_tracks_in_px_of_their_pictures(scene, tmp_path):

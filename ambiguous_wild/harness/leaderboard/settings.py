@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shlex
 import unicodedata
@@ -97,7 +98,7 @@ def command(config: Mapping[str, Any], before: Sequence[str] = ()) -> str:
 
 
 def _changed(config: Mapping[str, Any]) -> dict[str, str]:
-    """Options that are not the method's defaults; of a method in a file, all of them."""
+    """Options that are not the method's defaults on every machine; of a method in a file, all of them."""
     usual = {} if config["source"] else _defaults(config["method"])
     if usual is None:
         return {}
@@ -112,9 +113,11 @@ def _defaults(method: str) -> dict[str, Any] | None:
     if "@" in method:
         return None  # a variant is its own setting, and its name says it
     try:
-        return _flat(to_plain(get_method(method).options()))
+        options = get_method(method).options()
     except (AwError, ImportError):
         return None
+    by_machine = {f.name for f in dataclasses.fields(options) if f.metadata.get("by_machine")}
+    return {k: v for k, v in _flat(to_plain(options)).items() if k not in by_machine}
 
 
 def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -7,7 +7,6 @@ values of `refinesplat`.
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -16,8 +15,7 @@ from ambiguous_wild.methods.refinesplat.density import EntropyDensityConfig
 from ambiguous_wild.methods.refinesplat.first_look import FirstLookConfig
 from ambiguous_wild.methods.refinesplat.merging import MergeConfig
 from ambiguous_wild.methods.refinesplat.support import SupportConfig
-from ambiguous_wild.vision.backends import DINO, SAM
-from ambiguous_wild.vision.weights import find, named
+from ambiguous_wild.vision.chosen import BY_MACHINE, first_here
 
 # Masks by entropy (Eqs. 3 to 7). Two forms are repaired: Kapur's for the additive objective of T_ent, and the
 # standard deviation for the variance in T_glb. No gate or limit of ours is on but `most`.
@@ -61,16 +59,12 @@ def features(size: str = "") -> str:
     Args:
         size: of the net's input as a back end has it, e.g. "@504".
     """
-    return f"dinov2-small{size}" if _ready(DINO["dinov2-small"]) else "labhog"
+    return first_here(f"dinov2-small{size}", "labhog")
 
 
 def instances() -> str:
     """All masks of SAM 2, joined over photos by SfM tracks, where its weights are here; else `graph`."""
-    return "sam2" if _ready(SAM["sam2"]) else "graph"
-
-
-def _ready(weights: str) -> bool:
-    return find(named(weights))[0] is not None and importlib.util.find_spec("transformers") is not None
+    return first_here("sam2", "graph")
 
 
 @dataclass(frozen=True)
@@ -79,8 +73,8 @@ class PaperConfig(RefineSplatConfig):
 
     mask: MaskConfig = MASK
     first_look: FirstLookConfig = FirstLookConfig(on=False)  # noqa: RUF009
-    features: str = field(default_factory=features)
-    instances: str = field(default_factory=instances)
+    features: str = field(default_factory=features, metadata=BY_MACHINE)
+    instances: str = field(default_factory=instances, metadata=BY_MACHINE)
     untracked: Literal["drop", "add"] = "add"
     density: EntropyDensityConfig = DENSITY
     lambda_id: float = 1.0
@@ -96,7 +90,7 @@ class PrintedConfig(PaperConfig):
     """To the letter, with nothing limited."""
 
     mask: MaskConfig = PRINTED_MASK
-    features: str = field(default_factory=lambda: features("@504"))
+    features: str = field(default_factory=lambda: features("@504"), metadata=BY_MACHINE)
     density: EntropyDensityConfig = PRINTED_DENSITY
     entropy_limit: float = 0.0
     weigh_id: bool = False

@@ -8,10 +8,22 @@ from typing import Literal
 from ambiguous_wild.core import AwError
 from ambiguous_wild.splat.density import NO_SIZE_PRUNING, DensityConfig
 from ambiguous_wild.vision.backends import DINO, check_features, parse
+from ambiguous_wild.vision.chosen import BY_MACHINE, first_here
 
 _SIZES = dict.fromkeys(DINO, 504) | {
     "vgg16": 252
 }  # px, input of the fine stage; others take the photo's size
+
+
+PUBLISHED = "dinov2-small-registers@504,normalise=raw"
+
+
+def features() -> str:
+    """The published features where their weights are on this machine, else EfficientNet-Lite0, else `labhog`.
+
+    Of those that need no hub EfficientNet-Lite0 alone falls below 3DGS on no capture (docs/fidelity.md).
+    """
+    return first_here(PUBLISHED, "efficientnet-lite0", "labhog")
 
 
 def _delayed_growth() -> DensityConfig:
@@ -31,7 +43,7 @@ class RobustSplatConfig:
     wider context and a wider net, both at lr 0.003; twins of static things: 29.5 dB and 0.68 with the latter.
     """
 
-    features: str = "labhog"  # see vision/backends.py; published: dinov2-small-registers@504,normalise=raw
+    features: str = field(default_factory=features, metadata=BY_MACHINE)  # see vision/backends.py
     coarse_features: str = ""  # of the coarse stage; "" = the same kind at 16/36 of the size, as published
     coarse_share: float = 16 / 36  # of the side of the pictures that coarse features see
     # what the cosine target is made of: the cosine; its distance in units of what blur makes; or in units of

@@ -86,6 +86,11 @@ SECTIONS = {
     "density": Section(("clean",), ("3dgs",), ("absgs", "mcmc", "uad", "pup-3dgs")),
     "resolution": Section(("clean",), ("3dgs",), ("mip-splatting",)),
 }  # fmt: skip
+# defaults that depend on what weights are on the machine; they need `aw weights get efficientnet-lite0`
+OPTIONS = {
+    "robustsplat": ("features=efficientnet-lite0",),
+    "refinesplat-paper": ("features=efficientnet-lite0", "instances=efficientnet-lite0"),
+}
 SIZES = (0.25, 0.5, 1.0, 2.0)  # of the photos trained on
 
 
@@ -108,6 +113,8 @@ class Job:
         words += ["--iterations", str(iterations), "--max-gaussians", str(self.most), "--device", "cpu"]
         words += ["--threads", "1", "--no-pictures", "--effects", "none", "--probes", "0"]
         words += ["--protocol", "half" if self.half else "full"]
+        for option in OPTIONS.get(self.method, ()):
+            words += ["--set", f"{self.method}.{option}"]
         words += ["-o", str(out / f"{'half' if self.half else 'full'}-{self.most}")]
         name = f"{self.method} on {load_name(self.scene)}, seed {self.seed}"
         return Run(name, self.folder(out), tuple(words))

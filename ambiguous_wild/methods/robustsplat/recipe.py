@@ -5,8 +5,9 @@ Source: "RobustSplat: Decoupling Densification and Dynamics for Transient-Free 3
 masks are stable; a per-pixel net on frozen features learns from the agreement of photos with renders,
 first at a low scale.
 
-With weights the published form is `features=dinov2-small-registers@504,normalise=raw`. Without, the
-features are hand-made (Lab and HOG); settings that change with that are "auto" in `config.py`.
+The published form is `features=dinov2-small-registers@504,normalise=raw`, the default where its weights are;
+else EfficientNet-Lite0, else hand-made features (Lab and HOG). Settings that change with that are "auto" in
+`config.py`.
 """
 
 from __future__ import annotations

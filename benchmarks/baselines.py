@@ -109,15 +109,13 @@ class Job:
         return out / group / load_name(self.scene) / self.method / f"seed{self.seed}"
 
     def run(self, out: Path, iterations: int) -> Run:
-        words = ["bench", "--method", self.method, "--scene", str(self.scene), "--seed", str(self.seed)]
+        words = ["--scene", str(self.scene), "--seed", str(self.seed)]
         words += ["--iterations", str(iterations), "--max-gaussians", str(self.most), "--device", "cpu"]
         words += ["--threads", "1", "--no-pictures", "--effects", "none", "--probes", "0"]
         words += ["--protocol", "half" if self.half else "full"]
-        for option in OPTIONS.get(self.method, ()):
-            words += ["--set", f"{self.method}.{option}"]
         words += ["-o", str(out / f"{'half' if self.half else 'full'}-{self.most}")]
         name = f"{self.method} on {load_name(self.scene)}, seed {self.seed}"
-        return Run(name, self.folder(out), tuple(words))
+        return Run(name, self.folder(out), self.method, tuple(words), OPTIONS.get(self.method, ()))
 
 
 _names: dict[Path, str] = {}

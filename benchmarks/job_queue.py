@@ -17,9 +17,10 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.running.result_file import RESULT
+from ambiguous_wild.harness.running.result_file import RESULT, read_result
 from ambiguous_wild.harness.running.store import read_config, run_folders
 from ambiguous_wild.io.atomic import atomic_path
 
@@ -32,39 +33,75 @@ class Run:
 
     name: str  # in messages
     folder: Path  # of the run
-    words: tuple[str, ...]  # of `aw`
+    method: str
+    words: tuple[str, ...]  # of `aw bench`, all but the method and its options
+    options: tuple[str, ...] = ()  # of the method, KEY=VALUE
 
     @property
     def finished(self) -> bool:
         return (self.folder / RESULT).is_file()
 
+    def psnr(self) -> str | None:
+        """The mean over its test photos in words; None if it is not finished, or failed."""
+        result = read_result(self.folder / RESULT) if self.finished else {"status": "missing"}
+        if result["status"] != "ok":
+            return None
+        return f"{fmean(float(row['psnr']) for row in result['per_image']):.2f} dB"
+
 
 def run_all(runs: Sequence[Run], at_once: int = 1, most: int | None = None) -> list[str]:
-    """Run what has no result, at most `most` of it; returns a line for each failure."""
+    """Run what has no result, at most `most` of it; returns a line for each failure.
+
+    Methods with the same other words share a process: it loads packages, kernels and photos once.
+    """
     todo = [run for run in runs if not run.finished]
     print(f"{len(runs)} runs: {len(runs) - len(todo)} finished before, {len(todo)} to go", flush=True)
     env = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     failed = []
     todo = todo[:most]
+    count = 0
     with ThreadPoolExecutor(at_once) as pool:
         waiting = {
             pool.submit(
                 subprocess.run,
-                [sys.executable, "-m", "ambiguous_wild.cli.main", *run.words],
+                [sys.executable, "-m", "ambiguous_wild.cli.main", *command(batch)],
                 env=env,
                 capture_output=True,
                 text=True,
-            ): run
-            for run in todo
+            ): batch
+            for batch in batches(todo)
         }
-        for number, done in enumerate(as_completed(waiting), start=1):
-            run, process = waiting[done], done.result()
+        for done in as_completed(waiting):
+            batch, process = waiting[done], done.result()
             lines = [line.strip() for line in process.stderr.splitlines() if line.strip()] or ["no output"]
-            told = lines[-1] if process.returncode else next((x for x in lines if "PSNR" in x), lines[-1])
-            print(f"[{number}/{len(todo)}] {run.name}: {told}", flush=True)
-            if process.returncode:
-                failed.append(f"{run.name}: {lines[-1]}")
+            for run in batch:
+                count += 1
+                told = run.psnr()
+                print(f"[{count}/{len(todo)}] {run.name}: {told or lines[-1]}", flush=True)
+                if told is None:
+                    failed.append(f"{run.name}: {lines[-1]}")
     return failed
+
+
+def batches(runs: Sequence[Run], largest: int = 8) -> list[list[Run]]:
+    """Runs that differ in the method alone, at most `largest` together; each method once."""
+    found: dict[tuple[str, ...], list[list[Run]]] = {}
+    for run in runs:
+        own = found.setdefault(run.words, [[]])
+        if len(own[-1]) == largest or any(run.method == other.method for other in own[-1]):
+            own.append([])
+        own[-1].append(run)
+    return [batch for own in found.values() for batch in own]
+
+
+def command(batch: Sequence[Run]) -> list[str]:
+    """The words of `aw` that make these runs."""
+    words = ["bench"]
+    for run in batch:
+        words += ["--method", run.method]
+        for option in run.options:
+            words += ["--set", f"{run.method}.{option}"]
+    return [*words, *batch[0].words]
 
 
 def keep(root: Path, archive: Path) -> None:

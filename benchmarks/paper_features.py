@@ -64,14 +64,13 @@ class Job:
         return out / (self.backend or "none") / self.name / self.method / f"seed{self.seed}"
 
     def run(self, args: argparse.Namespace) -> Run:
-        words = ["bench", "--method", self.method, "--scene", str(self.scene), "--seed", str(self.seed)]
+        words = ["--scene", str(self.scene), "--seed", str(self.seed)]
         words += ["--iterations", str(args.iterations), "--max-gaussians", str(args.max_gaussians)]
         words += ["--device", "cpu", "--threads", "1", "--no-pictures", "--effects", "none", "--probes", "0"]
-        for key, value in settings_of(self.method, self.backend).items():
-            words += ["--set", f"{self.method}.{key}={value}"]
         words += ["-o", str(args.out / (self.backend or "none"))]
         name = f"{self.method} {self.backend} on {self.name}, seed {self.seed}"
-        return Run(name, self.folder(args.out), tuple(words))
+        options = tuple(f"{k}={v}" for k, v in settings_of(self.method, self.backend).items())
+        return Run(name, self.folder(args.out), self.method, tuple(words), options)
 
 
 def settings_of(method: str, backend: str) -> dict[str, str]:

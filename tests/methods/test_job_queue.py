@@ -2,12 +2,15 @@
 
 import io
 import json
+import shlex
 import tarfile
 
 import pytest
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.running.store import read_config
 from tests.benchmark_scripts import benchmark
+from tests.tiny_scene import write_tiny_scene
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +28,7 @@ def finish(folder, text):
 
 
 def runs_of(queue, root):
-    return [queue.Run(f"seed {s}", root / "a" / f"seed{s}", ("methods",)) for s in (0, 1)]
+    return [queue.Run(f"seed {s}", root / "a" / f"seed{s}", "3dgs", ()) for s in (0, 1)]
 
 
 def test_texts_of_finished_runs_come_back_and_are_not_run_again(queue, tmp_path, capsys):
@@ -59,11 +62,33 @@ def test_runs_of_other_settings_are_not_mixed(queue, tmp_path):
 
 
 def test_a_failed_run_is_told_and_the_others_go_on(queue, tmp_path, capsys):
-    bad = queue.Run("bad", tmp_path / "bad", ("methods", "no-such-method"))
-    good = queue.Run("good", tmp_path / "good", ("--version",))
+    scene, out = write_tiny_scene(tmp_path / "wall"), tmp_path / "runs"
+    words = ("--scene", str(scene), "--iterations", "2", "--effects", "none", "--probes", "0", "-o", str(out))
+    folder = out / "wall" / "mcmc" / "seed0"
+    bad = queue.Run("bad", tmp_path / "bad", "no-such-method", (*words, "--no-pictures"))
+    good = queue.Run("good", folder, "mcmc", words, ("start=400",))
     (failed,) = queue.run_all([bad, good])
     assert failed.startswith("bad: ") and "no-such-method" in failed
-    assert "[2/2]" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "[2/2]" in said and " dB" in said
+    assert read_config(folder)["options"]["start"] == 400
+
+
+def test_methods_with_the_same_other_words_share_a_process(queue, tmp_path):
+    runs = [
+        queue.Run(f"{method} {seed}", tmp_path, method, ("--seed", seed), options)
+        for seed in "01"
+        for method, options in (("3dgs", ()), ("mcmc", ("start=9",)), ("3dgs", ()))
+    ]
+    first, second, *_ = found = queue.batches(runs)
+    assert [[run.name for run in batch] for batch in found] == [
+        ["3dgs 0", "mcmc 0"], ["3dgs 0"], ["3dgs 1", "mcmc 1"], ["3dgs 1"]
+    ]  # fmt: skip
+    assert queue.command(first) == shlex.split(
+        "bench --method 3dgs --method mcmc --set mcmc.start=9 --seed 0"
+    )
+    assert queue.command(second) == shlex.split("bench --method 3dgs --seed 0")
+    assert [len(batch) for batch in queue.batches([runs[1]], largest=1)] == [1]
 
 
 def test_damaged_archives_and_paths_that_leave_are_refused(queue, tmp_path):

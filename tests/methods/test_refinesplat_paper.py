@@ -241,15 +241,17 @@ def test_the_papers_networks_are_the_default_where_their_weights_are(tmp_path, m
     monkeypatch.setenv("AW_WEIGHTS", str(tmp_path))
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "hub"))
     monkeypatch.setattr(chosen.importlib.util, "find_spec", lambda name: object())
-    assert (PaperConfig().features, PaperConfig().instances) == ("labhog", "graph")
-    for name in ("dinov2-small", "sam2.1-hiera-tiny"):
+    found = [(PaperConfig().features, PaperConfig().instances)]
+    for name in ("efficientnet-lite0", "dinov2-small", "sam2.1-hiera-tiny"):
         (tmp_path / name).mkdir()
-        for file in ("config.json", "model.safetensors"):
+        for file in ("efficientnet-lite0.safetensors", "config.json", "model.safetensors"):
             (tmp_path / name / file).write_bytes(b"{}")
-    assert (PaperConfig().features, PaperConfig().instances) == ("dinov2-small", "sam2")
+        found.append((PaperConfig().features, PaperConfig().instances))
+    lite = "efficientnet-lite0"
+    assert found == [("labhog", "graph"), (lite, lite), ("dinov2-small", lite), ("dinov2-small", "sam2")]
     assert PrintedConfig().features == "dinov2-small@504"
-    monkeypatch.setattr(chosen.importlib.util, "find_spec", lambda name: None)
-    assert (PaperConfig().features, PaperConfig().instances) == ("labhog", "graph")
+    monkeypatch.setattr(chosen.importlib.util, "find_spec", lambda name: None)  # no transformers
+    assert (PaperConfig().features, PaperConfig().instances) == (lite, lite)
 
 
 # -- instances beyond those that a tracker follows ----------------------------------------------------

@@ -54,22 +54,27 @@ PRINTED_DENSITY = dataclasses.replace(DENSITY, merge=MergeConfig(form="literal",
 
 
 def features(size: str = "") -> str:
-    """The paper's features, DINOv2 ViT-S/14, where their weights are on this machine; else `labhog`.
+    """The paper's features, DINOv2 ViT-S/14, where their weights are on this machine.
+
+    Else EfficientNet-Lite0, and without its weights `labhog`: docs/fidelity.md compares them.
 
     Args:
         size: of the net's input as a back end has it, e.g. "@504".
     """
-    return first_here(f"dinov2-small{size}", "labhog")
+    return first_here(f"dinov2-small{size}", "efficientnet-lite0", "labhog")
 
 
 def instances() -> str:
-    """All masks of SAM 2, joined over photos by SfM tracks, where its weights are here; else `graph`."""
-    return first_here("sam2", "graph")
+    """All masks of SAM 2, joined over photos by SfM tracks, where its weights are here.
+
+    Else segments grouped by EfficientNet-Lite0, and without its weights `graph`.
+    """
+    return first_here("sam2", "efficientnet-lite0", "graph")
 
 
 @dataclass(frozen=True)
 class PaperConfig(RefineSplatConfig):
-    """All parts of the paper; its networks where they are on this machine, else hand-made features."""
+    """All parts of the paper; its networks, or the best of those that are on this machine."""
 
     mask: MaskConfig = MASK
     first_look: FirstLookConfig = FirstLookConfig(on=False)  # noqa: RUF009

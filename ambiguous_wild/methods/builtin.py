@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ambiguous_wild.methods.entry import MethodEntry
 
-PAPER_NETWORKS = "DINOv2 and SAM 2; without their weights efficientnet-lite0, else labhog and graph, hand-made"
+PAPER_NETWORKS = "DINOv2 and SAM 2; without their weights efficientnet-lite0; else labhog and graph"
 
 BUILTIN = (
     MethodEntry(

@@ -60,6 +60,9 @@ def test_the_share_of_the_gap_by_hand(baselines, scene, tmp_path, monkeypatch):
     assert row["gain_db"] == 2.5 and row["gap_db"] == 4.0 and row["share"] == 0.625
     assert row["gain_sd"] == pytest.approx(np.std([2, 3], ddof=1)) and row["ms_ratio"] == 3.0
     assert "| desplat |" in baselines.to_markdown(data) and "+2.50" in baselines.to_markdown(data)
+    monkeypatch.setattr(baselines, "result_of", lambda job, out: None if job.seed else result(job, out))
+    (one,) = baselines.report(baselines.plan(args, [scene]), args)["rows"]
+    assert (row["seeds"], one["seeds"], one["gain_db"], one["gain_sd"]) == (2, 1, 2.0, None)
     monkeypatch.setattr(baselines, "result_of", lambda job, out: None)
     nothing = baselines.report(baselines.plan(args, [scene]), args)
     assert nothing["rows"] == [] and nothing["missing"] == ["desplat on wall-plain (transient)"]

@@ -1,7 +1,7 @@
 """Tests that need a GPU are skipped elsewhere. Parallel test processes use one kernel thread each.
 
 The calibration of the machine is a small one in tests: their runs are shorter than the real one. Weights that
-lie on the machine are not seen: methods choose their features by them.
+lie on the machine are not seen, for methods choose their features by them; `machine_weights` shows them.
 """
 
 from __future__ import annotations
@@ -15,8 +15,16 @@ import pytest
 with suppress(ImportError):  # torch.utils.cpp_extension wants it, and it refuses to come after distutils
     import setuptools  # noqa: F401
 
-os.environ["AW_WEIGHTS"] = os.path.join(os.path.dirname(__file__), "no-weights")
-os.environ["HF_HUB_CACHE"] = os.environ["AW_WEIGHTS"]
+NO_WEIGHTS = os.path.join(os.path.dirname(__file__), "no-weights")
+if os.environ.get("AW_WEIGHTS") != NO_WEIGHTS:  # parallel test processes inherit it
+    os.environ["AW_TEST_WEIGHTS"] = os.environ.get("AW_WEIGHTS", "")
+    os.environ["AW_WEIGHTS"] = os.environ["HF_HUB_CACHE"] = NO_WEIGHTS
+
+
+@pytest.fixture
+def machine_weights(monkeypatch):
+    """Weights that lie on the machine, for tests that compare published networks."""
+    monkeypatch.setenv("AW_WEIGHTS", os.environ["AW_TEST_WEIGHTS"])
 
 
 def pytest_collection_modifyitems(config, items):

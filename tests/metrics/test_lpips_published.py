@@ -6,6 +6,7 @@ from ambiguous_wild.metrics import lpips
 from tests.metrics.lpips_published import PUBLISHED, published_pairs
 
 
+@pytest.mark.usefixtures("machine_weights")
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_ten_pairs_give_the_values_of_the_reference_package(name: str) -> None:
     reason = lpips.available()[name]

@@ -174,6 +174,7 @@ PUBLISHED = {
 }
 
 
+@pytest.mark.usefixtures("machine_weights")
 @pytest.mark.parametrize("layer", PUBLISHED)
 def test_the_published_network_gives_the_values_of_the_reference_package(layer: str) -> None:
     if weights.where(weights.named("efficientnet-lite0")) is None:

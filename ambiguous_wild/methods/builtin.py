@@ -53,6 +53,7 @@ BUILTIN = (
         recipe="ambiguous_wild.methods.robustsplat.recipe:build",
         config="ambiguous_wild.methods.robustsplat.recipe:Config",
         paper="Fu et al., ICCV 2025 (arXiv 2506.02751)",
+        note="features {features}",
     ),
     MethodEntry(
         name="dronesplat",
@@ -60,6 +61,7 @@ BUILTIN = (
         recipe="ambiguous_wild.methods.dronesplat:build",
         config="ambiguous_wild.methods.dronesplat:DroneSplatConfig",
         paper="Tang et al., CVPR 2025 (arXiv 2503.16964)",
+        note="instances {instances}",
     ),
     MethodEntry(
         name="wildgaussians",
@@ -103,6 +105,7 @@ BUILTIN = (
         recipe="ambiguous_wild.methods.asymgs:build",
         config="ambiguous_wild.methods.asymgs:AsymGsConfig",
         paper="AsymGS, NeurIPS 2025 (arXiv 2506.03538), its EMA-GS form",
+        note="features {features}, instances {instances}",
     ),
     MethodEntry(
         name="asymgs-twin",
@@ -117,6 +120,7 @@ BUILTIN = (
         recipe="ambiguous_wild.methods.spotlesssplats.recipe:build",
         config="ambiguous_wild.methods.spotlesssplats.recipe:SpotLessSplatsConfig",
         paper="SpotLessSplats (arXiv 2406.20055), its MLP form",
+        note="features {features}",
     ),
     MethodEntry(
         name="spotlesssplats-cluster",
@@ -124,6 +128,7 @@ BUILTIN = (
         recipe="ambiguous_wild.methods.spotlesssplats.recipe:build",
         config="ambiguous_wild.methods.spotlesssplats.recipe:ClusterConfig",
         paper="SpotLessSplats (arXiv 2406.20055), its clustered form",
+        note="features {features}",
     ),
     MethodEntry(
         name="mip-splatting",
@@ -160,6 +165,7 @@ BUILTIN = (
         recipe="ambiguous_wild.methods.nexussplats:build",
         config="ambiguous_wild.methods.nexussplats:NexusSplatsConfig",
         paper="NexusSplats (arXiv 2411.14514), without anchors",
+        note="features {features}",
     ),
     MethodEntry(
         name="hybridgs",
@@ -174,6 +180,7 @@ BUILTIN = (
         recipe="ambiguous_wild.methods.t3dgs:build",
         config="ambiguous_wild.methods.t3dgs:T3dgsConfig",
         paper="T-3DGS (arXiv 2412.00155), its first stage",
+        note="features {features}",
     ),
     MethodEntry(
         name="forestsplats",

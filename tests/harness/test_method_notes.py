@@ -37,6 +37,12 @@ def test_the_papers_method_names_the_networks_of_its_runs(tmp_path):
     assert any("features not recorded" in n for n in nothing)
 
 
+def test_baselines_on_features_name_them(tmp_path):
+    both = {"features": "vgg16", "instances": "graph"}
+    for method, said in (("robustsplat", "features vgg16"), ("dronesplat", "instances graph")):
+        assert f"{method}: {said}" in notes_of(tmp_path / method, (method, both))
+
+
 def test_variants_and_grafts_are_their_methods(tmp_path):
     variant = {"features": "labhog", "instances": "graph"}
     graft = {"host": {"features": "x"}, "mask": {"features": "sceneconv", "instances": "graph"}}
@@ -53,6 +59,26 @@ def test_a_graft_in_an_ablation_names_the_options_of_its_donor(tmp_path):
     options = {"host": {"features": "x"}, "mask": {"features": "sceneconv", "instances": "graph"}}
     notes = notes_of(tmp_path, ("refinesplat-paper@plug-in-wildgaussians-t-ent", options))
     assert any("features sceneconv, instances graph" in n for n in notes)
+
+
+def test_another_method_in_an_ablation_gets_its_networks_and_the_report_names_them(tmp_path):
+    scene = write_tiny_scene(tmp_path / "scene")
+    for settings, features in ((["features=sceneconv", "lambda_id=0.5"], "sceneconv"), ([], "labhog")):
+        study = plan_study(
+            "refinesplat-paper",
+            [scene],
+            [0],
+            TrainConfig(iterations=9),
+            settings=settings,
+            groups=["modules"],
+        )
+        (row,) = [row for row in study.rows if row.variant.name == "robustsplat"]
+        assert row.cells[0].options.features == features
+        own = "refinesplat-paper@modules-robustsplat"
+        assert row.cells[0].method.name == (own if settings else "robustsplat")
+        page = to_markdown(report(study, tmp_path / "runs"))
+        (line,) = [line for line in page.splitlines() if line.startswith("| robustsplat")]
+        assert f"`features={features}`" in line
 
 
 def test_the_report_of_an_ablation_says_it_too(tmp_path):

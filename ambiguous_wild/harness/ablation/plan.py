@@ -17,6 +17,7 @@ from ambiguous_wild.harness.running.grid import cell_folder, plan_cells
 from ambiguous_wild.harness.running.records import RunResult, metrics_of
 from ambiguous_wild.harness.running.result_file import FAILED, RESULT, read_result
 from ambiguous_wild.methods.ablation import DEFAULT, Group, Variant, choose_groups, folder_name
+from ambiguous_wild.methods.describe import BACK_ENDS
 from ambiguous_wild.methods.registry import MethodEntry, get_method
 from ambiguous_wild.splat.pace import TrainConfig
 
@@ -115,7 +116,7 @@ def plan_study(
                 if variant.method:
                     _check_features(variant)
                     host = variant.method.partition("@")[0] == method
-                    given = own if host else _settings_of(variant, method, own)
+                    given = own if host else _settings_of(variant, method, settings)
                     cells = plan_cells(
                         [variant.method], scenes, seeds, train, settings=given, device=device, factor=factor
                     )
@@ -138,12 +139,18 @@ def plan_study(
     return Study(method, chosen, tuple(settings), default, tuple(rows))
 
 
-def _settings_of(variant: Variant, method: str, own: Sequence[str]) -> list[str]:
-    """Settings of a variant that is another method: the study's where its method is the donor of the graft,
-    and the variant's own."""
-    peer = get_method(variant.method)
-    shared = own if peer.option_keys(method, "key") else []
-    return [*shared, *(f"{method}.{text}" for text in variant.settings)]
+def _settings_of(variant: Variant, method: str, settings: Sequence[str]) -> list[str]:
+    """Settings of a variant that is another method.
+
+    Those of the study where its method is the donor of the graft, and the study's networks where the other
+    method has such options: networks of its own would decide the comparison. Then the variant's own.
+    """
+    peer, name = get_method(variant.method), variant.method.partition("@")[0]
+    shared = [f"{method}.{text}" for text in settings if peer.option_keys(method, "key")]
+    known = to_plain(get_method(name).options())
+    keys = [text.partition("=")[0] for text in settings]
+    nets = [f"{name}.{text}" for key, text in zip(keys, settings) if key in BACK_ENDS and key in known]
+    return [*shared, *nets, *(f"{method}.{text}" for text in variant.settings)]
 
 
 def earlier_groups(study: Study, output: Path) -> list[str]:

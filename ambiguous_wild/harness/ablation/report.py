@@ -13,9 +13,11 @@ import math
 from pathlib import Path
 from typing import Any, Literal
 
+from ambiguous_wild.core.config import to_plain
 from ambiguous_wild.harness.ablation.plan import DIFFERENCES, METRICS, Outcome, Planned, Study, read_outcomes
 from ambiguous_wild.harness.ablation.records import GroupFacts, StudyReport, Summary, VariantRow
 from ambiguous_wild.io.atomic import atomic_path, write_json, write_text
+from ambiguous_wild.methods.describe import BACK_ENDS
 from ambiguous_wild.metrics import stats
 
 
@@ -51,7 +53,7 @@ def _row(row: Planned, outcomes: list[Outcome], default: list[Outcome]) -> Varia
     return {
         "group": row.group,
         "variant": row.variant.name,
-        "settings": list(row.variant.settings),
+        "settings": [*row.variant.settings, *_networks(row)],
         "text": row.variant.text,
         "status": status,
         "reason": reason,
@@ -64,6 +66,14 @@ def _row(row: Planned, outcomes: list[Outcome], default: list[Outcome]) -> Varia
             for o in outcomes
         ],
     }
+
+
+def _networks(row: Planned) -> list[str]:
+    """Features and instances of a variant that is another method."""
+    if not row.variant.method or not row.cells:
+        return []
+    options = to_plain(row.cells[0].options)
+    return [f"{key}={options[key]}" for key in BACK_ENDS if key in options]
 
 
 def _summary(values: list[float | None]) -> Summary:
@@ -147,7 +157,7 @@ def _subtitle(data: StudyReport) -> str:
     train = data["train"]
     budget = train["budget_s"]
     length = f"{train['iterations']} iterations" if budget is None else f"{budget:g} s of training"
-    base = f"; in every row: {' '.join(data['settings'])}" if data["settings"] else ""
+    base = f"; in every row of the method: {' '.join(data['settings'])}" if data["settings"] else ""
     return (
         f"{', '.join(data['scenes'])}; seeds {', '.join(map(str, data['seeds']))}; {length}{base}. "
         "Differences are to the default, on the same scene with the same seed; +- is the sample deviation "

@@ -88,7 +88,7 @@ def command(config: Mapping[str, Any], before: Sequence[str] = ()) -> str:
             words += [flag, value]
     words += ["--effects", ",".join(map(str, config.get("effects") or ["none"]))]
     for key, value in _changed(config).items():
-        words += ["--set", f"{method.split('@')[0]}.{key}={value}"]
+        words += ["--set", f"{key}={value}"]
     words += ["--device", config.get("device", "cpu"), "-o", "runs"]
     text = " && ".join([*before, shlex.join(str(w) for w in words)])
     hidden = next((c for c in text if unicodedata.category(c) in HIDDEN), None)
@@ -98,26 +98,51 @@ def command(config: Mapping[str, Any], before: Sequence[str] = ()) -> str:
 
 
 def _changed(config: Mapping[str, Any]) -> dict[str, str]:
-    """Options that are not the method's defaults on every machine; of a method in a file, all of them."""
-    usual = {} if config["source"] else _defaults(config["method"])
+    """METHOD.KEY and value of options that are not the method's defaults on every machine.
+
+    Of a method in a file, all of them. Of a variant only those that depend on the machine: its name says the
+    others.
+    """
+    options, name = _flat(config["options"]), config["method"]
+    if "@" in name:
+        pairs = [(place, member, k) for place, member in _places(name) for k in _by_machine(member)]
+        kept = {f"{member}.{k}": options.get(f"{place}.{k}") for place, member, k in sorted(pairs)}
+        return {key: _word(value) for key, value in kept.items() if value is not None}
+    usual = {} if config["source"] else _defaults(name)
     if usual is None:
         return {}
-    options = _flat(config["options"])
-    return {k: _word(v) for k, v in sorted(options.items()) if k not in usual or usual[k] != v}
+    return {f"{name}.{k}": _word(v) for k, v in sorted(options.items()) if k not in usual or usual[k] != v}
+
+
+def _places(method: str) -> tuple[tuple[str, str], ...]:
+    """Where the options of the members of a graft stand; none of another variant."""
+    from ambiguous_wild.methods.registry import get_method
+
+    try:
+        return tuple(get_method(method).places)
+    except (AwError, ImportError):
+        return ()
+
+
+@cache
+def _by_machine(method: str) -> frozenset[str]:
+    """Names of the options whose defaults depend on the machine."""
+    from ambiguous_wild.methods.registry import get_method
+
+    fields = dataclasses.fields(get_method(method).options())
+    return frozenset(f.name for f in fields if f.metadata.get("by_machine"))
 
 
 @cache
 def _defaults(method: str) -> dict[str, Any] | None:
+    """Defaults that are the same on every machine; None of an unknown method."""
     from ambiguous_wild.methods.registry import get_method
 
-    if "@" in method:
-        return None  # a variant is its own setting, and its name says it
     try:
-        options = get_method(method).options()
+        options = _flat(to_plain(get_method(method).options()))
     except (AwError, ImportError):
         return None
-    by_machine = {f.name for f in dataclasses.fields(options) if f.metadata.get("by_machine")}
-    return {k: v for k, v in _flat(to_plain(options)).items() if k not in by_machine}
+    return {k: v for k, v in options.items() if k not in _by_machine(method)}
 
 
 def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

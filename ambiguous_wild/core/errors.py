@@ -36,7 +36,7 @@ def unknown(kind: str, name: str, choices: Iterable[str], hint: str = "") -> AwE
     if near:
         tail = f"did you mean {near[0]!r}?"
     elif len(known) <= 12:
-        tail = "there is: " + ", ".join(known)
+        tail = "there is: " + ", ".join(known) if known else "there is none"
     else:
         some = difflib.get_close_matches(name, known, n=3, cutoff=0.0)
         tail = f"the nearest of {len(known)}: {', '.join(some)}"

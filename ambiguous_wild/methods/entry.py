@@ -67,6 +67,12 @@ class MethodEntry:
             )
         return cls()
 
+    def by_machine(self) -> frozenset[str]:
+        """Options whose defaults depend on the weights on the machine, see vision/chosen.py."""
+        options = self.options()
+        fields = dataclasses.fields(options) if dataclasses.is_dataclass(options) else ()
+        return frozenset(f.name for f in fields if f.metadata.get("by_machine"))
+
     def about(self, options: Iterable[Mapping[str, Any]]) -> str:
         """`note` with the values of the options that it names in braces.
 

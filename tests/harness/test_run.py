@@ -12,6 +12,7 @@ import yaml
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.running.grid import cell_folder, plan_cells, run_cells
 from ambiguous_wild.harness.running.result_file import read_result
+from ambiguous_wild.harness.running.run_folder import refuse_other_config
 from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.lock import folder_lock
 from ambiguous_wild.io.ply import read_splat_ply
@@ -55,6 +56,18 @@ def scene(tmp_path_factory):
 def bench(scene, output, *methods, train=SHORT, overwrite="missing", **kw):
     cells = plan_cells(methods, [scene], kw.pop("seeds", [0]), train, **kw)
     return cells, run_cells(cells, output, overwrite=overwrite)
+
+
+def test_what_to_do_where_a_default_followed_the_weights(scene, tmp_path):
+    given = ["robustsplat.features=sceneconv"]
+    (old,) = plan_cells(["robustsplat"], [scene], [0], SHORT, settings=given)
+    (new,) = plan_cells(["robustsplat"], [scene], [0], SHORT)
+    written = {**old.config, "config_hash": old.identity}
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(json.loads(json.dumps(written))))
+    (tmp_path / "point_cloud.ply").touch()
+    refuse_other_config(tmp_path, old)
+    with pytest.raises(AwError, match=r"as before with --set robustsplat\.features=sceneconv$"):
+        refuse_other_config(tmp_path, new)
 
 
 def test_a_run_folder_holds_everything_and_the_numbers_follow_from_it(scene, tmp_path):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import shlex
 import unicodedata
@@ -105,8 +104,7 @@ def _changed(config: Mapping[str, Any]) -> dict[str, str]:
     """
     options, name = _flat(config["options"]), config["method"]
     if "@" in name:
-        pairs = [(place, member, k) for place, member in _places(name) for k in _by_machine(member)]
-        kept = {f"{member}.{k}": options.get(f"{place}.{k}") for place, member, k in sorted(pairs)}
+        kept = {f"{member}.{k}": options.get(f"{place}.{k}") for place, member, k in _chosen(name)}
         return {key: _word(value) for key, value in kept.items() if value is not None}
     usual = {} if config["source"] else _defaults(name)
     if usual is None:
@@ -114,23 +112,15 @@ def _changed(config: Mapping[str, Any]) -> dict[str, str]:
     return {f"{name}.{k}": _word(v) for k, v in sorted(options.items()) if k not in usual or usual[k] != v}
 
 
-def _places(method: str) -> tuple[tuple[str, str], ...]:
-    """Where the options of the members of a graft stand; none of another variant."""
+def _chosen(method: str) -> list[tuple[str, str, str]]:
+    """Of a graft: place, member and name of each option whose default depends on the machine."""
     from ambiguous_wild.methods.registry import get_method
 
     try:
-        return tuple(get_method(method).places)
+        places = get_method(method).places
+        return sorted((p, member, k) for p, member in places for k in get_method(member).by_machine())
     except (AwError, ImportError):
-        return ()
-
-
-@cache
-def _by_machine(method: str) -> frozenset[str]:
-    """Names of the options whose defaults depend on the machine."""
-    from ambiguous_wild.methods.registry import get_method
-
-    fields = dataclasses.fields(get_method(method).options())
-    return frozenset(f.name for f in fields if f.metadata.get("by_machine"))
+        return []
 
 
 @cache
@@ -139,10 +129,11 @@ def _defaults(method: str) -> dict[str, Any] | None:
     from ambiguous_wild.methods.registry import get_method
 
     try:
-        options = _flat(to_plain(get_method(method).options()))
+        entry = get_method(method)
+        options = _flat(to_plain(entry.options()))
     except (AwError, ImportError):
         return None
-    return {k: v for k, v in options.items() if k not in _by_machine(method)}
+    return {k: v for k, v in options.items() if k not in entry.by_machine()}
 
 
 def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import traceback
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import flatten
@@ -72,6 +74,15 @@ def _is_our_config(path: Path) -> bool:
         return True
 
 
+def _of_weights(cell: Cell, names: Sequence[str], before: Mapping[str, Any]) -> str:
+    """What to do where weights that came or went since then changed a default; empty elsewhere."""
+    for key in (name.removeprefix("options.") for name in names):
+        if key in cell.method.by_machine() and f"options.{key}" in before:
+            same = f"--set {cell.method.name.partition('@')[0]}.{key}={before[f'options.{key}']}"
+            return f"; the default follows the weights on this machine: as before with {same}"
+    return ""
+
+
 def refuse_other_config(folder: Path, cell: Cell) -> None:
     """Raise AwError if the folder was made by another configuration; names the keys that differ."""
     path = folder / CONFIG
@@ -94,5 +105,5 @@ def refuse_other_config(folder: Path, cell: Cell) -> None:
     shown = ", ".join(f"{k} was {before.get(k)}, is {now.get(k)}" for k in names[:4]) or "its hash"
     raise AwError(
         f"{folder} holds a run of another configuration ({shown}); "
-        "choose another -o, or replace it with --overwrite always"
+        f"choose another -o, or replace it with --overwrite always{_of_weights(cell, names, before)}"
     )

@@ -74,7 +74,7 @@ def instances() -> str:
 
 @dataclass(frozen=True)
 class PaperConfig(RefineSplatConfig):
-    """All parts of the paper; its networks, or the best of those that are on this machine."""
+    """All parts of the paper; its networks where they are on this machine, see `features`, `instances`."""
 
     mask: MaskConfig = MASK
     first_look: FirstLookConfig = FirstLookConfig(on=False)  # noqa: RUF009

@@ -10,11 +10,7 @@ from ambiguous_wild.splat.density import NO_SIZE_PRUNING, DensityConfig
 from ambiguous_wild.vision.backends import DINO, check_features, parse
 from ambiguous_wild.vision.chosen import BY_MACHINE, first_here
 
-_SIZES = dict.fromkeys(DINO, 504) | {
-    "vgg16": 252
-}  # px, input of the fine stage; others take the photo's size
-
-
+_SIZES = dict.fromkeys((*DINO, "vgg16"), 252)  # px of a net's input without "@"; others take the photo's size
 PUBLISHED = "dinov2-small-registers@504,normalise=raw"
 
 

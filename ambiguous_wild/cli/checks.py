@@ -310,7 +310,7 @@ def _metrics() -> list[Check]:
     for metric in lpips.VARIANTS:
         missing = lpips.missing_weights(metric)
         detail = f"weights missing: {', '.join(missing)}" if missing else "weights found"
-        fix = weights.get_command(*missing) if missing else ""
+        fix = weights.fix(*missing) if missing else ""
         checks.append(Check("optional", metric, not missing, detail, fix))
     return checks
 

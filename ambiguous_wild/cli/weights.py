@@ -25,7 +25,7 @@ def command() -> None:
 @click.option("--json", "as_json", is_flag=True, help="Print the list as JSON.")
 def list_command(as_json: bool) -> None:
     """List every network: size, licence, source, use, and whether it is on this machine."""
-    from ambiguous_wild.core.weight_places import weights_folder
+    from ambiguous_wild.core.weight_places import folder_fault, weights_folder
     from ambiguous_wild.vision import weights
 
     every = weights.KNOWN + weights.OTHER_SIZES
@@ -55,24 +55,24 @@ def list_command(as_json: bool) -> None:
     for name, members in weights.GROUPS.items():
         click.echo(f"\n{name} = {', '.join(members)}")
     present = sum(line.present for _, line in rows)
-    click.echo(
-        f"{present} of {len(rows)} on this machine; 'aw weights get NAME' downloads into {weights_folder()}"
-    )
+    how = folder_fault() or f"'aw weights get NAME' downloads into {weights_folder()}"
+    click.echo(f"{present} of {len(rows)} on this machine; {how}")
 
 
 @command.command(name="get")
 @click.argument("names", nargs=-1, required=True)
+@click.option("--again", is_flag=True, help="Download also what is there and seems complete.")
 @click.option("--json", "as_json", is_flag=True, help="Print names and places as JSON.")
-def get_command(names: tuple[str, ...], as_json: bool) -> None:
+def get_command(names: tuple[str, ...], again: bool, as_json: bool) -> None:
     """Download networks into AW_WEIGHTS (by default ~/.cache/ambiguous_wild/weights).
 
-    What is there already is not downloaded again. Hashes are checked; pickles are converted to safetensors,
-    and only arrays are read from them.
+    What is there already is checked, and downloaded again only if it is damaged. Hashes are checked; pickles are
+    converted to safetensors, and only arrays are read from them.
     """
     from ambiguous_wild.vision import fetch, weights
 
     wanted = weights.chosen(names)
-    places = fetch.get(wanted, lambda line: click.echo(line, err=True))
+    places = fetch.get(wanted, lambda line: click.echo(line, err=True), again)
     if as_json:
         rows = [{"name": w.name, "where": str(place)} for w, place in zip(wanted, places)]
         click.echo(json.dumps(rows, indent=2))
@@ -86,6 +86,7 @@ def check_command(names: tuple[str, ...], as_json: bool) -> None:
 
     Exit code 2 if one is missing, damaged, or not the network that its name says.
     """
+    from ambiguous_wild.core.weight_places import folder_fault
     from ambiguous_wild.vision import weights
     from ambiguous_wild.vision.verify import verify
 
@@ -100,7 +101,8 @@ def check_command(names: tuple[str, ...], as_json: bool) -> None:
     if as_json:
         click.echo(json.dumps([dataclasses.asdict(v) for v in verdicts], indent=2, ensure_ascii=False))
     elif not wanted:
-        click.echo("no weights on this machine; 'aw weights list' lists what can be downloaded")
+        how = folder_fault() or "'aw weights list' lists what can be downloaded"
+        click.echo(f"no weights on this machine; {how}")
     wrong = [v for v in verdicts if not v.ok]
     if wrong:
         raise AwError(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
@@ -19,6 +19,8 @@ _TRY_S, _AGAIN_S = 0.05, 0.005
 
 class Busy(AwError):
     """Another process works on the folder."""
+
+    holder = "another process"
 
 
 class Held(Exception):
@@ -42,16 +44,20 @@ def folder_lock(folder: Path | str, doing: str) -> Iterator[None]:
         try:
             stack.enter_context(file_lock(lock_path(folder), f"{doing} (process {os.getpid()})"))
         except Held as held:
-            holder = str(held) or "another process"
-            raise Busy(
+            holder = str(held) or Busy.holder
+            busy = Busy(
                 f"{folder} is being worked on by {holder}; wait for it to end, or choose another folder"
-            ) from None
+            )
+            busy.holder = holder
+            raise busy from None
         yield
 
 
 @contextmanager
-def patient_lock(folder: Path | str, doing: str, patience_s: float) -> Iterator[None]:
-    """As `folder_lock`, but wait for up to `patience_s` seconds.
+def patient_lock(
+    folder: Path | str, doing: str, patience_s: float, waiting: Callable[[str], None] | None = None
+) -> Iterator[None]:
+    """As `folder_lock`, but wait for up to `patience_s` seconds; `waiting` is told once who holds it.
 
     Raises:
         Busy: it is locked even then.
@@ -62,9 +68,12 @@ def patient_lock(folder: Path | str, doing: str, patience_s: float) -> Iterator[
             try:
                 stack.enter_context(folder_lock(folder, doing))
                 break
-            except Busy:
+            except Busy as busy:
                 if time.monotonic() > deadline:
                     raise
+                if waiting is not None:
+                    waiting(busy.holder)
+                    waiting = None
                 time.sleep(0.5)
         yield
 

@@ -21,7 +21,7 @@ import numpy as np
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.core.tensor_files import read_tensors
-from ambiguous_wild.core.weight_places import find_file
+from ambiguous_wild.core.weight_places import find_file, folder_fault
 from ambiguous_wild.metrics.image import checked_pair
 
 if TYPE_CHECKING:
@@ -205,24 +205,23 @@ def _network(backbone: _Backbone, stamps: tuple[tuple[str, int], ...]) -> tuple[
     file is read again."""
     trunk, head = (Path(path) for path, _ in stamps)
     stack = _stack(backbone)
-    weights = {
-        k.removeprefix("features."): v for k, v in read_tensors(trunk).items() if k.startswith("features.")
-    }
+    tensors = read_tensors(trunk, f"run: aw weights get {backbone.name}")
+    weights = {k.removeprefix("features."): v for k, v in tensors.items() if k.startswith("features.")}
     try:
         stack.load_state_dict(weights, strict=True)
     except RuntimeError as error:
         line = " ".join(str(error).split())
         raise AwError(
-            f"{trunk} is not {backbone.name}: {line}; delete it and run: aw weights get {backbone.name}"
+            f"{trunk} is not {backbone.name}: {line}; run: aw weights get {backbone.name}"
         ) from None
     stack.eval().requires_grad_(False)
     expected = {f"lin{i}.model.1.weight": (1, c, 1, 1) for i, c in enumerate(backbone.channels)}
-    linear = read_tensors(head)
+    linear = read_tensors(head, f"run: aw weights get {backbone.head_name}")
     found = {key: tuple(value.shape) for key, value in linear.items()}
     if found != expected:
         raise AwError(
             f"{head} does not hold the LPIPS heads of {backbone.name} (five of [1, C, 1, 1]); "
-            f"delete it and run: aw weights get {backbone.head_name}"
+            f"run: aw weights get {backbone.head_name}"
         )
     return stack, [linear[key][0].float() for key in expected]
 
@@ -252,4 +251,5 @@ def _reason(backbone: _Backbone) -> str | None:
     need = [name for name, files in _files(backbone) if find_file(name, files) is None]
     if not need:
         return None
-    return f"weights missing: {', '.join(need)}; run: aw weights get {' '.join(need)}"
+    how = folder_fault() or f"run: aw weights get {' '.join(need)}"
+    return f"weights missing: {', '.join(need)}; {how}"

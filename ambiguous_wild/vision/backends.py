@@ -10,6 +10,7 @@ from pathlib import Path
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import with_options
 from ambiguous_wild.core.errors import unknown
+from ambiguous_wild.core.weight_places import expanded
 from ambiguous_wild.vision.protocols import Features, Instances
 
 # name in a spec: name of the weights, see vision/weights.py
@@ -237,7 +238,7 @@ _BUILDERS: dict[str, Callable[[Spec, str], Instances]] = {
 def _weights(options: dict[str, str], key: str = "weights") -> tuple[Path | None, dict[str, str]]:
     """The folder an option names, and the other options."""
     rest = {k: v for k, v in options.items() if k != key}
-    return (Path(options[key]).expanduser() if key in options else None), rest
+    return (expanded(options[key], key) if key in options else None), rest
 
 
 def _no_options(found: Spec, spec: str) -> None:

@@ -42,9 +42,9 @@ def save(arrays: Mapping[str, np.ndarray], target: Path) -> None:
     save_file({k: np.ascontiguousarray(v) for k, v in arrays.items()}, target, metadata={"format": "pt"})
 
 
-def read_as_arrays(path: Path) -> dict[str, np.ndarray]:
+def read_as_arrays(path: Path, advice: str = "download it again") -> dict[str, np.ndarray]:
     """See `core.tensor_files.read_tensors`."""
-    return {key: value.numpy() for key, value in read_tensors(path).items()}
+    return {key: value.numpy() for key, value in read_tensors(path, advice).items()}
 
 
 def used_tensors(weight: Weight, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

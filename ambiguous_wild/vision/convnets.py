@@ -18,9 +18,11 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.core.tensor_files import read_tensors
+from ambiguous_wild.core.weight_places import expanded
 from ambiguous_wild.io.hashing import sha256_file
-from ambiguous_wild.vision import efficientnet, weights
+from ambiguous_wild.vision import efficientnet, intact, weights
 from ambiguous_wild.vision.calibration import cell_grid, check_image, degraded_distance, whole_cells
+from ambiguous_wild.vision.convert import used_tensors
 from ambiguous_wild.vision.dino import normalised
 
 _VGG = (64, 64, "M", 128, 128, "M", 256, 256, 256, "M", 512, 512, 512, "M", 512, 512, 512)
@@ -115,8 +117,10 @@ class ConvFeatures:
                 f"got {self.size} and {self.config.fit_photos}"
             )
         self.path = _file(name, folder)
+        self._registered = folder is None
+        self._sha256 = sha256_file(self.path)
         settings = config_hash([self.size, layer, self.config.fit_photos])[:8]
-        self.name = f"conv-1-{name}-{sha256_file(self.path)[:12]}-{settings}"
+        self.name = f"conv-1-{name}-{self._sha256[:12]}-{settings}"
         self.unit = 0.1  # until `fit`
         self._what = name
         self._model: nn.Module | None = None
@@ -127,20 +131,24 @@ class ConvFeatures:
         """The net, loaded at first use.
 
         Raises:
-            AwError: the file is damaged or holds another network.
+            AwError: the file is damaged or holds another network; or, where the user named no folder, other
+                values than those published.
         """
         if self._model is None:
-            tensors = read_tensors(self.path)
+            command = weights.get_command(self._what)
+            advice = f"run: {command}" if self._registered else f"replace it by the file of: {command}"
+            tensors = read_tensors(self.path, advice)
             try:
                 # building a net draws random numbers; keep the caller's generator unchanged
                 with torch.random.fork_rng(devices=[]):
                     net = self._network.build(tensors, self._layer)
             except (KeyError, ValueError, RuntimeError) as error:
                 line = " ".join(str(error).split())
-                raise AwError(
-                    f"{self.path} is not {self._what} ({line}); delete it and run: "
-                    f"{weights.get_command(self._what)}"
-                ) from None
+                raise AwError(f"{self.path} is not {self._what} ({line}); {advice}") from None
+            if self._registered:
+                weight = weights.named(self._what)
+                arrays = used_tensors(weight, {key: value.numpy() for key, value in tensors.items()})
+                intact.check_published(weight, self.path, arrays, advice, self._sha256)
             self._model = net.eval().requires_grad_(False)
         return self._model
 
@@ -190,10 +198,9 @@ def _file(name: str, folder: str | Path | None) -> Path:
     if folder is None:
         path = weights.where(weight)
         if path is None:
-            how = f"download them with: {weights.get_command(name)}"
-            raise AwError(f"the weights of {name} are missing ({weights.find(weight)[1]}); {how}")
+            raise AwError(weights.missing(weight))
         return path
-    place = Path(folder).expanduser()
+    place = expanded(folder, "the folder of weights")
     found = [place / file for file in weight.files if (place / file).is_file()]
     if not found:
         raise AwError(f"{place} has no {' or '.join(weight.files)}")

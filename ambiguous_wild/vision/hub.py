@@ -13,6 +13,7 @@ from typing import Any
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.core.extras import install_command
 from ambiguous_wild.io.atomic import write_json
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.vision.convert import read_as_arrays, save
@@ -21,10 +22,16 @@ from ambiguous_wild.vision.weights import Weight
 TENSORS, PICKLE, RECEIPT = "model.safetensors", "pytorch_model.bin", "source.json"
 
 
-def offline() -> bool:
-    """Whether the user has set the hub's library to offline."""
+def offline() -> str:
+    """The variables by which the user has set the hub's library to offline; "" if it is not."""
     on = ("1", "true", "yes", "on")
-    return any(os.environ.get(name, "").lower() in on for name in ("HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE"))
+    names = ("HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE")
+    return " and ".join(name for name in names if os.environ.get(name, "").lower() in on)
+
+
+def switched_off() -> str:
+    """Why nothing is downloaded while `offline`."""
+    return f"the hub is switched off by {offline()}"
 
 
 def download(weight: Weight, folder: Path) -> None:
@@ -35,11 +42,11 @@ def download(weight: Weight, folder: Path) -> None:
             pytorch_model.bin that holds more than tensors.
     """
     if offline():
-        raise AwError("the hub is switched off by HF_HUB_OFFLINE or TRANSFORMERS_OFFLINE")
+        raise AwError(switched_off())
     try:
         from huggingface_hub import HfApi
     except ImportError:
-        raise AwError("huggingface_hub is not installed") from None
+        raise AwError(f"huggingface_hub is not installed ({install_command('masks')})") from None
     try:
         info = HfApi().model_info(weight.hub_id, files_metadata=True)
         stated = {file.rfilename: file for file in info.siblings or []}

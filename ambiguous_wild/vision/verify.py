@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.io.hashing import sha256_file
-from ambiguous_wild.vision import hub, weights
+from ambiguous_wild.vision import intact, weights
 from ambiguous_wild.vision.weights import Weight
 
 _SIDE = 64  # px of the picture that features are computed for
@@ -31,8 +29,7 @@ def verify(weight: Weight) -> Verdict:
     try:
         place = weights.where(weight)
         if place is None:
-            reason = weights.find(weight)[1]
-            raise AwError(f"{reason}; run: {weights.get_command(weight.name)}")
+            raise AwError(weights.missing(weight))
         if weight.kind == "file":
             return Verdict(weight.name, True, f"{_file(weight, place)}: {place}")
         return Verdict(weight.name, True, f"{_folder(weight, place)}: {place}")
@@ -41,43 +38,14 @@ def verify(weight: Weight) -> Verdict:
 
 
 def _file(weight: Weight, path: Path) -> str:
-    from ambiguous_wild.vision.convert import read_as_arrays, tensors_digest, used_tensors
-
-    arrays = used_tensors(weight, read_as_arrays(path))
-    stated = path.stem.rpartition("-")[2]  # torchvision's names end in the first 8 digits of the sha256
-    if path.suffix == ".pth" and len(stated) == 8 and set(stated) <= set("0123456789abcdef"):
-        if not sha256_file(path).startswith(stated):
-            raise AwError(f"{path} does not have the sha256 of its name; delete it and download it again")
-    elif tensors_digest(arrays) != weight.tensors:
-        raise AwError(
-            f"{path} holds other tensors than those published; delete it and run: "
-            f"{weights.get_command(weight.name)}"
-        )
-    return f"{len(arrays)} tensors, sha256 as published"
+    count = intact.check_file(weight, path, f"run: {weights.get_command(weight.name)}")
+    return f"{count} tensors, sha256 as published"
 
 
 def _folder(weight: Weight, folder: Path) -> str:
-    known = _receipt(weight, folder)
+    known = intact.check_folder(weight, folder, f"run: {weights.get_command(weight.name)}")
     count = _load(weight, folder)
     return f"{count} tensors, {'sha256 as downloaded' if known else 'no record of their sha256'}"
-
-
-def _receipt(weight: Weight, folder: Path) -> bool:
-    """Whether the folder holds hashes from its download; they are compared."""
-    path = folder / hub.RECEIPT
-    if not path.is_file():
-        return False
-    try:
-        stated = json.loads(path.read_text(encoding="utf-8"))["sha256"]
-        wrong = [name for name in weight.files if sha256_file(folder / name) != stated[name]]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise AwError(f"cannot read {path} ({error}); delete {folder} and download it again") from None
-    if wrong:
-        raise AwError(
-            f"{folder / wrong[0]} has changed since its download; delete {folder} and run: "
-            f"{weights.get_command(weight.name)}"
-        )
-    return True
 
 
 def _load(weight: Weight, folder: Path) -> int:
@@ -117,4 +85,7 @@ def _try(features: object, name: str) -> None:
     with torch.no_grad():
         found = features(image.permute(1, 2, 0))  # type: ignore[operator]
     if not bool(torch.isfinite(found).all()) or not bool(found.std() > 0):
-        raise AwError(f"the features of {name} are not finite or equal everywhere; download it again")
+        raise AwError(
+            f"the features of {name} are not finite or equal everywhere; "
+            f"run: {weights.get_command(name, again=True)}"
+        )

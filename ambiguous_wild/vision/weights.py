@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from ambiguous_wild.core.weight_places import file_places, find_file, weights_folder
+from ambiguous_wild.core.weight_places import expanded, file_places, find_file, folder_fault, weights_folder
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class WeightStatus(NamedTuple):
     name: str
     present: bool
     where: str  # the path, or why it is missing
-    command: str  # downloads it; "" if present
+    command: str  # downloads it, or a comment if none can; "" if present
 
 
 _HUB_FILES = ("config.json", "model.safetensors")
@@ -161,9 +161,9 @@ def hub_folder() -> Path:
     """Folder of models that huggingface_hub downloads: HF_HUB_CACHE, HF_HOME/hub or the default."""
     explicit = os.environ.get("HF_HUB_CACHE", "").strip()
     if explicit:
-        return Path(explicit).expanduser()
-    cache = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser()
-    return Path(os.environ.get("HF_HOME", cache / "huggingface")).expanduser() / "hub"
+        return expanded(explicit, "HF_HUB_CACHE")
+    cache = expanded(os.environ.get("XDG_CACHE_HOME", "~/.cache"), "XDG_CACHE_HOME")
+    return expanded(os.environ.get("HF_HOME", cache / "huggingface"), "HF_HOME") / "hub"
 
 
 def find(weight: Weight) -> tuple[Path | None, str]:
@@ -171,7 +171,7 @@ def find(weight: Weight) -> tuple[Path | None, str]:
     if weight.kind == "file":
         path = find_file(weight.name, weight.files)
         places = ", ".join(str(place) for place in file_places(weight.name))
-        return (None, f"not in {places}") if path is None else (path.parent, "")
+        return (None, folder_fault() or f"not in {places}") if path is None else (path.parent, "")
     places_of_hub = _hub_places(weight)
     for place in places_of_hub:
         missing = [name for name in weight.files if not (place / name).is_file()]
@@ -181,7 +181,7 @@ def find(weight: Weight) -> tuple[Path | None, str]:
             return None, f"{place} has pytorch_model.bin only; model.safetensors is needed"
         if place.is_dir() and len(missing) < len(weight.files):
             return None, f"incomplete: {place} lacks {', '.join(missing)}"
-    return None, f"not in {weights_folder() / weight.name}, {hub_folder()}"
+    return None, folder_fault() or f"not in {weights_folder() / weight.name}, {hub_folder()}"
 
 
 def where(weight: Weight) -> Path | None:
@@ -197,13 +197,25 @@ def status(weights: Iterable[Weight] = KNOWN) -> list[WeightStatus]:
         if place is not None:
             lines.append(WeightStatus(weight.name, True, str(where(weight)), ""))
         else:
-            lines.append(WeightStatus(weight.name, False, reason, get_command(weight.name)))
+            lines.append(WeightStatus(weight.name, False, reason, fix(weight.name)))
     return lines
 
 
-def get_command(*names: str) -> str:
-    """The command that downloads the weights."""
-    return f"aw weights get {' '.join(names)}"
+def get_command(*names: str, again: bool = False) -> str:
+    """The command that downloads the weights; `again`: also those that it takes for complete."""
+    return f"aw weights get {'--again ' if again else ''}{' '.join(names)}"
+
+
+def fix(*names: str) -> str:
+    """A shell line: `get_command`, or a comment if a file is in the place of the weights folder."""
+    fault = folder_fault()
+    return f"# {fault}" if fault else get_command(*names)
+
+
+def missing(weight: Weight) -> str:
+    """The error about weights that are not on this machine and not downloaded by themselves."""
+    how = "" if folder_fault() else f"; run: {get_command(weight.name)}"
+    return f"the weights of {weight.name} are missing ({find(weight)[1]}){how}"
 
 
 def _hub_places(weight: Weight) -> list[Path]:

@@ -12,6 +12,9 @@ import numpy as np
 import pytest
 import torch
 
+from ambiguous_wild.vision import packages
+from tests.vision.stub_sources import Hub
+
 VIT = {"hidden_size": 32, "num_hidden_layers": 3, "num_attention_heads": 2, "initializer_range": 0.2}
 WORDS = ["[PAD]", "[UNK]", "[CLS]", "[SEP]", "[MASK]", ".", "person", "car", "a", "dog", "red", "blue"]
 
@@ -165,6 +168,28 @@ def own(offline: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     monkeypatch.delenv("TORCH_HOME", raising=False)
     monkeypatch.setenv("AW_WEIGHTS", str(tmp_path / "own"))
     return tmp_path / "own"
+
+
+@pytest.fixture
+def index(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A folder in which pip searches, and nowhere else."""
+    monkeypatch.setenv("PIP_NO_INDEX", "1")
+    monkeypatch.setenv("PIP_FIND_LINKS", str(tmp_path / "index"))
+    (tmp_path / "index").mkdir()
+    return tmp_path / "index"
+
+
+@pytest.fixture
+def without_pip(index: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What pip would download: these tests are about what follows."""
+    monkeypatch.setattr(packages, "_pip_download", lambda package, folder, what: index / package.archive)
+
+
+@pytest.fixture
+def hub(own: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Hub:
+    found = Hub(tmp_path / "hub")
+    found.install(monkeypatch)
+    return found
 
 
 @pytest.fixture

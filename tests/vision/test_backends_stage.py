@@ -116,7 +116,7 @@ def test_without_weights_a_name_answers_with_the_command(offline):
         (make_instances, "grounded:car"),
         (make_instances, "efficientnet-lite0"),
     ):
-        with pytest.raises(AwError, match=r"download them with: aw weights get [a-z0-9.-]+$"):
+        with pytest.raises(AwError, match=r"missing \(not in .* run: aw weights get [a-z0-9.-]+"):
             make(spec)
 
 

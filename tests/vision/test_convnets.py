@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ from safetensors.torch import save_file
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.vision import efficientnet, weights
+from ambiguous_wild.vision.convert import read_as_arrays, tensors_digest
 from ambiguous_wild.vision.convnets import NETWORKS, ConvConfig, ConvFeatures
 from ambiguous_wild.vision.labhog import blurred_noisy_copy
 
@@ -198,7 +201,7 @@ def test_loading_keeps_the_callers_random_numbers(folder: Path, photo) -> None:
 
 
 @pytest.mark.parametrize("name", NETWORKS)
-@pytest.mark.parametrize("damage", ["missing", "shape", "cut", "pickle"])
+@pytest.mark.parametrize("damage", ["missing", "shape", "cut", "pickle", "infinite"])
 def test_files_of_another_network_are_named(tmp_path: Path, name: str, damage: str, photo) -> None:
     tensors = vgg_tensors() if name == "vgg16" else efficientnet_tensors()
     key = next(k for k in tensors if k.endswith("weight") and tensors[k].ndim == 4)
@@ -210,11 +213,40 @@ def test_files_of_another_network_are_named(tmp_path: Path, name: str, damage: s
     save_file(tensors, path)
     if damage == "cut":
         path.write_bytes(path.read_bytes()[:2000])
+    elif damage == "infinite":
+        save_file(tensors | {key: torch.full_like(tensors[key], float("inf"))}, path)
     elif damage == "pickle":
         torch.save({"a": Path("x")}, path)
-    words = f"is not {name}.*aw weights get {name}" if damage in ("missing", "shape") else "cannot be read"
-    with pytest.raises(AwError, match=words) as error:
+    words = {"missing": f"is not {name}", "shape": f"is not {name}", "infinite": "not finite, in tensor"}
+    with pytest.raises(
+        AwError, match=f"{words.get(damage, 'cannot be read')}.*aw weights get {name}"
+    ) as error:
         ConvFeatures(name, None, tmp_path)(photo(0, 40, 40))
     assert "\n" not in str(error.value)
     with pytest.raises(AwError, match=f"has no {path.name}"):
         ConvFeatures(name, None, tmp_path / "absent")
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_the_registered_place_holds_the_published_network_and_a_folder_any(
+    folder: Path, own: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    weight = weights.named(name)
+    path = own / name / weight.files[0]
+    path.parent.mkdir(parents=True)
+    shutil.copy(folder / path.name, path)
+    with pytest.raises(AwError, match=f"{path} holds other tensors.*; run: aw weights get {name}"):
+        _ = ConvFeatures(name).model
+    assert ConvFeatures(name, None, path.parent).model is not None
+    published = dataclasses.replace(weight, tensors=tensors_digest(read_as_arrays(path)))
+    monkeypatch.setattr(weights, "named", lambda _: published)
+    assert ConvFeatures(name).model is not None
+
+
+def test_a_file_of_torch_in_the_registered_place_has_the_hash_of_its_name(own: Path) -> None:
+    own.mkdir()
+    torch.save(vgg_tensors(), own / "vgg16-397923af.pth")
+    with pytest.raises(
+        AwError, match=r"vgg16-397923af\.pth does not have the sha256 of its name; run: aw weights"
+    ):
+        _ = ConvFeatures("vgg16").model

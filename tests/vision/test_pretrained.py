@@ -55,12 +55,22 @@ def test_tensors_of_another_shape_and_damaged_files_are_refused(copy):
     path = folder / "config.json"
     config = json.loads(path.read_text())
     path.write_text(json.dumps({**config, "hidden_size": 64}))
-    with pytest.raises(AwError, match="download it again"):
+    with pytest.raises(AwError, match=r"could not be loaded.*replace this folder"):
         _ = DinoFeatures("x", folder=folder).model
     path.write_text(json.dumps(config))
     data = (folder / "model.safetensors").read_bytes()
     (folder / "model.safetensors").write_bytes(data[: len(data) // 2])
     with pytest.raises(AwError, match="could not be loaded as Dinov2Model"):
+        _ = DinoFeatures("x", folder=folder).model
+
+
+def test_values_that_are_not_finite_are_refused(copy):
+    folder = copy("dinov2")
+    tensors = load_file(folder / "model.safetensors")
+    key = next(k for k in tensors if "query.weight" in k)
+    tensors[key][0, 0] = float("nan")
+    save_file(tensors, folder / "model.safetensors", metadata={"format": "pt"})
+    with pytest.raises(AwError, match=r"model\.safetensors holds values that are not finite, in tensor .*q"):
         _ = DinoFeatures("x", folder=folder).model
 
 
@@ -96,7 +106,8 @@ def test_offline_the_message_is_the_command(offline: Path):
         locate("dinov2-small", ("dinov2",))
     text = str(error.value)
     assert "\n" not in text
-    assert text.endswith("download them with: aw weights get dinov2-small")
+    assert "the hub is switched off by HF_HUB_OFFLINE; unset HF_HUB_OFFLINE and run: aw weights get" in text
+    assert "copy its folder" in text and "download them" not in text
     with pytest.raises(AwError, match="did you mean 'dinov2-small'"):
         locate("dinov2-smal", ("dinov2",))
 

@@ -240,7 +240,8 @@ def main_table(planned: dict[str, list[Job]], args: argparse.Namespace) -> str:
         return ""
     runs = read_runs(args.out / f"full-{args.max_gaussians}")
     scenes = list(dict.fromkeys(load_name(job.scene) for job in jobs))
-    return to_layout(paper(runs, metrics=("psnr", "ssim", "lpips_alex"), scenes=scenes, per_table=5))
+    table = to_layout(paper(runs, metrics=("psnr", "ssim", "lpips_alex"), scenes=scenes, per_table=5))
+    return table.replace(f"{args.out}/", "")  # stopped runs are named: below --out, wherever that is
 
 
 def truth_at(scene: Scene, size: float) -> list[tuple[Any, np.ndarray]]:

@@ -27,8 +27,8 @@ def starts(scene, tmp_path_factory):
     )
 
 
-def shot(view=0):
-    return Shot(iteration=1, nominal=1.0, view=view, camera=SimpleNamespace())
+def shot(view=0, iteration=300):
+    return Shot(iteration=iteration, nominal=1.0, view=view, camera=SimpleNamespace())
 
 
 def frame(value, alpha):
@@ -69,6 +69,16 @@ def test_the_composite_by_hand():
     assert back[str(0)].alpha[0, 0].item() == pytest.approx(-3 * 0.8)
 
 
+def test_layers_are_not_drawn_before_their_start():
+    layers = Layers(DeSplatConfig(min_start=300))
+    assert layers.drawn(shot(4)) == ("4",) and layers.drawn(shot(4, 299)) == ()
+    assert layers.drawn(shot(None)) == ()
+    static, given = frame(0.8, 0.9), Cotangents(image=torch.ones(2, 3, 3))
+    made, pull = layers.compose({STATIC: static}, shot(4, 299))
+    assert made is static and pull(given) == {STATIC: given}
+    assert set(layers.regularise({STATIC: static}, shot(4, 299))) == {STATIC}
+
+
 def test_the_alpha_terms_pull_static_up_and_the_layer_down():
     layers = Layers(DeSplatConfig(alpha_static=0.6, alpha_own=0.3))
     terms = layers.regularise({STATIC: frame(0.8, 0.9), str(2): frame(0.3, 0.4)}, shot(2))
@@ -77,7 +87,7 @@ def test_the_alpha_terms_pull_static_up_and_the_layer_down():
 
 
 def test_only_the_layer_of_the_view_learns(scene, tmp_path):
-    trainer = trainer_of(scene, tmp_path, parts_of("desplat", points="200"))
+    trainer = trainer_of(scene, tmp_path, parts_of("desplat", points="200", min_start="0"))
     others = trainer.drawing.others
     before = {name: field.gaussians.sh0.clone() for name, field in others.items()}
     trainer.step()
@@ -88,7 +98,7 @@ def test_only_the_layer_of_the_view_learns(scene, tmp_path):
 
 
 def test_test_views_show_the_static_field_alone_and_the_mask_is_what_the_layer_leaves(scene, tmp_path):
-    trainer = trained(scene, tmp_path, parts_of("desplat", points="200"), iterations=60)
+    trainer = trained(scene, tmp_path, parts_of("desplat", points="200", min_start="0"), iterations=60)
     for view, camera in enumerate(trainer.data.cameras):
         step = trainer.make_step(trainer.iteration, view)
         alpha = frames_of(step.rendered)[str(view)].alpha
@@ -102,7 +112,7 @@ def test_test_views_show_the_static_field_alone_and_the_mask_is_what_the_layer_l
 
 def test_layers_take_up_distractors(scene, tmp_path):
     """The red squares of the photos are covered more than the rest of them."""
-    trainer = trained(scene, tmp_path, parts_of("desplat", points="200"), iterations=400)
+    trainer = trained(scene, tmp_path, parts_of("desplat", points="200", min_start="0"), iterations=400)
     inside, outside = [], []
     for view in range(6):
         keep = trainer.parts.mask.predict(trainer.make_step(trainer.iteration, view)).numpy()
@@ -114,7 +124,9 @@ def test_layers_take_up_distractors(scene, tmp_path):
 
 def test_it_resumes_to_the_same_bits_layers_included(scene, tmp_path):
     def make():
-        return parts_of("desplat", points="100", **{"density.every": "2000", "density.min_every": "10"})
+        return parts_of(
+            "desplat", points="100", min_start="0", **{"density.every": "2000", "density.min_every": "10"}
+        )
 
     resumed_equals_whole(scene, tmp_path, make)
     whole, again = (trainer_of(scene, tmp_path / name, make()) for name in ("whole", "parts"))

@@ -4,7 +4,8 @@ Source: arXiv 2411.14514 and juliantang324/NexusSplats; which of its settings th
 unverified. LEFT OUT: anchors, so each Gaussian has codes of its own and 3DGS's growth, without opacity
 resets. Ours too: features (Lab and HOG for DINOv2's, option `features`) with a distance in units of what
 blur alone makes; toned colours are colour + 2 sigmoid(net) - 1; D-SSIM is of the toned picture; growth
-reads the photometric gradient alone; nets are narrower, for they run on each Gaussian, not on each tenth.
+reads the photometric gradient alone; the uncertainty moves no Gaussians (option `through_geometry`); nets are
+narrower, for they run on each Gaussian, not on each tenth.
 Cost: a second picture a step and the features of the render.
 """
 
@@ -36,6 +37,7 @@ from ambiguous_wild.vision.backends import check_features, make_features
 from ambiguous_wild.vision.precompute import photo_features
 
 CODE, SHIFT = 32, 4.0  # of photos and of doubts; added to what is drawn, for the renderer clamps at 0
+GEOMETRY = ("means", "quats", "log_scales", "opacity_logits")
 COLOURING = ("nexussplats", "exposure", "appearance")  # effects that an uncertainty does not go through
 
 
@@ -52,6 +54,9 @@ class NexusSplatsConfig:
     normal_units: float = 40.0  # of hand-made features: distance, in units of blur, that is 1
     prior: float = 0.5  # times the mean ln sigma
     volume: float = 0.01  # times the mean volume of a Gaussian
+    # whether the loss of the uncertainty also moves Gaussians, as published for anchors. Without anchors that
+    # costs 4 dB (docs/baselines.md)
+    through_geometry: bool = False
     light_width: int = 64  # published 256, for ten Gaussians at once
     doubt_width: int = 64  # published 128, likewise
     dropout: float = 0.2
@@ -187,6 +192,8 @@ class Doubt(WarmUpMask):
         d_codes = torch.zeros_like(g.extra["nexus_doubt"])
         d_codes[seen] = found[0]
         own = {name: d for name, d in zip(leaf, found[1:]) if d is not None}
+        if not self.config.through_geometry:
+            back = replace(back, **{k: torch.zeros_like(getattr(back, k)) for k in GEOMETRY})
         gradients = replace(
             back, sh0=torch.zeros_like(g.sh0), sh_rest=torch.zeros_like(g.sh_rest), screen_abs=None,
             screen=torch.zeros_like(back.screen), extra={"nexus_doubt": d_codes}, own={self.codes.name: own},

@@ -10,7 +10,7 @@ import torch
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.methods.forestsplats.nets import fill
 from ambiguous_wild.methods.hybridgs import COVERED, composed, planar_sums
-from ambiguous_wild.methods.nexussplats import SHIFT, as_colour, boundary
+from ambiguous_wild.methods.nexussplats import GEOMETRY, SHIFT, as_colour, boundary
 from ambiguous_wild.methods.t3dgs import Head, divergence, inverse_depth, likelihood_loss, variation
 from ambiguous_wild.splat.fields import STATIC, frames_of
 from ambiguous_wild.splat.gaussians import SH_C0
@@ -96,8 +96,18 @@ def test_gradients_of_the_uncertainty_are_those_of_its_loss(nexus):
         (through,) = torch.autograd.grad(policy.codes.doubts(code, leaf).sum(), code)
     torch.testing.assert_close(found[row], (slope_of_doubt * through[0]).float(), rtol=0.03, atol=1e-7)
     assert gradients.own["nexussplats"].keys() >= {"transient", "doubt_weight0", "doubt_bias2"}
-    assert not gradients.sh0.any() and not gradients.screen.any() and gradients.means.any()
+    assert not gradients.sh0.any() and not gradients.screen.any()
     assert torch.equal(keep > 1, policy.predict(step) > 0)
+
+
+def test_the_uncertainty_moves_gaussians_only_if_asked(nexus, monkeypatch):
+    policy, step = nexus.parts.mask, nexus.make_step(10, 0)
+    _, alone = policy._weight(step, learn=True)
+    assert not any(getattr(alone, name).any() for name in GEOMETRY)
+    monkeypatch.setattr(policy, "config", replace(policy.config, through_geometry=True))
+    _, whole = policy._weight(step, learn=True)
+    assert all(getattr(whole, name).any() for name in GEOMETRY)
+    assert torch.equal(alone.extra["nexus_doubt"], whole.extra["nexus_doubt"])
 
 
 def test_boundaries_weigh_least_at_the_lower_middle():

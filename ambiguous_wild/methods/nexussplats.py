@@ -193,7 +193,8 @@ class Doubt(WarmUpMask):
         d_codes[seen] = found[0]
         own = {name: d for name, d in zip(leaf, found[1:]) if d is not None}
         if not self.config.through_geometry:
-            back = replace(back, **{k: torch.zeros_like(getattr(back, k)) for k in GEOMETRY})
+            still: dict[str, Any] = {k: torch.zeros_like(getattr(back, k)) for k in GEOMETRY}
+            back = replace(back, **still)
         gradients = replace(
             back, sh0=torch.zeros_like(g.sh0), sh_rest=torch.zeros_like(g.sh_rest), screen_abs=None,
             screen=torch.zeros_like(back.screen), extra={"nexus_doubt": d_codes}, own={self.codes.name: own},

@@ -46,7 +46,14 @@ class DeSplatConfig:
     alpha_own: float = 0.01  # on mean(A) of the layer
 
     def __post_init__(self) -> None:
-        check_limits(self, "desplat", points=(4, 1e7), distance=(1e-9, 1e9), start_opacity=(1e-4, 0.999))
+        check_limits(
+            self,
+            "desplat",
+            points=(4, 1e7),
+            distance=(1e-9, 1e9),
+            start_opacity=(1e-4, 0.999),
+            min_start=(0, 1e9),
+        )
 
 
 def build(options: DeSplatConfig) -> Parts:

@@ -148,8 +148,8 @@ def _settings_of(variant: Variant, method: str, settings: Sequence[str]) -> list
     peer, name = get_method(variant.method), variant.method.partition("@")[0]
     shared = [f"{method}.{text}" for text in settings if peer.option_keys(method, "key")]
     known = to_plain(get_method(name).options())
-    keys = [text.partition("=")[0] for text in settings]
-    nets = [f"{name}.{text}" for key, text in zip(keys, settings) if key in BACK_ENDS and key in known]
+    both = [key for key in BACK_ENDS if key in known]
+    nets = [f"{name}.{text}" for text in settings if text.partition("=")[0] in both]
     return [*shared, *nets, *(f"{method}.{text}" for text in variant.settings)]
 
 

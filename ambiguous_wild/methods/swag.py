@@ -21,13 +21,14 @@ from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.methods.masking_common import hashed_uniform
 from ambiguous_wild.splat import device
 from ambiguous_wild.splat.density import DensityConfig
+from ambiguous_wild.splat.effects.hash_grid import hash_encoding
 from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_leaves
 from ambiguous_wild.splat.effects.placing import Unit, in_picture, with_penalty
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
 from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.step import Shot, TrainData
 
-PHOTO, PRIMES = 24, (1, 2_654_435_761, 805_459_861)  # Instant-NGP's
+PHOTO = 24
 CLOSED, LEAST = -20.0, 1e-7  # logit of what is left out; opacity below which nothing is drawn
 
 
@@ -136,26 +137,3 @@ class GatedColours(Learnt):
     def step(self, own: Mapping[str, Tensor], shot: Shot, called_off: Tensor | None = None) -> None:
         self._left_out = None
         super().step(own, shot, called_off)
-
-
-def hash_encoding(unit: Tensor, grid: Tensor, coarsest: int, finer: float) -> Tensor:
-    """[N, 2 L] of positions [N, 3] in [0, 1] from tables [L, T, 2]: trilinear, as Instant-NGP's.
-
-    Level l has floor(coarsest finer^l) cells a side; a corner's entry is the exclusive or of its integer
-    coordinates times `PRIMES`, modulo T.
-    """
-    levels, entries, _ = grid.shape
-    cells = [float(int(coarsest * finer**level)) for level in range(levels)]
-    scaled = torch.stack([unit * count for count in cells])  # [L, N, 3]
-    low = scaled.floor()
-    share, corner, found = scaled - low, low.long(), torch.zeros_like(scaled[:, :, :2])
-    first = (torch.arange(levels, device=grid.device) * entries)[:, None]
-    table = grid.reshape(levels * entries, 2)
-    for number in range(8):
-        weight, key = torch.ones_like(share[:, :, 0]), torch.zeros_like(corner[:, :, 0])
-        for axis in range(3):
-            up = number >> axis & 1
-            weight = weight * (share[:, :, axis] if up else 1.0 - share[:, :, axis])
-            key = key ^ ((corner[:, :, axis] + up) * PRIMES[axis])
-        found = found + weight[:, :, None] * table[first + key % entries]
-    return found.permute(1, 0, 2).reshape(len(unit), 2 * levels)

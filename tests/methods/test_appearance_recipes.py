@@ -11,7 +11,6 @@ from ambiguous_wild.methods.gsw import net as gsw_net
 from ambiguous_wild.methods.gsw.recipe import GswAppearance, GswConfig, Visibility
 from ambiguous_wild.methods.masking_common import d_keep
 from ambiguous_wild.methods.splatfactow import SplatfactoDensity, trimmed
-from ambiguous_wild.methods.swag import hash_encoding
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.effects.learnt import Visible
 from ambiguous_wild.splat.effects.placing import (
@@ -290,21 +289,6 @@ def test_growth_waits_after_a_reset():
 
 
 # -- SWAG -----------------------------------------------------------------------------------------
-
-
-def test_the_hash_encoding_by_a_second_implementation():
-    grid, unit = random(3, 64, 2), random(7, 3, seed=1)
-    found = hash_encoding(unit, grid, 4, 1.5).numpy()
-    for n, point in enumerate(unit.double().numpy()):
-        for level in range(3):
-            cells = int(4 * 1.5**level)
-            low, want = np.floor(point * cells).astype(int), np.zeros(2)
-            for corner in np.ndindex(2, 2, 2):
-                at = low + corner
-                weight = np.prod(1 - np.abs(point * cells - at))
-                key = int(at[0]) ^ int(at[1]) * 2654435761 ^ int(at[2]) * 805459861
-                want += weight * grid[level, key % 64].double().numpy()
-            assert found[n, 2 * level : 2 * level + 2] == pytest.approx(want, abs=1e-5)
 
 
 @pytest.fixture(scope="module")

@@ -203,7 +203,7 @@ def bench(
         from ambiguous_wild.harness.running.grid import plan_cells, run_cells
         from ambiguous_wild.harness.running.groups import grouped
         from ambiguous_wild.harness.running.passes import check_passes
-        from ambiguous_wild.harness.running.prepare import prepare_cpu
+        from ambiguous_wild.harness.running.prepare import prepare_cpu, try_recipes
         from ambiguous_wild.io.atomic import check_output
         from ambiguous_wild.splat.pace import TrainConfig
 
@@ -240,10 +240,11 @@ def bench(
             check_passes(cell)
         for line in _remarks(cells):
             told.say(line)
+        to_train = [] if where.remote else unfinished(cells, out, overwrite)
+        try_recipes(to_train)
         check_output(out / "run")  # before half a minute of compiling
         if chosen == "cpu" and not where.remote and any(cell.method.program is None for cell in cells):
             prepare_cpu(threads, told.say)
-            to_train = unfinished(cells, out, overwrite)
             if to_train and iterations is None and not budgets_s:
                 told.say(expected_line(to_train))
         one_by_one = gpus > 1 or session.in_process(cells)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.core.weight_places import expanded
 from ambiguous_wild.io.images import decode
 from ambiguous_wild.vision.progress import Bar, no_bar
 
@@ -32,9 +33,9 @@ class LabelMaps:
         """Check the folder.
 
         Raises:
-            AwError: it does not exist, or holds no label map.
+            AwError: it does not exist, its ~ names no home folder, or it holds no label map.
         """
-        self.folder = Path(folder).expanduser()
+        self.folder = expanded(folder, "labels:FOLDER")
         if not self.folder.is_dir():
             raise AwError(f"no folder {self.folder} with label maps; give one with a .png or .npy per photo")
         if not any(p.suffix.lower() in SUFFIXES for p in self.folder.rglob("*")):

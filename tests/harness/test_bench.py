@@ -120,6 +120,20 @@ def test_what_cannot_be_is_said_before_anything_is_made(scene, tmp_path, options
     assert not (tmp_path / "runs").exists()
 
 
+def test_a_fault_of_the_last_method_is_found_before_the_first_is_trained(scene, tmp_path):
+    wrong = ["dronesplat.instances=graph,nonsense=3"]
+    with pytest.raises(AwError, match="nonsense"):
+        bench(
+            ["3dgs", "dronesplat"],
+            scene,
+            output=tmp_path / "runs",
+            iterations=5,
+            device="cpu",
+            settings=wrong,
+        )
+    assert not (tmp_path / "runs").exists()
+
+
 def test_a_misspelt_method_is_answered_without_torch():
     code = (
         "import sys\nfrom ambiguous_wild import bench\n"

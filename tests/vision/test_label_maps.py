@@ -90,3 +90,8 @@ def test_what_is_no_label_map_is_refused_by_name(tmp_path):
     for file in sorted(tmp_path.iterdir()):
         with pytest.raises(AwError, match=file.name):
             read_labels(file)
+
+
+def test_a_home_that_nobody_has_is_told():
+    with pytest.raises(AwError, match="no home folder is known"):
+        LabelMaps("~nobody-of-this-name/labels")

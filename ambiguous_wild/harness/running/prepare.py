@@ -1,8 +1,26 @@
-"""Make the CPU kernels ready before a run."""
+"""What comes before the first run: the recipes are tried, the CPU kernels are made ready."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+
+from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.harness.running.cell import Cell
+
+
+def try_recipes(cells: Sequence[Cell]) -> None:
+    """Put every method's parts together once: the last method's fault is found before the first is trained.
+
+    Raises:
+        AwError: an option or the weights that a recipe refuses. Other errors are a run's own.
+    """
+    for cell in {(cell.method.name, repr(cell.options)): cell for cell in cells}.values():
+        try:
+            cell.method.build(cell.options)
+        except AwError:
+            raise
+        except Exception:
+            continue  # a plug-in's bug: its runs fail with their traceback, the others are trained
 
 
 def prepare_cpu(threads: int | None, say: Callable[[str], None] = lambda text: None) -> None:

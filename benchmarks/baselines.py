@@ -31,7 +31,7 @@ import cv2
 import numpy as np
 import torch
 from captures import find_scenes
-from job_queue import Run, archive_of, check_settings, keep, restore, run_all
+from job_queue import Run, archive_of, check_settings, keep, parser_of, restore, run_all
 
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.harness.running.environment import environment
@@ -326,23 +326,11 @@ def report(planned: dict[str, list[Job]], args: argparse.Namespace) -> dict[str,
 
 
 def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--captures", nargs="+", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--out", type=Path, required=True, help="folder of the runs")
+    parser = parser_of(__doc__, iterations=1500, tables=".json and .md")
+    parser.set_defaults(results=RESULTS)
     parser.add_argument("--sections", nargs="+", choices=list(SECTIONS), default=list(SECTIONS))
     parser.add_argument("--only", nargs="+", default=[], metavar="METHOD", help="and the references")
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
-    parser.add_argument("--iterations", type=int, default=1500)
-    parser.add_argument("--max-gaussians", type=int, default=12_000)
-    parser.add_argument("--jobs", type=int, default=1, help="runs at a time")
-    parser.add_argument("--most", type=int, help="runs of this call at most")
-    parser.add_argument("--results", type=Path, default=RESULTS, help="where .json and .md go")
-    parser.add_argument("--report-only", action="store_true", help="train nothing, tabulate what is there")
-    args = parser.parse_args(words)
-    counts = (args.iterations, args.max_gaussians, args.jobs, 1 if args.most is None else args.most)
-    if min(counts) < 1:
-        parser.error("--iterations, --max-gaussians, --jobs and --most count from 1")
-    return args
+    return parser.parse_args(words)
 
 
 def main(words: Sequence[str] | None = None) -> int:

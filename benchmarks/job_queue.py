@@ -6,6 +6,7 @@ tables, so that the queue goes on at another machine and every figure can be tra
 
 from __future__ import annotations
 
+import argparse
 import io
 import json
 import lzma
@@ -47,6 +48,33 @@ class Run:
         if result["status"] != "ok":
             return None
         return f"{fmean(float(row['psnr']) for row in result['per_image']):.2f} dB"
+
+
+def parser_of(doc: str | None, iterations: int, tables: str) -> argparse.ArgumentParser:
+    """The options that every queue has.
+
+    Args:
+        doc: of the script.
+        iterations: of a run, the default.
+        tables: endings of the files that hold the tables, in words.
+    """
+    parser = argparse.ArgumentParser(description=(doc or "").splitlines()[0])
+    parser.add_argument("--captures", nargs="+", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the runs")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--iterations", type=_count, default=iterations)
+    parser.add_argument("--max-gaussians", type=_count, default=12_000)
+    parser.add_argument("--jobs", type=_count, default=1, help="runs at a time")
+    parser.add_argument("--most", type=_count, help="runs of this call at most")
+    parser.add_argument("--results", type=Path, help=f"where {tables} go")
+    parser.add_argument("--report-only", action="store_true", help="train nothing, tabulate what is there")
+    return parser
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is no count from 1 on")
+    return int(text)
 
 
 def run_all(runs: Sequence[Run], at_once: int = 1, most: int | None = None) -> list[str]:

@@ -5,6 +5,8 @@ Source: EastbeanZhang/Gaussian-Wild. Ours: a small U-Net without ImageNet's weig
 colours, for the renderer clamps at 0; positions in units of the scene, without a gradient of the net (the
 release's is unverified); boxes start at the photo's size (published: 512 px). A test photo shows the net
 its left half only (the release: all of it); a camera without a photo gets the mean of all photos' maps.
+Gaussians outside of what may be read get the mean of what they sample at their pixels in the train photos,
+which they always had in training: zeros instead cost 3.8 dB.
 """
 
 from __future__ import annotations
@@ -164,11 +166,11 @@ class GswAppearance(Learnt):
     @torch.no_grad()
     def _usual(self, shot: Shot, leaf: Mapping[str, Tensor], means: Tensor, box: Tensor) -> Tensor:
         """[M, 16] that Gaussians sample at their pixels, in the mean of the train photos that show them."""
-        total, count = torch.zeros(len(means), CHANNELS, device=means.device), 0.0
+        total, count = means.new_zeros(len(means), CHANNELS), means.new_zeros(len(means), 1)
         for k, maps in zip(self.chosen, self._maps(shot, leaf)):
             own, inside = at_pixels(maps[FREE], means, self.cameras[k], box)
             total, count = total + own * inside[:, None], count + inside[:, None].float()
-        return total / torch.as_tensor(count).clamp(min=1.0)
+        return total / count.clamp(min=1.0)
 
     def learnable(self, shot: Shot) -> dict[str, Tensor]:
         """Copies of all leaves, for a graph of one's own."""

@@ -126,8 +126,8 @@ def test_a_map_is_sampled_between_its_cells():
 
 
 def shot_of(data, view=0, **changes):
-    known = {"iteration": 1, "nominal": 10.0, "view": view, "camera": data.cameras[view]}
-    return Shot(**{**known, "photo": data.photos[view], **changes})
+    known = {"iteration": 1, "nominal": 10.0, "view": view, "camera": data.cameras[view or 0]}
+    return Shot(**{**known, "photo": data.photos[view or 0], **changes})
 
 
 def visible_of(effect, n=5):
@@ -177,6 +177,37 @@ def test_colours_by_a_second_implementation(gsw):
         towards = (mean - view.center) / np.linalg.norm(mean - view.center)
         want = 0.5 + net("head", np.concatenate([hidden, towards]))
         assert found[i].numpy() == pytest.approx(want, abs=2e-4)
+
+
+def test_without_a_photo_a_gaussian_samples_what_it_does_in_the_photos_that_show_it(gsw):
+    data, effect = gsw
+    visible, shot = visible_of(effect), shot_of(data, view=None, photo=None)
+    leaf, box = effect._leaf(shot), visible.extra["gsw_box"]
+    found, total, count = effect._usual(shot, leaf, visible.means, box), torch.zeros(5, 16), torch.zeros(5, 1)
+    for photo, view in zip(data.photos, data.cameras):
+        pixels, z = projected(visible.means, view)
+        at = pixels / torch.tensor([view.width, view.height])
+        shown = ((z > 0) & (at > 0).all(1) & (at < 1).all(1)).float()[:, None]
+        map_ = gsw_net.maps_of(photo, leaf, 32)[2]
+        total, count = total + shown * gsw_net.sample(map_, 2.0 * at - 1.0), count + shown
+    assert count.min() >= 1 and count.max() > 1
+    torch.testing.assert_close(found, total / count)
+
+    half = shot_of(data, view=None, fitting=True)
+    camera = half.camera
+    right = projected(visible.means, camera)[0][:, 0] > camera.width // 2
+    assert right.any() and not right.all()
+    mixed = effect.forward(visible, leaf, half)
+    black = effect.forward(
+        visible, leaf, shot_of(data, view=None, fitting=True, photo=half_black(half.photo))
+    )
+    assert torch.equal(mixed, black)  # the right half is not read
+
+
+def half_black(photo):
+    left = photo.clone()
+    left[:, photo.shape[1] // 2 :] = 0.0
+    return left
 
 
 def test_intrinsic_features_start_as_harmonics_and_places_in_the_box(gsw):

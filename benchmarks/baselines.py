@@ -91,6 +91,8 @@ OPTIONS = {
     "robustsplat": ("features=efficientnet-lite0",),
     "refinesplat-paper": ("features=efficientnet-lite0", "instances=efficientnet-lite0"),
 }
+# as published for captures, in which the light does not change
+CAPTURES = dict.fromkeys(("wildgaussians", "nexussplats"), ("appearance=false",))
 SIZES = (0.25, 0.5, 1.0, 2.0)  # of the photos trained on
 
 
@@ -115,7 +117,8 @@ class Job:
         words += ["--protocol", "half" if self.half else "full"]
         words += ["-o", str(out / f"{'half' if self.half else 'full'}-{self.most}")]
         name = f"{self.method} on {load_name(self.scene)}, seed {self.seed}"
-        return Run(name, self.folder(out), self.method, tuple(words), OPTIONS.get(self.method, ()))
+        options = OPTIONS.get(self.method, ()) if self.half else (OPTIONS | CAPTURES).get(self.method, ())
+        return Run(name, self.folder(out), self.method, tuple(words), options)
 
 
 _names: dict[Path, str] = {}

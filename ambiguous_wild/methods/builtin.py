@@ -65,11 +65,12 @@ BUILTIN = (
     ),
     MethodEntry(
         name="wildgaussians",
-        summary="appearance of every photo: an embedding per Gaussian and per photo changes colours",
+        summary="masks by an uncertainty learnt from features; embeddings of photos and Gaussians tint them",
         recipe="ambiguous_wild.methods.wildgaussians:build",
         config="ambiguous_wild.methods.wildgaussians:Config",
         ablations="ambiguous_wild.methods.plug_in:WILDGAUSSIANS",
-        paper="Kulhanek et al., NeurIPS 2024 (arXiv 2407.08447); its appearance only",
+        paper="Kulhanek et al., NeurIPS 2024 (arXiv 2407.08447)",
+        note="features {features}",
     ),
     MethodEntry(
         name="absgs",

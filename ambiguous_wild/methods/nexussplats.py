@@ -21,8 +21,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ambiguous_wild.core.config import check_limits
-from ambiguous_wild.methods.masking_common import MaskedShares, WarmUpMask, hashed_uniform, upsampled
-from ambiguous_wild.methods.robustsplat.supervision import calibrated, resized
+from ambiguous_wild.methods.feature_distance import FeatureDistance
+from ambiguous_wild.methods.masking_common import MaskedShares, WarmUpMask, hashed_uniform
 from ambiguous_wild.methods.wildgaussians import fourier
 from ambiguous_wild.splat import device
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
@@ -33,8 +33,7 @@ from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
 from ambiguous_wild.splat.parts import Parts, State
 from ambiguous_wild.splat.rendered import Cotangents, Gradients
 from ambiguous_wild.splat.step import Shot, Step, TrainData
-from ambiguous_wild.vision.backends import check_features, make_features
-from ambiguous_wild.vision.precompute import photo_features
+from ambiguous_wild.vision.backends import check_features
 
 CODE, SHIFT = 32, 4.0  # of photos and of doubts; added to what is drawn, for the renderer clamps at 0
 GEOMETRY = ("means", "quats", "log_scales", "opacity_logits")
@@ -140,14 +139,13 @@ class Doubt(WarmUpMask):
 
     def __init__(self, codes: Codes) -> None:
         self.codes, self.config = codes, codes.config
-        self.features, self.shares = make_features(self.config.features), MaskedShares()
+        self.distance = FeatureDistance(self.config.features, self.config.normal_units)
+        self.shares = MaskedShares()
         self.pending: Gradients | None = None  # of the step under way
 
     def setup(self, data: TrainData) -> None:
         self.codes.require_setup()
-        self.cameras = data.cameras
-        self.features.fit(data.photos)
-        self.phi = photo_features(self.features, data.photos, data.cache_dir)
+        self.distance.setup(data)
 
     def keep(self, step: Step) -> Tensor | None:
         weight, self.pending = self._weight(step, learn=True)
@@ -182,7 +180,7 @@ class Doubt(WarmUpMask):
         if not learn:
             return weight, None
         with torch.enable_grad():
-            loss = (self._distance(step) * weight).mean() + self.config.prior * (sigma + 1e-6).log().mean()
+            loss = (self.distance(step) * weight).mean() + self.config.prior * (sigma + 1e-6).log().mean()
             (d_raw,) = torch.autograd.grad(loss, raw)
         image = torch.stack([d_raw, torch.zeros_like(d_raw), torch.zeros_like(d_raw)], dim=2)
         back = drawn.backward(Cotangents(image=image, alpha=-SHIFT * d_raw))
@@ -207,18 +205,8 @@ class Doubt(WarmUpMask):
             return slice(None)
         return torch.nonzero(in_picture(step.gaussians.means, step.camera, margin=0.5)).squeeze(1)
 
-    @torch.no_grad()
-    def _distance(self, step: Step) -> Tensor:
-        """clip(2 - 2 cos, 0, 1) [H, W] of the features of photo and render."""
-        full = self.cameras[step.view]  # not the photo, which may not be on the device
-        seen = self.features(upsampled(step.rendered.image.detach(), full.height, full.width))
-        cosine = F.cosine_similarity(self.phi[step.view], seen, dim=2)
-        if self.config.features.startswith("labhog"):
-            cosine = calibrated(cosine, self.features.unit, self.config.normal_units)
-        return resized((2.0 - 2.0 * cosine).clamp(0.0, 1.0), *step.photo.shape[:2])
-
     def facts(self) -> dict[str, Any]:
-        return {"masked_share": self.shares.mean(), "features": self.features.name}
+        return {"masked_share": self.shares.mean(), "features": self.distance.name}
 
     def state_dict(self) -> State:
         return {"shares": self.shares.state_dict()}

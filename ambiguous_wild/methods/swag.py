@@ -26,7 +26,7 @@ from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_
 from ambiguous_wild.splat.effects.placing import Unit, in_picture, with_penalty
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
 from ambiguous_wild.splat.parts import Parts
-from ambiguous_wild.splat.step import Shot, TrainData
+from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Shot, TrainData
 
 PHOTO = 24
 CLOSED, LEAST = -20.0, 1e-7  # logit of what is left out; opacity below which nothing is drawn
@@ -48,7 +48,7 @@ class SwagConfig:
     off: float = 0.01  # times the mean gate in the loss
     transient: float = 0.5  # left out below this share of photos in which it is on
     lr_grid: float = 0.01
-    lr_net: float = 1e-3
+    lr_net: float = 1e-3  # this and the next for 30 000 iterations; more in shorter runs
     lr_photo: float = 1e-3
 
     def __post_init__(self) -> None:
@@ -85,8 +85,9 @@ class GatedColours(Learnt):
         last[:3], last[3] = 0.0, c.start_logit
         net["net_weight3"] = replace(net["net_weight3"], values=0.1 * net["net_weight3"].values)
         net["net_bias3"] = replace(net["net_bias3"], values=last)
-        net = {name: replace(leaf, final=0.01) for name, leaf in net.items()}
-        return {"grid": Leaf(grid, c.lr_grid, 0.01), "photo": Leaf(photo, c.lr_photo, 0.01, True), **net}
+        net = {name: replace(leaf, final=0.01, made_for=NOMINAL_ITERATIONS) for name, leaf in net.items()}
+        codes = Leaf(photo, c.lr_photo, 0.01, per_photo=True, made_for=NOMINAL_ITERATIONS)
+        return {"grid": Leaf(grid, c.lr_grid, 0.01), "photo": codes, **net}
 
     def encoded(self, means: Tensor, leaf: Mapping[str, Tensor]) -> Tensor:
         """[N, 2 levels] of positions; they learn nothing from it."""

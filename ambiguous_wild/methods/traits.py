@@ -50,7 +50,8 @@ BUILTIN_TRAITS = {
         published="Stable Diffusion (DIFT), 1280 channels",
     ),
     "wildgaussians": Traits(
-        "", "net on codes of both", "", "24 numbers a Gaussian, 32 a photo", source="code",
+        "uncertainty of features", "net on codes of both", "", "24 numbers a Gaussian, 32 a photo, head",
+        source="code", published="DINOv2 ViT-S/14 with registers",
     ),
     "gs-w": Traits(
         "U-Net on the photo", "net on maps of the photo", "higher threshold", "54 numbers a Gaussian, nets",

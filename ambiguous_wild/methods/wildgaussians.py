@@ -1,27 +1,41 @@
-"""WildGaussians' appearance on the shared trainer: an embedding per Gaussian and one per photo.
+"""WildGaussians on the shared trainer: masks of a learnt uncertainty, an embedding a Gaussian and a photo.
 
 Source: "WildGaussians: 3D Gaussian Splatting in the Wild", Kulhanek et al., NeurIPS 2024 (arXiv
-2407.08447), and its code. An MLP of (colour, embedding of the Gaussian, embedding of the photo) gives (o,
-m); the colour becomes m colour + o. Different from the release: the MLP reads the colour in the view's
-direction, not the constant harmonic; m is 1 + its output, so that training starts from unchanged colours;
-D-SSIM is of the toned picture (one render a step); the MLP runs on visible Gaussians only. Masks, sky and
-growth are not part of it.
+2407.08447), and its code. A linear head on features of the photo gives an uncertainty, which learns from the
+distance of the render's features; where it is high is masked. An MLP of (colour, embedding of the Gaussian,
+embedding of the photo) gives (o, m); the colour becomes m colour + o.
+Different from the release: features (Lab and HOG for DINOv2's, option `features`) with a distance in units of
+what blur alone makes; the head's normalisation is that of all photos' features; the MLP reads the colour in
+the view's direction, not the constant harmonic; m is 1 + its output, so that training starts from unchanged
+colours; D-SSIM is of the toned picture (one render a step); the MLP runs on visible Gaussians only; a test
+photo's embedding is fitted without masks. Sky, 3D filter and growth are not part of it.
+Cost: features of every render.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+import torch.nn.functional as F
+from torch import Tensor, nn
 
+from ambiguous_wild.core.config import check_limits
+from ambiguous_wild.methods.feature_distance import FeatureDistance
+from ambiguous_wild.methods.masking_common import MaskedShares, PausingMask, hashed_uniform
+from ambiguous_wild.methods.robustsplat.net import adam_of, adam_state, load_adam_state
+from ambiguous_wild.methods.robustsplat.supervision import resized
+from ambiguous_wild.splat.effects.base import hurried
 from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_leaves
 from ambiguous_wild.splat.field import Row
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.parts import Parts
-from ambiguous_wild.splat.step import Shot, TrainData
+from ambiguous_wild.splat.parts import MaskPolicy, Parts, State
+from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Shot, Step, TrainData
+from ambiguous_wild.vision.backends import check_features
 
 PHOTO, OCTAVES = 32, 4  # of the photo's embedding; of the Fourier features that the Gaussians' start from
 GAUSSIAN = 6 * OCTAVES
@@ -29,18 +43,37 @@ GAUSSIAN = 6 * OCTAVES
 
 @dataclass(frozen=True)
 class WildGaussiansConfig:
-    """Options. Its code has lr_photo 1e-3, lr_net 5e-4 and scale 0.01, for 70 000 to 200 000 iterations."""
+    """Options; times in nominal iterations (of 30 000).
 
+    Its code has lr_photo 1e-3, lr_net 5e-4 and scale 0.01, for 70 000 to 200 000 iterations.
+    """
+
+    masks: bool = True
+    appearance: bool = True  # published: on for photo collections, off for captures
+    features: str = "labhog"  # see vision/backends.py; published: dinov2-small-registers@350,blocks=6
+    normal_units: float = 160.0  # of hand-made features: distance, in units of blur, that is 1
+    mask_start: float = 2000.0
+    min_mask_start: int = 300  # iterations: earlier renders show too little
+    reset_pause: float = 500.0  # after an opacity reset the head does not learn
+    min_reset_pause: int = 100
+    prior: float = 0.5  # times the mean ln sigma
+    dropout: float = 0.5  # of channels that the head sees
+    lr_head: float = 1e-3  # published for 30 000 iterations; more in shorter runs
     lr_photo: float = 0.01
     lr_gaussian: float = 5e-3
     lr_net: float = 1e-3
     width: int = 128  # of both hidden layers
     scale: float = 0.1  # of the MLP's output; at 0.01 a run of 700 iterations gains 0.8 dB, at 0.1 2.0
 
+    def __post_init__(self) -> None:
+        check_features(self.features)
+        check_limits(self, "wildgaussians", normal_units=(1e-3, 1e9), dropout=(0, 0.9), prior=(1e-3, 1e3))
+
 
 def build(options: WildGaussiansConfig) -> Parts:
-    """3DGS with that appearance."""
-    return Parts(effects=(WildAppearance(options),))
+    """3DGS with the masks, the appearance, or both."""
+    effects = (WildAppearance(options),) if options.appearance else ()
+    return Parts(mask=Uncertainty(options) if options.masks else MaskPolicy(), effects=effects)
 
 
 Config = WildGaussiansConfig
@@ -84,3 +117,94 @@ def fourier(means: Tensor) -> Tensor:
     unit = 0.5 * centred / spread + 0.5
     angles = torch.cat([2.0 * torch.pi * 2.0**k * unit for k in range(OCTAVES)], dim=1)
     return torch.cat([angles.sin(), (angles + torch.pi / 2).sin()], dim=1)
+
+
+class Head(nn.Module):
+    """Features [h, w, C] of a photo to sigma [H, W] > 0, which starts near 1."""
+
+    def __init__(self, photos: Sequence[Tensor], seed: int) -> None:
+        """
+        Args:
+            photos: [h, w, C] features of every photo; their mean and deviation normalise.
+            seed: of the weights.
+        """
+        super().__init__()
+        channels = torch.cat([f.reshape(-1, f.shape[2]) for f in photos])
+        self.mean, self.deviation = channels.mean(dim=0), channels.std(dim=0).clamp(min=1e-6)
+        weight = 0.01 * torch.randn(channels.shape[1], generator=torch.Generator().manual_seed(seed))
+        self.weight = nn.Parameter(weight.to(channels.device))
+        self.bias = nn.Parameter(channels.new_zeros(1))
+
+    def forward(self, features: Tensor, height: int, width: int, kept: Tensor | None = None) -> Tensor:
+        """`kept` [C]: factors of channels."""
+        normal = (features - self.mean) / self.deviation
+        seen = normal if kept is None else normal * kept
+        sigma = F.softplus(seen @ self.weight + self.bias + math.log(math.e - 1.0))
+        return resized(sigma, height, width).clamp(min=0.1)
+
+
+def uncertainty_loss(sigma: Tensor, distance: Tensor, prior: float) -> Tensor:
+    """Mean d / (2 sigma^2) + prior ln sigma; least at sigma^2 = d / prior."""
+    return (distance * 0.5 / sigma.square()).mean() + prior * sigma.log().mean()
+
+
+class Uncertainty(PausingMask):
+    """Static where 1 / (2 sigma^2) > 1; the head learns with the Gaussians, but not after opacity resets."""
+
+    config: WildGaussiansConfig
+
+    def __init__(self, config: WildGaussiansConfig) -> None:
+        self.config, self.shares = config, MaskedShares()
+        self.distance = FeatureDistance(config.features, config.normal_units)
+
+    def setup(self, data: TrainData) -> None:
+        self.distance.setup(data)
+        self.seed, self.head = data.seed, Head(self.distance.photos, data.seed)
+        self.optimiser = adam_of(self.head, self.config.lr_head, data.device)
+
+    def keep(self, step: Step) -> Tensor | None:
+        if not self.paused(step):
+            self._learn(step)
+        if not self.begun(step):
+            return None
+        keep = self._static(step)
+        self.shares.take(step.view, keep)
+        return keep
+
+    def predict(self, step: Step) -> Tensor | None:
+        return self._static(step) if self.begun(step) else None
+
+    @torch.no_grad()
+    def _static(self, step: Step) -> Tensor:
+        """A photo without a static pixel is kept whole, or it would teach nothing."""
+        sigma = self.head(self.distance.photos[step.view], *step.photo.shape[:2])
+        static = sigma < math.sqrt(0.5)
+        return torch.where(static.any(), static, True).float()
+
+    def _learn(self, step: Step) -> None:
+        photo, c = self.distance.photos[step.view], self.config
+        key = (self.seed, step.iteration, 0x57)
+        kept = (hashed_uniform(photo.shape[2], key, photo.device) >= c.dropout) / (1.0 - c.dropout)
+        with torch.enable_grad():
+            sigma = self.head(photo, *step.photo.shape[:2], kept)
+            loss = uncertainty_loss(sigma, self.distance(step), c.prior)
+            self.optimiser.zero_grad(set_to_none=True)
+            loss.backward()
+        for group in self.optimiser.param_groups:
+            group["lr"] = hurried(c.lr_head, NOMINAL_ITERATIONS, step)
+        self.optimiser.step()
+
+    def facts(self) -> dict[str, Any]:
+        return {"masked_share": self.shares.mean(), "features": self.distance.name}
+
+    def state_dict(self) -> State:
+        net = {"weight": self.head.weight.detach(), "bias": self.head.bias.detach()}
+        return {
+            "net": net, "adam": adam_state(self.optimiser), "last_reset": self.last_reset,
+            "shares": self.shares.state_dict(),
+        }  # fmt: skip
+
+    def load_state_dict(self, state: State) -> None:
+        self.head.load_state_dict(state["net"])
+        load_adam_state(self.optimiser, state["adam"])
+        self.last_reset, self.shares = int(state["last_reset"]), MaskedShares.from_state(state["shares"])

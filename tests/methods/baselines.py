@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import torch
 
 from ambiguous_wild.core.config import with_options
@@ -15,6 +16,7 @@ from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.splat.trainer import Trainer
+from tests.tiny_scene import TRAIN
 
 
 def data_of(scene: Path, cache: Path, seed: int = 0) -> TrainData:
@@ -86,3 +88,14 @@ def _same(a: object, b: object) -> bool:
     if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor):
         return torch.equal(a, b)
     return bool(a == b)
+
+
+def masked_more_inside(trainer: Trainer) -> tuple[float, float]:
+    """Mean keep on the red squares, and elsewhere."""
+    inside, outside = [], []
+    for view in range(len(TRAIN)):
+        keep = trainer.parts.mask.predict(trainer.make_step(trainer.iteration, view)).numpy()
+        square = np.zeros(keep.shape, bool)
+        square[14:26, 14 + 4 * view : 26 + 4 * view] = True
+        inside.append(keep[square].mean()), outside.append(keep[~square].mean())
+    return float(np.mean(inside)), float(np.mean(outside))

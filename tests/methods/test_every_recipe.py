@@ -15,6 +15,7 @@ from tests.tiny_scene import with_points, write_tiny_scene
 GROWTH = {"density.every": "2000", "density.min_every": "10"}
 RECIPES = {
     "gs-w": {**GROWTH, "side": "32", "width": "4"},
+    "wildgaussians": {"width": "8", "mask_start": "0", "min_mask_start": "10"},
     "splatfacto-w": {**GROWTH, "width": "16"},
     "swag": {**GROWTH, "levels": "2", "entries": "256", "width": "8"},
     "nexussplats": {**GROWTH, "light_width": "8", "doubt_width": "8"},

@@ -16,9 +16,9 @@ from ambiguous_wild.splat.fields import STATIC, frames_of
 from ambiguous_wild.splat.gaussians import SH_C0
 from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.render import render
-from tests.methods.baselines import data_of, parts_of, step_of, trained, trainer_of
+from tests.methods.baselines import data_of, masked_more_inside, parts_of, step_of, trained, trainer_of
 from tests.splat.scenes import camera, gaussians
-from tests.tiny_scene import TRAIN, write_tiny_scene
+from tests.tiny_scene import write_tiny_scene
 
 
 @pytest.fixture(scope="module")
@@ -28,17 +28,6 @@ def scene(tmp_path_factory):
 
 def random(*shape, seed=0):
     return torch.rand(*shape, generator=torch.Generator().manual_seed(seed))
-
-
-def masked_more_inside(trainer):
-    """Mean keep on the red squares, and elsewhere."""
-    inside, outside = [], []
-    for view in range(len(TRAIN)):
-        keep = trainer.parts.mask.predict(trainer.make_step(trainer.iteration, view)).numpy()
-        square = np.zeros(keep.shape, bool)
-        square[14:26, 14 + 4 * view : 26 + 4 * view] = True
-        inside.append(keep[square].mean()), outside.append(keep[~square].mean())
-    return np.mean(inside), np.mean(outside)
 
 
 def slope(function, values, at, small=1e-3):
@@ -80,7 +69,7 @@ def nexus(scene, tmp_path_factory):
 def test_gradients_of_the_uncertainty_are_those_of_its_loss(nexus):
     policy, step = nexus.parts.mask, nexus.make_step(10, 0)
     keep, gradients = policy._weight(step, learn=True)
-    distance = policy._distance(step)
+    distance = policy.distance(step)
     codes, leaf = step.gaussians.extra["nexus_doubt"], policy.codes._leaf(step)
 
     def loss(doubts):

@@ -1,4 +1,4 @@
-"""WildGaussians' appearance: its formula by hand, its start, and what it carries."""
+"""WildGaussians: its appearance by hand, what it carries, and what its uncertainty masks."""
 
 import numpy as np
 import pytest
@@ -6,12 +6,21 @@ import torch
 
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import get_method
-from ambiguous_wild.methods.wildgaussians import GAUSSIAN, PHOTO, WildAppearance, WildGaussiansConfig, fourier
+from ambiguous_wild.methods.wildgaussians import (
+    GAUSSIAN,
+    PHOTO,
+    Head,
+    WildAppearance,
+    WildGaussiansConfig,
+    fourier,
+    uncertainty_loss,
+)
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.effects.learnt import Visible
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.step import Shot
 from ambiguous_wild.splat.trainer import Trainer
+from tests.methods.baselines import masked_more_inside, parts_of, trainer_of
 from tests.splat.scenes import camera
 from tests.tiny_scene import write_tiny_scene
 
@@ -69,3 +78,37 @@ def test_it_trains_resumes_and_carries_its_embeddings(tmp_path):
     after = whole.gaussians.extra["wild_embedding"]
     assert len(after) == len(whole.gaussians) and not torch.equal(after[: len(start)], start)
     assert whole.effects.facts()["wildgaussians"]["photo_std"] > 0
+
+
+def test_the_uncertainty_is_least_lossy_where_its_square_is_twice_the_distance():
+    distance = torch.tensor([[0.05, 0.3], [0.7, 1.0]])
+    best = (distance / 0.5).sqrt()
+    at_best = uncertainty_loss(best, distance, 0.5)
+    by_hand = (distance / (2 * best**2) + 0.5 * best.log()).mean()
+    torch.testing.assert_close(at_best, by_hand)
+    for factor in (0.9, 1.1):
+        assert uncertainty_loss(factor * best, distance, 0.5) > at_best
+
+
+def test_the_head_starts_near_one_and_is_never_below_a_tenth():
+    features = torch.randn(6, 8, 20, generator=torch.Generator().manual_seed(0)) * 3.0 + 5.0
+    head = Head([features], seed=0)
+    sigma = head(features, 12, 16).detach()
+    assert sigma.shape == (12, 16) and (sigma - 1.0).abs().max() < 0.15
+    with torch.no_grad():
+        head.bias -= 20.0
+    assert head(features, 12, 16).detach().min() == pytest.approx(0.1)
+
+
+def test_it_masks_what_only_one_photo_shows_and_can_do_without_either_part(tmp_path):
+    scene = write_tiny_scene(tmp_path / "scene")
+    options = {"width": "8", "mask_start": "0", "min_mask_start": "100"}
+    trainer = trainer_of(scene, tmp_path / "run", parts_of("wildgaussians", **options), iterations=300)
+    assert trainer.parts.mask.predict(trainer.make_step(1, 0)) is None  # not begun
+    trainer.train()
+    inside, outside = masked_more_inside(trainer)
+    assert inside < outside - 0.3, (inside, outside)
+    alone = parts_of("wildgaussians", appearance="false")
+    assert not alone.effects and type(alone.mask).__name__ == "Uncertainty"
+    colours = parts_of("wildgaussians", masks="false")
+    assert colours.effects and type(colours.mask).__name__ == "MaskPolicy"

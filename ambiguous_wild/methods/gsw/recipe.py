@@ -39,6 +39,7 @@ from ambiguous_wild.splat.rendered import Cotangents
 from ambiguous_wild.splat.step import Shot, Step, TrainData
 
 INTRINSIC, OCTAVES = 48, 10  # features a Gaussian has; of the code of positions
+LENGTH = 70_000  # iterations of the release's commands
 MOST = 64  # train photos that stand for all where a camera has none
 
 
@@ -50,7 +51,7 @@ class GswConfig:
     side: int = 128  # px, the longer side of the photo that the U-Net sees
     width: int = 16  # channels of its first level
     lr_unet: float = 2e-3  # to a tenth of it
-    lr_colour: float = 5e-4
+    lr_colour: float = 5e-4  # for 70 000 iterations; more in shorter runs
     lr_places: float = 1.0  # of free coordinates, and in px of boxes; to a hundredth of it
     lr_intrinsic: float = 1.25e-4
     dropout: float = 0.1  # of what is sampled
@@ -87,18 +88,19 @@ class GswAppearance(Learnt):
         )
         self.cameras, count = data.cameras, len(data.photos)
         self.chosen = sorted({k * count // min(count, MOST) for k in range(min(count, MOST))})
-        self._known: tuple[int, list[Tensor]] | None = None  # maps of those photos, of an iteration
+        self._known: tuple[float, list[Tensor]] | None = None  # maps of those photos, at a nominal iteration
         super().setup(data)
 
     def acts(self, hook: str) -> bool:
         return hook != "fit" and super().acts(hook)  # a test photo is read, nothing is fitted to it
 
     def leaves(self, data: TrainData, rng: np.random.Generator) -> Mapping[str, Leaf]:
-        found = unet_leaves(self.config.width, rng, self.config.lr_unet)
         lr, position = self.config.lr_colour, 3 * (1 + 2 * OCTAVES)
-        found |= mlp_leaves("encoder", (position + DYNAMIC + INTRINSIC, 128, 96, 64, 48), rng, lr)
-        found |= mlp_leaves("decoder", (48 + INTRINSIC, 48, 48, 48), rng, lr)
-        return found | mlp_leaves("head", (48 + 3, 48, 3), rng, lr)
+        nets = mlp_leaves("encoder", (position + DYNAMIC + INTRINSIC, 128, 96, 64, 48), rng, lr)
+        nets |= mlp_leaves("decoder", (48 + INTRINSIC, 48, 48, 48), rng, lr)
+        nets |= mlp_leaves("head", (48 + 3, 48, 3), rng, lr)
+        nets = {name: replace(leaf, made_for=LENGTH) for name, leaf in nets.items()}
+        return unet_leaves(self.config.width, rng, self.config.lr_unet) | nets
 
     def rows(self, gaussians: Gaussians) -> Mapping[str, Row]:
         rng, means, rate = np.random.default_rng([self.seed, 0x65]), gaussians.means, self.config.lr_places
@@ -149,9 +151,9 @@ class GswAppearance(Learnt):
     @torch.no_grad()
     def _maps(self, shot: Shot, leaf: Mapping[str, Tensor]) -> list[Tensor]:
         """Maps of train photos, at most `MOST` of them, evenly chosen; made once an iteration."""
-        if self._known is None or self._known[0] != shot.iteration:
+        if self._known is None or self._known[0] != shot.nominal:
             self._known = (
-                shot.iteration,
+                shot.nominal,
                 [maps_of(self.all_photos[k], leaf, self.config.side) for k in self.chosen],
             )
         return self._known[1]

@@ -25,7 +25,7 @@ from ambiguous_wild.splat.rendered import (
     ShadeGradients,
     ShadePull,
 )
-from ambiguous_wild.splat.step import Shot, Step, TrainData
+from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Shot, Step, TrainData
 
 if TYPE_CHECKING:
     from ambiguous_wild.splat.parts import Parts
@@ -182,3 +182,13 @@ def share_of(called_off: Tensor, like: Tensor) -> Tensor:
 def decayed(first: float, last: float, progress: float) -> float:
     """Exponential decay from `first` to `last` over the run."""
     return float(first * (last / first) ** progress)
+
+
+def hurried(rate: float, made_for: int, shot: Shot) -> float:
+    """A learning rate of Adam for a run of another length than the rate was published for.
+
+    Times the root of how many times shorter the run is; a longer run gets the rate itself. Adam's steps have
+    the size of the rate, and a random walk of them goes as far as the root of their number.
+    """
+    length = shot.iteration * NOMINAL_ITERATIONS / max(shot.nominal, 1e-9)  # of the run, in iterations
+    return rate * max(made_for / length, 1.0) ** 0.5

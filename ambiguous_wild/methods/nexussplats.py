@@ -32,10 +32,11 @@ from ambiguous_wild.splat.field import Row
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
 from ambiguous_wild.splat.parts import Parts, State
 from ambiguous_wild.splat.rendered import Cotangents, Gradients
-from ambiguous_wild.splat.step import Shot, Step, TrainData
+from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Shot, Step, TrainData
 from ambiguous_wild.vision.backends import check_features
 
 CODE, SHIFT = 32, 4.0  # of photos and of doubts; added to what is drawn, for the renderer clamps at 0
+LEAST = 0.1  # sigma
 GEOMETRY = ("means", "quats", "log_scales", "opacity_logits")
 COLOURING = ("nexussplats", "exposure", "appearance")  # effects that an uncertainty does not go through
 
@@ -59,7 +60,7 @@ class NexusSplatsConfig:
     light_width: int = 64  # published 256, for ten Gaussians at once
     doubt_width: int = 64  # published 128, likewise
     dropout: float = 0.2
-    lr_code: float = 1e-3  # of photos and doubts
+    lr_code: float = 1e-3  # of photos and doubts; of photos and of nets more in runs below 30 000 iterations
     lr_light: float = 5e-3  # of a Gaussian's light
     lr_net: float = 5e-4
 
@@ -94,15 +95,15 @@ class Codes(Learnt):
     def leaves(self, data: TrainData, rng: np.random.Generator) -> Mapping[str, Leaf]:
         def codes() -> Leaf:
             start = torch.tensor(0.01 * rng.normal(size=(len(data.photos), CODE)), dtype=torch.float32)
-            return Leaf(start, self.config.lr_code, per_photo=True)
+            return Leaf(start, self.config.lr_code, per_photo=True, made_for=NOMINAL_ITERATIONS)
 
         light, doubt, rate = self.config.light_width, self.config.doubt_width, self.config.lr_net
-        return {
-            "light": codes(),
-            "transient": codes(),
+        nets = {
             **mlp_leaves("toned", (3 + 24 + CODE + 3, light, light, 3), rng, rate),
             **mlp_leaves("doubt", (2 * CODE, doubt, doubt, 1), rng, rate),
         }
+        nets = {name: replace(leaf, made_for=NOMINAL_ITERATIONS) for name, leaf in nets.items()}
+        return {"light": codes(), "transient": codes(), **nets}
 
     def rows(self, gaussians: Gaussians) -> Mapping[str, Row]:
         light = fourier(gaussians.means)
@@ -172,15 +173,16 @@ class Doubt(WarmUpMask):
         drawn = step.draw(gaussians=as_colour(g, seen, doubts.detach()), without=COLOURING)
         with torch.set_grad_enabled(learn):
             raw = (drawn.image[..., 0] - SHIFT * drawn.alpha).detach().requires_grad_(learn)
-            sigma = F.softplus(raw)
+            # a floor as in WildGaussians; a ceiling of w alone would let sigma fall without end: above it
+            # the distance pulls no more
+            sigma = F.softplus(raw).clamp(min=LEAST)
             weight = 0.5 / sigma.square()
             if self.config.boundary:
                 weight = weight / boundary(weight.shape[0], weight.shape[1], weight)
-            weight = weight.clamp(max=3.0)
         if not learn:
             return weight, None
         with torch.enable_grad():
-            loss = (self.distance(step) * weight).mean() + self.config.prior * (sigma + 1e-6).log().mean()
+            loss = (self.distance(step) * weight).mean() + self.config.prior * sigma.log().mean()
             (d_raw,) = torch.autograd.grad(loss, raw)
         image = torch.stack([d_raw, torch.zeros_like(d_raw), torch.zeros_like(d_raw)], dim=2)
         back = drawn.backward(Cotangents(image=image, alpha=-SHIFT * d_raw))

@@ -51,7 +51,7 @@ class WildGaussiansConfig:
     masks: bool = True
     appearance: bool = True  # published: on for photo collections, off for captures
     features: str = "labhog"  # see vision/backends.py; published: dinov2-small-registers@350,blocks=6
-    normal_units: float = 160.0  # of hand-made features: distance, in units of blur, that is 1
+    normal_units: float = 80.0  # of hand-made features: distance, in units of blur, that is 1
     mask_start: float = 2000.0
     min_mask_start: int = 300  # iterations: earlier renders show too little
     reset_pause: float = 500.0  # after an opacity reset the head does not learn

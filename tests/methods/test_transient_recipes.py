@@ -74,8 +74,9 @@ def test_gradients_of_the_uncertainty_are_those_of_its_loss(nexus):
 
     def loss(doubts):
         drawn = step.draw(gaussians=as_colour(step.gaussians, slice(None), doubts), without=("nexussplats",))
-        sigma = torch.nn.functional.softplus(drawn.image[..., 0] - SHIFT * drawn.alpha).double()
-        return (distance / (2 * sigma**2).clamp(min=1 / 3)).mean() + 0.5 * (sigma + 1e-6).log().mean()
+        raw = (drawn.image[..., 0] - SHIFT * drawn.alpha).double()
+        sigma = raw.exp().log1p().clamp(min=0.1)
+        return (distance / (2 * sigma**2)).mean() + 0.5 * sigma.log().mean()
 
     found = gradients.extra["nexus_doubt"]
     row = int(found.abs().sum(dim=1).argmax())
@@ -97,6 +98,15 @@ def test_the_uncertainty_moves_gaussians_only_if_asked(nexus, monkeypatch):
     _, whole = policy._weight(step, learn=True)
     assert all(getattr(whole, name).any() for name in GEOMETRY)
     assert torch.equal(alone.extra["nexus_doubt"], whole.extra["nexus_doubt"])
+
+
+def test_errors_pull_back_what_is_very_certain(nexus, monkeypatch):
+    policy, step = nexus.parts.mask, nexus.make_step(10, 0)
+    monkeypatch.setattr(policy.codes, "doubts", lambda codes, leaf: 0.1 * codes[:, 0] - 2.0)
+    monkeypatch.setattr(policy, "distance", lambda step: torch.ones(step.photo.shape[:2]))
+    weight, gradients = policy._weight(step, learn=True)
+    pull = gradients.extra["nexus_doubt"][:, 0]
+    assert weight.max() > 3.0 and pull.min() < 0.0 and pull.max() <= 1e-9  # a step against it raises sigma
 
 
 def test_boundaries_weigh_least_at_the_lower_middle():

@@ -51,7 +51,7 @@ class NexusSplatsConfig:
     mask_start: float = 2000.0
     min_mask_start: int = 300  # iterations: earlier renders show too little
     boundary: bool = False  # photo collections: the lower middle of a picture is masked more easily
-    normal_units: float = 40.0  # of hand-made features: distance, in units of blur, that is 1
+    normal_units: float = 80.0  # of hand-made features: distance, in units of blur, that is 1
     prior: float = 0.5  # times the mean ln sigma
     volume: float = 0.01  # times the mean volume of a Gaussian
     # whether the loss of the uncertainty also moves Gaussians, as published for anchors. Without anchors that
@@ -98,12 +98,12 @@ class Codes(Learnt):
             return Leaf(start, self.config.lr_code, per_photo=True, made_for=NOMINAL_ITERATIONS)
 
         light, doubt, rate = self.config.light_width, self.config.doubt_width, self.config.lr_net
+        photos = {"light": codes(), "transient": codes()}
         nets = {
             **mlp_leaves("toned", (3 + 24 + CODE + 3, light, light, 3), rng, rate),
             **mlp_leaves("doubt", (2 * CODE, doubt, doubt, 1), rng, rate),
         }
-        nets = {name: replace(leaf, made_for=NOMINAL_ITERATIONS) for name, leaf in nets.items()}
-        return {"light": codes(), "transient": codes(), **nets}
+        return photos | {name: replace(leaf, made_for=NOMINAL_ITERATIONS) for name, leaf in nets.items()}
 
     def rows(self, gaussians: Gaussians) -> Mapping[str, Row]:
         light = fourier(gaussians.means)

@@ -117,7 +117,7 @@ class Job:
         words += ["--protocol", "half" if self.half else "full"]
         words += ["-o", str(out / f"{'half' if self.half else 'full'}-{self.most}")]
         name = f"{self.method} on {load_name(self.scene)}, seed {self.seed}"
-        options = OPTIONS.get(self.method, ()) if self.half else (OPTIONS | CAPTURES).get(self.method, ())
+        options = OPTIONS.get(self.method, ()) + (() if self.half else CAPTURES.get(self.method, ()))
         return Run(name, self.folder(out), self.method, tuple(words), options)
 
 

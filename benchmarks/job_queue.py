@@ -14,13 +14,16 @@ import os
 import subprocess
 import sys
 import tarfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 
+import yaml
+
 from ambiguous_wild.core import AwError
+from ambiguous_wild.core.config import flatten
 from ambiguous_wild.harness.running.result_file import RESULT, read_result
 from ambiguous_wild.harness.running.store import read_config, run_folders
 from ambiguous_wild.io.atomic import atomic_path
@@ -40,7 +43,15 @@ class Run:
 
     @property
     def finished(self) -> bool:
-        return (self.folder / RESULT).is_file()
+        """Whether there is a result with these options; one with others `aw bench` refuses by itself."""
+        return (self.folder / RESULT).is_file() and self._has(read_config(self.folder).get("options") or {})
+
+    def _has(self, options: Mapping[str, object]) -> bool:
+        known = flatten(options)
+        return all(
+            known.get(key) == yaml.safe_load(value)
+            for key, _, value in (option.partition("=") for option in self.options)
+        )
 
     def psnr(self) -> str | None:
         """The mean over its test photos in words; None if it is not finished, or failed."""
@@ -58,7 +69,7 @@ def parser_of(doc: str | None, iterations: int, tables: str) -> argparse.Argumen
         iterations: of a run, the default.
         tables: endings of the files that hold the tables, in words.
     """
-    parser = argparse.ArgumentParser(description=(doc or "").splitlines()[0])
+    parser = argparse.ArgumentParser(description=(doc or "").partition("\n")[0])
     parser.add_argument("--captures", nargs="+", type=Path, required=True, metavar="DIR")
     parser.add_argument("--out", type=Path, required=True, help="folder of the runs")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])

@@ -65,7 +65,7 @@ BUILTIN = (
     ),
     MethodEntry(
         name="wildgaussians",
-        summary="masks by an uncertainty learnt from features; embeddings of photos and Gaussians tint them",
+        summary="masks by an uncertainty learnt from features; embeddings change colours",
         recipe="ambiguous_wild.methods.wildgaussians:build",
         config="ambiguous_wild.methods.wildgaussians:Config",
         ablations="ambiguous_wild.methods.plug_in:WILDGAUSSIANS",

@@ -1,11 +1,12 @@
 """NexusSplats on plain Gaussians: uncertainty is drawn like a colour, light is a code beside each Gaussian.
 
-Source: arXiv 2411.14514 and juliantang324/NexusSplats; which of its settings the tables used is
-unverified. LEFT OUT: anchors, so each Gaussian has codes of its own and 3DGS's growth, without opacity
-resets. Ours too: features (Lab and HOG for DINOv2's, option `features`) with a distance in units of what
-blur alone makes; toned colours are colour + 2 sigmoid(net) - 1; D-SSIM is of the toned picture; growth
-reads the photometric gradient alone; the uncertainty moves no Gaussians (option `through_geometry`); nets are
-narrower, for they run on each Gaussian, not on each tenth.
+Source: arXiv 2411.14514 and juliantang324/NexusSplats; which of its settings the tables used is unverified.
+LEFT OUT: anchors, so each Gaussian has codes of its own and 3DGS's growth, without opacity resets. Ours too:
+features (Lab and HOG for DINOv2's, option `features`) with a distance in units of what blur alone makes;
+toned colours are colour + 2 sigmoid(net) - 1; D-SSIM is of the toned picture; growth reads the photometric
+gradient alone; the uncertainty moves no Gaussians (option `through_geometry`) and is at least 0.1 (the
+release: weights are at most 3); nets are narrower, for they run on each Gaussian, not on each tenth; rates of
+nets and of codes of photos rise in runs below 30 000 iterations.
 Cost: a second picture a step and the features of the render.
 """
 
@@ -36,7 +37,7 @@ from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Shot, Step, TrainData
 from ambiguous_wild.vision.backends import check_features
 
 CODE, SHIFT = 32, 4.0  # of photos and of doubts; added to what is drawn, for the renderer clamps at 0
-LEAST = 0.1  # sigma
+LEAST = 0.1  # smallest sigma
 GEOMETRY = ("means", "quats", "log_scales", "opacity_logits")
 COLOURING = ("nexussplats", "exposure", "appearance")  # effects that an uncertainty does not go through
 
@@ -45,7 +46,7 @@ COLOURING = ("nexussplats", "exposure", "appearance")  # effects that an uncerta
 class NexusSplatsConfig:
     """Options; times in nominal iterations (of 30 000)."""
 
-    features: str = "labhog"  # see vision/backends.py; published: dinov2-small-registers@350
+    features: str = "labhog"  # see vision/backends.py; published: dinov2-small-registers@350,blocks=6
     appearance: bool = True  # published: on for photo collections, off for captures
     density: DensityConfig = field(default_factory=lambda: DensityConfig(resets=()))
     mask_start: float = 2000.0
@@ -173,14 +174,15 @@ class Doubt(WarmUpMask):
         drawn = step.draw(gaussians=as_colour(g, seen, doubts.detach()), without=COLOURING)
         with torch.set_grad_enabled(learn):
             raw = (drawn.image[..., 0] - SHIFT * drawn.alpha).detach().requires_grad_(learn)
-            # a floor as in WildGaussians; a ceiling of w alone would let sigma fall without end: above it
-            # the distance pulls no more
-            sigma = F.softplus(raw).clamp(min=LEAST)
+            # with a ceiling on w instead, the distance no longer pulls where w reached it, and sigma falls
+            # without end
+            sigma = LEAST + F.softplus(raw)
             weight = 0.5 / sigma.square()
-            if self.config.boundary:
-                weight = weight / boundary(weight.shape[0], weight.shape[1], weight)
+        judged = weight.detach()
+        if self.config.boundary:
+            judged = judged / boundary(judged.shape[0], judged.shape[1], judged)
         if not learn:
-            return weight, None
+            return judged, None
         with torch.enable_grad():
             loss = (self.distance(step) * weight).mean() + self.config.prior * sigma.log().mean()
             (d_raw,) = torch.autograd.grad(loss, raw)
@@ -199,7 +201,7 @@ class Doubt(WarmUpMask):
             back, sh0=torch.zeros_like(g.sh0), sh_rest=torch.zeros_like(g.sh_rest), screen_abs=None,
             screen=torch.zeros_like(back.screen), extra={"nexus_doubt": d_codes}, own={self.codes.name: own},
         )  # fmt: skip
-        return weight.detach(), gradients
+        return judged, gradients
 
     def _seen(self, step: Step) -> Any:
         """Rows that may be in the picture; on an accelerator all of them."""

@@ -21,7 +21,7 @@ from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.methods.masking_common import hashed_uniform
 from ambiguous_wild.splat import device
 from ambiguous_wild.splat.density import DensityConfig
-from ambiguous_wild.splat.effects.hash_grid import hash_encoding
+from ambiguous_wild.splat.effects.hash_grid import hash_encoding, prepare
 from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_leaves
 from ambiguous_wild.splat.effects.placing import Unit, in_picture, with_penalty
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
@@ -74,6 +74,7 @@ class GatedColours(Learnt):
     def setup(self, data: TrainData) -> None:
         self.seed, self.unit, self.cameras = data.seed, Unit(data.scene.points.xyz, data.device), data.cameras
         self._left_out: tuple[float, int, Tensor] | None = None  # of a moment and a number of Gaussians
+        prepare(data.device)
         super().setup(data)
 
     def leaves(self, data: TrainData, rng: np.random.Generator) -> Mapping[str, Leaf]:

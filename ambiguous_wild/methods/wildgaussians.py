@@ -5,10 +5,12 @@ Source: "WildGaussians: 3D Gaussian Splatting in the Wild", Kulhanek et al., Neu
 distance of the render's features; where it is high is masked. An MLP of (colour, embedding of the Gaussian,
 embedding of the photo) gives (o, m); the colour becomes m colour + o.
 Different from the release: features (Lab and HOG for DINOv2's, option `features`) with a distance in units of
-what blur alone makes; the head's normalisation is that of all photos' features; the MLP reads the colour in
-the view's direction, not the constant harmonic; m is 1 + its output, so that training starts from unchanged
-colours; D-SSIM is of the toned picture (one render a step); the MLP runs on visible Gaussians only; a test
-photo's embedding is fitted without masks. Sky, 3D filter and growth are not part of it.
+what blur alone makes; the head normalises by all photos' features, drops channels after that, and learns from
+the first iteration on; masks begin at once, without a blend; a photo without a static pixel is kept; the MLP
+reads the colour in the view's direction, not the constant harmonic; m is 1 + its output, so that training
+starts from unchanged colours; D-SSIM is of the toned picture (one render a step); the MLP runs on visible
+Gaussians only; a test photo's embedding is fitted without masks. Sky, 3D filter and growth are not part of
+it.
 Cost: features of every render.
 """
 
@@ -48,7 +50,7 @@ class WildGaussiansConfig:
     Its code has lr_photo 1e-3, lr_net 5e-4 and scale 0.01, for 70 000 to 200 000 iterations.
     """
 
-    masks: bool = True
+    masks: bool = True  # by the uncertainty
     appearance: bool = True  # published: on for photo collections, off for captures
     features: str = "labhog"  # see vision/backends.py; published: dinov2-small-registers@350,blocks=6
     normal_units: float = 80.0  # of hand-made features: distance, in units of blur, that is 1
@@ -129,11 +131,13 @@ class Head(nn.Module):
             seed: of the weights.
         """
         super().__init__()
-        channels = torch.cat([f.reshape(-1, f.shape[2]) for f in photos])
-        self.mean, self.deviation = channels.mean(dim=0), channels.std(dim=0).clamp(min=1e-6)
-        weight = 0.01 * torch.randn(channels.shape[1], generator=torch.Generator().manual_seed(seed))
-        self.weight = nn.Parameter(weight.to(channels.device))
-        self.bias = nn.Parameter(channels.new_zeros(1))
+        cells = sum(f.shape[0] * f.shape[1] for f in photos)
+        mean = torch.stack([f.double().sum(dim=(0, 1)) for f in photos]).sum(dim=0) / cells
+        apart = torch.stack([(f.double() - mean).square().sum(dim=(0, 1)) for f in photos]).sum(dim=0)
+        self.mean, self.deviation = mean.to(photos[0]), (apart / cells).sqrt().clamp(min=1e-6).to(photos[0])
+        weight = 0.01 * torch.randn(len(mean), generator=torch.Generator().manual_seed(seed))
+        self.weight = nn.Parameter(weight.to(photos[0]))
+        self.bias = nn.Parameter(photos[0].new_zeros(1))
 
     def forward(self, features: Tensor, height: int, width: int, kept: Tensor | None = None) -> Tensor:
         """`kept` [C]: factors of channels."""

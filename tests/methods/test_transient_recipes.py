@@ -10,7 +10,7 @@ import torch
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.methods.forestsplats.nets import fill
 from ambiguous_wild.methods.hybridgs import COVERED, composed, planar_sums
-from ambiguous_wild.methods.nexussplats import GEOMETRY, SHIFT, as_colour, boundary
+from ambiguous_wild.methods.nexussplats import GEOMETRY, SHIFT, as_colour, boundary, kept
 from ambiguous_wild.methods.t3dgs import Head, divergence, inverse_depth, likelihood_loss, variation
 from ambiguous_wild.splat.fields import STATIC, frames_of
 from ambiguous_wild.splat.gaussians import SH_C0
@@ -75,7 +75,7 @@ def test_gradients_of_the_uncertainty_are_those_of_its_loss(nexus):
     def loss(doubts):
         drawn = step.draw(gaussians=as_colour(step.gaussians, slice(None), doubts), without=("nexussplats",))
         raw = (drawn.image[..., 0] - SHIFT * drawn.alpha).double()
-        sigma = raw.exp().log1p().clamp(min=0.1)
+        sigma = 0.1 + raw.exp().log1p()
         return (distance / (2 * sigma**2)).mean() + 0.5 * sigma.log().mean()
 
     found = gradients.extra["nexus_doubt"]
@@ -87,7 +87,8 @@ def test_gradients_of_the_uncertainty_are_those_of_its_loss(nexus):
     torch.testing.assert_close(found[row], (slope_of_doubt * through[0]).float(), rtol=0.03, atol=1e-7)
     assert gradients.own["nexussplats"].keys() >= {"transient", "doubt_weight0", "doubt_bias2"}
     assert not gradients.sh0.any() and not gradients.screen.any()
-    assert torch.equal(keep > 1, policy.predict(step) > 0)
+    assert torch.equal(kept(keep), policy.predict(step))
+    assert kept(torch.tensor([1.5, 0.9])).tolist() == [1.0, 0.0] and kept(torch.tensor([0.9])).item() == 1.0
 
 
 def test_the_uncertainty_moves_gaussians_only_if_asked(nexus, monkeypatch):
@@ -102,11 +103,20 @@ def test_the_uncertainty_moves_gaussians_only_if_asked(nexus, monkeypatch):
 
 def test_errors_pull_back_what_is_very_certain(nexus, monkeypatch):
     policy, step = nexus.parts.mask, nexus.make_step(10, 0)
-    monkeypatch.setattr(policy.codes, "doubts", lambda codes, leaf: 0.1 * codes[:, 0] - 2.0)
+    monkeypatch.setattr(policy.codes, "doubts", lambda codes, leaf: 0.1 * codes[:, 0] - 3.9)
     monkeypatch.setattr(policy, "distance", lambda step: torch.ones(step.photo.shape[:2]))
     weight, gradients = policy._weight(step, learn=True)
     pull = gradients.extra["nexus_doubt"][:, 0]
     assert weight.max() > 3.0 and pull.min() < 0.0 and pull.max() <= 1e-9  # a step against it raises sigma
+
+
+def test_boundaries_widen_what_is_kept_and_not_what_is_learnt(nexus, monkeypatch):
+    policy, step = nexus.parts.mask, nexus.make_step(10, 0)
+    plain, before = policy._weight(step, learn=True)
+    monkeypatch.setattr(policy, "config", replace(policy.config, boundary=True))
+    wide, after = policy._weight(step, learn=True)
+    torch.testing.assert_close(wide, plain / boundary(*plain.shape, plain))
+    assert torch.equal(before.extra["nexus_doubt"], after.extra["nexus_doubt"])
 
 
 def test_boundaries_weigh_least_at_the_lower_middle():

@@ -112,3 +112,20 @@ def test_it_masks_what_only_one_photo_shows_and_can_do_without_either_part(tmp_p
     assert not alone.effects and type(alone.mask).__name__ == "Uncertainty"
     colours = parts_of("wildgaussians", masks="false")
     assert colours.effects and type(colours.mask).__name__ == "MaskPolicy"
+
+
+def test_after_an_opacity_reset_the_head_rests(tmp_path):
+    scene = write_tiny_scene(tmp_path / "scene")
+    options = {"width": "8", "mask_start": "0", "min_mask_start": "5", "min_reset_pause": "20"}
+    trainer = trainer_of(scene, tmp_path / "run", parts_of("wildgaussians", **options))
+    policy = trainer.parts.mask
+    for _ in range(10):
+        trainer.step()
+    policy.on_opacity_reset(trainer.make_step(10, 0))
+    before = policy.head.weight.detach().clone()
+    for _ in range(9):
+        trainer.step()
+    assert torch.equal(policy.head.weight, before) and policy.state_dict()["last_reset"] == 10
+    for _ in range(30):
+        trainer.step()
+    assert not torch.equal(policy.head.weight, before)

@@ -58,3 +58,12 @@ def test_its_gradient_has_the_same_bits_on_one_thread():
 def test_it_runs_without_numbers_on_the_meta_device():
     found = hash_encoding(torch.empty(5, 3, device="meta"), torch.empty(4, 128, 2, device="meta"), 4, 1.5)
     assert found.shape == (5, 8) and found.is_meta
+
+
+def test_what_lies_outside_counts_as_the_end_and_nothing_is_no_error():
+    grid, ends = random(3, 100, 2), torch.tensor([[0.0, 1.0, 0.5]])
+    outside = torch.tensor([[-3.0, 7.0, 0.5]])
+    assert torch.equal(hash_encoding(outside, grid, 4, 1.5), hash_encoding(ends, grid, 4, 1.5))
+    assert hash_encoding(torch.zeros(0, 3), grid, 4, 1.5).shape == (0, 6)
+    strange = hash_encoding(torch.tensor([[float("nan"), 0.1, float("inf")]]), grid, 4, 1.5)
+    assert strange.shape == (1, 6)

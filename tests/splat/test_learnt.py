@@ -11,6 +11,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.density import DensityConfig
+from ambiguous_wild.splat.effects.base import hurried
 from ambiguous_wild.splat.effects.chain import Chain
 from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_leaves
 from ambiguous_wild.splat.field import Row
@@ -175,3 +176,13 @@ def test_names_are_told_apart(scene, tmp_path):
 
     with pytest.raises(AwError, match="'code' names two inputs"):
         trainer_for(scene, tmp_path, Twice()).step()
+
+
+@pytest.mark.parametrize(
+    ("length", "factor"), [(700, 10.0), (17_500, 2.0), (70_000, 1.0), (140_000, 1.0), (50, 10.0)]
+)
+def test_rates_rise_with_the_root_of_how_much_shorter_a_run_is(length, factor):
+    for iteration in (1, length // 2, length):
+        shot = Shot(iteration=iteration, nominal=iteration / length * 30_000, view=0, camera=camera())
+        assert hurried(0.002, 70_000, shot) == pytest.approx(0.002 * factor)
+    assert hurried(0.002, 70_000, Shot(iteration=1, nominal=0.0, view=0, camera=camera())) == 0.002

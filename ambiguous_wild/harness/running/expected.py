@@ -16,9 +16,14 @@ def unfinished(cells: Sequence[Cell], output: Path, overwrite: Overwrite) -> lis
     return [
         cell
         for cell in cells
-        if cell.method.program is None
-        and (overwrite == "always" or not is_finished(cell_folder(output, cell)))
+        if cell.method.program is None and not _kept(cell_folder(output, cell), overwrite)
     ]
+
+
+def _kept(folder: Path, overwrite: Overwrite) -> bool:
+    if overwrite == "never":
+        return folder.exists()
+    return overwrite == "missing" and is_finished(folder)
 
 
 def expected_line(cells: Sequence[Cell]) -> str:

@@ -14,11 +14,14 @@ def try_recipes(cells: Sequence[Cell]) -> None:
     Raises:
         AwError: an option or the weights that a recipe refuses. Other errors are a run's own.
     """
-    for cell in {(cell.method.name, repr(cell.options)): cell for cell in cells}.values():
+    from ambiguous_wild.splat.effects import with_effects
+
+    different = {(cell.method.name, repr(cell.options), cell.chosen.effects): cell for cell in cells}
+    for cell in different.values():
         try:
-            cell.method.build(cell.options)
-        except AwError:
-            raise
+            with_effects(cell.method.build(cell.options), cell.chosen.effects)
+        except AwError as error:
+            raise AwError(f"{cell.method.name}: {error}") from error
         except Exception:
             continue  # a plug-in's bug: its runs fail with their traceback, the others are trained
 

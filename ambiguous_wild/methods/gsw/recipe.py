@@ -4,9 +4,9 @@ Source: EastbeanZhang/Gaussian-Wild. Ours: a small U-Net without ImageNet's weig
 `side` px (published: ResNet-18 at full size); no LPIPS term (it needs VGG's weights); 0.5 is added to
 colours, for the renderer clamps at 0; positions in units of the scene, without a gradient of the net (the
 release's is unverified); boxes start at the photo's size (published: 512 px). A test photo shows the net
-its left half only (the release: all of it); a camera without a photo gets the mean of all photos' maps.
-Gaussians outside of what may be read get the mean of what they sample at their pixels in the train photos,
-which they always had in training: zeros instead cost 3.8 dB.
+its left half only (the release: all of it); a camera without a photo gets the mean of the train photos' maps.
+Gaussians outside of what may be read get the mean of what they sample at their pixels in the train photos
+whose pictures they lie in (at most 64 photos), as in training: zeros instead cost 3.8 dB on a courtyard.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from ambiguous_wild.splat.effects.placing import (
 )
 from ambiguous_wild.splat.field import Row
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.parts import MaskPolicy, Parts, Schedule
+from ambiguous_wild.splat.parts import MaskPolicy, Parts, Schedule, State
 from ambiguous_wild.splat.rendered import Cotangents
 from ambiguous_wild.splat.step import Shot, Step, TrainData
 
@@ -122,10 +122,8 @@ class GswAppearance(Learnt):
         maps = self._mean_maps(shot, leaf) if photo is None else maps_of(photo, leaf, self.config.side)
         places, box = visible.extra["gsw_places"], visible.extra["gsw_box"]
         free = [sample(maps[k], places[:, 2 * k : 2 * k + 2]) for k in range(FREE)]
-        camera = shot.camera
-        if shot.fitting:
-            camera = replace(camera, width=camera.width // 2)  # of what is read
-        own, inside = at_pixels(maps[FREE], means, camera, box)
+        width = shot.camera.width // 2 if shot.fitting else shot.camera.width  # of what is read
+        own, inside = at_pixels(maps[FREE], means, shot.camera, width, box)
         if shot.fitting or photo is None:
             usual = self._usual(shot, leaf, means, box)
             own = usual if photo is None else torch.where(inside[:, None], own, usual)
@@ -170,28 +168,37 @@ class GswAppearance(Learnt):
         """[M, 16] that Gaussians sample at their pixels, in the mean of the train photos that show them."""
         total, count = means.new_zeros(len(means), CHANNELS), means.new_zeros(len(means), 1)
         for k, maps in zip(self.chosen, self._maps(shot, leaf)):
-            own, inside = at_pixels(maps[FREE], means, self.cameras[k], box)
+            own, inside = at_pixels(maps[FREE], means, self.cameras[k], self.cameras[k].width, box)
             total, count = total + own * inside[:, None], count + inside[:, None].float()
         return total / count.clamp(min=1.0)
+
+    def step(self, own: Mapping[str, Tensor], shot: Shot, called_off: Tensor | None = None) -> None:
+        self._known = None
+        super().step(own, shot, called_off)
+
+    def load_state_dict(self, state: State) -> None:
+        self._known = None
+        super().load_state_dict(state)
 
     def learnable(self, shot: Shot) -> dict[str, Tensor]:
         """Copies of all leaves, for a graph of one's own."""
         return {name: value.requires_grad_() for name, value in self._leaf(shot).items()}
 
 
-def at_pixels(maps: Tensor, means: Tensor, camera: Camera, box: Tensor) -> tuple[Tensor, Tensor]:
+def at_pixels(maps: Tensor, means: Tensor, camera: Camera, width: int, box: Tensor) -> tuple[Tensor, Tensor]:
     """What Gaussians sample of a map [16, h, w] at their pixels in a camera.
 
     Args:
-        maps: of the photo that the camera took.
+        maps: of the photo that the camera took, or of its left part.
         means: [M, 3] world.
+        width: px, of what the maps are of.
         box: [M, 2] part of width and height that a Gaussian takes for the whole.
 
     Returns:
         [M, 16] samples, and [M] bool where the pixel is inside.
     """
     pixels, z = projected(means, camera)
-    at = torch.stack([pixels[:, 0] / camera.width, pixels[:, 1] / camera.height], dim=1) / box
+    at = torch.stack([pixels[:, 0] / width, pixels[:, 1] / camera.height], dim=1) / box
     inside = (z > 0) & (at > 0).all(dim=1) & (at < 1).all(dim=1)
     return sample(maps, 2.0 * at - 1.0), inside
 

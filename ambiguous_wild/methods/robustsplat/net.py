@@ -87,6 +87,7 @@ def adam_state(optimiser: torch.optim.Adam) -> list[dict[str, Any]]:
 
 def load_adam_state(optimiser: torch.optim.Adam, rows: list[dict[str, Any]]) -> None:
     """Restore what `adam_state` returned."""
+    optimiser.state.clear()  # what was saved before the first step is empty
     parameters = [p for group in optimiser.param_groups for p in group["params"]]
     fused = bool(optimiser.defaults["fused"])
     for parameter, row in zip(parameters, rows):

@@ -31,7 +31,7 @@ def _cached() -> bool:
 
 
 def warm_up(announce: Callable[[str], None] = lambda text: None) -> float:
-    """Run every kernel on eight Gaussians; returns the seconds it took.
+    """Run every kernel that all methods need on eight Gaussians; returns the seconds it took.
 
     Args:
         announce: told once, before, if the compiled kernels are not on disk yet.

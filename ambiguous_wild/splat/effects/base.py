@@ -187,8 +187,8 @@ def decayed(first: float, last: float, progress: float) -> float:
 def hurried(rate: float, made_for: int, shot: Shot) -> float:
     """A learning rate of Adam for a run of another length than the rate was published for.
 
-    Times the root of how many times shorter the run is; a longer run gets the rate itself. Adam's steps have
-    the size of the rate, and a random walk of them goes as far as the root of their number.
+    Times the root of how many times shorter the run is, at most 10; a longer run gets the rate itself. Adam's
+    steps have the size of the rate, and a random walk of them goes as far as the root of their number.
     """
     length = shot.iteration * NOMINAL_ITERATIONS / max(shot.nominal, 1e-9)  # of the run, in iterations
-    return rate * max(made_for / length, 1.0) ** 0.5
+    return rate * min(max(made_for / length, 1.0), 100.0) ** 0.5

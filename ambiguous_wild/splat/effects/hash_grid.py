@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from ambiguous_wild.splat import device
 
@@ -16,13 +17,21 @@ def hash_encoding(unit: Tensor, grid: Tensor, coarsest: int, finer: float) -> Te
     """[N, 2 L] of positions [N, 3] in [0, 1] from tables [L, T, 2]: trilinear, as Instant-NGP's.
 
     Level l has floor(coarsest finer^l) cells a side; a corner's entry is the exclusive or of its integer
-    coordinates times `PRIMES`, modulo T. On the CPU, in float32, positions get no gradient.
+    coordinates times `PRIMES`, modulo T. Positions outside of [0, 1] count as its ends, and learn nothing.
     """
+    unit = unit.detach().to(grid).clamp(0.0, 1.0)
     cells = [float(int(coarsest * finer**level)) for level in range(len(grid))]
     if device.accelerated(grid.device) or grid.dtype != torch.float32:
         return in_torch(unit, grid, cells)
-    found: Tensor = _Encoding.apply(unit.detach(), grid, torch.tensor(cells))
+    found: Tensor = _Encoding.apply(unit, grid, torch.tensor(cells))
     return found
+
+
+def prepare(place: torch.device) -> None:
+    """Compile the kernel if it is needed there and was not yet, so that no training time goes into it."""
+    grid = torch.zeros(1, 1, 2, device=place, requires_grad=True)
+    with torch.enable_grad():
+        torch.autograd.grad(hash_encoding(grid.new_zeros(1, 3), grid, 1, 1.0).sum(), grid)
 
 
 def in_torch(unit: Tensor, grid: Tensor, cells: list[float]) -> Tensor:
@@ -56,6 +65,7 @@ class _Encoding(torch.autograd.Function):
         return found
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *d_found: Tensor) -> tuple[None, Tensor, None]:
         from ambiguous_wild.splat.cpu.hash_grid import give_back
 

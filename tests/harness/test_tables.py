@@ -130,12 +130,13 @@ def test_a_mean_over_a_missing_scene_is_missing_and_said(tmp_path: Path) -> None
         fake_result("a", "one"),
         fake_result("a", "two"),
         fake_result("b", "one", psnr=(40.0,)),
+        fake_result("c", "one"),
     )
     assert cell(table, "b", "psnr").state == "missing"
     assert cell(table, "a", "psnr").rank is None  # alone: nothing to be first of
     assert cell(table, "b", "psnr", 2).state == "absent"
     assert cell(table, "b", "psnr", 1).rank == 1
-    assert "no result: b on two; its mean over scenes is missing" in table.notes
+    assert "no result: b, c on two; no mean over scenes" in table.notes
 
 
 def test_a_failed_seed_fails_its_cell(tmp_path: Path) -> None:

@@ -45,12 +45,15 @@ def _failed(runs: Runs) -> list[str]:
 
 def _absent(runs: Runs, methods: Sequence[str], scenes: Sequence[str]) -> list[str]:
     done = set(zip(runs.runs["method"], runs.runs["scene"]))
-    lines = []
+    # methods that lack the same scenes share a line
+    lacking: dict[tuple[str, ...], list[str]] = {}
     for method in methods:
-        gone = [scene for scene in scenes if (method, scene) not in done]
-        if gone:
-            lines.append(f"no result: {method} on {shortlist(gone)}; its mean over scenes is missing")
-    return lines
+        if gone := tuple(scene for scene in scenes if (method, scene) not in done):
+            lacking.setdefault(gone, []).append(method)
+    return [
+        f"no result: {', '.join(names)} on {shortlist(gone)}; no mean over scenes"
+        for gone, names in lacking.items()
+    ]
 
 
 def _not_ranked(runs: Runs) -> list[str]:

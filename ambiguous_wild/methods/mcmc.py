@@ -17,7 +17,7 @@ from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.rendered import Gradients
-from ambiguous_wild.splat.step import Step, TrainData
+from ambiguous_wild.splat.step import Step
 
 
 @dataclass(frozen=True)
@@ -39,11 +39,12 @@ class McmcConfig(DensityConfig):
 def build(options: McmcConfig) -> Parts:
     """A start and a density control of its own; the rest of the loop is 3DGS."""
 
-    def start(data: TrainData) -> Gaussians:
-        g = Parts(start_opacity=options.start_opacity).first_gaussians(data)
+    def start(g: Gaussians) -> Gaussians:
         return replace(g, log_scales=g.log_scales + math.log(options.start_scale))
 
-    return Parts(density=McmcDensity, density_config=options, start=start)
+    return Parts(
+        density=McmcDensity, density_config=options, start=start, start_opacity=options.start_opacity
+    )
 
 
 def divided(opacity: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:

@@ -22,6 +22,10 @@ from ambiguous_wild.splat.render import BLUR
 from ambiguous_wild.splat.rendered import Cotangents, Gradients
 from ambiguous_wild.splat.step import Step, TrainData
 
+# of the Gaussians that a run may have; `more_points` fill the start up to it. With more, growth has no room:
+# 20.1 dB instead of 21.2 in a yard of 16 photos
+START_SHARE = 2 / 3
+
 State = dict[str, Any]  # nested dicts of tensors and plain values, see checkpoint.py
 
 
@@ -121,23 +125,32 @@ class Parts:
     antialias: bool = False
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     start_opacity: float = 0.1
-    # the first Gaussians; None = one at every point of the sparse model
-    start: Callable[[TrainData], Gaussians] | None = None
+    # changes the first Gaussians, one at every point of the sparse model and of `more_points`
+    start: Callable[[Gaussians], Gaussians] | None = None
+    # (data, how many at most): xyz [M, 3] and rgb [M, 3] uint8 of further points to start from
+    more_points: Callable[[TrainData, int], tuple[np.ndarray, np.ndarray]] | None = None
     blur: float = BLUR  # px^2 added to both variances of a splat
     fields: Fields | None = None  # other fields beside the static one, see fields.py
     # trains on something else than the capture's photos (references on clean ones); None = the capture
     train_data: Callable[[TrainData], TrainData] | None = None
     effects: tuple[Effect, ...] = ()  # optional ones, see effects/; none = that code is never reached
 
-    def first_gaussians(self, data: TrainData) -> Gaussians:
+    def first_gaussians(self, data: TrainData, most: int | None = None) -> Gaussians:
         """What training starts from.
+
+        Args:
+            data: with the sparse model.
+            most: Gaussians that the run may have; None = the density control's own limit.
 
         Raises:
             AwError: fewer than 4 points.
         """
-        if self.start is not None:
-            return self.start(data)
-        points = data.scene.points
-        return Gaussians.from_points(
-            points.xyz, points.rgb, sh_degree=self.sh_degree, opacity=self.start_opacity, device=data.device
+        xyz, rgb = data.scene.points.xyz, data.scene.points.rgb
+        room = int(START_SHARE * (most or self.density_config.max_gaussians)) - len(xyz)
+        if self.more_points is not None and room > 0:
+            more = self.more_points(data, room)
+            xyz, rgb = np.concatenate([xyz, more[0]]), np.concatenate([rgb, more[1]])
+        found = Gaussians.from_points(
+            xyz, rgb, sh_degree=self.sh_degree, opacity=self.start_opacity, device=data.device
         )
+        return found if self.start is None else self.start(found)

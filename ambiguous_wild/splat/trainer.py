@@ -60,7 +60,7 @@ class Trainer(Run):
         on = device.accelerated(data.device)
         self.sentinel = Sentinel(data.device, len(data.photos)) if on else None
         check_needs(parts.density.needs, accelerated=on)
-        gaussians = parts.first_gaussians(data)
+        gaussians = parts.first_gaussians(data, config.max_gaussians)
         start, most = len(gaussians), parts.density_config.max_gaussians
         self.pace = Pace(config, parts.schedule, data, start=start, most=most)
         if on:

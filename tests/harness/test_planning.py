@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import AwError, Camera, Points, Scene, View
+from ambiguous_wild.harness.planning import decide as decide_module
 from ambiguous_wild.harness.planning import probe
-from ambiguous_wild.harness.planning.decide import Plan, decide, plan_without_training
+from ambiguous_wild.harness.planning.decide import FEW_PHOTOS, Plan, decide, plan_without_training
 from ambiguous_wild.harness.planning.evidence import measure
 from ambiguous_wild.harness.planning.file import read_plan
 from ambiguous_wild.harness.planning.probe import Occlusion, summarise, unexplained, with_occlusion
@@ -72,9 +73,13 @@ def synthetic(*, exposure=0.0, place=0.0, zoom=1.0, noise_px=0.0, shine=0.0, see
     return Scene(None, "dots", tuple(views), points), photos
 
 
+def measured(**kw):
+    """As of a capture of many photos; there are few, to be quick."""
+    return dataclasses.replace(measure(*synthetic(**kw)), photos=FEW_PHOTOS + 1)
+
+
 def decisions(**kw):
-    scene, photos = synthetic(**kw)
-    return {d.effect: d for d in decide("dots", measure(scene, photos)).decisions}
+    return {d.effect: d for d in decide("dots", measured(**kw)).decisions}
 
 
 INJECTED = {
@@ -89,7 +94,7 @@ INJECTED = {
 @pytest.mark.parametrize("seed", [0, 1])
 def test_nothing_is_called_for_where_nothing_was_put_in(seed):
     found = decisions(seed=seed)
-    assert {name: d.decision for name, d in found.items()} == dict.fromkeys(INJECTED, "off")
+    assert {name: d.decision for name, d in found.items()} == dict.fromkeys([*INJECTED, "dense start"], "off")
 
 
 @pytest.mark.parametrize("effect", INJECTED)
@@ -99,6 +104,17 @@ def test_what_was_put_in_is_called_for_and_nothing_else(effect):
     assert answers[effect] == "on"
     # a colour that follows the direction or the place leaves its mark on what is read as the other
     assert others <= {"SH degree"} if effect in ("appearance embedding", "pose refinement") else not others
+
+
+@pytest.mark.parametrize(("photos", "answer"), [(0, "unknown"), (9, "on"), (24, "on"), (25, "off")])
+def test_few_photos_call_for_a_dense_start(photos, answer):
+    plan = decide("dots", dataclasses.replace(measured(), photos=photos))
+    assert [d.decision for d in plan.decisions if d.effect == "dense start"] == [answer]
+    assert plan.effects() == (("dense",) if answer == "on" else ())
+    assert (
+        choose("default", synthetic()[0], [get_method("refinesplat")], plan)["refinesplat"].effects
+        == plan.effects()
+    )
 
 
 def test_the_numbers_are_what_was_put_in():
@@ -112,12 +128,13 @@ def test_a_scene_without_tracks_reads_no_photo_and_says_unknown(tmp_path):
     scene, _ = synthetic()
     empty = dataclasses.replace(scene.points, track_views=np.full_like(scene.points.track_views, -1))
     plan = plan_without_training(dataclasses.replace(scene, points=empty))
-    assert {d.decision for d in plan.decisions} == {"unknown"}
-    assert plan.effects() == ()
+    # photos can be counted
+    assert {d.decision for d in plan.decisions if d.effect != "dense start"} == {"unknown"}
+    assert plan.effects() == ("dense",)
 
 
 def test_a_plan_survives_its_file(tmp_path):
-    plan = with_occlusion(decide("dots", measure(*synthetic(zoom=3.0))), Occlusion(0.1, 0.02, 0.3))
+    plan = with_occlusion(decide("dots", measured(zoom=3.0)), Occlusion(0.1, 0.02, 0.3))
     plan = plan.with_costs({"antialias": 0.5})
     write_json(tmp_path / "plan.json", plan.plain())
     again = read_plan(tmp_path / "plan.json")
@@ -186,8 +203,8 @@ def test_words_and_lists():
 
 
 def test_a_baseline_stays_what_its_paper_defines_unless_asked():
-    scene, photos = synthetic(zoom=3.0, exposure=0.15)
-    plan = decide("dots", measure(scene, photos))
+    scene, _ = synthetic()
+    plan = decide("dots", measured(zoom=3.0, exposure=0.15))
     methods = [get_method(name) for name in ("3dgs", "refinesplat", "refinesplat@mask=truth")]
     by_default = choose("default", scene, methods, plan)
     assert by_default["3dgs"].effects == by_default["refinesplat@mask=truth"].effects == ()
@@ -207,7 +224,8 @@ def tiny(tmp_path_factory):
 SHORT = TrainConfig(iterations=40, probes=0)
 
 
-def test_a_scene_that_calls_for_nothing_keeps_the_identity_of_its_runs(tiny):
+def test_a_scene_that_calls_for_nothing_keeps_the_identity_of_its_runs(tiny, monkeypatch):
+    monkeypatch.setattr(decide_module, "FEW_PHOTOS", 0)
     (none,) = plan_cells(["refinesplat"], [tiny], [0], SHORT)
     (default,) = plan_cells(["refinesplat"], [tiny], [0], SHORT, effects="default")
     (listed,) = plan_cells(["refinesplat"], [tiny], [0], SHORT, effects="poses")
@@ -216,13 +234,13 @@ def test_a_scene_that_calls_for_nothing_keeps_the_identity_of_its_runs(tiny):
 
 
 def test_a_run_says_what_was_on_and_why_and_ships_the_filtered_model(tiny, tmp_path):
-    plan = Plan("scene", decide("scene", measure(*synthetic(zoom=3.0))).decisions)
+    plan = Plan("scene", decide("scene", measured(zoom=3.0)).decisions)
     cells = plan_cells(["3dgs"], [tiny], [0], SHORT, effects="auto", plan=plan, protocol="half")
     (report,) = run_cells(cells, tmp_path, pictures=False)
     assert report.outcome == "trained", report.error
     said = json.loads((cell_folder(tmp_path, cells[0]) / "effects.json").read_text())
     assert said["asked"] == "auto" and said["effects"] == ["antialias"]
-    assert {d["effect"] for d in said["plan"]["decisions"]} == set(INJECTED)
+    assert {d["effect"] for d in said["plan"]["decisions"]} == {*INJECTED, "dense start"}
     facts = report.result["facts"]
     assert facts["effects"] == ["antialias"] and facts["protocol"] == "half"
     assert facts["effect_facts"]["antialias"]["filter_size_median"] > 0

@@ -9,7 +9,7 @@ import torch
 from ambiguous_wild.core import AwError, Points, Scene, View
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.data import load_train_data
-from ambiguous_wild.splat.effects import ALL, EFFECTS, check_effects, with_effects
+from ambiguous_wild.splat.effects import ALL, EFFECTS, check_effects, dense, with_effects
 from ambiguous_wild.splat.effects.appearance import AppearanceEmbedding
 from ambiguous_wild.splat.effects.base import Effect, RowAdam
 from ambiguous_wild.splat.effects.chain import Chain
@@ -114,10 +114,29 @@ def test_names():
     assert set(ALL) < set(EFFECTS)
 
 
+def test_a_dense_start_leaves_room_to_grow(scene, tmp_path, monkeypatch):
+    asked = []
+
+    def points(cameras, photos, sparse, tracks, keep, most):
+        asked.append(most)
+        rng = np.random.default_rng(0)
+        return rng.normal(4.0, 1.0, (most, 3)), np.full((most, 3), 200, np.uint8)
+
+    monkeypatch.setattr(dense, "dense_points", points)
+    sparse = len(scene.points)
+    plain = trainer_for(scene, tmp_path / "plain")
+    first = trainer_for(scene, tmp_path / "first", ("dense",), max_gaussians=3 * sparse)
+    assert len(plain.gaussians.means) == sparse and len(first.gaussians.means) == 2 * sparse
+    assert torch.equal(first.gaussians.means[:sparse], plain.gaussians.means)
+    assert first.effects is not None and first.effects.facts() == {"dense": {"points": sparse}}
+    full = trainer_for(scene, tmp_path / "full", ("dense",), max_gaussians=sparse)
+    assert len(full.gaussians.means) == sparse and asked == [sparse]  # no room
+
+
 # -- state ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("names", [*((name,) for name in ALL), ALL, ("sh1",)], ids="+".join)
+@pytest.mark.parametrize("names", [*((name,) for name in ALL), ALL, ("sh1",), ("dense",)], ids="+".join)
 def test_a_resumed_run_equals_an_undisturbed_one(scene, tmp_path, names):
     whole = trainer_for(scene, tmp_path / "whole", names, iterations=140)
     whole.train()

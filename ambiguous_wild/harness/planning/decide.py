@@ -23,6 +23,7 @@ OF_SHINE = 1.7
 SAMPLING = 1.5
 VIEW_DEPENDENCE = 0.015
 REPROJECTION_PX = 1.0
+FEW_PHOTOS = 24  # captures of 9 to 20 photos gained by a dense start, those of 30 did not (docs/effects.md)
 
 
 @dataclass(frozen=True)
@@ -157,10 +158,20 @@ def decide(scene: str, found: Evidence) -> Plan:
             "poses are off by more than the photos can hide" if moved == "on" else "poses fit the photos",
             "--effects poses",
         ),
+        _dense_start(found.photos),
     )  # fmt: skip
     missing = f"cannot be told from {seen}"
     lines = tuple(replace(d, why=missing) if d.decision == "unknown" else d for d in lines)
     return Plan(scene, lines)
+
+
+def _dense_start(photos: int) -> Decision:
+    few = 0 < photos <= FEW_PHOTOS
+    return Decision(
+        "dense start", "train photos; on up to the limit", photos or math.nan, FEW_PHOTOS,
+        "photos", "on" if few else "off" if photos else "unknown",
+        "photos leave much to guess" if few else "enough photos see a surface", "--effects dense",
+    )  # fmt: skip
 
 
 def plan_without_training(scene: Scene) -> Plan:
@@ -169,7 +180,7 @@ def plan_without_training(scene: Scene) -> Plan:
     Raises:
         AwError: a photo cannot be read.
     """
-    nothing = Evidence(*(math.nan,) * 5, observations=0)
+    nothing = Evidence(*(math.nan,) * 5, observations=0, photos=len(scene.train))
     if not has_tracks(scene):
         return decide(scene.name, nothing)
     from ambiguous_wild.io.images import load_image_float

@@ -28,6 +28,7 @@ class Evidence:
     view_dependence: float  # median amplitude of what follows the direction, code values in [0, 1]
     reprojection_px: float  # median of points in the train photos, px of the loaded images
     observations: int  # in train photos, usable for colour
+    photos: int = 0  # that train; 0 = not counted
 
 
 def measure(scene: Scene, photos: Sequence[np.ndarray]) -> Evidence:
@@ -49,6 +50,7 @@ def measure(scene: Scene, photos: Sequence[np.ndarray]) -> Evidence:
         view_dependence=view_dependence(in_codes),
         reprojection_px=reprojection(scene),
         observations=len(colours.point),
+        photos=len(scene.train),
     )
 
 

@@ -1,0 +1,51 @@
+"""A dense start: Gaussians at points of plane sweeps too, not only at those of structure from motion.
+
+Where photos overlap little, 3DGS's growth puts Gaussians where they explain one photo, often close to its
+camera. Points on which several photos agree leave less to be guessed. The idea is that of EDGS (Kotovenko et
+al., 2025); we use plane sweeps instead of a matching network.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ambiguous_wild.splat.effects.base import Effect
+from ambiguous_wild.splat.plane_sweep import dense_points
+from ambiguous_wild.splat.step import TrainData
+
+if TYPE_CHECKING:
+    from ambiguous_wild.splat.parts import Parts
+
+
+class DenseStart(Effect):
+    """Acts on the first Gaussians alone."""
+
+    name = "dense"
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    def change_parts(self, parts: Parts) -> Parts:
+        return replace(parts, more_points=self.points)
+
+    def points(self, data: TrainData, most: int) -> tuple[np.ndarray, np.ndarray]:
+        """xyz [M, 3] and rgb [M, 3] uint8 of at most so many points."""
+        photos = [photo.cpu().numpy() for photo in data.photos]
+        keep = [None if k is None else k.cpu().numpy() for k in data.user_keep]
+        xyz, rgb = dense_points(data.cameras, photos, data.scene.points.xyz, tracks_of(data), keep, most)
+        self.count = len(xyz)
+        return xyz, rgb
+
+    def facts(self) -> dict[str, Any]:
+        return {"points": self.count}
+
+
+def tracks_of(data: TrainData) -> list[np.ndarray]:
+    """Of each train photo the indices of the points that were found in it, sorted."""
+    points = data.scene.points
+    owner = np.repeat(np.arange(len(points)), np.diff(points.track_offsets))
+    train = [index for index, view in enumerate(data.scene.views) if view.split == "train"]
+    return [np.unique(owner[points.track_views == index]) for index in train]

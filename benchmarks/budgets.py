@@ -43,9 +43,11 @@ def folder_of(out: Path, scene: Path, factor: int | None, method: str, budget: s
     return out / f"{size}px-{budget}" / load_scene(scene, factor=factor).name / method / f"seed{seed}"
 
 
-def load_now() -> float:
-    """Load of the machine, once our own last run no longer counts much."""
-    time.sleep(20 if os.getloadavg()[0] > QUIET else 0)
+def load_now(patience_s: float = 150.0) -> float:
+    """Load of the machine, once our own last run no longer counts: it falls by a factor of e a minute."""
+    end = time.monotonic() + patience_s
+    while os.getloadavg()[0] > QUIET and time.monotonic() < end:
+        time.sleep(5)
     return round(os.getloadavg()[0], 2)
 
 

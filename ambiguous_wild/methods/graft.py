@@ -154,7 +154,9 @@ def build(name: str, entries: Mapping[str, MethodEntry], options: Any) -> Parts:
     if "density" in entries:
         density = parts_of("density")
         changed |= {"density": density.density, "density_config": density.density_config}
-        if density.start is not None:  # MCMC's fixed number starts from Gaussians of its own
+        # MCMC's fixed number starts from Gaussians of its own
+        changed["start_opacity"] = density.start_opacity
+        if density.start is not None:
             changed["start"] = density.start
     if "effects" not in entries:
         _warn_of_effects(name, host, [(donor, parts) for donor, _, parts in built])

@@ -135,18 +135,18 @@ class Parts:
     train_data: Callable[[TrainData], TrainData] | None = None
     effects: tuple[Effect, ...] = ()  # optional ones, see effects/; none = that code is never reached
 
-    def first_gaussians(self, data: TrainData, most: int | None = None) -> Gaussians:
+    def first_gaussians(self, data: TrainData, most: int = 0) -> Gaussians:
         """What training starts from.
 
         Args:
             data: with the sparse model.
-            most: Gaussians that the run may have; None = the density control's own limit.
+            most: Gaussians that the run may have; 0 = no `more_points`.
 
         Raises:
             AwError: fewer than 4 points.
         """
         xyz, rgb = data.scene.points.xyz, data.scene.points.rgb
-        room = int(START_SHARE * (most or self.density_config.max_gaussians)) - len(xyz)
+        room = int(START_SHARE * most) - len(xyz)
         if self.more_points is not None and room > 0:
             more = self.more_points(data, room)
             xyz, rgb = np.concatenate([xyz, more[0]]), np.concatenate([rgb, more[1]])

@@ -9,7 +9,7 @@ depths agree. A distractor that moves has no depth on which two other photos agr
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -19,11 +19,9 @@ from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import check_limits
 
 _LEAST_POINTS = 10  # of the sparse model in a photo, for the range of its depths
-_ANGLE, _BELOW, _ABOVE = (
-    8.0,
-    4.0,
-    12.0,
-)  # degrees: best between two photos' rays, and its spread to both sides
+_MOST_POINTS = 5000  # that choose neighbours where there are no tracks
+# degrees between two photos' rays: the best, its spread below and above, and the least in the median
+_ANGLE, _BELOW, _ABOVE, _LEAST_ANGLE = 8.0, 4.0, 12.0, 1.0
 _NOISE = 1e-5  # variance of grey in [0, 1] that is no structure
 _PEAK = 3  # planes around the best one that belong to its peak
 
@@ -56,13 +54,14 @@ class _Photo:
     camera: Camera  # of the small photo
     rgb: np.ndarray  # [h, w, 3] float32
     grey: np.ndarray  # [h, w] float32
+    shown: np.ndarray  # the same, -1 where it is masked
     judged: np.ndarray  # [h, w] bool, static by the capture's own masks
     seen: np.ndarray  # indices of the sparse points it sees
 
 
 def dense_points(
     cameras: Sequence[Camera],
-    photos: Sequence[np.ndarray],
+    photo: Callable[[int], np.ndarray],
     sparse: np.ndarray,
     tracks: Sequence[np.ndarray],
     keep: Sequence[np.ndarray | None],
@@ -73,10 +72,10 @@ def dense_points(
 
     Args:
         cameras: of the photos.
-        photos: [H, W, 3] in [0, 1], sRGB.
+        photo: of a camera's index, [H, W, 3] in [0, 1], sRGB.
         sparse: [N, 3] points of the sparse model, which give the range of depths.
         tracks: of each photo, the indices of points that were found in it; may be empty.
-        keep: of each photo, [H, W] in [0, 1], below 0.5 = not used; None = all is used.
+        keep: of each photo, [H, W], 1 = used; None = all is used.
         most: points to return at most.
         config: settings.
 
@@ -85,12 +84,14 @@ def dense_points(
     """
     config = config or SweepConfig()
     count = len(cameras)
+    if most < 1 or not count:
+        return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     chosen = sorted({k * count // min(count, config.photos) for k in range(min(count, config.photos))})
-    small = [_small(cameras[k], photos[k], keep[k], sparse, tracks[k], config.side) for k in chosen]
+    small = [_small(cameras[k], photo(k), keep[k], sparse, tracks[k], config.side) for k in chosen]
     near = [_neighbours(small, k, sparse, 2 * config.views) for k in range(len(small))]
     depths = [
-        _depth(photo, [small[j] for j in near[k][: config.views]], sparse, config)
-        for k, photo in enumerate(small)
+        _depth(own, [small[j] for j in near[k][: config.views]], sparse, config)
+        for k, own in enumerate(small)
     ]
     found = [
         _agreeing(small[k], depths[k], [(small[j], depths[j]) for j in near[k]], config)
@@ -112,20 +113,24 @@ def _small(
     shrunk = camera.resized(*size)
     seen = np.asarray(track, np.int64)
     if len(seen) < _LEAST_POINTS:  # a model without tracks: all points in the frame
-        pixels, z = _projected(shrunk, xyz)
-        seen = np.flatnonzero(_inside(pixels, z, rgb.shape[:2]))
-    return _Photo(shrunk, rgb, cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), judged, seen)
+        some = np.arange(0, len(xyz), max(-(-len(xyz) // _MOST_POINTS), 1))
+        pixels, z = _projected(shrunk, xyz[some])
+        seen = some[_inside(pixels, z, rgb.shape[:2])]
+    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    return _Photo(shrunk, rgb, grey, np.where(judged, grey, np.float32(-1.0)), judged, seen)
 
 
 def _neighbours(small: Sequence[_Photo], at: int, xyz: np.ndarray, most: int) -> list[int]:
     """The photos with most sparse points in common under good angles, the best first (as MVSNet chooses)."""
     own, scores = small[at], []
     for k, other in enumerate(small):
-        both = np.intersect1d(own.seen, other.seen) if k != at else own.seen[:0]
+        both = np.intersect1d(own.seen, other.seen, assume_unique=True) if k != at else own.seen[:0]
         if len(both):
             a, b = xyz[both] - own.camera.center, xyz[both] - other.camera.center
             cosine = (a * b).sum(axis=1) / np.linalg.norm(a, axis=1) / np.linalg.norm(b, axis=1)
             angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+            if not np.median(angle) >= _LEAST_ANGLE:  # from one place every depth looks the same
+                continue
             spread = np.where(angle < _ANGLE, _BELOW, _ABOVE)
             scores.append((-float(np.exp(-0.5 * ((angle - _ANGLE) / spread) ** 2).sum()), k))
     return [k for _, k in sorted(scores)[:most]]
@@ -136,10 +141,12 @@ def _depth(photo: _Photo, others: Sequence[_Photo], xyz: np.ndarray, config: Swe
     shape = photo.grey.shape
     z = _projected(photo.camera, xyz[photo.seen])[1]
     z = z[z > 0]
-    if len(z) < _LEAST_POINTS or not others:
+    if len(z) < _LEAST_POINTS or len(others) < 2:
         return np.zeros(shape, np.float32)
-    near, far = np.quantile(z, [0.01, 0.99])
-    inverse = np.linspace(1.0 / (1.5 * far), 1.0 / (0.8 * near), config.planes)
+    # a few wrong points must not spread the planes
+    near, middle, far = np.quantile(z, [0.05, 0.5, 0.95])
+    near, far = max(near, middle / 4.0), min(far, 20.0 * middle)
+    inverse = np.linspace(1.0 / (1.5 * far), 1.0 / (0.7 * near), config.planes)
     mean, variance = _moments(photo.grey, config.window)
     scores = np.empty((config.planes, *shape), np.float32)
     parts = [_plane_warp(photo.camera, other.camera) for other in others]
@@ -147,12 +154,11 @@ def _depth(photo: _Photo, others: Sequence[_Photo], xyz: np.ndarray, config: Swe
         first = np.full(shape, -1.0, np.float32)
         second = first.copy()
         for other, (turn, shift) in zip(others, parts):
-            score = _correlation(
-                photo.grey, mean, variance, other.grey, turn + nearness * shift, config.window
-            )
+            warp = turn + nearness * shift
+            score = _correlation(photo.grey, mean, variance, other.shown, warp, config.window)
             second = np.maximum(second, np.minimum(first, score))
             first = np.maximum(first, score)
-        scores[k] = first if len(others) == 1 else 0.5 * (first + second)
+        scores[k] = 0.5 * (first + second)
     best = scores.argmax(axis=0)
     inner = np.clip(best, 1, config.planes - 2)
     below, top, above = (np.take_along_axis(scores, (inner + d)[None], axis=0)[0] for d in (-1, 0, 1))
@@ -179,6 +185,10 @@ def _correlation(
     """ZNCC [h, w] of windows around each pixel and where `warp` takes them in `other`; -1 outside of it."""
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     drawn = cv2.warpPerspective(other, warp, grey.shape[::-1], flags=flags, borderValue=-1.0)
+    height, width = grey.shape
+    ends = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]]) @ warp[2]
+    if ends.min() <= 0:  # a part of the plane lies behind the other camera
+        return np.full(grey.shape, -1.0, np.float32)
     outside = drawn < 0
     drawn[outside] = 0.0
     their_mean, their_variance = _moments(drawn, window)
@@ -207,7 +217,7 @@ def _agreeing(
     for other, theirs in others:
         votes += _same_surface(other.camera, theirs, world, config.tolerance)
     found = np.zeros_like(depth)
-    sure = votes >= min(config.agreeing, len(others))
+    sure = votes >= config.agreeing
     found[rows[sure], columns[sure]] = depth[rows[sure], columns[sure]]
     return found
 

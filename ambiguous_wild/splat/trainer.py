@@ -60,9 +60,10 @@ class Trainer(Run):
         on = device.accelerated(data.device)
         self.sentinel = Sentinel(data.device, len(data.photos)) if on else None
         check_needs(parts.density.needs, accelerated=on)
-        gaussians = parts.first_gaussians(data, config.max_gaussians)
-        start, most = len(gaussians), parts.density_config.max_gaussians
-        self.pace = Pace(config, parts.schedule, data, start=start, most=most)
+        most = parts.density_config.max_gaussians
+        room = Pace(config, parts.schedule, data, start=0, most=most).most
+        gaussians = parts.first_gaussians(data, room)
+        self.pace = Pace(config, parts.schedule, data, start=len(gaussians), most=most)
         if on:
             from ambiguous_wild.splat.gpu import fused_loss
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from ambiguous_wild.methods.gsw import net as gsw_net
-from ambiguous_wild.methods.gsw.recipe import GswAppearance, GswConfig, Visibility, completed
+from ambiguous_wild.methods.gsw.recipe import GswAppearance, GswConfig, Visibility
 from ambiguous_wild.methods.masking_common import d_keep
 from ambiguous_wild.methods.splatfactow import SplatfactoDensity, trimmed
 from ambiguous_wild.splat.density import DensityConfig
@@ -202,15 +202,6 @@ def test_without_a_photo_a_gaussian_samples_what_it_does_in_the_photos_that_show
         visible, leaf, shot_of(data, view=None, fitting=True, photo=half_black(half.photo))
     )
     assert torch.equal(mixed, black)  # the right half is not read
-
-
-def test_what_is_not_read_of_a_photo_has_the_light_of_what_is():
-    own, usual = torch.rand(6, 16), torch.rand(6, 16)
-    inside = torch.tensor([True, True, False, False, True, False])
-    light = torch.linspace(-1, 1, 16)
-    found = completed(torch.where(inside[:, None], usual + light, own), inside, usual)
-    torch.testing.assert_close(found, usual + light)
-    assert torch.equal(completed(own, inside & False, usual), usual)  # nothing is read
 
 
 def half_black(photo):

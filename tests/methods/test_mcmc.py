@@ -137,6 +137,8 @@ def test_it_starts_opaque_and_small(scene, tmp_path):
     )
     assert torch.sigmoid(ours.opacity_logits).tolist() == pytest.approx([0.5] * len(ours))
     assert torch.allclose(ours.log_scales.exp(), 0.1 * plain.log_scales.exp())
+    grafted = parts_of("3dgs@density=mcmc").first_gaussians(data)
+    assert torch.sigmoid(grafted.opacity_logits).tolist() == pytest.approx([0.5] * len(ours))
 
 
 def test_it_trains_to_its_ceiling_and_resumes_to_the_same_bits(scene, tmp_path):

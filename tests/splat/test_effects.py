@@ -18,7 +18,7 @@ from ambiguous_wild.splat.effects.poses import PoseRefinement, moved
 from ambiguous_wild.splat.effects.smoothing import SmoothingFilter, filter_sizes
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.pace import TrainConfig
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.parts import START_SHARE, Parts
 from ambiguous_wild.splat.reference import render_reference
 from ambiguous_wild.splat.rendered import Cotangents, Frame, Gradients
 from ambiguous_wild.splat.step import Shot, TrainData
@@ -117,7 +117,7 @@ def test_names():
 def test_a_dense_start_leaves_room_to_grow(scene, tmp_path, monkeypatch):
     asked = []
 
-    def points(cameras, photos, sparse, tracks, keep, most):
+    def points(cameras, photo, sparse, tracks, keep, most):
         asked.append(most)
         rng = np.random.default_rng(0)
         return rng.normal(4.0, 1.0, (most, 3)), np.full((most, 3), 200, np.uint8)
@@ -129,8 +129,13 @@ def test_a_dense_start_leaves_room_to_grow(scene, tmp_path, monkeypatch):
     assert len(plain.gaussians.means) == sparse and len(first.gaussians.means) == 2 * sparse
     assert torch.equal(first.gaussians.means[:sparse], plain.gaussians.means)
     assert first.effects is not None and first.effects.facts() == {"dense": {"points": sparse}}
+    # without a limit, the photos' pixels set it in a short run
+    pixels = float(np.median([p.shape[0] * p.shape[1] for p in plain.data.photos]))
+    free = trainer_for(scene, tmp_path / "free", ("dense",))
+    assert len(free.gaussians.means) <= START_SHARE * Parts().schedule.per_pixel_short * pixels
+    assert free.pace.most == plain.pace.most
     full = trainer_for(scene, tmp_path / "full", ("dense",), max_gaussians=sparse)
-    assert len(full.gaussians.means) == sparse and asked == [sparse]  # no room
+    assert len(full.gaussians.means) == sparse and len(asked) == 2  # no room
 
 
 # -- state ----------------------------------------------------------------------------------------

@@ -54,13 +54,13 @@ def sparse() -> np.ndarray:
 VIEWS = [camera(x, y) for x, y in ((0, 0), (0.5, 0), (-0.5, 0), (0, 0.5), (0.5, 0.5), (-0.5, -0.5))]
 
 
-def found(photos=None, keep=None, most=5000, **options):
+def found(photos=None, keep=None, most=5000, points=None, **options):
+    points = sparse() if points is None else points
     photos = photos if photos is not None else [photo(v) for v in VIEWS]
-    tracks = [np.arange(60)] * len(photos)
+    tracks = [np.arange(len(points))] * len(photos)
     keep = keep or [None] * len(photos)
-    return dense_points(
-        VIEWS[: len(photos)], photos, sparse(), tracks, keep, most, SweepConfig(agreeing=2, **options)
-    )
+    views = VIEWS[: len(photos)]
+    return dense_points(views, photos.__getitem__, points, tracks, keep, most, SweepConfig(**options))
 
 
 def off_surface(xyz: np.ndarray) -> np.ndarray:
@@ -119,17 +119,44 @@ def test_nothing_where_nothing_agrees():
     assert len(found(noise)[0]) < 5
     flat = [np.full((H, W, 3), 0.5, np.float32) for _ in VIEWS]
     assert len(found(flat)[0]) == 0
-    assert len(found([photo(VIEWS[0])])[0]) == 0  # one photo agrees with nobody
+
+
+@pytest.mark.parametrize(("photos", "some"), [(1, False), (2, False), (3, True)])
+def test_three_photos_must_agree(photos, some):
+    xyz, _ = found([photo(v) for v in VIEWS[:photos]])
+    assert (len(xyz) > 100) == some
+
+
+def test_photos_from_one_place_are_one_witness():
+    twice = [VIEWS[0], VIEWS[0], VIEWS[1], VIEWS[1]]
+    photos = [photo(v) for v in twice]
+    xyz, _ = dense_points(twice, photos.__getitem__, sparse(), [np.arange(60)] * 4, [None] * 4, 5000)
+    lonely, _ = dense_points(
+        [VIEWS[0]] * 3, (lambda view: photos[0]), sparse(), [np.arange(60)] * 3, [None] * 3, 5000
+    )
+    assert len(lonely) == 0 and np.mean(off_surface(xyz) < 0.02) > 0.95
+
+
+def test_a_few_wrong_points_change_little():
+    near = np.random.default_rng(0).normal(0, 0.02, (2, 3)) + np.array([0, 0, 0.1])
+    points = np.concatenate([sparse(), near])
+    plain, changed = found()[0], found(points=points)[0]
+    assert len(changed) > 0.8 * len(plain) and np.mean(off_surface(changed) < 0.02) > 0.95
+
+
+def test_no_points_asked_for_or_no_photos():
+    assert len(found(most=0)[0]) == 0
+    assert len(dense_points([], [].__getitem__, sparse(), [], [], 10)[0]) == 0
 
 
 def test_a_model_without_tracks_and_photos_of_other_sizes():
     photos = [photo(v) for v in VIEWS]
     none = [np.zeros(0, np.int64)] * len(photos)
-    xyz, _ = dense_points(VIEWS, photos, sparse(), none, [None] * len(photos), 5000)
+    xyz, _ = dense_points(VIEWS, photos.__getitem__, sparse(), none, [None] * len(photos), 5000)
     assert len(xyz) > 300 and np.mean(off_surface(xyz) < 0.02) > 0.97
     cameras = [v.resized(2 * W, 2 * H) if k % 2 else v for k, v in enumerate(VIEWS)]
     photos = [cv2.resize(p, (2 * W, 2 * H)) if k % 2 else p for k, p in enumerate(photos)]
-    xyz, _ = dense_points(cameras, photos, sparse(), none, [None] * len(photos), 5000)
+    xyz, _ = dense_points(cameras, photos.__getitem__, sparse(), none, [None] * len(photos), 5000)
     assert len(xyz) > 300 and np.mean(off_surface(xyz) < 0.025) > 0.9
 
 

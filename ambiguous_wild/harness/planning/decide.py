@@ -23,7 +23,8 @@ OF_SHINE = 1.7
 SAMPLING = 1.5
 VIEW_DEPENDENCE = 0.015
 REPROJECTION_PX = 1.0
-FEW_PHOTOS = 24  # captures of 9 to 20 photos gained by a dense start, those of 30 did not (docs/effects.md)
+# captures of 9 to 20 photos gained SSIM by a dense start, those of 30 did not (docs/effects.md)
+LEAST_PHOTOS, FEW_PHOTOS = 3, 24
 
 
 @dataclass(frozen=True)
@@ -158,18 +159,19 @@ def decide(scene: str, found: Evidence) -> Plan:
             "poses are off by more than the photos can hide" if moved == "on" else "poses fit the photos",
             "--effects poses",
         ),
-        _dense_start(found.photos),
+        _dense_start(found.photos, tracks=not math.isnan(found.exposure)),
     )  # fmt: skip
     missing = f"cannot be told from {seen}"
     lines = tuple(replace(d, why=missing) if d.decision == "unknown" else d for d in lines)
     return Plan(scene, lines)
 
 
-def _dense_start(photos: int) -> Decision:
-    few = 0 < photos <= FEW_PHOTOS
+def _dense_start(photos: int, tracks: bool) -> Decision:
+    """On for few photos whose exposures are known: where they differ unnoticed, test PSNR fell."""
+    few, known = photos <= FEW_PHOTOS, tracks and photos >= LEAST_PHOTOS
     return Decision(
         "dense start", "train photos; on up to the limit", photos or math.nan, FEW_PHOTOS,
-        "photos", "on" if few else "off" if photos else "unknown",
+        "photos", "unknown" if not known else "on" if few else "off",
         "photos leave much to guess" if few else "enough photos see a surface", "--effects dense",
     )  # fmt: skip
 

@@ -126,7 +126,7 @@ class GswAppearance(Learnt):
         own, inside = at_pixels(maps[FREE], means, shot.camera, width, box)
         if shot.fitting or photo is None:
             usual = self._usual(shot, leaf, means, box)
-            own = usual if photo is None else completed(own, inside, usual)
+            own = usual if photo is None else torch.where(inside[:, None], own, usual)
         else:
             own = own * inside[:, None]
         dynamic = torch.cat([*free, own], dim=1)
@@ -201,20 +201,6 @@ def at_pixels(maps: Tensor, means: Tensor, camera: Camera, width: int, box: Tens
     at = torch.stack([pixels[:, 0] / width, pixels[:, 1] / camera.height], dim=1) / box
     inside = (z > 0) & (at > 0).all(dim=1) & (at < 1).all(dim=1)
     return sample(maps, 2.0 * at - 1.0), inside
-
-
-def completed(own: Tensor, inside: Tensor, usual: Tensor) -> Tensor:
-    """Samples [M, 16] of all Gaussians from those that could be read.
-
-    Args:
-        own: [M, 16] samples of the photo.
-        inside: [M] bool, where they count.
-        usual: [M, 16] mean samples of the train photos; moved by their mean difference from `own` where both
-            are known, so that the light of the part that is read is the light of the rest too.
-    """
-    read = inside[:, None].to(own.dtype)
-    moved = ((own - usual) * read).sum(dim=0) / read.sum().clamp(min=1.0)
-    return torch.where(inside[:, None], own, usual + moved)
 
 
 class Visibility(MaskPolicy):

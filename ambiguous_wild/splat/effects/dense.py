@@ -33,9 +33,12 @@ class DenseStart(Effect):
 
     def points(self, data: TrainData, most: int) -> tuple[np.ndarray, np.ndarray]:
         """xyz [M, 3] and rgb [M, 3] uint8 of at most so many points."""
-        photos = [photo.cpu().numpy() for photo in data.photos]
+
+        def photo(view: int) -> np.ndarray:  # one at a time: they may lie on a GPU
+            return data.photos[view].cpu().numpy()
+
         keep = [None if k is None else k.cpu().numpy() for k in data.user_keep]
-        xyz, rgb = dense_points(data.cameras, photos, data.scene.points.xyz, tracks_of(data), keep, most)
+        xyz, rgb = dense_points(data.cameras, photo, data.scene.points.xyz, tracks_of(data), keep, most)
         self.count = len(xyz)
         return xyz, rgb
 

@@ -144,9 +144,9 @@ def _depth(photo: _Photo, others: Sequence[_Photo], xyz: np.ndarray, config: Swe
     if len(z) < _LEAST_POINTS or len(others) < 2:
         return np.zeros(shape, np.float32)
     # a few wrong points must not spread the planes
-    near, middle, far = np.quantile(z, [0.05, 0.5, 0.95])
+    near, middle, far = np.quantile(z, [0.02, 0.5, 0.98])
     near, far = max(near, middle / 4.0), min(far, 20.0 * middle)
-    inverse = np.linspace(1.0 / (1.5 * far), 1.0 / (0.7 * near), config.planes)
+    inverse = np.linspace(1.0 / (1.5 * far), 1.0 / (0.8 * near), config.planes)
     mean, variance = _moments(photo.grey, config.window)
     scores = np.empty((config.planes, *shape), np.float32)
     parts = [_plane_warp(photo.camera, other.camera) for other in others]

@@ -155,7 +155,7 @@ def build(name: str, entries: Mapping[str, MethodEntry], options: Any) -> Parts:
         density = parts_of("density")
         changed |= {"density": density.density, "density_config": density.density_config}
         # MCMC's fixed number starts from Gaussians of its own
-        changed["start_opacity"] = density.start_opacity
+        changed |= {"start_opacity": density.start_opacity, "start_scale": density.start_scale}
         if density.start is not None:
             changed["start"] = density.start
     if "effects" not in entries:

@@ -4,7 +4,6 @@ Source: the released code, ubc-vision/3dgs-mcmc. `min_every` and `start_scale` a
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -38,13 +37,10 @@ class McmcConfig(DensityConfig):
 
 def build(options: McmcConfig) -> Parts:
     """A start and a density control of its own; the rest of the loop is 3DGS."""
-
-    def start(g: Gaussians) -> Gaussians:
-        return replace(g, log_scales=g.log_scales + math.log(options.start_scale))
-
     return Parts(
-        density=McmcDensity, density_config=options, start=start, start_opacity=options.start_opacity
-    )
+        density=McmcDensity, density_config=options,
+        start_opacity=options.start_opacity, start_scale=options.start_scale,
+    )  # fmt: skip
 
 
 def divided(opacity: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:

@@ -6,8 +6,9 @@ that is not there is never called and allocates nothing.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -125,8 +126,9 @@ class Parts:
     antialias: bool = False
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     start_opacity: float = 0.1
-    # changes the first Gaussians, one at every point of the sparse model and of `more_points`
-    start: Callable[[Gaussians], Gaussians] | None = None
+    start_scale: float = 1.0  # times 3DGS's
+    # the first Gaussians; None = one at every point of the sparse model and of `more_points`
+    start: Callable[[TrainData], Gaussians] | None = None
     # (data, how many at most): xyz [M, 3] and rgb [M, 3] uint8 of further points to start from
     more_points: Callable[[TrainData, int], tuple[np.ndarray, np.ndarray]] | None = None
     blur: float = BLUR  # px^2 added to both variances of a splat
@@ -145,6 +147,8 @@ class Parts:
         Raises:
             AwError: fewer than 4 points.
         """
+        if self.start is not None:
+            return self.start(data)
         xyz, rgb = data.scene.points.xyz, data.scene.points.rgb
         room = int(START_SHARE * most) - len(xyz)
         if self.more_points is not None and room > 0:
@@ -153,4 +157,4 @@ class Parts:
         found = Gaussians.from_points(
             xyz, rgb, sh_degree=self.sh_degree, opacity=self.start_opacity, device=data.device
         )
-        return found if self.start is None else self.start(found)
+        return replace(found, log_scales=found.log_scales + math.log(self.start_scale))

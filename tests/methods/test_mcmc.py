@@ -138,6 +138,7 @@ def test_it_starts_opaque_and_small(scene, tmp_path):
     assert torch.sigmoid(ours.opacity_logits).tolist() == pytest.approx([0.5] * len(ours))
     assert torch.allclose(ours.log_scales.exp(), 0.1 * plain.log_scales.exp())
     grafted = parts_of("3dgs@density=mcmc").first_gaussians(data)
+    assert torch.equal(grafted.log_scales, plain.log_scales)
     assert torch.sigmoid(grafted.opacity_logits).tolist() == pytest.approx([0.5] * len(ours))
 
 

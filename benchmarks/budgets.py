@@ -21,7 +21,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from ambiguous_wild.core import AwError
+from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.harness.running.environment import environment
 from ambiguous_wild.harness.running.result_file import RESULT, read_result
 from ambiguous_wild.io.atomic import write_json, write_text
@@ -38,9 +38,8 @@ def place_of(text: str) -> tuple[Path, int | None]:
     return (Path(folder), int(factor)) if folder and factor.isdecimal() else (Path(text), None)
 
 
-def folder_of(out: Path, scene: Path, factor: int | None, method: str, budget: str, seed: int) -> Path:
-    size = load_scene(scene, factor=factor).train[0].camera.width
-    return out / f"{size}px-{budget}" / load_scene(scene, factor=factor).name / method / f"seed{seed}"
+def folder_of(out: Path, scene: Scene, method: str, budget: str, seed: int) -> Path:
+    return out / f"{scene.train[0].camera.width}px-{budget}" / scene.name / method / f"seed{seed}"
 
 
 def load_now(patience_s: float = 150.0) -> float:
@@ -66,16 +65,16 @@ def bench(scene: Path, factor: int | None, method: str, budget: str, seed: int, 
     return None
 
 
-def row_of(folder: Path, method: str, budget: str, scene: Path, factor: int | None) -> dict[str, Any] | None:
+def row_of(folder: Path, method: str, budget: str, scene: Scene) -> dict[str, Any] | None:
     if not (folder / RESULT).is_file():
         return None
-    result, loaded = read_result(folder / RESULT), load_scene(scene, factor=factor)
+    result = read_result(folder / RESULT)
     if result["status"] != "ok":
         return None
     note = folder / "load.txt"
     return {
-        "scene": loaded.name,
-        "width": loaded.train[0].camera.width,
+        "scene": scene.name,
+        "width": scene.train[0].camera.width,
         "method": method,
         "budget": budget,
         "psnr": fmean(float(row["psnr"]) for row in result["per_image"]),
@@ -132,15 +131,16 @@ def main(words: Sequence[str] | None = None) -> int:
     args = arguments(words)
     rows, failed = [], []
     for text in args.captures:
-        scene, factor = place_of(text)
+        place, factor = place_of(text)
+        scene = load_scene(place, factor=factor)
         runs = [(OURS, budget) for budget in args.budgets] + [(name, args.at) for name in args.methods]
         for method, budget in runs:
-            folder = folder_of(args.out, scene, factor, method, budget, args.seed)
+            folder = folder_of(args.out, scene, method, budget, args.seed)
             if not args.report_only and not (folder / RESULT).is_file():
-                wrong = bench(scene, factor, method, budget, args.seed, folder)
+                wrong = bench(place, factor, method, budget, args.seed, folder)
                 if wrong:
                     failed.append(f"{method}, {budget}, {scene.name}: {wrong}")
-            row = row_of(folder, method, budget, scene, factor)
+            row = row_of(folder, method, budget, scene)
             if row:
                 rows.append(row)
                 print(

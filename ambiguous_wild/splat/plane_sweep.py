@@ -279,7 +279,9 @@ def _one_a_cell(
 
 def _intrinsics(camera: Camera) -> np.ndarray:
     """[3, 3] for pixels whose centres are whole numbers, as OpenCV's are."""
-    return np.array([[camera.fx, 0.0, camera.cx - 0.5], [0.0, camera.fy, camera.cy - 0.5], [0.0, 0.0, 1.0]])
+    found = camera.intrinsics
+    found[:2, 2] -= 0.5
+    return found
 
 
 def _projected(camera: Camera, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

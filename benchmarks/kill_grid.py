@@ -1,10 +1,11 @@
 """`aw bench` over methods x scenes x seeds, killed (-9) at random times, against an uninterrupted run.
 
-    python benchmarks/kill_grid.py [-o DIR] [--kills 2] [--iterations 60] [--random 0]
+    python benchmarks/kill_grid.py [-o DIR] [--methods METHOD...] [--kills 2] [--iterations 60] [--random 0]
+        [--engines]
 
 Scenes are tiny simulated captures with true poses. The killed run must end with all cells and the same files
-as the uninterrupted one: same names, same bytes, except for times, frames per second and memory. Exit code 1
-otherwise.
+as the uninterrupted one: same names, same bytes, except for times, frames per second and memory. --engines:
+the same grid with `--jobs 2`, and on Ray, must give these files too. Exit code 1 otherwise.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ from ambiguous_wild.splat.cpu.warmup import warm_up
 from ambiguous_wild.vision.sparse_surface import world_points
 
 METHODS = ("3dgs", "robustsplat", "refinesplat")
+ENGINES = {"jobs": ("--jobs", "2"), "ray": ("--engine", "ray", "--jobs", "2")}
 CLOCK = {"train_s", "setup_s", "ms_per_iteration", "ms_parts", "fps", "fps_low", "fps_high", "peak_rss_mb"}
 CLOCK |= {"elapsed_s", "parts_s", "wall_s"}
 CLOCK |= {"cores"}  # that the process may use: whoever shares the machine may change it between two starts
@@ -82,11 +84,13 @@ def quaternion(rotation: np.ndarray) -> tuple[float, float, float, float]:
     return float(w), float(x), float(y), float(z)
 
 
-def bench_command(scenes: Sequence[Path], seeds: Sequence[int], iterations: int, output: Path) -> list[str]:
+def bench_command(
+    methods: Sequence[str], scenes: Sequence[Path], seeds: Sequence[int], iterations: int, output: Path
+) -> list[str]:
     """The `aw bench` command of the whole grid."""
     words = [sys.executable, "-m", "ambiguous_wild.cli.main", "bench", "--iterations", str(iterations)]
     words += ["--device", "cpu", "--threads", "1", "--checkpoint-every", "0.5", "-o", str(output)]
-    for flag, values in (("--method", METHODS), ("--scene", scenes), ("--seed", seeds)):
+    for flag, values in (("--method", methods), ("--scene", scenes), ("--seed", seeds)):
         words += [w for value in values for w in (flag, str(value))]
     return words
 
@@ -160,11 +164,13 @@ def differences(one: Path, other: Path) -> list[str]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, help="folder to keep; default: a temporary one")
+    parser.add_argument("--methods", nargs="+", default=list(METHODS), metavar="METHOD")
     parser.add_argument("--kills", type=int, default=2)
     parser.add_argument("--scenes", type=int, default=3)
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--iterations", type=int, default=60)
     parser.add_argument("--random", type=int, default=0, help="seed of the moments of the kills")
+    parser.add_argument("--engines", action="store_true", help="also two processes, and Ray")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         root = args.output or Path(temporary)
@@ -173,13 +179,20 @@ def main() -> int:
         quiet, disturbed = root / "quiet", root / "killed"
         warm_up(print)  # compiling is no part of the time in which the kills fall
         begin = time.monotonic()
-        subprocess.run(bench_command(scenes, seeds, args.iterations, quiet), check=True)
+
+        def command(output: Path) -> list[str]:
+            return bench_command(args.methods, scenes, seeds, args.iterations, output)
+
+        subprocess.run(command(quiet), check=True)
         whole_s = time.monotonic() - begin
         rng = random.Random(args.random)
         delays = [whole_s * rng.uniform(0.2, 0.45) for _ in range(args.kills)]
-        story = killed_run(bench_command(scenes, seeds, args.iterations, disturbed), delays, disturbed)
+        story = killed_run(command(disturbed), delays, disturbed)
         wrong = differences(quiet, disturbed)
-        cells = len(METHODS) * args.scenes * args.seeds
+        for name, words in ENGINES.items() if args.engines else ():
+            subprocess.run([*command(root / name), *words], check=True)
+            wrong += [f"{name}: {line}" for line in differences(quiet, root / name)]
+        cells = len(args.methods) * args.scenes * args.seeds
         compared = len(files_of(quiet))
     print(f"\n| start | ended after s | exit code | cells finished of {cells} | last line |")
     print("|---|---:|---:|---:|---|")

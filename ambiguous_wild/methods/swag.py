@@ -49,7 +49,7 @@ class SwagConfig:
     transient: float = 0.5  # left out below this share of photos in which it is on
     lr_grid: float = 0.01
     lr_net: float = 1e-3  # this and the next for 30 000 iterations; more in shorter runs
-    lr_photo: float = 1e-3
+    lr_photo: float = 0.01
 
     def __post_init__(self) -> None:
         check_limits(

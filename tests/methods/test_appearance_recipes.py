@@ -142,6 +142,9 @@ def test_colours_by_a_second_implementation(gsw):
     visible, shot = visible_of(effect), shot_of(data)
     leaf = effect._leaf(shot)
     found = effect.forward(visible, leaf, shot)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(effect, "config", replace(effect.config, residual=False))
+        published = effect.forward(visible, leaf, shot)
     maps = gsw_net.maps_of(data.photos[0], leaf, 32).numpy()
     assert maps.shape[:2] == (3, 16)
 
@@ -175,8 +178,9 @@ def test_colours_by_a_second_implementation(gsw):
         hidden = net("encoder", np.concatenate([*code, dynamic, intrinsic]))
         hidden = net("decoder", np.concatenate([hidden, intrinsic]))
         towards = (mean - view.center) / np.linalg.norm(mean - view.center)
-        want = 0.5 + net("head", np.concatenate([hidden, towards]))
-        assert found[i].numpy() == pytest.approx(want, abs=2e-4)
+        alone = 0.5 + net("head", np.concatenate([hidden, towards]))
+        assert found[i].numpy() == pytest.approx(alone + 0.28209479 * intrinsic[:3], abs=2e-4)
+        assert published[i].numpy() == pytest.approx(alone, abs=2e-4)
 
 
 def test_without_a_photo_a_gaussian_samples_what_it_does_in_the_photos_that_show_it(gsw):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.methods.mcmc import McmcConfig, McmcDensity, divided
 from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.render import render
@@ -16,7 +17,7 @@ from tests.splat.scenes import camera, gaussians
 from tests.tiny_scene import write_tiny_scene
 
 NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh0", "sh_rest", "tag")
-ROUND = McmcConfig(start=1.0, every=1.0, min_every=1, noise=0.0)
+ROUND = McmcConfig(start=1.0, every=1.0, min_every=1, noise=0.0, apart=0.0)  # as released
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +83,23 @@ def test_the_dead_move_and_the_number_grows_by_a_share():
     assert bool((first[:5] == 1).all())  # of rows that moved they stay, as in the released code
 
 
+@pytest.mark.parametrize("dead", [0, 1500])
+def test_copies_start_at_draws_of_their_source(dead):
+    g = gaussians(n=1, rest=3).carrying({"tag": torch.zeros(1)})
+    for tensor, value in ((g.means, 0.0), (g.quats, 0.0), (g.opacity_logits, 3.0)):
+        tensor.fill_(value)
+    g.quats[:, 0] = g.quats[:, 3] = 0.5**0.5  # a quarter turn around z: x becomes y
+    g.log_scales[:] = torch.log(torch.tensor([1.0, 2.0, 0.5]))
+    g = g.select(torch.zeros(20_000, dtype=torch.int64))
+    g.opacity_logits[:dead] = -9.0
+    # the dead move and nothing grows, or nobody is dead and the number grows
+    new, _, _ = one_round(g, replace(ROUND, apart=0.5), ceiling=20_000 if dead else 30_000)
+    copies = torch.arange(len(new)) < dead if dead else torch.arange(len(new)) >= 20_000
+    assert int(copies.sum()) == (dead or 1000) and not new.means[~copies].any()
+    along = new.log_scales[copies].exp()[:, [1, 0, 2]]  # copies have the scales of their sources
+    assert (new.means[copies] / along).std(dim=0).tolist() == pytest.approx([0.5] * 3, rel=0.1)
+
+
 def test_growth_stops_at_the_ceiling_and_after_its_time():
     assert len(one_round(some(), ceiling=41)[0]) == 41
     assert len(one_round(some(), ceiling=10)[0]) == 40
@@ -96,6 +114,11 @@ def test_a_picture_stays_nearly_the_same():
     dead_moved = one_round(g)[0]
     after = render(dead_moved, camera(), sh_degree=1).image
     assert float((after - before).abs().mean()) < 0.02
+
+
+def test_a_distance_that_is_none_is_refused():
+    with pytest.raises(AwError, match=r"mcmc.*apart"):
+        McmcConfig(apart=-1.0)
 
 
 def test_the_regularisers_against_differences():

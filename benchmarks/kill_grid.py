@@ -39,7 +39,7 @@ from ambiguous_wild.vision.sparse_surface import world_points
 METHODS = ("3dgs", "robustsplat", "refinesplat")
 ENGINES = {"jobs": ("--jobs", "2"), "ray": ("--engine", "ray", "--jobs", "2")}
 CLOCK = {"train_s", "setup_s", "ms_per_iteration", "ms_parts", "fps", "fps_low", "fps_high", "peak_rss_mb"}
-CLOCK |= {"elapsed_s", "parts_s", "wall_s"}
+CLOCK |= {"elapsed_s", "parts_s", "wall_s", "cpu_s", "reference_s", "timing", "meter"}
 CLOCK |= {"cores"}  # that the process may use: whoever shares the machine may change it between two starts
 POINTS_A_VIEW = 60
 

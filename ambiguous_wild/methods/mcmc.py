@@ -14,7 +14,7 @@ from scipy.special import comb
 from torch import Tensor
 
 from ambiguous_wild.core.config import check_limits
-from ambiguous_wild.splat.density import DensityConfig, DensityControl, rotation_matrices
+from ambiguous_wild.splat.density import DensityConfig, DensityControl, rotation_matrices, shaped
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.parts import Parts
@@ -104,9 +104,8 @@ class McmcDensity(DensityControl):
         """[N, 3] by which copies lie beside their sources: a draw of their Gaussians, times `apart`."""
         if not self.config.apart:
             return torch.zeros_like(g.means)
-        draws = torch.from_numpy(self.rng.standard_normal((len(g), 3), dtype=np.float32)).to(g.device)
-        own = draws * g.log_scales.exp() * self.config.apart
-        return (rotation_matrices(g.quats) @ own[:, :, None]).squeeze(2)
+        noise = torch.from_numpy(self.rng.standard_normal((len(g), 3), dtype=np.float32)).to(g.device)
+        return self.config.apart * shaped(noise, g)
 
     def _draw(self, g: Gaussians, optimiser: SplatAdam, among: Tensor, count: int) -> Tensor:
         """Rows [count] drawn by opacity; each is already one of the copies that it is about to have."""

@@ -233,8 +233,7 @@ class DensityControl:
     def _split_half(self, parents: Gaussians) -> Gaussians:
         """One of two samples drawn from each parent, 1.6 times smaller."""
         noise = torch.from_numpy(self.rng.standard_normal((len(parents), 3)).astype(np.float32))
-        local = noise.to(parents.device) * parents.log_scales.exp()
-        parents.means += (rotation_matrices(parents.quats) @ local[:, :, None]).squeeze(2)
+        parents.means += shaped(noise.to(parents.device), parents)
         parents.log_scales -= float(np.log(1.6))
         return parents
 
@@ -302,6 +301,12 @@ def largest(score: Tensor, chosen: Tensor, room: int) -> Tensor:
     kept = torch.zeros_like(chosen)
     kept[order[:room]] = True
     return kept
+
+
+def shaped(noise: Tensor, gaussians: Gaussians) -> Tensor:
+    """Normal draws [N, 3] as offsets from the means [N, 3], with the Gaussians' covariances."""
+    local = noise * gaussians.log_scales.exp()
+    return (rotation_matrices(gaussians.quats) @ local[:, :, None]).squeeze(2)
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:

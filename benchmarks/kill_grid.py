@@ -26,7 +26,9 @@ from typing import Any
 
 import numpy as np
 
+from ambiguous_wild.core import AwError
 from ambiguous_wild.io.images import write_png
+from ambiguous_wild.methods.registry import get_method
 from ambiguous_wild.simulate.capture import plan
 from ambiguous_wild.simulate.image_effects.photo_random import PhotoRandom as Moment
 from ambiguous_wild.simulate.presets import preset, resized
@@ -172,6 +174,8 @@ def main() -> int:
     parser.add_argument("--random", type=int, default=0, help="seed of the moments of the kills")
     parser.add_argument("--engines", action="store_true", help="also two processes, and Ray")
     args = parser.parse_args()
+    for name in args.methods:
+        get_method(name)  # an unknown one is named before anything runs
     with tempfile.TemporaryDirectory() as temporary:
         root = args.output or Path(temporary)
         scenes = [write_scene(root / "scenes" / f"tiny{k}", k) for k in range(args.scenes)]
@@ -207,4 +211,7 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        sys.exit(main())
+    except AwError as error:
+        sys.exit(f"error: {error}")

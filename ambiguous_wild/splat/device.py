@@ -19,3 +19,12 @@ def wait(device: torch.device | str) -> None:
     """Until what was launched there is done; elsewhere than on a GPU it is already."""
     if torch.device(device).type == "cuda":
         torch.cuda.synchronize(device)
+
+
+def set_torch_threads(n: int, device: torch.device | str) -> None:
+    """Use n threads for torch's own work on the CPU: its sums, and so the bits of a run, depend on n."""
+    if not accelerated(device):
+        from ambiguous_wild.splat.cpu.compile import threads
+
+        threads()  # starts Numba's pool, which sets the number of OpenMP's threads, torch's with it
+    torch.set_num_threads(n)

@@ -49,7 +49,7 @@ class Trainer(Run):
             folder: where checkpoint and timeline go.
             probe: gets a function that renders a camera, returns PSNR in dB of the test views.
         """
-        torch.set_num_threads(config.torch_threads)
+        device.set_torch_threads(config.torch_threads, data.device)
         if parts.train_data is not None:
             data = parts.train_data(data)
         super().__init__(data, config, folder, probe)

@@ -313,3 +313,32 @@ def test_shrinking_averages_photos_and_keeps_only_whole_blocks():
     keep = torch.ones(4, 6)
     keep[0, 1] = 0
     assert shrink_keep(keep, 2).tolist() == [[0, 1, 1], [1, 1, 1]]
+
+
+FIRST_IN_A_PROCESS = """
+import sys
+from pathlib import Path
+import torch
+from ambiguous_wild.splat.data import load_train_data
+from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.trainer import Trainer
+from ambiguous_wild.io.scene_folder import load_scene
+
+torch.set_num_threads(2)
+scene, folder = load_scene(sys.argv[1]), Path(sys.argv[2])
+data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=folder)
+trainer = Trainer(data, Parts(), TrainConfig(iterations=2, probes=0), folder=folder)
+trainer.step()
+print(torch.get_num_threads())
+"""
+
+
+def test_the_first_training_of_a_process_has_its_number_of_torch_threads(tmp_path):
+    """Numba's pool, which starts with its first kernel, sets the number for torch too."""
+    scene = write_tiny_scene(tmp_path / "scene")
+    command = [sys.executable, "-c", FIRST_IN_A_PROCESS, str(scene), str(tmp_path / "run")]
+    found = subprocess.run(
+        command, capture_output=True, text=True, env=os.environ | {"NUMBA_NUM_THREADS": "2"}
+    )
+    assert found.stdout.split() == ["1"], found.stderr

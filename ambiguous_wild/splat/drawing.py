@@ -102,7 +102,10 @@ class Drawing:
         if fields is None or shot.view is None:
             return rendered
         bent = {name: fields.bend(name, self.others[name].gaussians, shot) for name in fields.drawn(shot)}
-        drawn = {name: self._draw(gaussians, shot, None) for name, (gaussians, _) in bent.items()}
+        drawn = {
+            name: self._draw(gaussians.settling_like(self.others[name].gaussians), shot, None)
+            for name, (gaussians, _) in bent.items()
+        }
         pulls = {name: pull for name, (_, pull) in bent.items()}
         needs = {name: control.needs for name in drawn if (control := self.others[name].density) is not None}
         return Composite(fields, {STATIC: rendered, **drawn}, needs, shot, pulls)

@@ -87,6 +87,12 @@ class Gaussians:
         if self.before_colours is not None:
             self.before_colours()
 
+    def settling_like(self, source: Gaussians) -> Gaussians:
+        """These, made of `source` for one picture with its `sh_rest`: postponed updates are made for them too."""
+        if self is not source and "before_colours" in source.__dict__:
+            self.__dict__["before_colours"] = source.before_colours
+        return self
+
     def select(self, rows: Tensor) -> Gaussians:
         """The rows given by a bool mask [N] or an index tensor, copied."""
         return self._each(lambda name, tensor: tensor[rows].contiguous())

@@ -85,9 +85,7 @@ class Chain:
         pulls = []
         for effect in self._with("model", without):
             changed, pull = effect.model(gaussians, shot)
-            if changed is not gaussians and "before_colours" in gaussians.__dict__:
-                changed.__dict__["before_colours"] = gaussians.before_colours  # for postponed rows
-            gaussians = changed
+            gaussians = changed.settling_like(gaussians)
             pulls.append(pull)
         return gaussians, pulls
 

@@ -88,7 +88,7 @@ class Gaussians:
             self.before_colours()
 
     def settling_like(self, source: Gaussians) -> Gaussians:
-        """These, made of `source` for one picture with its `sh_rest`: postponed updates are made for them too."""
+        """These, made of `source` for one picture with its `sh_rest`: postponed updates are made here too."""
         if self is not source and "before_colours" in source.__dict__:
             self.__dict__["before_colours"] = source.before_colours
         return self

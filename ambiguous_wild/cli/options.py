@@ -36,7 +36,7 @@ _OPTIONS = (
     click.option(
         "--max-gaussians",
         type=click.IntRange(4),
-        help="Largest number of Gaussians.  [default: the method's]",
+        help="Growth stops at this number of Gaussians.  [default: the method's]",
     ),
     click.option(
         "--plugin",

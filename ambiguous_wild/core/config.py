@@ -70,7 +70,8 @@ def with_options(config: T, options: Mapping[str, str], where: str = "option") -
     """The config with ``key=value`` strings of the command line applied; dots reach nested configs.
 
     Raises:
-        AwError: unknown key, or a value that does not parse as the key's type.
+        AwError: unknown key, a value that does not parse as the key's type, or a negative one of a key that
+            is positive by default.
     """
     names = [f.name for f in dataclasses.fields(config)]  # type: ignore[arg-type]
     hints = typing.get_type_hints(type(config))
@@ -93,7 +94,11 @@ def with_options(config: T, options: Mapping[str, str], where: str = "option") -
             raise AwError(f"{where} {key!r}: {head!r} has no keys of its own")
         values[head] = with_options(inner, inside, f"{where} {head}")
     # All at once: limits between two options apply to the result only.
-    return dataclasses.replace(config, **values)  # type: ignore[type-var]
+    made = dataclasses.replace(config, **values)  # type: ignore[type-var]
+    for name, value in values.items():
+        if _positive(getattr(config, name)) and _number(value) and not value >= 0:
+            raise AwError(f"{where} {name} is at least 0, got {value:g}")
+    return made
 
 
 def check_limits(config: Any, where: str, **limits: tuple[float, float]) -> None:
@@ -113,6 +118,15 @@ def check_limits(config: Any, where: str, **limits: tuple[float, float]) -> None
             if not low <= number <= high:
                 span = f"at least {low:g}" if math.isinf(high) else f"from {low:g} to {high:g}"
                 raise AwError(f"{where}.{name} is {span}, got {number:g}")
+
+
+def _number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _positive(value: Any) -> bool:
+    # rates, weights, counts and times: what is positive by default is not meant to be negative
+    return _number(value) and value > 0
 
 
 def _parse(text: str) -> Any:

@@ -64,6 +64,9 @@ def build(options: DeSplatConfig) -> Parts:
 class Uncovered(MaskPolicy):
     """1 - A of the photo's layer, for pictures and measures: the composite has weighed the loss already."""
 
+    def composed_keep(self, step: Step) -> Tensor | None:
+        return self.predict(step)
+
     def predict(self, step: Step) -> Tensor | None:
         layer = frames_of(step.rendered).get(str(step.view))
         return None if layer is None else 1.0 - layer.alpha

@@ -37,6 +37,9 @@ class GraftedPolicy(MaskPolicy):
         other = None if self.regulariser is None else self.regulariser.gradients(step, keep)
         return other if mine is None else mine if other is None else mine + other
 
+    def composed_keep(self, step: Step) -> Tensor | None:
+        return self.mask.composed_keep(step)
+
     def predict(self, step: Step) -> Tensor | None:
         return self.mask.predict(step)
 

@@ -106,6 +106,9 @@ class Uncovered(MaskPolicy):
             self.shares.take(step.view, keep)
         return keep if step.nominal < self.config.joint else None
 
+    def composed_keep(self, step: Step) -> Tensor | None:
+        return self.predict(step) if step.nominal >= self.config.joint else None
+
     @torch.no_grad()
     def predict(self, step: Step) -> Tensor | None:
         if step.nominal < self.config.apart:

@@ -117,7 +117,7 @@ def hashed_uniform(count: int, key: tuple[int, ...], place: torch.device) -> Ten
         x = ((x ^ (x >> 16)) * 0x85EBCA6B) & (_WORD - 1)
         x = ((x ^ (x >> 13)) * 0xC2B2AE35) & (_WORD - 1)
         x = x ^ (x >> 16)
-    return ((x >> 8).to(torch.float32) + 0.5) * 2.0**-24
+    return ((x >> 8).to(torch.float32) + 0.5).mul(2.0**-24).clamp(max=1.0 - 2.0**-24)
 
 
 def sampled(keep: Tensor, probability: float, key: tuple[int, ...]) -> Tensor:

@@ -13,6 +13,7 @@ import torch
 from scipy.special import comb
 from torch import Tensor
 
+from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.splat.density import DensityConfig, DensityControl, rotation_matrices, shaped
 from ambiguous_wild.splat.gaussians import Gaussians
@@ -42,7 +43,13 @@ class McmcConfig(DensityConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_limits(self, "mcmc", apart=(0, 10))
+        check_limits(
+            self, "mcmc", apart=(0, 10), start_opacity=(1e-3, 0.999), start_scale=(1e-3, 1e3),
+            dead_opacity=(0, 0.5),
+        )  # fmt: skip
+        for name in ("grow_grad", "grow_scale"):
+            if getattr(self, name) != getattr(DensityConfig, name):
+                raise AwError(f"mcmc.{name} is not used: its copies are drawn by opacity; leave it out")
 
 
 def build(options: McmcConfig) -> Parts:

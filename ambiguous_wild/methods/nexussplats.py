@@ -68,7 +68,9 @@ class NexusSplatsConfig:
     def __post_init__(self) -> None:
         check_features(self.features)
         widths = dict.fromkeys(("light_width", "doubt_width"), (1, 4096))
-        check_limits(self, "nexussplats", normal_units=(1e-3, 1e9), dropout=(0, 0.9), **widths)
+        check_limits(
+            self, "nexussplats", normal_units=(1e-3, 1e9), dropout=(0, 0.9), prior=(1e-3, 1e3), **widths
+        )
 
 
 def build(options: NexusSplatsConfig) -> Parts:

@@ -23,7 +23,7 @@ from ambiguous_wild.splat import device
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.effects.hash_grid import hash_encoding, prepare
 from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_leaves
-from ambiguous_wild.splat.effects.placing import Unit, in_picture, with_penalty
+from ambiguous_wild.splat.effects.placing import Unit, in_picture, mean_of_seen, with_penalty
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
 from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Shot, TrainData
@@ -119,7 +119,8 @@ class GatedColours(Learnt):
         opacity = (torch.sigmoid(logits[seen]) * (1.0 - z)).clamp(LEAST, 1.0 - 1e-6)
         opened = logits.clone()
         opened[seen] = torch.logit(opacity)
-        return {"opacity_logits": with_penalty(opened, self.config.off * z.mean())}
+        gate = mean_of_seen(z, gaussians.means.detach()[seen], shot.camera)
+        return {"opacity_logits": with_penalty(opened, self.config.off * gate)}
 
     @torch.no_grad()
     def _transient(self, gaussians: Gaussians, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:

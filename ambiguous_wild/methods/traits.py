@@ -26,7 +26,7 @@ BUILTIN_TRAITS = {
     "3dgs+truth": Traits(masks="exact"),
     "3dgs-clean": Traits(),
     "refinesplat": Traits(
-        "entropy of features, by instance and pixel", "", "late; merging", "net of identities",
+        "structure of pixels and instances, other views", "", "late; merging; support", "",
         source="summaries", published="DINOv2 ViT-S/14, instances with ids of a video",
     ),
     "refinesplat-paper": Traits(

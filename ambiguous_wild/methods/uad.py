@@ -41,6 +41,7 @@ class UncertaintyAware(DensityControl):
 
     config: UadConfig
     needs: ClassVar[frozenset[str]] = frozenset({"count"})
+    reads_keep: ClassVar[bool] = True
     sums: ClassVar[Mapping[str, tuple[int, ...]]] = {"grad_sum": (), "seen": ()}
 
     @torch.no_grad()

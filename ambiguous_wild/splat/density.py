@@ -74,6 +74,7 @@ class DensityControl:
 
     # statistics of the backward pass beyond the signed sums, of `rendered.NEEDS`
     needs: ClassVar[frozenset[str]] = frozenset()
+    reads_keep: ClassVar[bool] = False  # whether `observe` does
     # as WildGaussians: rows change before the optimiser moves, which then leaves out that step
     before_optimiser: ClassVar[bool] = False
     # sums of every Gaussian since the last round, by attribute, with what follows [N]
@@ -190,7 +191,10 @@ class DensityControl:
     def _reset_due(self, step: Step) -> bool:
         config = self.config
         while self.resets_done < len(config.resets) and step.nominal >= config.resets[self.resets_done]:
+            late = config.resets[self.resets_done] > config.stop  # as in 3DGS: none after growth
             self.resets_done += 1
+            if late:
+                continue
             rest = step.iteration * (NOMINAL_ITERATIONS / step.nominal - 1.0)
             if step.iteration - self.last_reset >= config.min_reset_spacing and rest >= config.min_reset_rest:
                 return True

@@ -47,6 +47,10 @@ class MaskPolicy:
         """The keep map that weighs this step's loss. May train nets of its own."""
         return None
 
+    def composed_keep(self, step: Step) -> Tensor | None:
+        """For density control, where a composite weighs the loss and `keep` gives None: its keep map."""
+        return None
+
     def cotangent(self, step: Step, keep: Tensor | None) -> Cotangents | Tensor | None:
         """dL/d(picture) of losses of the method's own on the step's render.
 

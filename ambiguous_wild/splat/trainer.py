@@ -272,18 +272,21 @@ class Trainer(Run):
         """The optimiser, density control and effects; returns what density control did."""
         part, progress = self.clock.part, self.progress(step.iteration)
         events: list[str] = []
+        weighed = keep
+        if self.density.reads_keep and (composed := self.parts.mask.composed_keep(step)) is not None:
+            weighed = self.combine_user_keep(step, composed)
         # as on the CPU, a photo that is all masked changes nothing; a round of growth waits for the device
         if called_off is not None and keep is not None and self.density.due(step) and bool(called_off):
             return events
         if self.density.before_optimiser:
             with part("density"):
-                events = self.field.refine(step, gradients, keep)
+                events = self.field.refine(step, gradients, weighed)
         if not events:  # rows that have just changed have no gradients yet
             with part("optimiser"):
                 self.field.learn(gradients, progress, called_off)
         if not self.density.before_optimiser:
             with part("density"):
-                events = self.field.refine(step, gradients, keep)
+                events = self.field.refine(step, gradients, weighed)
         if gradients.fields:
             with part("fields"):
                 self.drawing.learn(step, gradients.fields, progress, called_off)

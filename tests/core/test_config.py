@@ -98,6 +98,20 @@ def test_options_are_judged_together():
         with_options(Ordered(), {"low": "5"})
 
 
+@dataclass(frozen=True)
+class Unlimited:
+    rate: float = 0.1
+    shift: float = -4.0
+    exposure: float = 0.0
+
+
+def test_what_is_positive_by_default_is_not_made_negative():
+    with pytest.raises(AwError, match=r"option rate is at least 0, got -0\.1"):
+        with_options(Unlimited(), {"rate": "-0.1"})
+    made = with_options(Unlimited(), {"rate": "0", "shift": "-5", "exposure": "-1"})
+    assert made == Unlimited(0.0, -5.0, -1.0)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

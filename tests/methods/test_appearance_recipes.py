@@ -18,6 +18,7 @@ from ambiguous_wild.splat.effects.placing import (
     frequencies,
     harmonics,
     in_picture,
+    mean_of_seen,
     projected,
     ray_directions,
     with_penalty,
@@ -339,6 +340,19 @@ def test_it_starts_as_3dgs_but_for_little(swag):
     colours = effect.forward(Visible(base, trainer.gaussians.means), effect._leaf(shot), shot)
     assert float((colours - base).abs().max()) < 0.1
     assert effect.change(trainer.gaussians, effect._leaf(shot), shot) == {}  # gates have not begun
+
+
+def test_means_over_what_is_seen_are_the_same_on_an_accelerator(swag, monkeypatch):
+    """There a recipe gets all rows."""
+    trainer, _ = swag
+    g, view = trainer.gaussians, trainer.data.cameras[0]
+    view = replace(view, fx=4 * view.fx, fy=4 * view.fy)  # sees a part
+    seen, values = in_picture(g.means, view), random(len(g), 2)
+    assert 0 < int(seen.sum()) < len(g)
+    on_cpu = mean_of_seen(values[seen], g.means[seen], view)
+    monkeypatch.setattr("ambiguous_wild.splat.device.accelerated", lambda device: True)
+    torch.testing.assert_close(mean_of_seen(values, g.means, view), on_cpu)
+    torch.testing.assert_close(mean_of_seen(values[:, 0], g.means, view), values[seen, 0].mean())
 
 
 def test_gates_close_by_their_logit_and_only_in_photos(swag):

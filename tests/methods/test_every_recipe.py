@@ -5,6 +5,7 @@ import torch
 
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.methods.uad import UncertaintyAware
 from tests.host_reads import moved, no_transfers
 from tests.methods.baselines import bits, parts_of, resumed_equals_whole, trainer_of
 from tests.splat import fake_gsplat
@@ -82,6 +83,28 @@ def flat(state, name=""):
         return {name: state}
     items = state.items() if isinstance(state, dict) else enumerate(state)
     return {path: value for key, held in items for path, value in flat(held, f"{name}/{key}").items()}
+
+
+@pytest.mark.parametrize("host", ["forestsplats", "desplat", "hybridgs"])
+def test_density_control_gets_the_masks_of_a_composite(scene, tmp_path, monkeypatch, host):
+    """Such a method weighs no loss by `keep`; UAD reads what its composite weighs."""
+    given = []
+    own = UncertaintyAware.observe
+
+    def observe(self, step, gradients, keep=None):
+        given.append(None if keep is None else float(keep.mean()))
+        own(self, step, gradients, keep)
+
+    monkeypatch.setattr(UncertaintyAware, "observe", observe)
+    small = {"forestsplats": {"points": "40", "width": "8", "side": "32"}, "hybridgs": {"points": "60"}}
+    options = {**small.get(host, {}), **({"apart": "1", "joint": "2"} if host == "hybridgs" else {})}
+    options |= {"min_start": "0"} if host == "desplat" else {}
+    parts = parts_of(f"{host}@density=uad", **{f"host.{k}": v for k, v in options.items()})
+    trainer = trainer_of(scene, tmp_path / "run", parts)
+    for _ in range(6):
+        trainer.step()
+    assert given and None not in given[1:]
+    assert all(0 <= value < 1 for value in given[1:])
 
 
 @pytest.mark.parametrize("method", ["spotlesssplats", "spotlesssplats-cluster", "mip-splatting", *RECIPES])

@@ -116,9 +116,13 @@ def test_a_picture_stays_nearly_the_same():
     assert float((after - before).abs().mean()) < 0.02
 
 
-def test_a_distance_that_is_none_is_refused():
-    with pytest.raises(AwError, match=r"mcmc.*apart"):
-        McmcConfig(apart=-1.0)
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("apart", -1.0), ("start_scale", 0.0), ("start_opacity", 2.0), ("grow_grad", 7.0), ("grow_scale", 1.0)],
+)
+def test_values_out_of_range_and_options_without_use_are_refused(name, value):
+    with pytest.raises(AwError, match=rf"mcmc\.{name}"):
+        McmcConfig(**{name: value})
 
 
 def test_the_regularisers_against_differences():

@@ -64,6 +64,12 @@ def test_pruning_before_growth_ends_is_refused():
         PupConfig(prune_at=9000.0)
 
 
+@pytest.mark.parametrize("options", [{"rounds": 8}, {"share": 1.0}])
+def test_rounds_that_cannot_remove_the_share_are_refused(options):
+    with pytest.raises(AwError, match=rf"pup-3dgs\.{next(iter(options))}"):
+        PupConfig(**options)
+
+
 def make():
     more = {"prune_at": "20000", "rounds": "1"}
     return parts_of("pup-3dgs", every="2000", min_every="10", share="0.75", divisor="2", signs="2", **more)

@@ -191,3 +191,9 @@ def test_what_cannot_be_is_refused():
 def test_resuming_gives_the_same_bits(scene, tmp_path, method):
     growing = {"density.every": "2000", "density.min_every": "10", "clusters": "30"}
     resumed_equals_whole(scene, tmp_path, lambda: parts_of(method, **growing))
+
+
+def test_no_draw_is_one():
+    # the one of these numbers whose 24 bits are all set
+    draws = hashed_uniform(1_043_727, (0, 2), torch.device("cpu"))
+    assert 0.9999 < float(draws[1_043_726]) == float(draws.max()) < 1.0

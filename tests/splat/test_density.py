@@ -139,9 +139,9 @@ def test_non_finite_rows_are_removed():
     assert torch.isfinite(after.means).all()
 
 
-def resets_of_a_run(iterations: int) -> tuple[list[int], Gaussians]:
+def resets_of_a_run(iterations: int, stop: float = 1e9) -> tuple[list[int], Gaussians]:
     gaussians = model()
-    density = DensityControl(DensityConfig(start=1e9, stop=1e9), extent=1.0, seed=0)
+    density = DensityControl(DensityConfig(start=1e9, stop=stop), extent=1.0, seed=0)
     optimiser, fired = SplatAdam(gaussians, RATES), []
     for iteration in range(50, iterations + 1, 50):
         step = step_at(gaussians, iteration, iteration * 30_000 / iterations)
@@ -162,6 +162,10 @@ def test_opacity_resets_keep_apart_and_leave_time_to_heal():
     fired, gaussians = resets_of_a_run(3000)
     assert fired == []
     assert torch.sigmoid(gaussians.opacity_logits).min() > 0.09
+
+
+def test_no_opacity_reset_after_growth():
+    assert resets_of_a_run(30_000, stop=7000)[0] == [3000, 6000]
 
 
 def test_state_goes_on_with_the_same_random_numbers():

@@ -74,6 +74,11 @@ def _is_our_config(path: Path) -> bool:
         return True
 
 
+def _said(key: str, config: Mapping[str, Any]) -> str:
+    """A value as the command line writes it: a config leaves out the full protocol."""
+    return str(config.get(key, "full" if key == "protocol" else None))
+
+
 def _of_weights(cell: Cell, names: Sequence[str], before: Mapping[str, Any]) -> str:
     """What to do where weights that came or went since then changed a default; empty elsewhere."""
     for key in (name.removeprefix("options.") for name in names):
@@ -102,7 +107,7 @@ def refuse_other_config(folder: Path, cell: Cell) -> None:
     names = [
         k for k in sorted(before.keys() | now.keys()) if before.get(k) != now.get(k) and k not in ignored
     ]
-    shown = ", ".join(f"{k} was {before.get(k)}, is {now.get(k)}" for k in names[:4]) or "its hash"
+    shown = ", ".join(f"{k} was {_said(k, before)}, is {_said(k, now)}" for k in names[:4]) or "its hash"
     raise AwError(
         f"{folder} holds a run of another configuration ({shown}); "
         f"choose another -o, or replace it with --overwrite always{_of_weights(cell, names, before)}"

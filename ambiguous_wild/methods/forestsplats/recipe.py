@@ -50,6 +50,7 @@ class Forest(Fields):
         self.nets, self.config = nets, nets.config
 
     def setup(self, data: TrainData, static: Gaussians, rates: Rates) -> Mapping[str, FieldStart]:
+        self.nets.require_setup()
         rng, count = np.random.default_rng([data.seed, 0xF0]), min(self.config.points, len(static))
         rows = torch.from_numpy(np.sort(rng.choice(len(static), count, replace=False))).to(static.device)
         return {TRANSIENT: FieldStart(replace(static.select(rows), extra={}), rates)}
@@ -117,6 +118,9 @@ class Mixed(MaskPolicy):
 
     def setup(self, data: TrainData) -> None:
         self.forest.nets.require_setup()
+
+    def composed_keep(self, step: Step) -> Tensor | None:
+        return self.predict(step)
 
     def predict(self, step: Step) -> Tensor | None:
         return 1.0 - self.forest.mask(step)

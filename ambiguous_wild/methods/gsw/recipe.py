@@ -31,6 +31,7 @@ from ambiguous_wild.splat.effects.placing import (
     Unit,
     directions,
     frequencies,
+    mean_of_seen,
     projected,
     with_penalty,
 )
@@ -143,7 +144,8 @@ class GswAppearance(Learnt):
         colours = 0.5 + mlp(torch.cat([hidden, directions(means, shot.camera)], dim=1), leaf, "head")
         if self.config.residual:
             colours = colours + SH_C0 * intrinsic[:, :3]
-        return with_penalty(colours, self.config.outside * F.relu(places.abs() - 1.0).mean())
+        beyond = mean_of_seen(F.relu(places.abs() - 1.0), means, shot.camera)
+        return with_penalty(colours, self.config.outside * beyond)
 
     def _seen(self, shot: Shot) -> Tensor | None:
         """What the U-Net sees: the photo, and of a test photo the left half."""

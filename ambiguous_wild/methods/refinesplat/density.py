@@ -61,6 +61,7 @@ class EntropyAwareDensity(DensityControl):
     config: EntropyDensityConfig
     # [N, 3] sum of -dL/dmean over views, world
     sums: ClassVar[Mapping[str, tuple[int, ...]]] = {**DensityControl.sums, "downhill": (3,)}
+    reads_keep: ClassVar[bool] = True  # for `support`
     downhill: Tensor
 
     def __init__(self, config: DensityConfig, extent: float, seed: int) -> None:

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import Camera
+from ambiguous_wild.splat import device
 from ambiguous_wild.splat.effects.learnt import Leaf
 from ambiguous_wild.splat.effects.posed import PosedCamera
 from ambiguous_wild.splat.gaussians import SH_C0
@@ -57,6 +58,18 @@ def in_picture(means: Tensor, camera: Camera, margin: float = 0.15) -> Tensor:
     pixels, z = projected(means, camera)
     u, v = pixels[:, 0] / camera.width - 0.5, pixels[:, 1] / camera.height - 0.5
     return (z > 0.01) & (u.abs() <= 0.5 + margin) & (v.abs() <= 0.5 + margin)
+
+
+def mean_of_seen(values: Tensor, means: Tensor, camera: Camera) -> Tensor:
+    """Mean of values [N, ...] over the rows that the camera may see.
+
+    On the CPU a recipe is given no others; on an accelerator it is given all rows.
+    """
+    if not device.accelerated(means.device):
+        return values.mean()
+    inside = in_picture(means, camera).to(values)
+    seen = inside.sum() * (values.numel() // max(len(values), 1))
+    return (values * inside.reshape(-1, *[1] * (values.dim() - 1))).sum() / seen.clamp(min=1.0)
 
 
 class Unit:

@@ -200,6 +200,7 @@ def bench(
     with Session(where, threads, told) as session:
         from ambiguous_wild.harness.running.choosing import Probing
         from ambiguous_wild.harness.running.expected import expected_line, unfinished
+        from ambiguous_wild.harness.running.external import check_program
         from ambiguous_wild.harness.running.grid import plan_cells, run_cells
         from ambiguous_wild.harness.running.groups import grouped
         from ambiguous_wild.harness.running.passes import check_passes
@@ -241,7 +242,10 @@ def bench(
             check_passes(cell)
         for line in [*_remarks(cells), *warnings]:
             told.say(line)
-        to_train = [] if where.remote else unfinished(cells, out, overwrite)
+        to_run = [] if where.remote else unfinished(cells, out, overwrite)
+        for cell in {cell.method.name: cell for cell in to_run}.values():
+            check_program(cell)
+        to_train = [cell for cell in to_run if cell.method.program is None]
         try_recipes(to_train)
         check_output(out / "run")  # before half a minute of compiling
         if chosen == "cpu" and not where.remote and any(cell.method.program is None for cell in cells):

@@ -200,10 +200,11 @@ def bench(
     with Session(where, threads, told) as session:
         from ambiguous_wild.harness.running.choosing import Probing
         from ambiguous_wild.harness.running.expected import expected_line, unfinished
+        from ambiguous_wild.harness.running.external import check_program
         from ambiguous_wild.harness.running.grid import plan_cells, run_cells
         from ambiguous_wild.harness.running.groups import grouped
         from ambiguous_wild.harness.running.passes import check_passes
-        from ambiguous_wild.harness.running.prepare import prepare_cpu, try_recipes
+        from ambiguous_wild.harness.running.prepare import check_grafts, prepare_cpu, try_recipes
         from ambiguous_wild.io.atomic import check_output
         from ambiguous_wild.splat.pace import TrainConfig
 
@@ -236,11 +237,15 @@ def bench(
         cells = grouped(planned, budgets_s)
         if gpus > 1:
             cells = _on_several_gpus(cells, gpus, where)
+        warnings = check_grafts(cells)
         for cell in {cell.method.name: cell for cell in cells}.values():
             check_passes(cell)
-        for line in _remarks(cells):
+        for line in [*_remarks(cells), *warnings]:
             told.say(line)
-        to_train = [] if where.remote else unfinished(cells, out, overwrite)
+        to_run = [] if where.remote else unfinished(cells, out, overwrite)
+        for cell in {cell.method.name: cell for cell in to_run}.values():
+            check_program(cell)
+        to_train = [cell for cell in to_run if cell.method.program is None]
         try_recipes(to_train)
         check_output(out / "run")  # before half a minute of compiling
         if chosen == "cpu" and not where.remote and any(cell.method.program is None for cell in cells):
@@ -328,21 +333,13 @@ def _on_several_gpus(cells: list[Cell], gpus: int, engine: Engine) -> list[Cell]
 
 
 def _remarks(cells: Sequence[Cell]) -> list[str]:
-    """Effects that are on, warnings of the scenes, regularisers that do nothing; each once."""
-    from ambiguous_wild.methods.graft import idle_regulariser
-
+    """Effects that are on, warnings of the scenes; each once."""
     lines = []
     for method, name, on in dict.fromkeys((c.method.name, c.scene.name, c.chosen.effects) for c in cells):
         if on:
             lines.append(f"{method} on {name}: {', '.join(on)}")
     for scene in {cell.scene.name: cell.scene for cell in cells}.values():
         lines += [f"warning: {scene.name}: {warning}" for warning in scene.info.get("warnings", ())]
-    for cell in {cell.method.name: cell for cell in cells}.values():
-        if idle := idle_regulariser(cell.method, cell.options):
-            lines.append(
-                f"warning: {cell.method.name}: {idle} adds no loss on the render with these options; "
-                f"switch it on with --set {idle}.KEY=VALUE, or leave the regulariser out"
-            )
     return lines
 
 

@@ -44,14 +44,15 @@ class AsymGsConfig:
 
 def build(options: AsymGsConfig) -> Parts:
     """Masks, the average as an effect, and growth that carries it."""
-    masks, rates, average = AsymMask(options), Schedule(lr_opacity=0.1), (SlowAverage(0.8),)
-    return Parts(masks, SlowDensity, options.density, rates, effects=average)
+    average, rates = SlowAverage(0.8), Schedule(lr_opacity=0.1)
+    return Parts(AsymMask(options, average), SlowDensity, options.density, rates, effects=(average,))
 
 
 class AsymMask(MaskPolicy):
     """Even iterations: instances that residual and features suspect. Odd ones: a map learnt for the photo."""
 
-    def __init__(self, config: AsymGsConfig) -> None:
+    def __init__(self, config: AsymGsConfig, average: SlowAverage | None = None) -> None:
+        self.average = average
         self.config, self.features = config, make_features(config.features)
         self.instances = make_instances(config.instances)
 
@@ -63,6 +64,9 @@ class AsymMask(MaskPolicy):
         left = (unsupported(labels, data.scene, name, least) for labels, name in found)
         self.labels = [torch.from_numpy(labels).to(data.device) for labels in left]
         self.soft = [RowAdam(torch.ones(1, *x.shape, device=data.device)) for x in self.labels]
+
+    def losses_read(self) -> SlowAverage | None:
+        return self.average
 
     def keep(self, step: Step) -> Tensor:
         keep = self.predict(step)

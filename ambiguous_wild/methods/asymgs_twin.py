@@ -23,7 +23,7 @@ from ambiguous_wild.splat.field import Rates
 from ambiguous_wild.splat.fields import STATIC, Fields, FieldStart
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.losses import photometric
-from ambiguous_wild.splat.parts import Parts, Schedule
+from ambiguous_wild.splat.parts import MaskPolicy, Parts, Schedule
 from ambiguous_wild.splat.rendered import Cotangents, Frame, Gradients
 from ambiguous_wild.splat.step import Shot, Step, TrainData
 
@@ -52,8 +52,7 @@ class HardMask(AsymMask):
 
     predict = keep
 
-    def cotangent(self, step: Step, keep: Tensor | None) -> None:
-        """Nothing: `Twin` compares the models."""
+    cotangent = MaskPolicy.cotangent  # type: ignore[assignment]  # none: `Twin` compares the models
 
 
 class Twin(Fields):

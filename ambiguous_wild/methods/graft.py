@@ -8,26 +8,25 @@ density      the density control and its config
 regulariser  the donor policy's loss on the render (`MaskPolicy.cotangent`), under the host's keep map
 effects      the donor's own effects (`Parts.effects`) instead of the host's
 
-Everything else - schedule, how the keep map enters SSIM, which photos - stays the host's. A warning names
-a donor's effects that the graft does not take. Imports no torch: names are checked before anything
-heavy is loaded.
+Everything else - schedule, how the keep map enters SSIM, which photos - stays the host's. What cannot work
+is refused, see graft_checks.py. Imports no torch: names are checked before anything heavy is loaded.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
-import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.methods.entry import MethodEntry, NoOptions, resolve
-from ambiguous_wild.methods.references import is_reference
+from ambiguous_wild.methods.references import is_program, is_reference, reference_file
 from ambiguous_wild.methods.second_pass import trained_once
 
 if TYPE_CHECKING:
+    from ambiguous_wild.methods.graft_checks import Member
     from ambiguous_wild.splat.parts import Parts
 
 PLACES = ("mask", "density", "regulariser", "effects")
@@ -59,6 +58,22 @@ def split_graft(name: str) -> tuple[str, str]:
         first = host.partition("@")[0]
         raise AwError(f"method {name!r}: write {first}@mask=METHOD,density=METHOD, with one @")
     return host, rest
+
+
+def refuse_parts_of_program(name: str) -> None:
+    """Raise AwError for `external:opensplat@density=uad`: a program of its own takes no parts."""
+    host, _, rest = name.rpartition("@")
+    if not is_program(host) or not all(place in PLACES for place, _ in _written(rest)):
+        return
+    path = reference_file(name)
+    if path is None or not path.exists():
+        raise _takes_none(host, rest)
+
+
+def _takes_none(host: str, rest: str) -> AwError:
+    return AwError(
+        f"{host} is trained by another program, which takes no parts of other methods: leave {rest} out"
+    )
 
 
 def knows_truth(name: str) -> bool:
@@ -93,6 +108,8 @@ def grafted(name: str, host: MethodEntry, methods: Mapping[str, MethodEntry]) ->
     if host.passes > 1:
         raise AwError(f"{name}: the end of the name says that it trains twice: {host.base}@...+2passes")
     pairs = _pairs(name)
+    if host.program is not None:
+        raise _takes_none(host.name, split_graft(name)[1])
     donors = {place: _donor(place, donor, methods) for place, donor in pairs}
     entries = {"host": host} | donors
     fields = [
@@ -136,52 +153,42 @@ def build(name: str, entries: Mapping[str, MethodEntry], options: Any) -> Parts:
         entries: "host", and the donor of every place that is filled.
         options: of each of them, by place.
     """
-    built: list[tuple[str, Any, Parts]] = []
+    from ambiguous_wild.methods.graft_checks import check_members
 
-    def parts_of(place: str) -> Parts:
-        entry, own = entries[place], getattr(options, place)
-        for donor, known, parts in built:
-            if donor == entry.name and known == own:
-                return parts
-        parts = entry.build(own)
-        built.append((entry.name, own, parts))
-        return parts
-
-    host = parts_of("host")
-    mask = parts_of("mask").mask if "mask" in entries else host.mask
-    regulariser = parts_of("regulariser").mask if "regulariser" in entries else host.mask
+    host_member, donors = _members(name, entries, options)
+    check_members(host_member, donors)
+    host = host_member.parts
+    mask, regulariser = (donors.get(place, host_member).parts.mask for place in ("mask", "regulariser"))
     changed: dict[str, Any] = {"mask": compose(mask, regulariser)}
-    if "density" in entries:
-        density = parts_of("density")
+    if "density" in donors:
+        density = donors["density"].parts
         changed |= {"density": density.density, "density_config": density.density_config}
         # MCMC's fixed number starts from Gaussians of its own
         changed |= {"start_opacity": density.start_opacity, "start_scale": density.start_scale}
         if density.start is not None:
             changed["start"] = density.start
-    if "effects" not in entries:
-        _warn_of_effects(name, host, [(donor, parts) for donor, _, parts in built])
+    if "effects" not in donors:
         return dataclasses.replace(host, **changed)
-    effects = parts_of("effects").effects
+    effects = donors["effects"].parts.effects
     for effect in effects:
         host = effect.change_parts(host)
     return dataclasses.replace(host, **changed, effects=effects)
 
 
-def _warn_of_effects(name: str, host: Parts, donors: Iterable[tuple[str, Parts]]) -> None:
-    """Warn if a donor's recipe brings effects that the host does not have."""
-    own = set(_effect_names(host))
-    for donor, parts in donors:
-        left_out = [effect for effect in _effect_names(parts) if effect not in own]
-        if left_out:
-            warnings.warn(
-                f"{name} leaves out {donor}'s effects ({', '.join(left_out)}): add effects={donor} to the "
-                "name to take them, or effects=none to leave them out without this warning",
-                stacklevel=2,
-            )
+def _members(name: str, entries: Mapping[str, MethodEntry], options: Any) -> tuple[Member, dict[str, Member]]:
+    """The host, and the donors by place, each built once for the same options."""
+    from ambiguous_wild.methods.graft_checks import Member
 
-
-def _effect_names(parts: Parts) -> list[str]:
-    return [effect.name or type(effect).__name__ for effect in parts.effects]
+    typed, members = dict(_pairs(name)), {}
+    built: list[tuple[str, Any, Parts]] = []
+    for place, entry in entries.items():
+        own = getattr(options, place)
+        parts = next((parts for known, of, parts in built if known == entry.name and of == own), None)
+        if parts is None:
+            parts = entry.build(own)
+            built.append((entry.name, own, parts))
+        members[place] = Member(typed.get(place, entry.name), parts)
+    return members.pop("host"), members
 
 
 def compose(mask: Any, regulariser: Any) -> Any:
@@ -194,13 +201,31 @@ def compose(mask: Any, regulariser: Any) -> Any:
     return GraftedPolicy(mask, regulariser if regulariser.regularises() else None)
 
 
-def idle_regulariser(method: MethodEntry, options: Any) -> str:
-    """The regulariser's donor if it adds no loss with these options; else empty."""
-    donor = dict(method.places).get("regulariser", "")
-    if not isinstance(method.recipe, Graft) or ALIASES.get(donor, donor) in ("", "3dgs"):
-        return ""
-    parts = method.recipe.entries["regulariser"].build(options.regulariser)
-    return "" if parts.mask.regularises() else donor
+def check_graft(method: MethodEntry, options: Any) -> list[str]:
+    """Warnings of a graft: losses that are switched off, and effects that it leaves out.
+
+    Other methods have none, nor has a graft whose recipes cannot be built: building tells why.
+
+    Raises:
+        AwError: it could not train, or would change nothing.
+    """
+    from ambiguous_wild.methods.graft_checks import NOTHING, check_members, left_out
+
+    recipe = method.recipe
+    if not isinstance(recipe, Graft):
+        return []
+    try:
+        host, donors = _members(recipe.name, recipe.entries, options)
+    except Exception:
+        return []
+    check_members(host, donors)
+    found, losses = left_out(host, donors), donors.get("regulariser")
+    if losses is not None and losses.name not in NOTHING and not losses.parts.mask.regularises():
+        found.append(
+            f"{losses.name} adds no loss on the render with these options; "
+            f"switch it on with --set {losses.name}.KEY=VALUE, or leave the regulariser out"
+        )
+    return found
 
 
 def _pairs(name: str) -> list[tuple[str, str]]:
@@ -229,6 +254,11 @@ def _written(rest: str) -> list[tuple[str, str]]:
 
 def _donor(place: str, name: str, methods: Mapping[str, MethodEntry]) -> MethodEntry:
     target = ALIASES.get(name, name)
+    if is_program(name) or (target in methods and methods[target].program is not None):
+        raise AwError(
+            f"{place}={name}: {name} is trained by another program, which has no parts for other methods; "
+            "name a method of 'aw methods'"
+        )
     if "@" in target or target not in methods:
         raise unknown(f"{place} donor", name, [*methods, *ALIASES], "'aw methods' lists them")
     return methods[target]

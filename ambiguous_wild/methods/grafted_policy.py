@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
+from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.parts import MaskPolicy, State
 from ambiguous_wild.splat.rendered import Cotangents, Gradients, as_cotangents
 from ambiguous_wild.splat.step import Step, TrainData
@@ -23,6 +24,12 @@ class GraftedPolicy(MaskPolicy):
         self.mask.setup(data)
         if self.regulariser is not None:
             self.regulariser.setup(data)
+
+    def reads(self) -> Effect | None:
+        return self.mask.reads()
+
+    def losses_read(self) -> Effect | None:
+        return None if self.regulariser is None else self.regulariser.losses_read()
 
     def keep(self, step: Step) -> Tensor | None:
         return self.mask.keep(step)

@@ -97,6 +97,9 @@ class Uncovered(MaskPolicy):
     def __init__(self, plane: Plane) -> None:
         self.plane, self.config, self.shares = plane, plane.config, MaskedShares()
 
+    def reads(self) -> Plane:
+        return self.plane
+
     def setup(self, data: TrainData) -> None:
         self.plane.require_setup()
 

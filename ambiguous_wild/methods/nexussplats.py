@@ -147,6 +147,9 @@ class Doubt(WarmUpMask):
         self.shares = MaskedShares()
         self.pending: Gradients | None = None  # of the step under way
 
+    def reads(self) -> Codes:
+        return self.codes
+
     def setup(self, data: TrainData) -> None:
         self.codes.require_setup()
         self.distance.setup(data)

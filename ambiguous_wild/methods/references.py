@@ -25,7 +25,12 @@ _RECIPE = re.compile(r"(?P<path>.+\.py):(?P<name>[A-Za-z_]\w*)")
 
 def is_reference(name: str) -> bool:
     """Whether the name is such a reference."""
-    return name.startswith((EXTERNAL, NERFBASELINES)) or _RECIPE.fullmatch(name) is not None
+    return is_program(name) or _RECIPE.fullmatch(name) is not None
+
+
+def is_program(name: str) -> bool:
+    """Whether the name is a reference to another program."""
+    return name.startswith((EXTERNAL, NERFBASELINES))
 
 
 def reference_file(name: str) -> Path | None:

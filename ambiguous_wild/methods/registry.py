@@ -15,7 +15,7 @@ from pathlib import Path
 from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.methods.builtin import BUILTIN
 from ambiguous_wild.methods.entry import MethodEntry
-from ambiguous_wild.methods.graft import grafted, knows_truth, split_graft
+from ambiguous_wild.methods.graft import grafted, knows_truth, refuse_parts_of_program, split_graft
 from ambiguous_wild.methods.plugin_file import import_file
 from ambiguous_wild.methods.references import is_reference, read_reference
 from ambiguous_wild.methods.second_pass import second_pass, trained_once
@@ -63,6 +63,7 @@ def get_method(name: str) -> MethodEntry:
     once = trained_once(name)
     if once != name:
         return second_pass(get_method(once))
+    refuse_parts_of_program(name)
     if is_reference(name):
         return load_reference(name)
     methods = all_methods()

@@ -141,6 +141,9 @@ class TrimmedLoss(MaskPolicy):
         self.low: float | Tensor = 1.0
         self.rounds = 0
 
+    def reads(self) -> SplatfactoColours:
+        return self.effect
+
     def setup(self, data: TrainData) -> None:
         self.effect.require_setup()
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -29,6 +29,9 @@ from ambiguous_wild.splat.rendered import (
     sum_own,
 )
 from ambiguous_wild.splat.step import Shot, Step, TrainData
+
+if TYPE_CHECKING:
+    from ambiguous_wild.splat.effects.base import Effect
 
 STATIC = "static"  # name of the first field, the one that is the result
 # dL/d(composed pictures) to those of every field's own pictures
@@ -57,6 +60,10 @@ class Fields(ABC):
             static: the first field's Gaussians.
             rates: the first field's learning rates.
         """
+
+    def reads(self) -> Effect | None:
+        """The effect of their method that they cannot work without; a graft that lacks it is refused."""
+        return None
 
     def drawn(self, shot: Shot) -> Sequence[str]:
         """Fields that take part in this picture beside the static one; only asked for train photos."""

@@ -189,13 +189,54 @@ def test_a_resume_command_takes_over_where_something_lies(scene, tmp_path):
             {"train": ["train", "--sleep", "60", *BASE["train"].split()[1:]], "timeout_h": 0.2 / 3600},
             "took longer",
         ),
-        ({"prefix": ["no-such-program"]}, "cannot start 'no-such-program'"),
+        ({"prefix": ["no-such-program"]}, "there is no program 'no-such-program'"),
     ],
 )
 def test_what_a_program_leaves_wrong_is_one_clear_line(scene, tmp_path, changes, message):
     _, report = run(describe(tmp_path, **changes), scene, tmp_path / "runs")
     assert report.outcome == "failed"
     assert message in report.error
+
+
+@pytest.mark.parametrize(
+    ("changes", "word"),
+    [
+        ({"prefix": ["no-such-program", "run"]}, "no-such-program"),
+        ({"prefix": [], "train": "./train.sh"}, "./train.sh"),  # may not be executed
+        ({"prefix": [], "train": "{tool} {scene}", "options": {"tool": "no-such-tool"}}, "no-such-tool"),
+        ({"prefix": [], "render": "no-renderer", "train": f"{sys.executable} x"}, "no-renderer"),
+        ({"prefix": ["echo"], "environment": {"PATH": "/nowhere"}}, "echo"),
+    ],
+)
+def test_a_program_that_is_not_here_is_told_before_anything_is_trained(scene, tmp_path, changes, word):
+    (tmp_path / "train.sh").write_text("#!/bin/sh")
+    reference = describe(tmp_path, needs="the program nearest on PATH", **changes)
+    output = tmp_path / "runs"
+    arguments = ["--method", "3dgs", "--method", reference, "--scene", str(scene), "--iterations", "3"]
+    result = CliRunner().invoke(bench, [*arguments, "-o", str(output)])
+    assert isinstance(result.exception, AwError), result.output
+    assert f"nearest needs the program nearest on PATH: there is no program {word!r}" in str(result.exception)
+    assert not output.exists()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"prefix": [], "train": "./train.sh"},
+        {"prefix": [], "train": "{output}/x", "render": "echo"},  # known when it runs
+        {"prefix": ["train.sh"], "environment": {"PATH": "{bin}"}, "options": {"bin": "."}},
+    ],
+)
+def test_a_program_that_is_here_is_found(tmp_path, changes):
+    script = tmp_path / "train.sh"
+    script.write_text("#!/bin/sh")
+    script.chmod(0o755)
+    changes = {"render": ""} | changes if changes else changes
+    if "options" in changes:
+        changes = changes | {"options": {"bin": str(tmp_path)}}
+    entry = registry.get_method(describe(tmp_path, **changes))
+    assert entry.program.missing(entry.options()) == ""
 
 
 @pytest.mark.parametrize(

@@ -121,7 +121,7 @@ def test_costs_of_both_by_hand():
     assert found["peak_rss_mb"] == 500.0 and found["gaussians"] == 9
 
 
-@pytest.mark.parametrize("method", ["3dgs", "absgs"])
+@pytest.mark.parametrize("method", ["3dgs", "absgs", "dronesplat@mask=none", "splatfacto-w@mask=none"])
 def test_a_method_without_masks_is_refused_in_one_line(scene, tmp_path, method):
     with pytest.raises(AwError, match=f"final masks, and {method} has none.*--mask METHOD"):
         bench(method, scene, output=tmp_path / "runs", iterations=5, passes=2, device="cpu")

@@ -5,7 +5,9 @@ import torch
 
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.methods.builtin import BUILTIN
 from ambiguous_wild.methods.uad import UncertaintyAware
+from ambiguous_wild.splat.parts import Parts
 from tests.host_reads import moved, no_transfers
 from tests.methods.baselines import bits, parts_of, resumed_equals_whole, trainer_of
 from tests.splat import fake_gsplat
@@ -122,10 +124,21 @@ def test_a_step_on_an_accelerator_leaves_the_host_alone(sparse, tmp_path, monkey
 
 @pytest.mark.parametrize("method", ["gs-w", "splatfacto-w", "nexussplats", "hybridgs", "forestsplats"])
 def test_masks_that_read_an_effect_are_not_grafted_without_it(scene, tmp_path, method):
-    with pytest.warns(UserWarning, match="leaves out"):
-        made = parts_of(f"3dgs@mask={method}")
-    with pytest.raises(AwError, match=f"HOST@mask={method},effects={method}"):
-        trainer_of(scene, tmp_path, made)
+    fields = method == "forestsplats"  # its masks belong to its fields: the effects alone would not do
+    message = f"use {method} as the host" if fields else f"masks of {method} need its effects: add effects="
+    with pytest.raises(AwError, match=message):
+        parts_of(f"3dgs@mask={method}")
+    # and where parts are put together by hand
+    with pytest.raises(AwError, match=f"masks of {method} need its effects"):
+        trainer_of(scene, tmp_path, Parts(mask=parts_of(method).mask))
+
+
+@pytest.mark.parametrize("method", sorted(entry.name for entry in BUILTIN))
+def test_what_a_mask_policy_reads_is_an_effect_of_its_method(method):
+    parts = parts_of(method)
+    read = [parts.mask.reads(), parts.mask.losses_read()]
+    read += [] if parts.fields is None else [parts.fields.reads()]
+    assert all(effect is None or any(effect is own for own in parts.effects) for effect in read)
 
 
 @pytest.mark.parametrize("method", ["gs-w", "nexussplats"])

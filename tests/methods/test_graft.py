@@ -13,7 +13,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import with_options
 from ambiguous_wild.harness.running.grid import plan_cells
 from ambiguous_wild.methods import MethodEntry, get_method, register, registry
-from ambiguous_wild.methods.graft import compose, graft_name, idle_regulariser
+from ambiguous_wild.methods.graft import check_graft, compose, graft_name
 from ambiguous_wild.methods.grafted_policy import GraftedPolicy
 from ambiguous_wild.methods.refinesplat.density import EntropyAwareDensity
 from ambiguous_wild.methods.refinesplat.policy import RefineSplatMask
@@ -140,17 +140,38 @@ def toned(monkeypatch):
     """A method whose recipe brings an effect of its own, an affine exposure per photo."""
     monkeypatch.setattr(registry, "_registered", {})
 
+    class Toned(RobustSplatMask):
+        def cotangent(self, step, keep):
+            return None
+
     def build(options):
-        return Parts(mask=RobustSplatMask(RobustSplatConfig()), effects=(AffineExposure(),))
+        return Parts(mask=Toned(RobustSplatConfig()), effects=(AffineExposure(),))
 
     return register(MethodEntry("toned", "", build))
 
 
-@pytest.mark.parametrize("place", ["mask", "density", "regulariser"])
-def test_a_donors_effects_that_are_left_out_are_named(toned, place):
-    with pytest.warns(UserWarning, match=r"leaves out toned's effects \(exposure\): add effects=toned"):
-        parts = parts_of(f"3dgs@{place}=toned")
-    assert parts.effects == ()
+def warnings_of(name, **options):
+    entry = get_method(name)
+    return check_graft(entry, with_options(entry.options(), options))
+
+
+@pytest.mark.parametrize("place", ["mask", "regulariser"])
+def test_a_donors_effects_that_are_left_out_are_named(toned, place, recwarn):
+    line = "leaves out toned's effects (exposure): add effects=toned to the name to take them, or effects="
+    (found,) = warnings_of(f"3dgs@{place}=toned")
+    assert found == f"{line}none to leave them out without this warning"
+    # where `effects=none` would take the host's own effects away, its name keeps them
+    (found,) = warnings_of(f"swag@{place}=toned")
+    assert found == f"{line}swag to leave them out without this warning"
+    assert parts_of(f"3dgs@{place}=toned").effects == () and not recwarn.list
+    assert warnings_of("swag@effects=swag,mask=toned") == []
+    assert len(warnings_of("3dgs@mask=toned,regulariser=toned")) == 1
+
+
+@pytest.mark.parametrize("name", ["3dgs@density=toned", "3dgs@density=gs-w", "toned@mask=none"])
+def test_effects_that_do_not_matter_are_not_named(toned, name, recwarn):
+    assert warnings_of(name) == []
+    assert parts_of(name).density is not None and not recwarn.list
 
 
 def test_the_effects_of_a_donor_are_taken_where_they_are_asked_for(toned, recwarn):
@@ -215,10 +236,112 @@ def test_a_regulariser_that_adds_nothing_is_told(scene):
             ("none", []),
         )
     )
-    assert idle_regulariser(off.method, off.options) == "refinesplat"
-    assert idle_regulariser(on.method, on.options) == ""
-    assert idle_regulariser(none.method, none.options) == ""
-    assert idle_regulariser(get_method("3dgs"), None) == ""
+    (line,) = check_graft(off.method, off.options)
+    assert "refinesplat adds no loss" in line and "--set refinesplat.KEY=VALUE" in line
+    assert check_graft(on.method, on.options) == []
+    assert check_graft(none.method, none.options) == []
+    assert check_graft(get_method("3dgs"), None) == []
+
+
+OF_ITS_FIELDS = "would mask nothing: the masks of {} come from its own fields.*use {} as the host"
+NO_LOSS = "{0} would add nothing: {0} has no loss of this kind"
+REFUSED = {
+    "3dgs@mask=desplat": OF_ITS_FIELDS.format("desplat", "desplat"),
+    "3dgs@mask=desplat+2passes": OF_ITS_FIELDS.format("desplat", "desplat"),
+    "gs-w@mask=forestsplats": OF_ITS_FIELDS.format("forestsplats", "forestsplats"),
+    "3dgs@mask=forestsplats,effects=forestsplats": OF_ITS_FIELDS.format("forestsplats", "forestsplats"),
+    "3dgs@effects=forestsplats": "effects=forestsplats would change no picture",
+    "forestsplats@effects=none": "fields of forestsplats need its effects.*leave effects=none out",
+    "3dgs@mask=gs-w": "masks of gs-w need its effects: add effects=gs-w to the name$",
+    "3dgs@mask=gs-w,effects=wildgaussians": "write effects=gs-w instead of effects=wildgaussians$",
+    "gs-w@effects=wildgaussians": "masks of gs-w need its own effects, which effects=wildgaussians replaces: "
+    "add mask=wildgaussians or mask=none to the name",
+    "gs-w@effects=none": "replaces: add mask=none to the name, or leave effects=none out$",
+    "splatfacto-w@effects=wildgaussians": "add mask=wildgaussians,regulariser=none or mask=none,",
+    "3dgs@regulariser=splatfacto-w": "losses of splatfacto-w need its effects: add effects=splatfacto-w",
+    "3dgs@regulariser=asymgs": "losses of asymgs need its effects: add effects=asymgs",
+    "gs-w@regulariser=mcmc": NO_LOSS.format("mcmc"),
+    "3dgs@regulariser=swag": NO_LOSS.format("swag"),
+    "3dgs@regulariser=gs-w": NO_LOSS.format("gs-w"),  # its loss trains its masks
+    "3dgs@regulariser=asymgs-twin": NO_LOSS.format("asymgs-twin"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_graft_that_would_do_nothing_or_cannot_train_is_refused(name, recwarn):
+    for check in (warnings_of, parts_of):
+        with pytest.raises(AwError, match=REFUSED[name]) as refused:
+            check(name)
+        assert "\n" not in str(refused.value)
+    assert not recwarn.list
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "desplat@mask=desplat",
+        "desplat@mask=truth",
+        "forestsplats@mask=truth",
+        "desplat+2passes",
+        "gs-w@mask=none,effects=none",
+        "gs-w@mask=gs-w,effects=gs-w",
+        "3dgs@regulariser=none",
+        "splatfacto-w@mask=none,regulariser=none,effects=none",
+    ],
+)
+def test_what_the_advice_names_is_accepted(name):
+    assert warnings_of(name) == []
+    assert parts_of(name.removesuffix("+2passes")).mask is not None
+
+
+def test_a_graft_is_refused_before_anything_is_trained_or_made(scene, tmp_path):
+    arguments = ["--method", "3dgs", "--scene", scene, "--iterations", "5", "-o", tmp_path / "runs"]
+    for more in (
+        ["--method", "3dgs@mask=desplat"],
+        ["--mask", "desplat", "--passes", "2"],
+        ["--method", "3dgs@mask=gs-w"],
+        ["--regulariser", "mcmc"],
+    ):
+        result = run(bench, *arguments, *more)
+        assert isinstance(result.exception, AwError), result.output
+        assert str(result.exception).startswith("3dgs@") and "leaves out" not in result.output
+        assert not (tmp_path / "runs").exists()
+
+
+def test_effects_that_are_left_out_are_one_line_of_warning(scene, tmp_path, recwarn):
+    arguments = ["--method", "3dgs@mask=wildgaussians", "--scene", scene, "--iterations", "5"]
+    result = run(bench, *arguments, "-o", tmp_path / "runs", "--no-pictures")
+    assert result.exit_code == 0, result.output
+    assert result.stderr.count("leaves out") == 1
+    assert "warning: 3dgs@mask=wildgaussians: leaves out wildgaussians's effects" in result.stderr
+    assert not [warning for warning in recwarn if "leaves out" in str(warning.message)]
+
+
+PROGRAMS = {
+    "external:opensplat@density=uad": "external:opensplat is trained by another program, which takes no "
+    "parts of other methods: leave density=uad out",
+    "external:opensplat@mask=truth+2passes": "takes no parts of other methods: leave mask=truth out",
+    "nerfbaselines:x@mask=truth": "nerfbaselines:x is trained by another program",
+    "gs-w@density=external:opensplat": "trained by another program, which has no parts for other",
+}
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_other_programs_neither_take_nor_give_parts(name):
+    with pytest.raises(AwError, match=PROGRAMS[name]):
+        get_method(name)
+
+
+def test_other_programs_are_known_by_their_names_too(monkeypatch, tmp_path):
+    monkeypatch.setattr(registry, "_registered", {})
+    get_method("external:opensplat")
+    with pytest.raises(AwError, match="opensplat is trained by another program, which takes no parts"):
+        get_method("opensplat@density=uad")
+    with pytest.raises(AwError, match="density=opensplat: opensplat is trained by another program"):
+        get_method("3dgs@density=opensplat")
+    odd = tmp_path / "a@mask=b.yaml"  # a file may be called so
+    odd.write_text("name: odd\ntrain: 'true'\nrenders: '{stem}.png'\n")
+    assert get_method(f"external:{odd}").name == "odd"
 
 
 def test_the_regulariser_sees_the_hosts_keep_map():

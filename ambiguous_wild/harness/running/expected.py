@@ -12,12 +12,8 @@ from ambiguous_wild.harness.running.step_time import LEAST, MOST, expected_s, sl
 
 
 def unfinished(cells: Sequence[Cell], output: Path, overwrite: Overwrite) -> list[Cell]:
-    """The cells that our trainer will train: not those of other programs, nor those that are kept."""
-    return [
-        cell
-        for cell in cells
-        if cell.method.program is None and not _kept(cell_folder(output, cell), overwrite)
-    ]
+    """The cells that will be run: not those that are kept."""
+    return [cell for cell in cells if not _kept(cell_folder(output, cell), overwrite)]
 
 
 def _kept(folder: Path, overwrite: Overwrite) -> bool:

@@ -41,6 +41,7 @@ def run_program(cell: Cell, folder: Path) -> RunResult:
         raise AwError(f"{cell.method.name} is no external method")
     if cell.chosen.effects:
         raise AwError(f"{cell.method.name} is an external program and takes no effects: use --effects none")
+    check_program(cell)
     (folder / WORK).mkdir(exist_ok=True)
     task = Task(
         scene=cell.scene,
@@ -77,6 +78,16 @@ def run_program(cell: Cell, folder: Path) -> RunResult:
         | ({} if cell.protocol == "full" else {"protocol": cell.protocol}),
         cost=cast(Cost, {"device": cell.device, **produced.cost, **time_cost, **_model(produced, folder)}),
     )
+
+
+def check_program(cell: Cell) -> None:
+    """Raise AwError if the method's program is not on this machine."""
+    program, method = cell.method.program, cell.method
+    if program is not None and (lacking := program.missing(cell.options)):
+        raise AwError(
+            f"{method.name} needs {method.needs}: there is no program {lacking!r}; install it, or name "
+            "another program in a copy of the description (docs/external-methods.md)"
+        )
 
 
 def _timed(program: Program, task: Task) -> tuple[Produced, Cost]:

@@ -21,6 +21,7 @@ from ambiguous_wild.harness.running.meter import Meter
 from ambiguous_wild.harness.running.records import Cost
 from ambiguous_wild.io.atomic import atomic_dir, write_json
 from ambiguous_wild.io.images import read_keep_map, write_png
+from ambiguous_wild.methods.grafted_policy import GraftedPolicy
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.pace import TrainConfig
@@ -58,7 +59,8 @@ def check_passes(cell: Cell) -> None:
 
 def refuse_without_masks(name: str, parts: Parts) -> None:
     """Raise AwError if the method's mask policy keeps everything."""
-    own = type(parts.mask)
+    policy = parts.mask
+    own = type(policy.mask if isinstance(policy, GraftedPolicy) else policy)
     if own.keep is MaskPolicy.keep and own.predict is MaskPolicy.predict:
         raise AwError(
             f"--passes 2 trains again with the final masks, and {name} has none: "

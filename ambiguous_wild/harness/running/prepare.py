@@ -26,6 +26,23 @@ def try_recipes(cells: Sequence[Cell]) -> None:
             continue  # a plug-in's bug: its runs fail with their traceback, the others are trained
 
 
+def check_grafts(cells: Sequence[Cell]) -> list[str]:
+    """Warnings of grafts, each once.
+
+    Raises:
+        AwError: a graft that could not train, or would change nothing.
+    """
+    from ambiguous_wild.methods.graft import check_graft
+
+    lines = []
+    for name, cell in {cell.method.name: cell for cell in cells}.items():
+        try:
+            lines += [f"warning: {name}: {line}" for line in check_graft(cell.method, cell.options)]
+        except AwError as error:
+            raise AwError(f"{name}: {error}") from error
+    return lines
+
+
 def prepare_cpu(threads: int | None, say: Callable[[str], None] = lambda text: None) -> None:
     """Set the threads of the kernels and compile them, once per machine.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import glob
 import json
+import os
 import shutil
 import subprocess
 from collections.abc import Sequence
@@ -43,6 +44,21 @@ class CommandProgram:
     timeout_s: float | None
     photos: Photos = "all"  # what the program sees, see staging.py
     drawn_by_us: bool = False  # it leaves splats, which our renderer draws
+
+    def missing(self, options: Any) -> str:
+        """The first word of a command, or of the prefix, that is no program here; empty if all are."""
+        values = dataclasses.asdict(options)
+        commands = [self.prefix] if self.prefix else [self.train, self.render, self.resume]
+        words = [command[0] for command in commands if command]
+        path = dict(self.environment).get("PATH")
+        for word in dict.fromkeys(words):
+            if templates.placeholders(f"{word}{path or ''}", self.name) - values.keys():
+                continue  # known when it runs
+            program = templates.fill(word, values)
+            where = self.cwd / program if os.path.dirname(program) else program
+            if shutil.which(where, path=path and templates.fill(path, values)) is None:
+                return program
+        return ""
 
     def run(self, task: Task) -> Produced:
         """Train unless that is done, render unless that is done, collect.

@@ -86,6 +86,10 @@ class NerfBaselines:
     method: str
     program: str
 
+    def missing(self, options: Any) -> str:
+        """Its command, where it has gone since it was found."""
+        return "" if shutil.which(self.program) else self.program
+
     def run(self, task: Task) -> Produced:
         """Train, render the test split to an archive, read it.
 

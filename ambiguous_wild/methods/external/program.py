@@ -43,6 +43,14 @@ class Produced:
 class Program(Protocol):
     """Trains, renders the test views, and returns the paths of its output."""
 
+    def missing(self, options: Any) -> str:
+        """The command that this machine lacks; empty if all are here.
+
+        Args:
+            options: the method's.
+        """
+        ...
+
     def run(self, task: Task) -> Produced:
         """Run, or resume a stopped run.
 

@@ -49,6 +49,9 @@ class Forest(Fields):
     def __init__(self, nets: Nets) -> None:
         self.nets, self.config = nets, nets.config
 
+    def reads(self) -> Nets:
+        return self.nets
+
     def setup(self, data: TrainData, static: Gaussians, rates: Rates) -> Mapping[str, FieldStart]:
         self.nets.require_setup()
         rng, count = np.random.default_rng([data.seed, 0xF0]), min(self.config.points, len(static))
@@ -115,6 +118,9 @@ class Mixed(MaskPolicy):
 
     def __init__(self, nets: Nets) -> None:
         self.forest = Forest(nets)
+
+    def reads(self) -> Nets:
+        return self.forest.nets
 
     def setup(self, data: TrainData) -> None:
         self.forest.nets.require_setup()

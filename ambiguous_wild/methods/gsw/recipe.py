@@ -218,6 +218,9 @@ class Visibility(MaskPolicy):
     def __init__(self, effect: GswAppearance) -> None:
         self.effect, self.config = effect, effect.config
 
+    def reads(self) -> GswAppearance:
+        return self.effect
+
     def setup(self, data: TrainData) -> None:
         self.effect.require_setup()
 

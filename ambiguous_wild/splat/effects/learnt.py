@@ -89,10 +89,7 @@ class Learnt(Effect):
     def require_setup(self) -> None:
         """Raise AwError where the run lacks this effect: a mask policy that reads it was grafted alone."""
         if not hasattr(self, "_adam"):
-            raise AwError(
-                f"the masks of {self.name} need its effects too: "
-                f"write HOST@mask={self.name},effects={self.name}"
-            )
+            raise AwError(f"the masks of {self.name} need its effects: use both, or masks of another method")
 
     def _table(self, leaf: Leaf) -> Tensor:
         values = leaf.values.detach().to(torch.float32)

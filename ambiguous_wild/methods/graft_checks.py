@@ -1,0 +1,145 @@
+"""Grafts that could not train or would change nothing, refused before training; what a graft leaves out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.splat.effects.base import Effect
+from ambiguous_wild.splat.parts import MaskPolicy, Parts
+
+NOTHING = ("none", "3dgs")  # donors that leave a place empty
+# where an effect changes a picture, or the Gaussians that it shows
+_SEEN = ("change_parts", "camera", "model", "shade", "image", "pose", "after_step")
+
+
+@dataclass(frozen=True)
+class Member:
+    """The host or a donor of a graft."""
+
+    name: str  # as the name of the graft gives it
+    parts: Parts
+
+
+def check_members(host: Member, donors: Mapping[str, Member]) -> None:
+    """Refuse a graft that could not train, or a donor that has nothing for its place.
+
+    Args:
+        host: that is trained.
+        donors: by place.
+
+    Raises:
+        AwError: a donor's masks come from its own fields, it has no loss on the render, or its effects change
+            no picture; or masks, losses or fields need effects that the graft leaves out.
+    """
+    if "mask" in donors:
+        _check_mask(host, donors["mask"])
+    if "regulariser" in donors:
+        _check_regulariser(donors["regulariser"])
+    if "effects" in donors:
+        _check_effects(host, donors)
+    _check_what_is_read(host, donors)
+
+
+def left_out(host: Member, donors: Mapping[str, Member]) -> list[str]:
+    """Warnings of effects that a donor of masks or losses brings, and the graft has not."""
+    if "effects" in donors:
+        return []
+    own, found = {name_of(effect) for effect in host.parts.effects}, {}
+    for place in ("mask", "regulariser"):
+        donor = donors.get(place)
+        if donor is None or (place == "regulariser" and not donor.parts.mask.regularises()):
+            continue
+        names = [name for name in map(name_of, donor.parts.effects) if name not in own]
+        if names:
+            found[donor.name] = (
+                f"leaves out {donor.name}'s effects ({', '.join(names)}): add effects={donor.name} to the "
+                f"name to take them, or effects={host.name if own else 'none'} to leave them out without "
+                "this warning"
+            )
+    return list(found.values())
+
+
+def has_masks(parts: Parts) -> bool:
+    """Whether the method's masks can be taken by another."""
+    return type(parts.mask).keep is not MaskPolicy.keep
+
+
+def masks_of_fields(parts: Parts) -> bool:
+    """Whether the method's masks only show what its own fields have learnt: they weigh no loss."""
+    shown = type(parts.mask).predict is not MaskPolicy.predict
+    return parts.fields is not None and shown and not has_masks(parts)
+
+
+def name_of(effect: Effect) -> str:
+    return effect.name or type(effect).__name__
+
+
+def _check_mask(host: Member, donor: Member) -> None:
+    if donor.parts is not host.parts and masks_of_fields(donor.parts):
+        raise AwError(
+            f"mask={donor.name} would mask nothing: the masks of {donor.name} come from its own fields, "
+            f"which a graft does not take; use {donor.name} as the host, or take the masks of another method"
+        )
+
+
+def _check_regulariser(donor: Member) -> None:
+    own = type(donor.parts.mask)
+    losses = own.cotangent is not MaskPolicy.cotangent or own.gradients is not MaskPolicy.gradients
+    if donor.name not in NOTHING and (own.learns_by_gradients or not losses):
+        raise AwError(
+            f"regulariser={donor.name} would add nothing: {donor.name} has no loss of this kind; name a "
+            "method with a loss on the render, e.g. t-3dgs, or leave the regulariser out"
+        )
+
+
+def _check_effects(host: Member, donors: Mapping[str, Member]) -> None:
+    donor = donors["effects"]
+    effects, mask = donor.parts.effects, donors.get("mask", host).parts.mask
+    if not effects or donor.parts is host.parts:
+        return
+    if not any(effect is mask.reads() or any(map(effect.acts, _SEEN)) for effect in effects):
+        raise AwError(
+            f"effects={donor.name} would change no picture: the effects of {donor.name} serve its own "
+            f"fields, which a graft does not take; use {donor.name} as the host, or write effects=none"
+        )
+
+
+def _check_what_is_read(host: Member, donors: Mapping[str, Member]) -> None:
+    taken = donors.get("effects", host).parts.effects
+
+    def lacks(effect: Effect | None) -> bool:
+        return effect is not None and not any(effect is other for other in taken)
+
+    if host.parts.fields is not None and lacks(host.parts.fields.reads()):
+        raise AwError(
+            f"the fields of {host.name} need its effects, which effects={donors['effects'].name} replaces: "
+            f"leave effects={donors['effects'].name} out"
+        )
+    unfit = {}  # method whose masks or losses need effects that are not there, by place
+    masking, losing = donors.get("mask", host), donors.get("regulariser", host)
+    if lacks(masking.parts.mask.reads()):
+        unfit["mask"] = masking
+    if losing.parts.mask.regularises() and lacks(losing.parts.mask.losses_read()):
+        unfit["regulariser"] = losing
+    for place, owner in unfit.items():
+        what = "masks" if place == "mask" else "losses"
+        if owner is host:
+            raise AwError(_of_host(what, host, donors["effects"], [p for p, m in unfit.items() if m is host]))
+        how = f"add effects={owner.name} to the name"
+        if "effects" in donors:
+            how = f"write effects={owner.name} instead of effects={donors['effects'].name}"
+        raise AwError(f"the {what} of {owner.name} need its effects: {how}")
+
+
+def _of_host(what: str, host: Member, effects: Member, places: list[str]) -> str:
+    """How to go on where the host's own masks or losses need the effects that a donor's replace."""
+    empty = ",".join(f"{place}=none" for place in places)
+    ways = [empty]
+    if places[0] == "mask" and has_masks(effects.parts):
+        ways.insert(0, empty.replace("mask=none", f"mask={effects.name}"))
+    return (
+        f"the {what} of {host.name} need its own effects, which effects={effects.name} replaces: "
+        f"add {' or '.join(ways)} to the name, or leave effects={effects.name} out"
+    )

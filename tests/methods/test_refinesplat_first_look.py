@@ -126,6 +126,29 @@ def test_later_evidence_weighs_more_where_others_show_something_else_and_less_wh
     assert (unknown[:, WIDTH // 2 + 14 :] == 1.0).all()  # no sparse point of a wall there: nobody could tell
 
 
+COLOURS = [(0.9, 0.1, 0.2), (0.1, 0.9, 0.2), (0.1, 0.2, 0.9), (0.9, 0.9, 0.1)]
+
+
+@pytest.mark.parametrize(("colours", "kept"), [(COLOURS, True), (COLOURS[:1] * 4, False)])
+def test_in_a_crowd_the_colour_that_most_photos_show_is_the_walls(colours, kept):
+    """Three of seven photos show a part of the wall; before it the others show people."""
+    photos, crowd = [wall(view) for view in range(VIEWS)], np.s_[16:34, :]
+    for view, colour in zip((1, 3, 5, 6), colours):
+        photos[view][crowd] = colour
+    inner = np.s_[20:30, 16:48]
+    few = keeps(photos, dataclasses.replace(JUDGE_ALL, consensus=0))
+    found = keeps(photos, dataclasses.replace(JUDGE_ALL, consensus=2, crowd=0.3))
+    calm = keeps(photos, dataclasses.replace(JUDGE_ALL, consensus=2, crowd=0.9))
+    alone = keeps(photos, dataclasses.replace(JUDGE_ALL, consensus=3, crowd=0.3))  # only two others show it
+    assert all(np.array_equal(a, b) for a, b in zip(calm, few))
+    for view in (0, 2, 4):
+        assert few[view][inner].mean() < 0.1 and alone[view][inner].mean() < 0.1
+        assert bool(found[view][inner].mean() > 0.9) == kept
+    assert all(np.array_equal(found[view][inner], few[view][inner]) for view in (1, 3, 5, 6))
+    if kept:
+        assert not any(found[view][inner].any() for view in (1, 3, 5, 6))
+
+
 @pytest.mark.parametrize("views", [2, 16])
 def test_the_same_every_time(views):
     photos, _ = passers()

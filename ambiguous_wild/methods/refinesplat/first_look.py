@@ -38,6 +38,10 @@ class FirstLookConfig:
     quantile: float = 0.3  # of their differences: this share of views must show the colour
     threshold: float = 0.02  # difference of colour in [0, 1] above which a pixel is masked at first
     normal: float = 3.0  # and above this many times what is normal in the photo
+    # in a crowd fewer views show a surface: this many others are enough if no other colour is shown there by
+    # more; 0 = not used. Crowd of seed 37, 700 iterations: 18.5 dB, with it 19.3
+    consensus: int = 2
+    crowd: float = 0.35  # of a photo: if as much would be masked, it is a crowd
     known_by: int = 3  # with fewer views that see it, a surface is not judged
     least: float = (
         0.1  # of a photo: if less would be masked, nothing is; so few distractors do no harm at the start
@@ -48,7 +52,7 @@ class FirstLookConfig:
         check_limits(
             self, "refinesplat.first_look",
             views=(1, math.inf), quantile=(0, 1), threshold=(0, math.inf), normal=(0, math.inf),
-            known_by=(1, math.inf), least=(0, 1), weight=(1, math.inf),
+            known_by=(1, math.inf), consensus=(0, math.inf), crowd=(0, 1), least=(0, 1), weight=(1, math.inf),
         )  # fmt: skip
 
 
@@ -97,12 +101,12 @@ def first_look(
             looks.append(None)
             continue
         world = world_points(cameras[view], inverse)
-        differences = [
-            _difference(ours, world, cameras[j], surface, limits)
+        seen = [
+            _seen_by(ours, world, cameras[j], surface, limits)
             for j in others
             if (surface := surfaces[j]) is not None and (limits := ranges[j]) is not None
         ]
-        looks.append(_judge(differences, config))
+        looks.append(_judge(ours, seen, config))
     return looks
 
 
@@ -111,14 +115,32 @@ def _small(photo: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     return cv2.resize(blurred, (shape[1], shape[0]), interpolation=cv2.INTER_AREA)
 
 
-def _difference(
+@dataclass(frozen=True)
+class _Seen:
+    """What another view shows at our surfaces."""
+
+    low: np.ndarray  # [h, w, 3] float32, least colour around the place
+    high: np.ndarray  # greatest
+    offset: np.ndarray  # [3], of our exposure
+    sees: np.ndarray  # [h, w] bool, whether the surface is in its picture and not behind another one
+
+    def outside(self, colour: np.ndarray) -> np.ndarray:
+        """Distance of colours [..., 3] to the range, [...]; NaN where it sees nothing."""
+        low, high = self.low + self.offset - colour, colour - self.high - self.offset
+        beyond = np.maximum(np.maximum(low, high), 0.0)
+        return np.where(self.sees, beyond.mean(axis=-1), np.float32(np.nan))
+
+    def at(self, rows: np.ndarray) -> _Seen:
+        return _Seen(self.low[rows], self.high[rows], self.offset, self.sees[rows])
+
+
+def _seen_by(
     ours: np.ndarray,  # [h, w, 3] float32
     world: np.ndarray,  # [h, w, 3], NaN where not known
     camera: Camera,
     surface: np.ndarray,  # inverse depth of the other view
     limits: tuple[np.ndarray, np.ndarray],  # least and greatest colours around each of its pixels
-) -> np.ndarray:
-    """Distance of our colours to the other view's range there, [h, w]; NaN where it sees nothing."""
+) -> _Seen:
     local = world @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
     x, y = in_map(camera, local, surface.shape)
     z = local[..., 2]
@@ -128,23 +150,44 @@ def _difference(
     sees = inside & ~(nearest * z > BEHIND)
     low, high = (cv2.remap(c, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for c in limits)
     offset = common_offset(ours - 0.5 * (low + high), sees)
-    outside = np.maximum(np.maximum(low + offset - ours, ours - high - offset), 0.0)
-    return np.where(sees, outside.mean(axis=2), np.float32(np.nan))
+    return _Seen(low, high, offset, sees)
 
 
-def _judge(differences: list[np.ndarray], config: FirstLookConfig) -> FirstLook | None:
-    """A first look from the differences of a photo to the others; None if nothing is known."""
-    if not differences:
+def _judge(ours: np.ndarray, seen: list[_Seen], config: FirstLookConfig) -> FirstLook | None:
+    """A first look from what the others show at the surfaces of a photo; None if nothing is known."""
+    if not seen:
         return None
-    stack = np.stack(differences)
+    stack = np.stack([view.outside(ours) for view in seen])
     evidence = quantile_of(stack, config.quantile)
     known = np.isfinite(stack).sum(axis=0) >= config.known_by
     if not known.any():
         return None
     # normal difference: distractors cover less than half of a photo, else nothing could be decided
     normal = float(np.quantile(evidence[known], 0.4))
-    passing = evidence > max(config.threshold, config.normal * normal)
+    limit = max(config.threshold, config.normal * normal)
+    passing = known & (evidence > limit)
+    if config.consensus and passing.mean() >= config.crowd:
+        at = passing & known & ((stack <= limit).sum(axis=0) >= config.consensus)
+        passing[at] = ~_leads(ours[at], [view.at(at) for view in seen], stack[:, at], limit)
     return FirstLook(np.where(known, passing, 0.5).astype(np.float32), config.least)
+
+
+def _leads(ours: np.ndarray, seen: list[_Seen], outside: np.ndarray, limit: float) -> np.ndarray:
+    """Whether no colour that others show at a place is shown by more of them than ours, [p] bool.
+
+    Args:
+        ours: [p, 3] colours.
+        seen: what n others show at these places.
+        outside: [n, p] distances of our colours to theirs.
+        limit: distance up to which two colours are the same.
+    """
+    support = (outside <= limit).sum(axis=0)
+    most = np.zeros_like(support)
+    for k, rival in enumerate(seen):
+        colour = 0.5 * (rival.low + rival.high) + rival.offset
+        backing = sum((other.outside(colour) <= limit).astype(np.int64) for other in seen)
+        most = np.maximum(most, np.where(rival.sees & ~(outside[k] <= limit), backing, 0))
+    return np.asarray(support >= most)
 
 
 def _resized(x: np.ndarray, shape: tuple[int, int]) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""`aw bench` over methods x scenes x seeds, killed (-9) at random times, against an uninterrupted run.
+"""`aw bench` over methods x scenes x seeds, killed (-9) at random moments, against an uninterrupted run.
 
     python benchmarks/kill_grid.py [-o DIR] [--methods METHOD...] [--kills 2] [--iterations 60] [--random 0]
         [--engines]
@@ -19,6 +19,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -97,17 +98,24 @@ def bench_command(
     return words
 
 
-def killed_run(command: Sequence[str], delays: Sequence[float], results: Path) -> list[dict[str, Any]]:
-    """Start the command, kill it after each delay in seconds, then let it end; returns what happened."""
+def killed_run(
+    command: Sequence[str], kills: Sequence[tuple[int, float]], results: Path
+) -> list[dict[str, Any]]:
+    """Start the command, kill it at each moment, then let it end; returns what happened.
+
+    Args:
+        command: a grid.
+        kills: in order: cells that are finished, and seconds to wait then. Time alone would depend on load.
+        results: folder of the runs.
+    """
     story = []
-    for delay in (*delays, None):
+    for moment in (*kills, None):
         begin = time.monotonic()
         process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-        try:
-            said = process.communicate(timeout=delay)[1]
-        except subprocess.TimeoutExpired:
-            os.kill(process.pid, signal.SIGKILL)
-            said = process.communicate()[1]
+        if moment is not None:
+            watched = threading.Thread(target=_kill_at, args=(process, *moment, results), daemon=True)
+            watched.start()
+        said = process.communicate()[1]
         last = said.strip().splitlines()[-1] if said.strip() else ""
         story.append(
             {
@@ -118,6 +126,15 @@ def killed_run(command: Sequence[str], delays: Sequence[float], results: Path) -
             }
         )
     return story
+
+
+def _kill_at(process: subprocess.Popen[str], cells: int, wait_s: float, results: Path) -> None:
+    """Kill it `wait_s` after its command began or, if later, `cells` cells were finished."""
+    while process.poll() is None and len(list(results.rglob("metrics.json"))) < cells:
+        time.sleep(0.05)
+    time.sleep(wait_s)
+    if process.poll() is None:
+        os.kill(process.pid, signal.SIGKILL)
 
 
 def content(path: Path) -> Any:
@@ -190,13 +207,14 @@ def main() -> int:
         subprocess.run(command(quiet), check=True)
         whole_s = time.monotonic() - begin
         rng = random.Random(args.random)
-        delays = [whole_s * rng.uniform(0.2, 0.45) for _ in range(args.kills)]
-        story = killed_run(command(disturbed), delays, disturbed)
+        cells = len(args.methods) * args.scenes * args.seeds
+        moments = sorted(rng.randrange(cells) for _ in range(args.kills))
+        kills = [(done, 6.0 * (done == 0) + rng.uniform(0.0, 2.0)) for done in moments]
+        story = killed_run(command(disturbed), kills, disturbed)
         wrong = differences(quiet, disturbed)
         for name, words in ENGINES.items() if args.engines else ():
             subprocess.run([*command(root / name), *words], check=True)
             wrong += [f"{name}: {line}" for line in differences(quiet, root / name)]
-        cells = len(args.methods) * args.scenes * args.seeds
         compared = len(files_of(quiet))
     print(f"\n| start | ended after s | exit code | cells finished of {cells} | last line |")
     print("|---|---:|---:|---:|---|")

@@ -129,7 +129,7 @@ def killed_run(
 
 
 def _kill_at(process: subprocess.Popen[str], cells: int, wait_s: float, results: Path) -> None:
-    """Kill it `wait_s` after its command began or, if later, `cells` cells were finished."""
+    """Kill it `wait_s` after `cells` cells are finished."""
     while process.poll() is None and len(list(results.rglob("metrics.json"))) < cells:
         time.sleep(0.05)
     time.sleep(wait_s)

@@ -191,12 +191,11 @@ class DensityControl:
     def _reset_due(self, step: Step) -> bool:
         config = self.config
         while self.resets_done < len(config.resets) and step.nominal >= config.resets[self.resets_done]:
-            late = config.resets[self.resets_done] > config.stop  # as in 3DGS: none after growth
+            grows = config.resets[self.resets_done] <= config.stop  # as in 3DGS: none after growth
             self.resets_done += 1
-            if late:
-                continue
             rest = step.iteration * (NOMINAL_ITERATIONS / step.nominal - 1.0)
-            if step.iteration - self.last_reset >= config.min_reset_spacing and rest >= config.min_reset_rest:
+            apart = step.iteration - self.last_reset >= config.min_reset_spacing
+            if grows and apart and rest >= config.min_reset_rest:
                 return True
         return False
 

@@ -167,7 +167,7 @@ def _judge(ours: np.ndarray, seen: list[_Seen], config: FirstLookConfig) -> Firs
     limit = max(config.threshold, config.normal * normal)
     passing = known & (evidence > limit)
     if config.consensus and passing.mean() >= config.crowd:
-        at = passing & known & ((stack <= limit).sum(axis=0) >= config.consensus)
+        at = passing & ((stack <= limit).sum(axis=0) >= config.consensus)
         passing[at] = ~_leads(ours[at], [view.at(at) for view in seen], stack[:, at], limit)
     return FirstLook(np.where(known, passing, 0.5).astype(np.float32), config.least)
 

@@ -71,18 +71,18 @@ def best_supported(shares: dict[str, float], count: int) -> list[str]:
 def build_base(data: Path, name: str, factor: int, out: Path) -> Path:
     """The base scene with its test list."""
     root = out / "bases" / name
-    chosen = root / "supported.csv"
+    chosen, listed = root.with_name(f"{name}.csv"), root.with_name(f"{name}.txt")
     if chosen.is_file():
         return root
     photos = data / name / "images"
-    if not root.is_dir():
-        source = photos if photos.is_dir() else data / name
-        aw("build-scene", str(source), "-o", str(root), "--factor", str(factor))
+    source = photos if photos.is_dir() else data / name
+    build = ("build-scene", str(source), "-o", str(root), "--factor", str(factor), "--overwrite")
+    aw(*build, "--keep-work")  # a scene has its test photos from its build; the next one continues from here
     scene = load_scene(root)
     shares = support(scene)
     tests = best_supported(shares, max(len(scene.views) // TEST_SHARE, 3))
-    write_text(root / "test_list.txt", "".join(f"{name}\n" for name in tests))
-    write_text(root / "train_list.txt", "".join(f"{name}\n" for name in sorted(shares) if name not in tests))
+    write_text(listed, "".join(f"{name}\n" for name in tests))
+    aw(*build, "--test-list", str(listed))
     rows = [f"{name},{shares[name]:.4f},{'test' if name in tests else 'train'}" for name in sorted(shares)]
     write_text(chosen, "photo,supported,split\n" + "\n".join(rows) + "\n")
     print(

@@ -107,7 +107,7 @@ class MappingResult(TypedDict):
     """Of the stage `mapping`."""
 
     models: list[ModelSummary]
-    plan: str  # "fast" or "thorough"
+    plan: str  # "fast", "wider" or "thorough"
 
 
 class UndistortResult(TypedDict):
@@ -140,7 +140,7 @@ class ChosenMethods(TypedDict):
     """What the settings "auto" became, and the model that was taken."""
 
     camera: str
-    sfm: str  # "fast" or "thorough"
+    sfm: str  # "fast", "wider" or "thorough"
     matcher: str
     mapper: str
     model: int

@@ -6,15 +6,19 @@ differences to it, each scaled to unit length. Similar vectors show the same sur
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
+
+from ambiguous_wild.builder.first_matches import best_partners, shared_features
 
 WORDS = 64  # visual words
 SAMPLE = 20_000  # descriptors that the words are learnt from
 MOST = 1500  # descriptors of a photo that count: the largest features come first in COLMAP
 SIMILAR = 16  # photos that each is matched with, unless a plan says otherwise
 NEIGHBOURS = 5  # next photos in the order of capture, likewise
+ALL_PAIRS = 100  # photos; 4950 pairs are looked at in about 10 s of a core
+SHORTLIST = 3
 _ROWS = 256  # photos compared at a time
 _ROUNDS = 12  # of k-means
 
@@ -95,26 +99,47 @@ def most_similar(
 
 
 def retrieval_pairs(
-    vectors: np.ndarray,  # [N, D], of `embed`
+    read: Callable[[str], np.ndarray],  # name -> [F, 128] uint8, the largest feature first
     names: Sequence[str],  # in the order of capture
     test_names: set[str],
     similar: int = SIMILAR,
     neighbours: int = NEIGHBOURS,
+    only: Collection[str] | None = None,
+    seed: int = 0,
+    jobs: int = 1,
 ) -> list[tuple[str, str]]:
-    """Each photo with the most similar ones and, but for those of a separate test set, the next ones.
+    """Each photo with those that share most features and, but for a separate test set, the next ones.
+
+    Up to `ALL_PAIRS` photos, every pair is looked at; above, each photo and the `SHORTLIST` times `similar`
+    photos with the most similar vectors.
+
+    Args:
+        read: called several times a name.
+        names: in the order of capture.
+        test_names: those of a separate test set.
+        similar: photos that each is matched with, at most.
+        neighbours: next photos that each is matched with.
+        only: photos that look for partners; None: all.
+        seed: of the visual words.
+        jobs: threads.
 
     Returns:
-        Each pair once, in a fixed order; fewer than `similar` + `neighbours` a photo.
+        Each pair once, in a fixed order; at most `similar` + `neighbours` a photo.
     """
     everyone = list(range(len(names)))
+    asking = [i for i in everyone if only is None or names[i] in only]
     walk = [i for i in everyone if names[i] not in test_names]
     pairs = {
         (walk[i], walk[i + s])
         for i in range(len(walk))
         for s in range(1, neighbours + 1)
-        if i + s < len(walk)
+        if i + s < len(walk) and (only is None or {names[walk[i]], names[walk[i + s]]} & set(only))
     }
-    pairs |= {(min(a, b), max(a, b)) for a, b in most_similar(vectors, everyone, everyone, similar)}
+    if len(names) <= ALL_PAIRS:
+        listed = [(a, b) for a in asking for b in everyone if a != b]
+    else:
+        listed = most_similar(embed(read, names, seed), asking, everyone, SHORTLIST * similar)
+    pairs |= best_partners(shared_features(read, names, listed, jobs), dict.fromkeys(asking, similar))
     return [(names[a], names[b]) for a, b in sorted(pairs)]
 
 

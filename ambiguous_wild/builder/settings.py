@@ -22,7 +22,7 @@ class BuildSettings:
 
     factor: int | None = None  # downsampling; None: of 1, 2, 4, 8 the largest that leaves 480 px
     camera: CameraMode = "auto"  # auto: one camera if EXIF and size agree, else one a device or a photo
-    sfm: Effort = "auto"  # auto: fast, and thorough where fast leaves photos out
+    sfm: Effort = "auto"  # auto: fast, then more where it leaves photos out
     matcher: Matcher = "auto"  # auto: exhaustive up to 25 photos (thorough: 200), then retrieval
     mapper: Mapper = "incremental"  # global is faster on many photos, weaker on few
     max_features: int = 3000  # SIFT features a photo

@@ -91,7 +91,7 @@ def extract_features(
         "masks": str(masks) if masks else None,
         "max_features": settings.max_features,
         "max_side": settings.max_side,
-        "first_octave": plan.first_octave,
+        "sift": plan.sift,
         "seed": settings.seed,
         "jobs": jobs,
     }
@@ -119,11 +119,25 @@ def match(
     plan: SfmPlan,
     jobs: int,
     bar: Bar,
+    earlier: Path | None = None,
+    left_out: Sequence[str] | None = None,
 ) -> MatchResult:
-    """Match and verify pairs, in a copy of the features' database."""
+    """Match and verify pairs.
+
+    Args:
+        folder: of the result: a database and the list of pairs.
+        features: folder of the database with features.
+        facts: of the photos.
+        settings: of the build.
+        plan: matcher, and numbers of partners.
+        jobs: threads.
+        bar: progress.
+        earlier: folder of an earlier result whose pairs are kept.
+        left_out: work names of the photos that look for partners; None: all.
+    """
     matcher = plan.matcher
     database = folder / DATABASE
-    shutil.copyfile(features / DATABASE, database)
+    shutil.copyfile((earlier or features) / DATABASE, database)
     names = [f["work_name"] for f in facts]
     test_names = [f["work_name"] for f in facts if f["side"] == "test"]
     listed = folder / PAIRS
@@ -138,6 +152,8 @@ def match(
         "matcher": matcher,
         "similar": plan.similar,
         "neighbours": plan.neighbours,
+        "only": list(left_out) if left_out is not None else None,
+        "earlier": str(earlier / PAIRS) if earlier else None,
         "seed": settings.seed,
         "jobs": jobs,
     }

@@ -17,7 +17,7 @@ class FeatureJob(TypedDict):
     masks: str | None  # folder
     max_features: int
     max_side: int  # px
-    first_octave: int  # of SIFT
+    sift: str  # whose: "opencv" or "colmap"
     seed: int
     jobs: int
     parent: NotRequired[int]  # process id, added when the job is written
@@ -33,6 +33,8 @@ class MatchJob(TypedDict):
     matcher: str
     similar: int
     neighbours: int
+    only: list[str] | None  # names that look for partners; None: all
+    earlier: str | None  # file of pairs that the database holds matched
     seed: int
     jobs: int
     parent: NotRequired[int]

@@ -1,31 +1,32 @@
-"""How much structure from motion works for a model: first little, then, if that loses photos, much."""
+"""How much structure from motion works for a model: first little, then, if that leaves photos out, more."""
 
 from __future__ import annotations
 
-import statistics
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 from ambiguous_wild.builder.pairs import EXHAUSTIVE_LIMIT, FAST_EXHAUSTIVE_LIMIT
 from ambiguous_wild.builder.records import PhotoRecord
+from ambiguous_wild.builder.retrieval import NEIGHBOURS
 from ambiguous_wild.builder.settings import BuildSettings
 
-FAST_SIDE = 800  # px; below it SIFT needs the doubled photo to find enough
-# Median over photos. 560 place 16 of the 66 photos of a smooth skull; 2100 all 11 of a facade.
-FEW_FEATURES = 1200
+WIDER = 40  # partners of a photo that was left out
+HALF = 0.5  # placed after that: where fewer are, matching everything cannot make it worse
 
 
 @dataclass(frozen=True)
 class SfmPlan:
     """What an attempt does; `benchmarks/results/build-scene.md` compares them on real captures."""
 
-    name: str  # "fast" or "thorough"
-    first_octave: int  # of SIFT; -1 doubles each photo first, which takes three quarters of its time
+    name: str  # "fast", "wider" or "thorough"
+    sift: str  # whose: "opencv", or "colmap", which takes three to five times as long
     matcher: str  # "exhaustive", "retrieval" or "sequential"
     similar: int  # photos that each is matched with, for "retrieval"
     neighbours: int  # next photos in the order of capture, for "retrieval"
     growth: float  # all cameras are adjusted when the model has grown so many times
     refinements: int  # rounds of such an adjustment, at most
+    continues: bool = False  # only photos left out so far look for partners, besides the pairs matched so far
+    below: float = 1.0  # the plan is for captures of which a smaller share is placed so far
 
 
 def plans(photos: Sequence[PhotoRecord], settings: BuildSettings) -> list[SfmPlan]:
@@ -34,24 +35,22 @@ def plans(photos: Sequence[PhotoRecord], settings: BuildSettings) -> list[SfmPla
     if settings.sfm == "thorough":
         return [thorough]
     fast = _fast(photos, settings)
-    return [fast] if settings.sfm == "fast" else [fast, thorough]
-
-
-def few_features(counts: Iterable[int]) -> bool:
-    """Whether photos at their own size show too little; the doubled ones have two to four times as many."""
-    return statistics.median(counts) < FEW_FEATURES
+    if settings.sfm == "fast":
+        return [fast]
+    if fast.matcher != "retrieval":
+        return [fast, thorough]
+    wider = replace(fast, name="wider", similar=WIDER, neighbours=NEIGHBOURS, continues=True)
+    return [fast, wider, replace(thorough, below=HALF)]
 
 
 def _fast(photos: Sequence[PhotoRecord], settings: BuildSettings) -> SfmPlan:
-    side = min((min(max(p["width"], p["height"]), settings.max_side) for p in photos), default=0)
-    octave = 0 if side >= FAST_SIDE else -1
     matcher = _matcher(len(photos), settings, FAST_EXHAUSTIVE_LIMIT)
     many = len(photos) > EXHAUSTIVE_LIMIT
-    return SfmPlan("fast", octave, matcher, 16 if many else 12, 5 if many else 2, 1.4, 2)
+    return SfmPlan("fast", "opencv", matcher, 16 if many else 20, 5 if many else 2, 1.4, 2)
 
 
 def _thorough(count: int, settings: BuildSettings) -> SfmPlan:
-    return SfmPlan("thorough", -1, _matcher(count, settings, EXHAUSTIVE_LIMIT), 16, 5, 1.1, 5)
+    return SfmPlan("thorough", "colmap", _matcher(count, settings, EXHAUSTIVE_LIMIT), 16, 5, 1.1, 5)
 
 
 def _matcher(count: int, settings: BuildSettings, limit: int) -> str:

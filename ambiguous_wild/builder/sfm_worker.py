@@ -22,6 +22,7 @@ from ambiguous_wild.builder.pairs import PAIRS, sequential_pairs
 from ambiguous_wild.builder.records import ModelSummary
 from ambiguous_wild.builder.retrieval import embed, pairs_of_tests, retrieval_pairs
 from ambiguous_wild.builder.sfm_jobs import FeatureJob, MappingJob, MatchJob, SfmJob, TriangulationJob
+from ambiguous_wild.builder.sift import features_of
 from ambiguous_wild.io.atomic import write_json
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
@@ -31,12 +32,6 @@ _PR_SET_PDEATHSIG = 1
 
 def run_features(job: FeatureJob) -> None:
     """SIFT on the CPU into a new database, then cameras."""
-    options = pycolmap.FeatureExtractionOptions()
-    options.use_gpu = False
-    options.num_threads = job["jobs"]
-    options.max_image_size = job["max_side"]
-    options.sift.max_num_features = job["max_features"]
-    options.sift.first_octave = job["first_octave"]
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = "SIMPLE_RADIAL"
     if job["masks"]:
@@ -49,6 +44,14 @@ def run_features(job: FeatureJob) -> None:
         pycolmap.import_images(
             job["database"], job["photos"], camera_mode=mode, image_names=names, options=reader
         )
+    if job["sift"] == "opencv":
+        _extract_with_opencv(job)
+        return
+    options = pycolmap.FeatureExtractionOptions()
+    options.use_gpu = False
+    options.num_threads = job["jobs"]
+    options.max_image_size = job["max_side"]
+    options.sift.max_num_features = job["max_features"]
     pycolmap.extract_features(
         job["database"],
         job["photos"],
@@ -57,6 +60,21 @@ def run_features(job: FeatureJob) -> None:
         reader_options=reader,
         extraction_options=options,
     )
+
+
+def _extract_with_opencv(job: FeatureJob) -> None:
+    database = pycolmap.Database.open(job["database"])
+    try:
+        numbers = {image.name: image.image_id for image in database.read_all_images()}
+        masks = Path(job["masks"]) if job["masks"] else None
+        for name, points, words in features_of(
+            Path(job["photos"]), masks, job["names"], job["max_features"], job["max_side"], job["jobs"]
+        ):
+            database.write_keypoints(numbers[name], points)
+            kind = pycolmap.FeatureExtractorType.SIFT
+            database.write_descriptors(numbers[name], pycolmap.FeatureDescriptors(kind, words))
+    finally:
+        database.close()
 
 
 def run_matches(job: MatchJob) -> None:
@@ -70,8 +88,10 @@ def run_matches(job: MatchJob) -> None:
         pycolmap.match_exhaustive(job["database"], matching_options=options, verification_options=verify)
         return
     listed = Path(job["database"]).with_name(PAIRS)
-    pairs = _likely_pairs(job)
-    listed.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="utf-8")
+    known = Path(job["earlier"]).read_text(encoding="utf-8").splitlines() if job["earlier"] else []
+    found = [f"{a} {b}" for a, b in _likely_pairs(job)]
+    # COLMAP leaves alone what is matched already
+    listed.write_text("".join(f"{line}\n" for line in dict.fromkeys(known + found)), encoding="utf-8")
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = str(listed)
     pycolmap.match_image_pairs(
@@ -92,13 +112,22 @@ def _likely_pairs(job: MatchJob) -> list[tuple[str, str]]:
         def read(name: str) -> np.ndarray:
             return np.asarray(database.read_descriptors(numbers[name]).data)
 
-        vectors = embed(read, job["names"], job["seed"])
+        if sequential:
+            vectors = embed(read, job["names"], job["seed"])
+            found = {*sequential_pairs(job["names"], tests), *pairs_of_tests(vectors, job["names"], tests)}
+            return sorted(found)
+        return retrieval_pairs(
+            read,
+            job["names"],
+            tests,
+            job["similar"],
+            job["neighbours"],
+            job["only"],
+            job["seed"],
+            job["jobs"],
+        )
     finally:
         database.close()
-    if sequential:
-        found = {*sequential_pairs(job["names"], tests), *pairs_of_tests(vectors, job["names"], tests)}
-        return sorted(found)
-    return retrieval_pairs(vectors, job["names"], tests, job["similar"], job["neighbours"])
 
 
 def run_mapping(job: MappingJob) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
@@ -35,7 +35,7 @@ from ambiguous_wild.builder.sfm import (
     map_scene,
     match,
 )
-from ambiguous_wild.builder.sfm_plans import SfmPlan, few_features, plans
+from ambiguous_wild.builder.sfm_plans import SfmPlan, plans
 from ambiguous_wild.builder.split import read_test_list, split_photos
 from ambiguous_wild.builder.versions import versions
 from ambiguous_wild.builder.workspace import StageResult, Workspace, content_key
@@ -195,11 +195,12 @@ class Stages:
         facts = screened.facts["photos"]
         attempts: list[SfmStages] = []
         for plan in plans(facts, self.settings):
-            if attempts:
-                self.bar.say(f"{attempts[-1].placed} of {len(facts)} photos placed: trying harder")
-            attempts.append(self._attempt(work, screened, masks, plan))
-            if attempts[-1].placed == len(facts):
+            placed = max((attempt.placed for attempt in attempts), default=0)
+            if placed >= plan.below * len(facts):
                 break
+            if attempts:
+                self.bar.say(f"{placed} of {len(facts)} photos placed: trying harder")
+            attempts.append(self._attempt(work, screened, masks, plan, attempts[-1] if attempts else None))
         # of equal ones the later, which is the more precise
         best = max(reversed(attempts), key=lambda attempt: attempt.placed)
         from ambiguous_wild.builder.select_model import check_registered
@@ -221,31 +222,32 @@ class Stages:
         screened: StageResult[ScreenResult],
         masks: StageResult[MaskResult] | None,
         plan: SfmPlan,
+        before: SfmStages | None,
     ) -> SfmStages:
         settings, facts = self.settings, screened.facts["photos"]
         photos = screened.folder / "photos"
         camera = choose_camera(facts, settings.camera)
         mask_folder = masks.folder / "masks" if masks else None
 
-        def features_of(plan: SfmPlan) -> StageResult[FeatureResult]:
-            found = [settings.max_features, settings.max_side, plan.first_octave]
-            return work.run(
-                "features",
-                [screened.key, masks and masks.key, camera, found, settings.seed],
-                lambda f: extract_features(
-                    f, photos, facts, settings, plan, self.jobs, camera, mask_folder, self.bar
-                ),
-            )
-
-        features = features_of(plan)
-        if plan.first_octave > -1 and few_features(features.facts["features"].values()):
-            plan = replace(plan, first_octave=-1)
-            features = features_of(plan)
+        features = work.run(
+            "features",
+            [screened.key, masks and masks.key, camera, settings.max_features, settings.max_side, plan.sift,
+             settings.seed],
+            lambda f: extract_features(
+                f, photos, facts, settings, plan, self.jobs, camera, mask_folder, self.bar
+            ),
+        )  # fmt: skip
+        earlier = before if plan.continues else None
+        left_out = _left_out(earlier.mapping, [f["work_name"] for f in facts]) if earlier else None
         matches = work.run(
             "matches",
-            [features.key, plan.matcher, plan.similar, plan.neighbours, settings.seed],
-            lambda f: match(f, features.folder, facts, settings, plan, self.jobs, self.bar),
-        )
+            [features.key, plan.matcher, plan.similar, plan.neighbours, earlier and earlier.matches.key,
+             left_out, settings.seed],
+            lambda f: match(
+                f, features.folder, facts, settings, plan, self.jobs, self.bar,
+                earlier.matches.folder if earlier else None, left_out,
+            ),
+        )  # fmt: skip
         mapping = work.run(
             "mapping",
             [matches.key, settings.mapper, to_plain(plan), settings.seed],
@@ -282,6 +284,14 @@ class Stages:
                 bar=self.bar,
             ),
         )
+
+
+def _left_out(mapping: StageResult[MappingResult], names: list[str]) -> list[str]:
+    """Photos that the largest model lacks."""
+    if not mapping.facts["models"]:
+        return names
+    placed = {image.name for image in _models(mapping)[1].images.values()}
+    return [name for name in names if name not in placed]
 
 
 def _models(mapping: StageResult[MappingResult]) -> tuple[int, Model, dict[int, Model]]:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     type=click.Choice(["auto", "fast", "thorough"]),
     default="auto",
     show_default=True,
-    help="Structure from motion; auto: fast, and thorough if fast leaves photos out.",
+    help="Structure from motion; auto: fast, and more if fast leaves photos out.",
 )
 @click.option(
     "--matcher",

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from ambiguous_wild.builder.first_matches import best_partners, shared_features
 from ambiguous_wild.builder.pipeline import build_scene
 from ambiguous_wild.builder.retrieval import (
-    NEIGHBOURS,
     SIMILAR,
     embed,
     most_similar,
@@ -40,14 +40,13 @@ def test_photos_of_one_place_find_each_other():
 
 
 def test_the_number_of_pairs_is_linear():
-    rng = np.random.default_rng(1)
-    vectors = rng.normal(size=(1000, 64)).astype(np.float32)
-    names = [f"p{i:04d}" for i in range(1000)]
+    names, _, photos = places(13, 8)  # 104: a shortlist is made
     tests = set(names[::8])
-    pairs = retrieval_pairs(vectors, names, tests)
-    assert len(pairs) <= 1000 * (SIMILAR + NEIGHBOURS) < 30 * 1000
+    pairs = retrieval_pairs(photos.__getitem__, names, tests, similar=7, neighbours=2)
+    assert len(pairs) <= 104 * 9
     assert len(pairs) == len({frozenset(p) for p in pairs})
-    assert ("p0001", "p0002") in pairs and all(a != b for a, b in pairs)
+    assert ("p001", "p002") in pairs and all(a != b for a, b in pairs)
+    vectors = embed(photos.__getitem__, names)
     of_tests = pairs_of_tests(vectors, names, tests)
     assert len(of_tests) <= len(tests) * (2 * SIMILAR + SIMILAR // 2)
     assert all(a in tests or b in tests for a, b in of_tests)
@@ -73,3 +72,24 @@ def test_a_scene_is_built_from_such_pairs(matcher, tmp_path):
     info = build_scene(tmp_path / "raw", tmp_path / "scene", settings, jobs=2).info
     assert info["counts"]["registered"] == 8
     assert info["chosen"]["matcher"] == matcher and 0 < info["counts"]["pairs"] <= 28
+
+
+@pytest.mark.parametrize("count", [6, 13])  # all pairs are looked at, or a shortlist
+def test_pairs_are_those_that_share_features(count):
+    names, place, photos = places(count, 8)
+    pairs = retrieval_pairs(photos.__getitem__, names, set(), similar=7, neighbours=0, jobs=2)
+    of = dict(zip(names, place))
+    every = {(a, b) for a in names for b in names if a < b and of[a] == of[b]}
+    assert set(pairs) >= every
+    assert pairs == retrieval_pairs(photos.__getitem__, names, set(), similar=7, neighbours=0, jobs=1)
+    some = retrieval_pairs(photos.__getitem__, names, set(), similar=7, neighbours=1, only={names[0]})
+    assert 7 <= len(some) <= 8 and all(names[0] in pair for pair in some)
+
+
+def test_what_looks_like_chance_is_left_out():
+    shared = {(0, 1): 50, (0, 2): 4, (0, 3): 3, (0, 4): 2, (0, 5): 1, (0, 6): 0, (1, 2): 9}
+    assert best_partners(shared, {0: 6}) == {(0, 1), (0, 2), (0, 3), (0, 4)}
+    assert best_partners(shared, {2: 1}) == {(1, 2)}
+    assert shared_features({"a": np.zeros((1, 128), np.uint8)}.__getitem__, ["a", "a"], [(0, 1)], 1) == {
+        (0, 1): 0
+    }

@@ -13,6 +13,7 @@ from ambiguous_wild.builder import stages
 from ambiguous_wild.builder.pipeline import build_scene
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.settings import BuildSettings
+from ambiguous_wild.builder.sfm_plans import SfmPlan
 from ambiguous_wild.builder.stages import SfmStages, Stages
 from tests.builder.capture_maker import write_capture
 
@@ -21,7 +22,8 @@ def attempts(monkeypatch: pytest.MonkeyPatch, placed: dict[str, int], photos: in
     """The plans that were tried, and what was chosen, where each places so many photos."""
     tried: list[str] = []
 
-    def attempt(self: Stages, work: Any, screened: Any, masks: Any, plan: Any) -> SfmStages:
+    def attempt(self: Stages, work: Any, screened: Any, masks: Any, plan: Any, before: Any) -> SfmStages:
+        assert (before.mapping.facts["plan"] if before else None) == (tried[-1] if tried else None)
         tried.append(plan.name)
         models = [{"model": 0, "images": placed[plan.name], "points": 9999}] if placed[plan.name] else []
         part = SimpleNamespace(folder=Path("nowhere"), facts={"models": models, "plan": plan.name})
@@ -34,48 +36,52 @@ def attempts(monkeypatch: pytest.MonkeyPatch, placed: dict[str, int], photos: in
 
 
 def test_fast_is_enough_where_it_places_everything(monkeypatch):
-    assert attempts(monkeypatch, {"fast": 30, "thorough": 30}, 30) == (["fast"], "fast")
+    assert attempts(monkeypatch, {"fast": 30, "wider": 30}, 30) == (["fast"], "fast")
 
 
-def test_the_attempt_that_places_more_is_kept(monkeypatch):
-    assert attempts(monkeypatch, {"fast": 20, "thorough": 28}, 30) == (["fast", "thorough"], "thorough")
-    assert attempts(monkeypatch, {"fast": 29, "thorough": 28}, 30)[1] == "fast"
-    assert attempts(monkeypatch, {"fast": 28, "thorough": 28}, 30)[1] == "thorough"
-    assert attempts(monkeypatch, {"fast": 0, "thorough": 28}, 30)[1] == "thorough"
+@pytest.mark.parametrize(
+    ("fast", "wider", "thorough", "tried", "chosen"),
+    [
+        (20, 28, 30, 2, "wider"),
+        (29, 28, 30, 2, "fast"),
+        (28, 28, 30, 2, "wider"),  # of equal ones the later
+        (0, 14, 12, 3, "wider"),
+        (0, 14, 28, 3, "thorough"),
+    ],
+)
+def test_the_attempt_that_places_more_is_kept(monkeypatch, fast, wider, thorough, tried, chosen):
+    """All pairs are matched only if less than half is placed."""
+    names, kept = attempts(monkeypatch, {"fast": fast, "wider": wider, "thorough": thorough}, 30)
+    assert names == ["fast", "wider", "thorough"][:tried] and kept == chosen
+
+
+def test_few_photos_are_matched_thoroughly_at_once(monkeypatch):
+    assert attempts(monkeypatch, {"fast": 20, "thorough": 24}, 25) == (["fast", "thorough"], "thorough")
 
 
 def test_photos_that_fast_loses_are_placed_by_thorough(monkeypatch, tmp_path):
-    """COLMAP itself; fast looks at photos of an eighth of the size here, and finds next to nothing."""
+    """COLMAP itself; fast looks at tiny photos here, and finds next to nothing."""
     write_capture(tmp_path / "raw", 8)
-    real = stages.plans
+    real = stages.extract_features
 
-    def blinded(photos: Any, settings: BuildSettings) -> list[Any]:
-        fast, thorough = real(photos, settings)
-        return [dataclasses.replace(fast, first_octave=3), thorough]
+    def blinded(folder: Path, photos: Path, facts: Any, settings: Any, plan: Any, *rest: Any) -> Any:
+        if plan.sift == "opencv":
+            settings = dataclasses.replace(settings, max_side=40)
+        return real(folder, photos, facts, settings, plan, *rest)
 
-    monkeypatch.setattr(stages, "few_features", lambda counts: False)
-    monkeypatch.setattr(stages, "plans", blinded)
+    monkeypatch.setattr(stages, "extract_features", blinded)
     settings = BuildSettings(factor=2, max_features=800)
     info = build_scene(tmp_path / "raw", tmp_path / "scene", settings, jobs=2).info
     assert info["counts"]["registered"] == 8 and info["chosen"]["sfm"] == "thorough"
     assert list(info["seconds"]).count("features") == 1
 
 
-def test_photos_with_few_features_are_doubled_at_once(monkeypatch, tmp_path):
+def test_photos_that_are_left_out_look_for_more_partners(monkeypatch, tmp_path):
+    """Pairs that are matched already stay, and are not matched again."""
     write_capture(tmp_path / "raw", 8)
-    real = stages.plans
-
-    def large(photos: Any, settings: BuildSettings) -> list[Any]:  # as if the photos had 800 px
-        return [dataclasses.replace(plan, first_octave=0) for plan in real(photos, settings)[:1]]
-
-    monkeypatch.setattr(stages, "plans", large)
-    octaves: list[int] = []
-    extract = stages.extract_features
-
-    def noted(folder: Path, photos: Path, facts: Any, settings: Any, plan: Any, *rest: Any) -> Any:
-        octaves.append(plan.first_octave)
-        return extract(folder, photos, facts, settings, plan, *rest)
-
-    monkeypatch.setattr(stages, "extract_features", noted)
+    fast = SfmPlan("fast", "opencv", "retrieval", 1, 0, 1.4, 2)  # a partner each: the photos do not chain
+    wider = dataclasses.replace(fast, name="wider", similar=7, continues=True)
+    monkeypatch.setattr(stages, "plans", lambda photos, settings: [fast, wider])
     info = build_scene(tmp_path / "raw", tmp_path / "scene", BuildSettings(factor=2), jobs=2).info
-    assert octaves == [0, -1] and info["counts"]["registered"] == 8
+    assert info["counts"]["registered"] == 8 and info["chosen"]["sfm"] == "wider"
+    assert 8 <= info["counts"]["pairs"] <= 28

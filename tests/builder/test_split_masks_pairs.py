@@ -148,7 +148,9 @@ def photos_of(count, side=1000):
 def test_fast_comes_before_thorough_and_each_may_be_asked_for():
     wanted = ("auto", "fast", "thorough")
     names = {w: [p.name for p in plans(photos_of(40), BuildSettings(sfm=w))] for w in wanted}
-    assert names == {"auto": ["fast", "thorough"], "fast": ["fast"], "thorough": ["thorough"]}
+    assert names == {"auto": ["fast", "wider", "thorough"], "fast": ["fast"], "thorough": ["thorough"]}
+    few = plans(photos_of(25), BuildSettings())  # all pairs are matched at once: there are no more
+    assert [p.name for p in few] == ["fast", "thorough"] and few[1].below == 1.0
 
 
 @pytest.mark.parametrize(
@@ -162,13 +164,8 @@ def test_fast_comes_before_thorough_and_each_may_be_asked_for():
     ],
 )
 def test_matcher_by_count(count, wanted, expected):
-    assert [p.matcher for p in plans(photos_of(count), BuildSettings(matcher=wanted))] == expected
-
-
-def test_small_photos_are_doubled_for_sift():
-    octaves = {side: plans(photos_of(9, side), BuildSettings())[0].first_octave for side in (799, 800)}
-    assert octaves == {799: -1, 800: 0}
-    assert plans(photos_of(9, 4000), BuildSettings(max_side=640))[0].first_octave == -1
+    found = [p.matcher for p in plans(photos_of(count), BuildSettings(matcher=wanted)) if p.name != "wider"]
+    assert found == expected
 
 
 def test_a_copy_in_a_test_list_stands_for_the_photo_that_is_used(tmp_path):

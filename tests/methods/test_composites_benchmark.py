@@ -36,7 +36,13 @@ def test_a_base_is_split_once_and_gets_its_placements(composites, tmp_path, monk
         asked.append(words)
         root = Path(words[words.index("-o") + 1])
         if words[0] == "build-scene":
-            write_tiny_scene(root, distractors=False)
+            if root.is_dir():  # the second build, with the test photos
+                listed = Path(words[words.index("--test-list") + 1]).read_text().split()
+                (root / "test_list.txt").write_text("".join(f"{n}\n" for n in listed))
+                train = [n for n in (*TRAIN, *TEST) if n not in listed]
+                (root / "train_list.txt").write_text("".join(f"{n}\n" for n in train))
+            else:
+                write_tiny_scene(root, distractors=False)
         else:
             shutil.copytree(words[1], root)
 
@@ -45,8 +51,9 @@ def test_a_base_is_split_once_and_gets_its_placements(composites, tmp_path, monk
     given = ["--data", str(tmp_path / "data"), "--out", str(tmp_path / "out"), "--bases", "wall=1"]
     for _ in range(2):
         assert composites.main([*given, "--placements", "3", "--prepare-only"]) == 0
-    assert [words[0] for words in asked] == ["build-scene", "composite", "composite", "composite"]
-    assert ["--patches" in words for words in asked[1:]] == [False, True, False]
+    assert [words[0] for words in asked] == [*["build-scene"] * 2, *["composite"] * 3]
+    assert "--keep-work" in asked[0] and "--overwrite" in asked[1]
+    assert ["--patches" in words for words in asked[2:]] == [False, True, False]
     scene = load_scene(tmp_path / "out" / "scenes" / "wall-cutouts-1")
     assert len(scene.test) == 3 and len(scene.train) == len(TRAIN) + len(TEST) - 3
     with pytest.raises(SystemExit):

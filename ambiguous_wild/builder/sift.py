@@ -17,6 +17,7 @@ import numpy as np
 
 PEAK, EDGE, LEVELS, BLUR = 0.02, 10.0, 3, 1.6
 SCALE = 512.0  # descriptors are stored as bytes; of a unit vector few elements exceed a half
+OCTAVES = 4  # from the doubled photo on; features of coarser ones are badly placed
 GRAY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION  # as COLMAP reads
 AHEAD = 2  # photos in work a thread, so that few lie in memory
 
@@ -26,7 +27,7 @@ def sift(gray: np.ndarray, most: int, mask: np.ndarray | None = None) -> tuple[n
 
     Args:
         gray: [H, W] uint8.
-        most: number of features, at most.
+        most: number of places, at most; a place may have several orientations, each of them a feature.
         mask: [H, W], zero where nothing is wanted.
 
     Returns:
@@ -34,12 +35,15 @@ def sift(gray: np.ndarray, most: int, mask: np.ndarray | None = None) -> tuple[n
         radians; [N, 128] uint8. The same for any number of threads.
     """
     finder = cv2.SIFT.create(0, LEVELS, PEAK, EDGE, BLUR, enable_precise_upscale=True)
-    found = finder.detect(gray, mask)
+    # OpenCV packs the octave into the lowest byte; -1, of the doubled photo, is 255
+    found = [k for k in finder.detect(gray, mask) if (k.octave + 1 & 255) < OCTAVES]
     if not found:
         return np.zeros((0, 4), np.float32), np.zeros((0, 128), np.uint8)
-    sizes = np.array([k.size for k in found], np.float32)
-    # OpenCV sorts by place, so the order of equal sizes is the same again
-    found, words = finder.compute(gray, [found[i] for i in np.argsort(-sizes, kind="stable")[:most]])
+    where = np.array([(k.size, *k.pt) for k in found], np.float32)
+    order = np.lexsort((where[:, 1], where[:, 2], -where[:, 0]))  # by size, then place: the same again
+    next_place = np.any(np.diff(where[order], axis=0) != 0.0, axis=1)
+    kept = order[np.concatenate([[0], np.cumsum(next_place)]) < most]
+    found, words = finder.compute(gray, [found[i] for i in kept])
     points = np.array([(*k.pt, k.size / 2, np.radians(k.angle)) for k in found], np.float32)
     points[:, :2] += 0.5  # OpenCV counts from the centre of the first pixel
     roots = np.sqrt(words / np.maximum(words.sum(1, keepdims=True), 1e-12))
@@ -55,7 +59,7 @@ def features_of(
         photos: folder.
         masks: folder of NAME.png, black where nothing is wanted; a photo without one is used whole.
         names: files in it.
-        most: features a photo.
+        most: places a photo.
         side: photos with a longer side are reduced to it first.
         jobs: photos at a time.
 

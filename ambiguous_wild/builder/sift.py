@@ -43,8 +43,8 @@ def sift(gray: np.ndarray, most: int, mask: np.ndarray | None = None) -> tuple[n
     order = np.lexsort((where[:, 1], where[:, 2], -where[:, 0]))  # by size, then place: the same again
     next_place = np.any(np.diff(where[order], axis=0) != 0.0, axis=1)
     kept = order[np.concatenate([[0], np.cumsum(next_place)]) < most]
-    found, words = finder.compute(gray, [found[i] for i in kept])
-    points = np.array([(*k.pt, k.size / 2, np.radians(k.angle)) for k in found], np.float32)
+    described, words = finder.compute(gray, [found[i] for i in kept])
+    points = np.array([(*k.pt, k.size / 2, np.radians(k.angle)) for k in described], np.float32)
     points[:, :2] += 0.5  # OpenCV counts from the centre of the first pixel
     roots = np.sqrt(words / np.maximum(words.sum(1, keepdims=True), 1e-12))
     return points, np.clip(np.rint(SCALE * roots), 0, 255).astype(np.uint8)

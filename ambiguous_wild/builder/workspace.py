@@ -78,9 +78,9 @@ class Workspace:
         return result
 
     def seconds(self) -> dict[str, float]:
-        """Of each stage; of one that ran twice the sum."""
+        """Of each stage; of one that gave several results the sum, each counted once."""
         found: dict[str, float] = {}
-        for result in self.results:
+        for result in {result.key: result for result in self.results}.values():
             found[result.name] = round(found.get(result.name, 0.0) + result.seconds, 3)
         return found
 

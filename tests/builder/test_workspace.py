@@ -1,5 +1,6 @@
 import fcntl
 import os
+import time
 
 import pytest
 
@@ -24,6 +25,16 @@ def test_a_stage_runs_once_for_the_same_inputs(tmp_path):
     other = Workspace(tmp_path / "w").run("stage", {"a": 2}, work)
     assert other.facts == {"n": 2}
     assert other.folder != first.folder
+
+
+def test_time_of_a_result_that_is_used_again_counts_once(tmp_path):
+    def slow(folder):
+        time.sleep(0.01)
+        return {}
+
+    work = Workspace(tmp_path / "w")
+    spent = [work.run("stage", {"a": a}, slow).seconds for a in (1, 1, 2, 1)]
+    assert work.seconds() == {"stage": round(spent[0] + spent[2], 3)}
 
 
 def test_a_stage_that_fails_leaves_no_folder(tmp_path):

@@ -322,7 +322,7 @@ class EmptySpace:
         """[N] bool of means [N, 3]: in this space of any camera."""
         found = torch.zeros(len(means), dtype=torch.bool, device=means.device)
         for camera, depth in self.cameras:
-            pose = torch.as_tensor(camera.cam_from_world, dtype=means.dtype, device=means.device)
+            pose = torch.tensor(camera.cam_from_world, dtype=means.dtype, device=means.device)
             x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
             u, v = camera.fx * x + camera.cx * z, camera.fy * y + camera.cy * z
             inside = (u >= 0) & (u <= camera.width * z) & (v >= 0) & (v <= camera.height * z)

@@ -35,7 +35,7 @@ def psnr_of(scene: Path, runs: Path, iterations: int) -> float:
     """Test PSNR in dB of 3DGS."""
     length = ("--iterations", iterations, "--effects", "none", "--device", "cpu", "--no-pictures")
     aw("bench", "--method", "3dgs", "--scene", scene, *length, "-o", runs)
-    return float(read_result(run_folders(runs)[0] / RESULT)["metrics"]["psnr"])
+    return float(read_result(next(iter(run_folders(runs))) / RESULT)["metrics"]["psnr"])
 
 
 def measure(raw: Path, out: Path, iterations: int, turn: int) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import Camera
-from ambiguous_wild.core.config import check_limits
+from ambiguous_wild.core.config import LATER, check_limits
 from ambiguous_wild.splat.density_log import DensityLog
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.rendered import Gradients
@@ -46,7 +46,7 @@ class DensityConfig:
     prune_scale: float = 0.1  # of the scene extent, applied after the first reset
     # What lies in a camera's picture nearer than this share of its nearest SfM points (2nd percentile) is
     # removed: floaters that no other photo corrects. 0 = never, as in 3DGS
-    near: float = 0.0
+    near: float = field(default=0.0, metadata=LATER)
     reset_opacity: float = 0.01
     max_gaussians: int = 1_000_000  # growth stops here unless the run says otherwise: largest gradients first
 

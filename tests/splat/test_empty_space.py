@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from ambiguous_wild.core import AwError, Camera
+from ambiguous_wild.core.config import from_plain, to_plain
 from ambiguous_wild.core.scene import Points
 from ambiguous_wild.splat.density import DensityConfig, DensityControl, EmptySpace
 from ambiguous_wild.splat.gaussians import Gaussians
@@ -72,3 +73,9 @@ def test_a_share_lies_between_nothing_and_everything():
     for wrong in (-0.1, 1.1):
         with pytest.raises(AwError, match="near"):
             DensityConfig(near=wrong)
+
+
+def test_runs_from_before_this_option_keep_their_identity():
+    assert "near" not in to_plain(DensityConfig())
+    assert to_plain(DensityConfig(near=0.3))["near"] == 0.3
+    assert from_plain(DensityConfig, to_plain(DensityConfig())) == DensityConfig()

@@ -15,6 +15,7 @@ import math
 import subprocess
 import sys
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from ambiguous_wild.harness.running.result_file import RESULT, read_result
@@ -35,7 +36,8 @@ def psnr_of(scene: Path, runs: Path, iterations: int) -> float:
     """Test PSNR in dB of 3DGS."""
     length = ("--iterations", iterations, "--effects", "none", "--device", "cpu", "--no-pictures")
     aw("bench", "--method", "3dgs", "--scene", scene, *length, "-o", runs)
-    return float(read_result(next(iter(run_folders(runs))) / RESULT)["metrics"]["psnr"])
+    result = read_result(next(iter(run_folders(runs))) / RESULT)
+    return fmean(float(row["psnr"]) for row in result["per_image"])
 
 
 def measure(raw: Path, out: Path, iterations: int, turn: int) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
 
-from ambiguous_wild.builder.first_matches import best_partners, shared_features
+from ambiguous_wild.builder.first_matches import best_partners, shared_features, unit
 
 WORDS = 64  # visual words
 SAMPLE = 20_000  # descriptors that the words are learnt from
@@ -35,7 +35,7 @@ def embed(
     for name in names:
         rows = read(name)[:MOST]
         if len(rows):
-            sample.append(_unit(rows[generator.permutation(len(rows))[:share]]))
+            sample.append(unit(rows[generator.permutation(len(rows))[:share]]))
     vectors = np.zeros((len(names), WORDS * 128), np.float32)
     if not sample:
         return vectors
@@ -43,11 +43,6 @@ def embed(
     for index, name in enumerate(names):
         vectors[index] = _vlad(read(name)[:MOST], words)
     return vectors
-
-
-def _unit(rows: np.ndarray) -> np.ndarray:
-    values = rows.astype(np.float32)
-    return values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-6)
 
 
 def _words(sample: np.ndarray, generator: np.random.Generator) -> np.ndarray:
@@ -70,7 +65,7 @@ def _nearest(rows: np.ndarray, words: np.ndarray) -> np.ndarray:
 def _vlad(rows: np.ndarray, words: np.ndarray) -> np.ndarray:
     out = np.zeros((WORDS, 128), np.float32)
     if len(rows):
-        units = _unit(rows)
+        units = unit(rows)
         nearest = _nearest(units, words)
         for word in np.unique(nearest):
             out[word] = (units[nearest == word] - words[word]).sum(axis=0)

@@ -1,162 +1,146 @@
-"""Test PSNR of `--effects auto` against hand-picked sets of effects, on presets with known effects.
+"""Test PSNR of `--effects auto` against effects picked by hand: presets, composites, real captures.
 
-    python benchmarks/auto.py --scenes DIR --out DIR [--presets NAME ...] [--iterations 1000] [--factor 2]
+    python benchmarks/auto.py --scenes DIR... --out DIR [--iterations 1500] [--jobs 2]
 
-Uses the scenes of benchmarks/presets.py (its --work DIR/scenes). On each, RefineSplat is trained with `auto`,
-with the effects the preset was designed for (colour per photo once as exposure, once as appearance), with
-none and with all. A lower SH degree is left out (its cost is in docs/effects.md). Writes
-benchmarks/results/auto.json and .md: test PSNR and training seconds of each set, and auto against the best
-other one: by PSNR, or by time within 0.02 dB. If both are the same set, times are not compared. What `auto`
-tried before it decided, and the seconds of that, are in a column of their own.
+A DIR is a scene folder or a folder of them. On each scene RefineSplat is trained with `auto` and with none,
+`near`, `dense`, and what may help there: on a preset the effects it was designed for (colour per photo once
+as exposure, once as appearance), elsewhere `exposure` and `antialias`; each alone and with `near`. One seed,
+one thread a run. Finished runs are kept. Writes benchmarks/results/auto.json and .md.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import subprocess
 import sys
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
-from presets import Stopped, aw, check_presets, mean_psnr, save
+from captures import find_scenes
 
 from ambiguous_wild.harness.running.environment import environment
 from ambiguous_wild.harness.running.result_file import RESULT, read_result
+from ambiguous_wild.io.atomic import write_json, write_text
 from ambiguous_wild.simulate.presets import PRESETS
+from ambiguous_wild.splat.effects import check_effects
 
 RESULTS = Path(__file__).parent / "results" / "auto"
 METHOD = "refinesplat"
-TIE_DB = 0.02
 # what a preset was designed for -> the trainer's effects that answer it
 ANSWERS = {"appearance": ("exposure", "appearance"), "antialiasing": ("antialias",), "pose": ("poses",)}
+ANYWHERE = ("exposure", "antialias")  # tried where nobody designed the scene
 
 
-def sets_of(preset: str) -> dict[str, str]:
-    """name -> value of --effects."""
-    designed = PRESETS[preset].designed.effects
-    wanted = [effect for effect in designed if effect in ANSWERS]
-    found = {"auto": "auto", "none": "none", "all": "all"}
-    for k in range(max((len(ANSWERS[effect]) for effect in wanted), default=1)):
-        picked = [ANSWERS[effect][min(k, len(ANSWERS[effect]) - 1)] for effect in wanted]
-        if picked:
-            found["+".join(picked)] = ",".join(picked)
-    return found
+def picked_by_hand(scene: str) -> list[str]:
+    """Values of --effects."""
+    if scene in PRESETS:
+        designed = [ANSWERS[e] for e in PRESETS[scene].designed.effects if e in ANSWERS]
+        depth = max((len(answers) for answers in designed), default=0)
+        helpful = [[answers[min(k, len(answers) - 1)] for answers in designed] for k in range(depth)]
+    else:
+        helpful = [[effect] for effect in ANYWHERE]
+    sets = [[], ["near"], ["dense"], *helpful, *([*names, "near"] for names in helpful)]
+    return list(dict.fromkeys(",".join(check_effects(names)) or "none" for names in sets))
 
 
-def train(scene: Path, effects: str, out: Path, args: argparse.Namespace) -> dict[str, Any]:
-    """One run: test PSNR, seconds of training, and the effects that were on.
+def train(scene: Path, effects: str, out: Path, iterations: int) -> dict[str, Any]:
+    """One run: test PSNR, the effects that were on, and what was tried before.
 
     Raises:
-        Stopped: the run failed.
+        subprocess.CalledProcessError: the run failed.
     """
-    words = ["bench", "--method", METHOD, "--scene", str(scene), "--effects", effects, "--no-pictures"]
-    words += ["--iterations", str(args.iterations), "--factor", str(args.factor), "-o", str(out)]
-    aw(*words)
-    run = out / scene.name / METHOD / "seed0"
-    result = read_result(run / RESULT)
+    folder = out / effects.replace(",", "+")
+    run = folder / scene.name / METHOD / "seed0"
+    if not (run / RESULT).is_file():
+        words = ["bench", "--method", METHOD, "--scene", str(scene), "--effects", effects, "--threads", "1"]
+        words += ["--device", "cpu", "--iterations", str(iterations), "--no-pictures", "-o", str(folder)]
+        subprocess.run(
+            [sys.executable, "-m", "ambiguous_wild.cli.main", *words],
+            check=True,
+            capture_output=True,
+            text=True,
+        )
     told = run / "effects.json"
     said = json.loads(told.read_text(encoding="utf-8")) if told.is_file() else {}
     plan = said.get("plan") or {"decisions": [], "cost": None}
     return {
-        "psnr": mean_psnr(result),
-        "train_s": result["cost"]["train_s"],
-        "setup_s": result["cost"].get("setup_s"),
-        "effects": said.get("effects"),
+        "psnr": fmean(float(row["psnr"]) for row in read_result(run / RESULT)["per_image"]),
+        "effects": ",".join(said.get("effects") or []) or "none",
         "tried": {
             d["effect"]: [d["gain_db"], d["error_db"]] for d in plan["decisions"] if d["gain_db"] is not None
         },
-        "deciding": plan["cost"],
     }
 
 
-def measure(preset: str, args: argparse.Namespace) -> dict[str, Any]:
-    """All sets on one preset, and auto against the best of the others."""
-    scene = args.scenes / preset
-    sets = sets_of(preset)
-    runs = {"auto": train(scene, sets.pop("auto"), args.out / "auto", args)}
-    for name, value in sets.items():
-        # what auto chose is the same run to the bit: not trained again
-        same = sorted(runs["auto"]["effects"] or []) == sorted([] if name == "none" else value.split(","))
-        runs[name] = runs["auto"] if same else train(scene, value, args.out / name, args)
-    others = {name: run for name, run in runs.items() if name != "auto"}
-    top = max(run["psnr"] for run in others.values())
-    near = {name: run for name, run in others.items() if run["psnr"] >= top - TIE_DB}
-    best = min(near, key=lambda name: near[name]["train_s"])
-    same = runs[best] is runs["auto"]
+def measure(scene: Path, out: Path, iterations: int) -> dict[str, Any]:
+    """All sets on one scene, and auto against the best of the others."""
+    auto = train(scene, "auto", out, iterations)
+    sets = {name: train(scene, name, out, iterations)["psnr"] for name in picked_by_hand(scene.name)}
+    best = max(sets, key=lambda name: sets[name])
+    sets.setdefault(auto["effects"], auto["psnr"])
     return {
-        "preset": preset,
-        "runs": runs,
+        "scene": scene.name,
+        "auto": auto,
+        "sets": sets,
         "best": best,
-        "auto_minus_best_db": runs["auto"]["psnr"] - runs[best]["psnr"],
-        "same_set": same,
-        "auto_over_best_time": None if same else runs["auto"]["train_s"] / runs[best]["train_s"],
+        "below_best_db": max(sets[best] - auto["psnr"], 0.0),
+        "over_none_db": auto["psnr"] - sets["none"],
     }
 
 
 def to_markdown(data: dict[str, Any]) -> str:
     """The results as Markdown."""
+    rows = data["scenes"]
     lines = [
-        "# Effects: what `auto` loses against the best set picked by hand",
+        "# Effects: `auto` against sets picked by hand",
         "",
-        f"{METHOD}, {data['iterations']} iterations, --factor {data['factor']}, seed 0; dB / s of training",
+        f"{METHOD}, {data['iterations']} iterations, seed 0, test PSNR in dB",
         "",
-        "| preset | auto chose | tried | auto | none | all | designed for | best | auto - best, dB | time |",
-        "|---|---|---|---:|---:|---:|---|---|---:|---:|",
+        "| scene | auto chose | auto | none | best by hand | below it | over none | tried |",
+        "|---|---|---:|---:|---|---:|---:|---|",
     ]
-    for row in data["presets"]:
-        if "error" in row:
-            lines.append(f"| {row['preset']} | {row['error']} |" + " |" * 8)
-            continue
-        shown = {name: f"{run['psnr']:.2f} / {run['train_s']:.0f}" for name, run in row["runs"].items()}
-        chosen = row["runs"]["auto"]["effects"]
-        hand = "; ".join(f"{k}: {v}" for k, v in shown.items() if k not in ("auto", "none", "all"))
-        lines.append(
-            f"| {row['preset']} | {', '.join(chosen or []) or 'none'} | {_tried(row['runs']['auto'])} "
-            f"| {shown['auto']} | {shown['none']} "
-            f"| {shown['all']} | {hand or 'none'} | {row['best']} | {row['auto_minus_best_db']:+.2f} "
-            f"| {'same set' if row['same_set'] else format(row['auto_over_best_time'], '.2f')} |"
+    for row in rows:
+        auto, sets = row["auto"], row["sets"]
+        tried = "; ".join(
+            f"{name} {gain:+.2f} ± {error:.2f}" for name, (gain, error) in auto["tried"].items()
         )
+        lines.append(
+            f"| {row['scene']} | {auto['effects']} | {auto['psnr']:.2f} | {sets['none']:.2f} "
+            f"| {row['best']} {sets[row['best']]:.2f} | {row['below_best_db']:.2f} "
+            f"| {row['over_none_db']:+.2f} | {tried} |"
+        )
+    near = sum(row["below_best_db"] <= 0.1 for row in rows)
+    worst = min(rows, key=lambda row: row["over_none_db"])
+    lines += [
+        "",
+        f"Within 0.1 dB of the best on {near} of {len(rows)}; mean below it "
+        f"{fmean(row['below_best_db'] for row in rows):.2f} dB, mean over none "
+        f"{fmean(row['over_none_db'] for row in rows):.2f} dB, least {worst['over_none_db']:+.2f} "
+        f"({worst['scene']}).",
+    ]
     return "\n".join(lines) + "\n"
 
 
-def _tried(run: dict[str, Any]) -> str:
-    found = [f"{effect} {gain:+.2f} ± {error:.2f} dB" for effect, (gain, error) in run["tried"].items()]
-    cost = run["deciding"]
-    return f"{'; '.join(found)} ({cost['seconds']:.0f} s)" if found and cost else "nothing"
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--scenes", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the runs")
-    parser.add_argument("--presets", nargs="+", default=[n for n in PRESETS if n != "tiny"])
-    parser.add_argument("--iterations", type=int, default=1000)
-    parser.add_argument("--factor", type=int, default=2)
+def main(words: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--scenes", nargs="+", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the runs")
+    parser.add_argument("--iterations", type=int, default=1500)
+    parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--results", type=Path, default=RESULTS)
-    args = parser.parse_args(argv)
-    check_presets(parser, args.presets)
-    rows = []
-    for k, preset in enumerate(args.presets, 1):
-        try:
-            rows.append(measure(preset, args))
-        except Stopped as error:
-            rows.append({"preset": preset, "error": str(error)})
-        row = rows[-1]
-        shown = row.get("error") or f"{row['auto_minus_best_db']:+.2f} dB against {row['best']}"
-        print(f"[{k}/{len(args.presets)}] {preset}: {shown}", flush=True)
-        data = {
-            "environment": environment("cpu"),
-            "method": METHOD,
-            "iterations": args.iterations,
-            "factor": args.factor,
-            "presets": rows,
-        }
-        save(args.results, data, to_markdown(data))
+    args = parser.parse_args(words)
+    scenes = find_scenes(args.scenes)
+    with ThreadPoolExecutor(args.jobs) as pool:
+        rows = list(pool.map(lambda scene: measure(scene, args.out, args.iterations), scenes))
+    data = {"environment": environment("cpu"), "iterations": args.iterations, "scenes": rows}
+    write_json(args.results.with_suffix(".json"), data)
+    write_text(args.results.with_suffix(".md"), to_markdown(data))
     print(to_markdown(data))
-    return 1 if any("error" in row for row in rows) else 0
+    return 0
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@
 A DIR is a scene folder, FACTOR one of its sizes. Every run is one `aw bench` with its default effects and all
 threads; one runs at a time. Finished runs are kept. Writes benchmarks/results/budgets.json and .md: for each
 capture refinesplat at each budget, how far each is below the best of them, and the other methods at --at.
-The load of the machine before each run is kept too: above 0.5 something else ran, and the row is marked.
+The cores at work before each run are kept too: above 0.5 something else ran, and the row is marked.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from ambiguous_wild.io.atomic import write_json, write_text
 from ambiguous_wild.io.scene_folder import load_scene
 
 RESULTS = Path(__file__).parent / "results" / "budgets"
-QUIET = 0.5  # load over the last minute, up to which nothing else ran
+QUIET = 0.5  # cores at work, up to which nothing else ran
 OURS = "refinesplat"
 
 
@@ -42,12 +42,26 @@ def folder_of(out: Path, scene: Scene, method: str, budget: str, seed: int) -> P
     return out / f"{scene.train[0].camera.width}px-{budget}" / scene.name / method / f"seed{seed}"
 
 
-def load_now(patience_s: float = 150.0) -> float:
-    """Load of the machine, once our own last run no longer counts: it falls by a factor of e a minute."""
+def busy_cores() -> float:
+    """Cores at work, over three seconds; where the system does not tell, the load over the last minute."""
+
+    def read() -> tuple[int, int]:
+        values = [int(word) for word in Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:9]]
+        return sum(values), values[3] + values[4]
+
+    if not Path("/proc/stat").is_file():
+        return os.getloadavg()[0]
+    (total, idle), _ = read(), time.sleep(3)
+    later = read()
+    return (1 - (later[1] - idle) / max(later[0] - total, 1)) * (os.cpu_count() or 1)
+
+
+def load_now(patience_s: float = 60.0) -> float:
+    """Cores at work once nothing else is, or after so long."""
     end = time.monotonic() + patience_s
-    while os.getloadavg()[0] > QUIET and time.monotonic() < end:
-        time.sleep(5)
-    return round(os.getloadavg()[0], 2)
+    while (busy := busy_cores()) > QUIET and time.monotonic() < end:
+        time.sleep(3)
+    return round(busy, 2)
 
 
 def bench(scene: Path, factor: int | None, method: str, budget: str, seed: int, folder: Path) -> str | None:
@@ -100,7 +114,7 @@ def to_markdown(data: dict[str, Any]) -> str:
         "",
         f"`aw bench --budget`, default effects, seed {data['seed']}, {data['environment']['cores']} cores. "
         'Made by `benchmarks/budgets.py`. "Below best": dB under RefineSplat\'s best budget of the table. '
-        f"(!): the load before the run was above {QUIET}, so something else ran.",
+        f"(!): more than {QUIET} cores were at work before the run.",
         "",
         "| capture | width px | method | budget | PSNR | below best | iterations | Gaussians |",
         "|---|---:|---|---:|---:|---:|---:|---:|",

@@ -1,10 +1,12 @@
 """Time and result of structure from motion: `aw build-scene --sfm auto` against `--sfm thorough`.
 
     python benchmarks/build_scene.py photos/ more-photos/ -o /tmp/builds [--iterations 700]
+        [--before CHECKOUT]
 
 Builds each capture both ways, the other way first for every second one; finished builds are kept. With
---iterations plain 3DGS is trained on both, on the same test photos. Run it alone on the machine. Writes
-benchmarks/results/build-scene.json and .md; captures are named after their folders.
+--before another checkout of the project builds the thorough way. With --iterations plain 3DGS is trained on
+both, on the same test photos. Run it alone on the machine. Writes benchmarks/results/build-scene.json and
+.md; captures are named after their folders.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -27,9 +30,11 @@ WAYS = ("thorough", "auto")
 STAGES = ("features", "matches", "mapping")
 
 
-def aw(*words: object) -> None:
-    """One command of this package."""
-    subprocess.run([sys.executable, "-m", "ambiguous_wild.cli.main", *map(str, words)], check=True)
+def aw(*words: object, checkout: Path | None = None) -> None:
+    """One command of this package, or of another checkout of it."""
+    env = {**os.environ, "PYTHONPATH": str(checkout)} if checkout else None
+    command = [sys.executable, "-m", "ambiguous_wild.cli.main", *map(str, words)]
+    subprocess.run(command, check=True, env=env, cwd=checkout)
 
 
 def psnr_of(scene: Path, runs: Path, iterations: int) -> float:
@@ -40,12 +45,13 @@ def psnr_of(scene: Path, runs: Path, iterations: int) -> float:
     return fmean(float(row["psnr"]) for row in result["per_image"])
 
 
-def measure(raw: Path, out: Path, iterations: int, turn: int) -> dict[str, Any]:
+def measure(raw: Path, out: Path, iterations: int, turn: int, before: Path | None) -> dict[str, Any]:
     """Both builds of one capture."""
     found: dict[str, Any] = {"capture": raw.name}
     for way in WAYS if turn % 2 == 0 else WAYS[::-1]:
         scene = out / raw.name / way
-        aw("build-scene", raw, "-o", scene, "--sfm", way, "--name", raw.name)
+        checkout = before if way == WAYS[0] else None
+        aw("build-scene", raw, "-o", scene, "--sfm", way, "--name", raw.name, checkout=checkout)
         facts = json.loads((scene / "scene.json").read_text(encoding="utf-8"))
         seconds = facts["seconds"]
         found[way] = {
@@ -94,9 +100,10 @@ def main() -> None:
     parser.add_argument("captures", type=Path, nargs="+")
     parser.add_argument("-o", "--output", type=Path, required=True)
     parser.add_argument("--iterations", type=int, default=0)
+    parser.add_argument("--before", type=Path, metavar="CHECKOUT")
     wanted = parser.parse_args()
     rows = [
-        measure(raw.resolve(), wanted.output, wanted.iterations, turn)
+        measure(raw.resolve(), wanted.output.resolve(), wanted.iterations, turn, wanted.before)
         for turn, raw in enumerate(wanted.captures)
     ]
     write_json(RESULTS.with_suffix(".json"), rows)

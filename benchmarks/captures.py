@@ -1,7 +1,8 @@
 """Methods x captures x seeds on captures with ground truth, compared with training on exact masks.
 
     python benchmarks/captures.py --captures DIR... --out DIR [--methods ...] [--seeds 0 1 2]
-        [--iterations 2000] [--jobs 2] [--set METHOD.KEY=VALUE ...] [--results STEM] [--report-only]
+        [--iterations 2000] [--jobs 2] [--effects none|default|LIST] [--set METHOD.KEY=VALUE ...]
+        [--results STEM] [--report-only]
 
 A DIR is a scene folder or a folder of them. Each run is one `aw bench` with one thread; --jobs run at the
 same time. Runs are ordinary run folders under --out: finished ones are kept, stopped ones resume. Writes
@@ -36,8 +37,10 @@ from captures_report import (
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.running.cell import Cell
+from ambiguous_wild.harness.running.choosing import Probing
 from ambiguous_wild.harness.running.environment import environment
 from ambiguous_wild.harness.running.grid import cell_folder, plan_cells
+from ambiguous_wild.harness.running.prepare import prepare_cpu
 from ambiguous_wild.harness.running.result_file import RESULT
 from ambiguous_wild.harness.running.run_folder import refuse_other_config
 from ambiguous_wild.harness.running.store import read_runs
@@ -70,7 +73,8 @@ def command(cell: Cell, args: argparse.Namespace) -> list[str]:
     """The `aw bench` command of one cell."""
     words = ["bench", "--method", cell.method.name, "--scene", str(cell.scene.root)]
     words += ["--seed", str(cell.train.seed), "--iterations", str(cell.train.iterations)]
-    words += ["--device", "cpu", "--threads", "1", "--no-pictures", "--effects", "none", "-o", str(args.out)]
+    words += ["--device", "cpu", "--threads", "1", "--no-pictures", "--effects", args.effects]
+    words += ["-o", str(args.out)]
     for setting in args.settings:
         method, _, key = setting.partition("=")[0].partition(".")
         if cell.method.option_keys(method, key):
@@ -129,6 +133,7 @@ def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--iterations", type=int, default=2000)
     parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--effects", default="none", help="as of aw bench; default: what each method chooses")
     parser.add_argument("--set", dest="settings", action="append", default=[], metavar="METHOD.KEY=VALUE")
     parser.add_argument("--results", type=Path, default=RESULTS, help="where .json, .csv and .md go")
     parser.add_argument("--report-only", action="store_true", help="train nothing, tabulate what is there")
@@ -141,8 +146,16 @@ def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
 def main(words: Sequence[str] | None = None) -> int:
     args = arguments(words)
     train = TrainConfig(iterations=args.iterations)
+    plans = Probing(train, args.out / ".cache" / "plans", lambda: prepare_cpu(args.jobs, print), print)
     cells = plan_cells(
-        args.methods, find_scenes(args.captures), args.seeds, train, settings=args.settings, device="cpu"
+        args.methods,
+        find_scenes(args.captures),
+        args.seeds,
+        train,
+        settings=args.settings,
+        device="cpu",
+        effects=args.effects,
+        probing=plans,
     )
     refuse_other_configs(cells, args.out)  # before anything is trained
     book_path = args.results.with_name(args.results.name + "-runs.csv")
@@ -163,6 +176,7 @@ def main(words: Sequence[str] | None = None) -> int:
         "seeds": args.seeds,
         "jobs": args.jobs,
         "threads": threads_of(book),
+        "effects": args.effects,
         "settings": [without_folders(setting) for setting in args.settings],
         "captures": captures,
         "rows": rows,

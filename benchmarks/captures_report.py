@@ -241,7 +241,8 @@ def to_markdown(data: dict[str, Any]) -> str:
         "# Captures with exact truth",
         "",
         f"{data['iterations']} iterations, seeds {seeds}, {data['jobs']} runs at a time, kernel threads a "
-        f"run: {' or '.join(map(str, data['threads']))}; {data['environment']['cpu']}. Mean +- sample "
+        f"run: {' or '.join(map(str, data['threads']))}; effects: {data.get('effects', 'none')}; "
+        f"{data['environment']['cpu']}. Mean +- sample "
         "deviation over the seeds; a cell that is `-` is missing. IoU, precision and recall are of masked "
         "pixels, counted over all train photos. Setup is what a method prepares before its first step, less "
         "what an earlier run left in the cache. Times are of the runs that had the machine to themselves.",

@@ -182,6 +182,8 @@ def map_scene(
         "mapper": settings.mapper,
         "growth": plan.growth,
         "refinements": plan.refinements,
+        "local_refinements": plan.local_refinements,
+        "local_cameras": plan.local_cameras,
         "seed": settings.seed,
     }
     run_job(job, folder, lambda: bar.at(_number(progress)))
@@ -199,6 +201,7 @@ def run_job(job: SfmJob, folder: Path, watch: Callable[[], None]) -> None:
     with open(log, "ab") as sink:
         process = subprocess.Popen(
             [sys.executable, "-m", "ambiguous_wild.builder.sfm_worker", str(folder / "job.json")],
+            env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},  # its jobs are the threads
             stdin=subprocess.DEVNULL,
             stdout=sink,
             stderr=sink,

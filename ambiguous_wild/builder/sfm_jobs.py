@@ -51,6 +51,8 @@ class MappingJob(TypedDict):
     mapper: str
     growth: float
     refinements: int
+    local_refinements: int
+    local_cameras: int
     seed: int
     parent: NotRequired[int]
 

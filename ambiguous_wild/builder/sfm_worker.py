@@ -175,6 +175,8 @@ def _map_incrementally(job: MappingJob, output: Path) -> dict[int, Any]:
     options.min_model_size = _MIN_MODEL
     options.ba_global_frames_ratio = options.ba_global_points_ratio = job["growth"]
     options.ba_global_max_refinements = job["refinements"]
+    options.ba_local_max_refinements = job["local_refinements"]
+    options.mapper.ba_local_num_images = job["local_cameras"]
     counter = Path(job["progress"])
     state = {"best": 0, "now": 0}
 

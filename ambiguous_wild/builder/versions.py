@@ -7,8 +7,8 @@ from importlib import metadata
 
 from ambiguous_wild import __version__
 
-BUILDER = 7  # raised when a stage gives another result for the same input
-_LIBRARIES = ("pycolmap", "OpenImageIO", "opencv-contrib-python-headless", "numpy")
+BUILDER = 8  # raised when a stage gives another result for the same input
+_LIBRARIES = ("pycolmap", "OpenImageIO", "opencv-contrib-python-headless", "pillow", "numpy")
 
 
 @cache

@@ -18,16 +18,10 @@ T = TypeVar("T")
 _POWER_OF_TEN = re.compile(r"[-+]?[0-9]+[eE][-+]?[0-9]+")
 
 
-# of a field that came later and by default changes nothing: runs from before it keep their identity
-LATER = {"later": True}
-
-
 def to_plain(config: Any) -> Any:
-    """The config as dicts, lists and scalars, ready for YAML or JSON; `LATER` fields only if they are set."""
+    """The config as dicts, lists and scalars, ready for YAML or JSON."""
     if dataclasses.is_dataclass(config) and not isinstance(config, type):
-        values = {f: getattr(config, f.name) for f in dataclasses.fields(config)}
-        told = {f.name: v for f, v in values.items() if not ("later" in f.metadata and v == f.default)}
-        return {name: to_plain(value) for name, value in told.items()}
+        return {f.name: to_plain(getattr(config, f.name)) for f in dataclasses.fields(config)}
     if isinstance(config, Mapping):
         return {str(k): to_plain(v) for k, v in config.items()}
     if isinstance(config, (list, tuple)):

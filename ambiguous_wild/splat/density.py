@@ -7,15 +7,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ambiguous_wild.core import Camera
-from ambiguous_wild.core.config import LATER, check_limits
+from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.splat.density_log import DensityLog
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.rendered import Gradients
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
     from ambiguous_wild.splat.optim import SplatAdam
 
 
-FEW_POINTS, NEAREST = 20, 0.02  # a camera with fewer says nothing; quantile of depths
 NO_SIZE_PRUNING = 1e9  # `prune_scale` of those who prune by opacity alone
 
 
@@ -44,9 +42,6 @@ class DensityConfig:
     grow_scale: float = 0.01  # of the scene extent: clone below, split above
     prune_opacity: float = 0.005
     prune_scale: float = 0.1  # of the scene extent, applied after the first reset
-    # What lies in a camera's picture nearer than this share of its nearest SfM points (2nd percentile) is
-    # removed: floaters that no other photo corrects. 0 = never, as in 3DGS
-    near: float = field(default=0.0, metadata=LATER)
     reset_opacity: float = 0.01
     max_gaussians: int = 1_000_000  # growth stops here unless the run says otherwise: largest gradients first
 
@@ -54,7 +49,7 @@ class DensityConfig:
         check_limits(
             self, "density",
             every=(1e-6, math.inf), min_every=(1, math.inf), max_gaussians=(1, math.inf),
-            prune_opacity=(0, 1), near=(0, 1), reset_opacity=(1e-6, 1),
+            prune_opacity=(0, 1), reset_opacity=(1e-6, 1),
             **dict.fromkeys(
                 ("start", "stop", "resets", "min_reset_spacing", "min_reset_rest", "grow_grad", "grow_scale",
                  "prune_scale"), (0, math.inf),
@@ -98,12 +93,9 @@ class DensityControl:
         self.resets_done = 0
         self.log = DensityLog()  # for pictures; decides nothing
         self._halves: dict[tuple[int, int], Tensor] = {}
-        self._empty: EmptySpace | None = None
 
     def setup(self, data: TrainData) -> None:
         """Called once before the first step, and again when a run resumes."""
-        if self.config.near > 0.0:
-            self._empty = EmptySpace(data, self.config.near)
 
     def before_step(self, step: Step, gradients: Gradients) -> Gradients:
         """The gradients that the optimiser takes: a place for regularisers of the parameters."""
@@ -252,8 +244,6 @@ class DensityControl:
         config = self.config
         drop = torch.sigmoid(gaussians.opacity_logits) < config.prune_opacity
         drop |= ~torch.isfinite(gaussians.means).all(dim=1)
-        if self._empty is not None:
-            drop |= self._empty.holds(gaussians.means)
         if self.last_reset:
             drop |= gaussians.log_scales.exp().amax(dim=1) > config.prune_scale * self.extent
         if not bool(drop.any()) or bool(drop.all()):
@@ -301,33 +291,6 @@ class DensityControl:
         self.resets_done = state["resets_done"]
         self.rng.bit_generator.state = state["rng"]
         self.log.load_state_dict(state["log"])
-
-
-class EmptySpace:
-    """The space between cameras and what they see: nearer than a share of a camera's nearest SfM points."""
-
-    def __init__(self, data: TrainData, share: float) -> None:
-        points, train = data.scene.points, {view.name for view in data.scene.train}
-        of_point = np.repeat(np.arange(len(points)), np.diff(points.track_offsets))
-        rows = [i for i, view in enumerate(data.scene.views) if view.name in train]
-        self.cameras: list[tuple[Camera, float]] = []
-        for index, camera in zip(rows, data.cameras):
-            xyz = points.xyz[of_point[points.track_views == index]]
-            if len(xyz) < FEW_POINTS:
-                continue
-            depth = xyz @ camera.cam_from_world[2, :3] + camera.cam_from_world[2, 3]
-            self.cameras.append((camera, share * float(np.quantile(depth, NEAREST))))
-
-    def holds(self, means: Tensor) -> Tensor:
-        """[N] bool of means [N, 3]: in this space of any camera."""
-        found = torch.zeros(len(means), dtype=torch.bool, device=means.device)
-        for camera, depth in self.cameras:
-            pose = torch.tensor(camera.cam_from_world, dtype=means.dtype, device=means.device)
-            x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
-            u, v = camera.fx * x + camera.cx * z, camera.fy * y + camera.cy * z
-            inside = (u >= 0) & (u <= camera.width * z) & (v >= 0) & (v <= camera.height * z)
-            found |= inside & (z > 0) & (z < depth)
-        return found
 
 
 def largest(score: Tensor, chosen: Tensor, room: int) -> Tensor:

@@ -11,6 +11,7 @@ import pytest
 
 from ambiguous_wild.core import AwError, Camera, Points, Scene, View
 from ambiguous_wild.harness.planning import decide as decide_module
+from ambiguous_wild.harness.planning import evidence as evidence_module
 from ambiguous_wild.harness.planning import probe
 from ambiguous_wild.harness.planning.decide import FEW_PHOTOS, Plan, decide, plan_without_training
 from ambiguous_wild.harness.planning.evidence import measure
@@ -94,13 +95,14 @@ INJECTED = {
 @pytest.mark.parametrize("seed", [0, 1])
 def test_nothing_is_called_for_where_nothing_was_put_in(seed):
     found = decisions(seed=seed)
-    assert {name: d.decision for name, d in found.items()} == dict.fromkeys([*INJECTED, "dense start"], "off")
+    off = dict.fromkeys([*INJECTED, "dense start"], "off")
+    assert {name: d.decision for name, d in found.items()} == off | {"near space": "on"}
 
 
 @pytest.mark.parametrize("effect", INJECTED)
 def test_what_was_put_in_is_called_for_and_nothing_else(effect):
     answers = {name: d.decision for name, d in decisions(**INJECTED[effect]).items()}
-    others = {name for name, a in answers.items() if a == "on"} - {effect}
+    others = {name for name, a in answers.items() if a == "on"} - {effect, "near space"}
     assert answers[effect] == "on"
     # a colour that follows the direction or the place leaves its mark on what is read as the other
     assert others <= {"SH degree"} if effect in ("appearance embedding", "pose refinement") else not others
@@ -112,11 +114,39 @@ def test_what_was_put_in_is_called_for_and_nothing_else(effect):
 def test_few_photos_call_for_a_dense_start(photos, answer):
     plan = decide("dots", dataclasses.replace(measured(), photos=photos))
     assert [d.decision for d in plan.decisions if d.effect == "dense start"] == [answer]
-    assert plan.effects() == (("dense",) if answer == "on" else ())
+    assert plan.effects() == (("dense", "near") if answer == "on" else ("near",))
     assert (
         choose("default", synthetic()[0], [get_method("refinesplat")], plan)["refinesplat"].effects
         == plan.effects()
     )
+
+
+@pytest.mark.parametrize(
+    ("outward", "near", "dense"), [(0.1, "on", "off"), (1.0, "on", "off"), (7.0, "off", "on")]
+)
+def test_cameras_in_the_middle_of_a_place_call_for_a_dense_start_and_for_no_empty_space(outward, near, dense):
+    plan = decide("dots", dataclasses.replace(measured(), outward=outward))
+    found = {d.effect: d.decision for d in plan.decisions}
+    assert (found["near space"], found["dense start"]) == (near, dense)
+
+
+def test_cameras_around_a_thing_look_inward_and_those_in_its_middle_outward():
+    scene, photos = synthetic()
+    turned = np.diag([-1.0, 1.0, -1.0, 1.0])  # each camera looks back, at points mirrored in its centre
+    assert measure(scene, photos).outward < 0.2
+    views, xyz = [], []
+    for view in scene.views:
+        camera = dataclasses.replace(view.camera, cam_from_world=turned @ view.camera.cam_from_world)
+        views.append(dataclasses.replace(view, camera=camera))
+        xyz.append(view.camera.center + 5.0 * camera.cam_from_world[2, :3] + np.eye(3)[[0, 1, 2, 0, 1]])
+    count = len(views) * 5
+    points = Points(
+        np.concatenate(xyz), np.zeros((count, 3), np.uint8), np.zeros(count), np.arange(count + 1),
+        np.repeat(np.arange(len(views)), 5).astype(np.int32), np.zeros((count, 2), np.float32),
+    )  # fmt: skip
+    assert evidence_module.outward(dataclasses.replace(scene, views=tuple(views), points=points)) > 1.5
+    two = dataclasses.replace(scene, views=tuple(views[:2]), points=points)
+    assert math.isnan(evidence_module.outward(two))
 
 
 def test_the_numbers_are_what_was_put_in():
@@ -140,7 +170,7 @@ def test_a_plan_survives_its_file(tmp_path):
     write_json(tmp_path / "plan.json", plan.plain())
     again = read_plan(tmp_path / "plan.json")
     assert again.plain() == plan.plain()
-    assert again.effects() == ("antialias",)  # a lower degree of the harmonics is never decided on
+    assert again.effects() == ("antialias", "near")  # a lower degree of the harmonics is never decided on
     assert [d.cost_ms for d in again.decisions if d.effect == "antialiasing"] == [0.5]
     for text in (
         "{half",
@@ -210,8 +240,8 @@ def test_a_baseline_stays_what_its_paper_defines_unless_asked():
     by_default = choose("default", scene, methods, plan)
     assert by_default["3dgs"].effects == by_default["refinesplat@mask=truth"].effects == ()
     assert not by_default["3dgs"].asked  # and its folder says nothing
-    assert by_default["refinesplat"].effects == ("exposure", "antialias")
-    assert choose("auto", scene, methods, plan)["3dgs"].effects == ("exposure", "antialias")
+    assert by_default["refinesplat"].effects == ("exposure", "antialias", "near")
+    assert choose("auto", scene, methods, plan)["3dgs"].effects == ("exposure", "antialias", "near")
     assert choose("none", scene, methods, plan)["refinesplat"].effects == ()
     with pytest.raises(AwError, match="of scene dots, not of other"):
         choose("auto", dataclasses.replace(scene, name="other"), methods, plan)
@@ -226,7 +256,8 @@ SHORT = TrainConfig(iterations=40, probes=0)
 
 
 def test_a_scene_that_calls_for_nothing_keeps_the_identity_of_its_runs(tiny, monkeypatch):
-    monkeypatch.setattr(decide_module, "FEW_PHOTOS", 0)
+    monkeypatch.setattr(decide_module, "LEAST_PHOTOS", 1000)
+    monkeypatch.setattr(decide_module, "OUTWARD", -1.0)
     (none,) = plan_cells(["refinesplat"], [tiny], [0], SHORT)
     (default,) = plan_cells(["refinesplat"], [tiny], [0], SHORT, effects="default")
     (listed,) = plan_cells(["refinesplat"], [tiny], [0], SHORT, effects="poses")
@@ -240,10 +271,10 @@ def test_a_run_says_what_was_on_and_why_and_ships_the_filtered_model(tiny, tmp_p
     (report,) = run_cells(cells, tmp_path, pictures=False)
     assert report.outcome == "trained", report.error
     said = json.loads((cell_folder(tmp_path, cells[0]) / "effects.json").read_text())
-    assert said["asked"] == "auto" and said["effects"] == ["antialias"]
-    assert {d["effect"] for d in said["plan"]["decisions"]} == {*INJECTED, "dense start"}
+    assert said["asked"] == "auto" and said["effects"] == ["antialias", "near"]
+    assert {d["effect"] for d in said["plan"]["decisions"]} == {*INJECTED, "dense start", "near space"}
     facts = report.result["facts"]
-    assert facts["effects"] == ["antialias"] and facts["protocol"] == "half"
+    assert facts["effects"] == ["antialias", "near"] and facts["protocol"] == "half"
     assert facts["effect_facts"]["antialias"]["filter_size_median"] > 0
     assert not any(math.isnan(row["psnr"]) for row in report.result["per_image"])
     with pytest.raises(AwError, match="effects was"):

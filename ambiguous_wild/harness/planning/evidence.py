@@ -5,6 +5,7 @@ Every function returns a number, NaN where the scene cannot tell; `decide.py` ho
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -15,6 +16,8 @@ from ambiguous_wild.splat.effects.tracks import TrackColours, log_gains, track_c
 
 LEAST = 50  # observations below which nothing is said
 LEAST_VIEWS = 6  # of a point, to fit four numbers to its colour
+OUTLYING = 4.5  # median deviations from a point's median colour: three standard deviations of noise
+LEAST_SPREAD = 0.01  # code values, or of the logarithm: the median deviation counts as at least so much
 MOST = 20_000  # points whose view dependence is fitted; more do not change a median
 
 
@@ -29,6 +32,7 @@ class Evidence:
     reprojection_px: float  # median of points in the train photos, px of the loaded images
     observations: int  # in train photos, usable for colour
     photos: int = 0  # that train; 0 = not counted
+    outward: float = math.nan  # spread of what the train cameras look at, over their own
 
 
 def measure(scene: Scene, photos: Sequence[np.ndarray]) -> Evidence:
@@ -51,6 +55,7 @@ def measure(scene: Scene, photos: Sequence[np.ndarray]) -> Evidence:
         reprojection_px=reprojection(scene),
         observations=len(colours.point),
         photos=len(scene.train),
+        outward=outward(scene),
     )
 
 
@@ -95,6 +100,28 @@ def sampling_ratio(scene: Scene) -> float:
     return float(high / low)
 
 
+def outward(scene: Scene) -> float:
+    """Spread of the places that train cameras look at, over that of the cameras themselves.
+
+    Near 0 where they stand around something, 1 where they look the same way, large where they stand in the
+    middle. A camera looks at its axis, as far away as its points are in the median.
+    """
+    cameras, places = [], []
+    for index, view in enumerate(scene.views):
+        if view.split != "train":
+            continue
+        axis, offset = view.camera.cam_from_world[2, :3], view.camera.cam_from_world[2, 3]
+        depth = scene.points.xyz[_points_of(scene, index)] @ axis + offset
+        depth = depth[depth > 0]
+        if len(depth) >= 5:
+            cameras.append(view.camera.center)
+            places.append(view.camera.center + float(np.median(depth)) * axis)
+    if len(cameras) < 3:
+        return float("nan")
+    apart, between = (float(np.std(np.array(a), axis=0).max()) for a in (cameras, places))
+    return between / apart if apart > 0 else float("nan")
+
+
 def reprojection(scene: Scene) -> float:
     """Median distance between where a point was found and where it projects, px of the loaded photos."""
     found = []
@@ -137,11 +164,19 @@ def _fit_points(scene: Scene, colours: TrackColours, values: np.ndarray) -> _Fit
     centres = np.array([v.camera.center for v in scene.train])
     fits = []
     for k in chosen:
-        rows = slice(starts[k], starts[k] + sizes[k])
+        rows = starts[k] + np.flatnonzero(_usual(values[starts[k] : starts[k] + sizes[k]]))
+        if len(rows) < LEAST_VIEWS:
+            continue
         direction = centres[view[rows]] - scene.points.xyz[point[starts[k]]]
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         fits.append(_fit(direction, values[rows]))
     return _Fits(*np.array(fits).reshape(-1, 2).T)
+
+
+def _usual(values: np.ndarray) -> np.ndarray:
+    """[n] bool: not far from the median; a photo in which something stands before the point is."""
+    apart = np.abs(values - np.median(values))
+    return apart <= OUTLYING * max(float(np.median(apart)), LEAST_SPREAD)
 
 
 def _fit(direction: np.ndarray, values: np.ndarray) -> tuple[float, float]:

@@ -23,6 +23,7 @@ EFFECTS: dict[str, tuple[str, str, str]] = {
     "antialias": ("smoothing", "SmoothingFilter", "Mip-Splatting's filters, for photos from near and far"),
     "poses": ("poses", "PoseRefinement", "a small correction of every camera's pose"),
     "dense": ("dense", "DenseStart", "first Gaussians on dense points too, for few photos"),
+    "near": ("near", "NearSpace", "no Gaussians close before a camera"),
     "sh0": ("", "", "colours that do not depend on the direction"),
     "sh1": ("", "", "spherical harmonics up to degree 1"),
     "sh2": ("", "", "spherical harmonics up to degree 2"),

@@ -82,7 +82,7 @@ def test_it_becomes_transparent_at_intervals():
 
 def test_a_run_with_it_is_repeatable(tmp_path, monkeypatch):
     monkeypatch.setattr(near_module, "FEW_POINTS", 1)
-    every = lambda data: [np.arange(len(data.scene.points))] * len(data.cameras)  # noqa: E731
+    every = lambda scene: [np.arange(len(scene.points))] * len(scene.train)  # noqa: E731
     monkeypatch.setattr(near_module, "tracks_of", every)  # the tiny scene has no tracks
     write_tiny_scene(tmp_path / "scene")
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ambiguous_wild.splat.effects.base import Effect
+from ambiguous_wild.splat.effects.tracks import tracks_of
 from ambiguous_wild.splat.plane_sweep import dense_points
 from ambiguous_wild.splat.step import TrainData
 
@@ -38,17 +39,9 @@ class DenseStart(Effect):
             return data.photos[view].cpu().numpy()
 
         keep = [None if k is None else k.cpu().numpy() for k in data.user_keep]
-        xyz, rgb = dense_points(data.cameras, photo, data.scene.points.xyz, tracks_of(data), keep, most)
+        xyz, rgb = dense_points(data.cameras, photo, data.scene.points.xyz, tracks_of(data.scene), keep, most)
         self.count = len(xyz)
         return xyz, rgb
 
     def facts(self) -> dict[str, Any]:
         return {"points": self.count}
-
-
-def tracks_of(data: TrainData) -> list[np.ndarray]:
-    """Of each train photo the indices of the points that were found in it, sorted."""
-    points = data.scene.points
-    owner = np.repeat(np.arange(len(points)), np.diff(points.track_offsets))
-    train = [index for index, view in enumerate(data.scene.views) if view.split == "train"]
-    return [np.unique(owner[points.track_views == index]) for index in train]

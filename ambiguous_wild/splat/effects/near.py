@@ -14,8 +14,8 @@ from torch import Tensor
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.splat.effects.base import Effect
-from ambiguous_wild.splat.effects.dense import tracks_of
 from ambiguous_wild.splat.effects.placing import in_picture, projected
+from ambiguous_wild.splat.effects.tracks import tracks_of
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.step import Step, TrainData
 
@@ -34,7 +34,7 @@ class NearSpace(Effect):
     def setup(self, data: TrainData) -> None:
         xyz = data.scene.points.xyz
         self.empty: list[tuple[Camera, float]] = []  # camera, depth up to which nothing belongs
-        for camera, seen in zip(data.cameras, tracks_of(data)):
+        for camera, seen in zip(data.cameras, tracks_of(data.scene)):
             if len(seen) < FEW_POINTS:
                 continue
             depth = xyz[seen] @ camera.cam_from_world[2, :3] + camera.cam_from_world[2, 3]

@@ -23,6 +23,14 @@ class TrackColours:
     rgb: np.ndarray  # [L, 3] float64 in (0, 1), sRGB, mean of 3x3 px
 
 
+def tracks_of(scene: Scene) -> list[np.ndarray]:
+    """Of each train photo the indices of the points that were found in it, sorted."""
+    points = scene.points
+    owner = np.repeat(np.arange(len(points)), np.diff(points.track_offsets))
+    train = [index for index, view in enumerate(scene.views) if view.split == "train"]
+    return [np.unique(owner[points.track_views == index]) for index in train]
+
+
 def track_colours(scene: Scene, photos: Sequence[np.ndarray]) -> TrackColours:
     """Read every train photo where its SfM points were found.
 

@@ -6,8 +6,7 @@
 --data holds a folder a base: its photos, or images/ with them; cut-outs lie in --data/cutouts. Each base is
 built once (`aw build-scene`). Its test photos are those that the others support best: a surface counts as
 supported where three of them see it. Odd placements paste cut-outs, even ones the scene's own texture.
-Training and tables are those of captures.py, in benchmarks/results/placements*, with the effects that each
-method chooses (`--effects default`). Everything resumes.
+Training and tables are those of captures.py, in benchmarks/results/placements*. Everything resumes.
 """
 
 from __future__ import annotations
@@ -127,7 +126,6 @@ def main(words: Sequence[str] | None = None) -> int:
     if args.prepare_only:
         return 0
     results = [] if "--results" in rest else ["--results", str(RESULTS)]
-    results += [] if "--effects" in rest else ["--effects", "default"]
     return captures.main(["--captures", *map(str, scenes), "--out", str(args.out / "runs"), *results, *rest])
 
 

@@ -74,7 +74,8 @@ def measure(raw: Path, out: Path, iterations: int, turn: int, before: Path | Non
 def markdown(rows: list[dict[str, Any]]) -> str:
     """A row a capture; times of the whole build."""
     lines = [
-        "| capture | photos | placed | error px | features s | matches s | mapping s | all s | faster | dB | supported dB |",
+        "| capture | photos | placed | error px | features s | matches s | mapping s | all s | faster "
+        "| dB | supported dB |",
         "|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]
     for row in rows:

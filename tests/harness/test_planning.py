@@ -150,6 +150,17 @@ def test_cameras_around_a_thing_look_inward_and_those_in_its_middle_outward():
     assert math.isnan(evidence_module.outward(two))
 
 
+def test_what_stands_before_points_is_no_light_that_differs_by_place(monkeypatch):
+    scene, photos = synthetic()
+    rng = np.random.default_rng(0)
+    for photo in photos:  # a fourteenth of each is covered
+        row, column = rng.integers(0, HEIGHT - 25), rng.integers(0, WIDTH - 40)
+        photo[row : row + 25, column : column + 40] = rng.uniform(0.1, 0.9, 3)
+    assert measure(scene, photos).appearance < decide_module.APPEARANCE / 2
+    monkeypatch.setattr(evidence_module, "OUTLYING", math.inf)
+    assert measure(scene, photos).appearance > decide_module.APPEARANCE
+
+
 def test_the_numbers_are_what_was_put_in():
     assert measure(*synthetic(exposure=0.15)).exposure == pytest.approx(0.15, rel=0.35)
     assert measure(*synthetic(zoom=3.0)).sampling == pytest.approx(3.0 ** (0.9), rel=0.1)

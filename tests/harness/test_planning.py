@@ -123,7 +123,7 @@ def test_few_photos_call_for_a_dense_start(photos, answer):
 
 @pytest.mark.parametrize(
     ("outward", "near", "dense"),
-    [(0.1, "on", "off"), (0.8, "on", "off"), (1.0, "off", "off"), (7.0, "off", "on")],
+    [(0.1, "on", "off"), (0.8, "on", "off"), (1.1, "off", "off"), (7.0, "off", "on")],
 )
 def test_cameras_in_the_middle_of_a_place_call_for_a_dense_start_and_for_no_empty_space(outward, near, dense):
     plan = decide("dots", dataclasses.replace(measured(), outward=outward))

@@ -118,7 +118,8 @@ def outward(scene: Scene) -> float:
             places.append(view.camera.center + float(np.median(depth)) * axis)
     if len(cameras) < 3:
         return float("nan")
-    apart, between = (float(np.std(np.array(a), axis=0).max()) for a in (cameras, places))
+    # the root of the summed variances does not depend on the axes of the world
+    apart, between = (float(np.sqrt(np.var(np.array(a), axis=0).sum())) for a in (cameras, places))
     return between / apart if apart > 0 else float("nan")
 
 

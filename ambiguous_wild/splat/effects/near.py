@@ -35,9 +35,10 @@ class NearSpace(Effect):
         xyz = data.scene.points.xyz
         self.empty: list[tuple[Camera, float]] = []  # camera, depth up to which nothing belongs
         for camera, seen in zip(data.cameras, tracks_of(data.scene)):
-            if len(seen) < FEW_POINTS:
-                continue
             depth = xyz[seen] @ camera.cam_from_world[2, :3] + camera.cam_from_world[2, 3]
+            depth = depth[depth > 0]
+            if len(depth) < FEW_POINTS:
+                continue
             self.empty.append((camera, SHARE * float(np.quantile(depth, NEAREST))))
 
     @torch.no_grad()

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import subprocess
 import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -21,6 +20,7 @@ from statistics import fmean
 from typing import Any
 
 from captures import find_scenes
+from presets import Stopped, aw, mean_psnr
 
 from ambiguous_wild.harness.running.environment import environment
 from ambiguous_wild.harness.running.result_file import RESULT, read_result
@@ -51,28 +51,20 @@ def train(scene: Path, effects: str, out: Path, iterations: int) -> dict[str, An
     """One run: test PSNR, the effects that were on, and what was tried before.
 
     Raises:
-        subprocess.CalledProcessError: the run failed.
+        Stopped: the run failed, or is there with another configuration.
     """
     folder = out / effects.replace(",", "+")
     run = folder / scene.name / METHOD / "seed0"
-    if not (run / RESULT).is_file():
-        words = ["bench", "--method", METHOD, "--scene", str(scene), "--effects", effects, "--threads", "1"]
-        words += ["--device", "cpu", "--iterations", str(iterations), "--no-pictures", "-o", str(folder)]
-        subprocess.run(
-            [sys.executable, "-m", "ambiguous_wild.cli.main", *words],
-            check=True,
-            capture_output=True,
-            text=True,
-        )
+    words = ["bench", "--method", METHOD, "--scene", str(scene), "--effects", effects, "--threads", "1"]
+    words += ["--device", "cpu", "--iterations", str(iterations), "--no-pictures", "-o", str(folder)]
+    aw(*words)  # keeps a finished run of the same configuration and scene, refuses another one
     told = run / "effects.json"
     said = json.loads(told.read_text(encoding="utf-8")) if told.is_file() else {}
-    plan = said.get("plan") or {"decisions": [], "cost": None}
+    decisions = (said.get("plan") or {"decisions": []})["decisions"]
     return {
-        "psnr": fmean(float(row["psnr"]) for row in read_result(run / RESULT)["per_image"]),
+        "psnr": mean_psnr(read_result(run / RESULT)),
         "effects": ",".join(said.get("effects") or []) or "none",
-        "tried": {
-            d["effect"]: [d["gain_db"], d["error_db"]] for d in plan["decisions"] if d["gain_db"] is not None
-        },
+        "tried": {d["effect"]: [d["gain_db"], d["error_db"]] for d in decisions if d["gain_db"] is not None},
     }
 
 
@@ -134,6 +126,8 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--results", type=Path, default=RESULTS)
     args = parser.parse_args(words)
     scenes = find_scenes(args.scenes)
+    if len({scene.name for scene in scenes}) < len(scenes):
+        parser.error("two scenes have the same name: their runs would share a folder")
     with ThreadPoolExecutor(args.jobs) as pool:
         rows = list(pool.map(lambda scene: measure(scene, args.out, args.iterations), scenes))
     data = {"environment": environment("cpu"), "iterations": args.iterations, "scenes": rows}
@@ -144,4 +138,7 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        sys.exit(main())
+    except Stopped as error:
+        sys.exit(f"error: {error}")

@@ -51,9 +51,10 @@ def busy_cores() -> float:
 
     if not Path("/proc/stat").is_file():
         return os.getloadavg()[0]
-    (total, idle), _ = read(), time.sleep(3)
-    later = read()
-    return (1 - (later[1] - idle) / max(later[0] - total, 1)) * (os.cpu_count() or 1)
+    total, idle = read()
+    time.sleep(3)
+    later_total, later_idle = read()
+    return (1 - (later_idle - idle) / max(later_total - total, 1)) * (os.cpu_count() or 1)
 
 
 def load_now(patience_s: float = 60.0) -> float:

@@ -201,7 +201,6 @@ def run_job(job: SfmJob, folder: Path, watch: Callable[[], None]) -> None:
     with open(log, "ab") as sink:
         process = subprocess.Popen(
             [sys.executable, "-m", "ambiguous_wild.builder.sfm_worker", str(folder / "job.json")],
-            env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},  # its jobs are the threads
             stdin=subprocess.DEVNULL,
             stdout=sink,
             stderr=sink,

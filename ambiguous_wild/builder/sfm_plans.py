@@ -25,8 +25,8 @@ class SfmPlan:
     neighbours: int  # next photos in the order of capture, for "retrieval"
     growth: float  # all cameras are adjusted when the model has grown so many times
     refinements: int  # rounds of such an adjustment, at most
-    local_refinements: int  # rounds of the adjustment of a new camera and those around it, at most
-    local_cameras: int  # so many, the new one included
+    local_refinements: int  # rounds of the adjustment after a photo was placed, at most
+    local_cameras: int  # cameras in that adjustment: the new one and those that share most points with it
     continues: bool = False  # only photos left out so far look for partners, besides the pairs matched so far
     below: float = 1.0  # the plan is for captures of which a smaller share is placed so far
 
@@ -48,11 +48,31 @@ def plans(photos: Sequence[PhotoRecord], settings: BuildSettings) -> list[SfmPla
 def _fast(photos: Sequence[PhotoRecord], settings: BuildSettings) -> SfmPlan:
     matcher = _matcher(len(photos), settings, FAST_EXHAUSTIVE_LIMIT)
     many = len(photos) > EXHAUSTIVE_LIMIT
-    return SfmPlan("fast", "opencv", matcher, 16 if many else 14, 5 if many else 2, 2.0, 1, 1, 4)
+    return SfmPlan(
+        "fast",
+        sift="opencv",
+        matcher=matcher,
+        similar=16 if many else 14,
+        neighbours=5 if many else 2,
+        growth=2.0,
+        refinements=1,
+        local_refinements=1,
+        local_cameras=4,
+    )
 
 
 def _thorough(count: int, settings: BuildSettings) -> SfmPlan:
-    return SfmPlan("thorough", "colmap", _matcher(count, settings, EXHAUSTIVE_LIMIT), 16, 5, 1.1, 5, 2, 6)
+    return SfmPlan(
+        "thorough",
+        sift="colmap",
+        matcher=_matcher(count, settings, EXHAUSTIVE_LIMIT),
+        similar=16,
+        neighbours=5,
+        growth=1.1,
+        refinements=5,
+        local_refinements=2,
+        local_cameras=6,
+    )
 
 
 def _matcher(count: int, settings: BuildSettings, limit: int) -> str:

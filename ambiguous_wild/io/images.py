@@ -130,7 +130,7 @@ def _encode_png(path: Path | str, image: np.ndarray) -> bytes:
     if cv2 is None:
         return pillow_fallback.encode_png(image)
     pixels = image[:, :, ::-1] if image.ndim == 3 else image
-    # one filter for all rows: as small, a third faster than to choose by row
+    # one filter for all rows: about as small as choosing by row, and faster
     options = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_PAETH]
     done, data = cv2.imencode(".png", np.ascontiguousarray(pixels), options)
     if not done:

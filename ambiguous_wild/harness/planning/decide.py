@@ -171,18 +171,18 @@ def decide(scene: str, found: Evidence) -> Plan:
 
 
 def _dense_start(found: Evidence) -> Decision:
-    """On for few photos, and for those from the middle of a place; exposures must be known.
+    """On for few photos, and for those from the middle of a place.
 
-    Where they differ unnoticed, test PSNR fell.
+    Exposures must be known: where they differed and nothing said so, test PSNR fell.
     """
     photos, tracks = found.photos, not math.isnan(found.exposure)
     few, middle = photos <= FEW_PHOTOS, found.outward > OUTWARD
     known = tracks and photos >= LEAST_PHOTOS
     why = "photos leave much to guess" if few else "enough photos see a surface"
-    why = "cameras look outward" if middle else why
     return Decision(
         "dense start", "train photos; on up to the limit", photos or math.nan, FEW_PHOTOS,
-        "photos", "unknown" if not known else "on" if few or middle else "off", why, "--effects dense",
+        "photos", "unknown" if not known else "on" if few or middle else "off",
+        "cameras look outward" if middle else why, "--effects dense",
     )  # fmt: skip
 
 

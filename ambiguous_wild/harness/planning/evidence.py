@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ambiguous_wild.core import Scene
+from ambiguous_wild.core import Camera, Scene
 from ambiguous_wild.splat.effects.tracks import TrackColours, log_gains, track_colours
 
 LEAST = 50  # observations below which nothing is said
@@ -85,15 +85,7 @@ def sampling_ratio(scene: Scene) -> float:
 
     A pixel covers depth / focal length; each photo counts with the median over its points.
     """
-    sizes = []
-    for index, view in enumerate(scene.views):
-        if view.split != "train":
-            continue
-        xyz = scene.points.xyz[_points_of(scene, index)]
-        depth = (xyz @ view.camera.cam_from_world[:3, :3].T + view.camera.cam_from_world[:3, 3])[:, 2]
-        depth = depth[depth > 0]
-        if len(depth) >= 5:
-            sizes.append(float(np.median(depth)) / (0.5 * (view.camera.fx + view.camera.fy)))
+    sizes = [depth / (0.5 * (camera.fx + camera.fy)) for camera, depth in _looking_at(scene)]
     if len(sizes) < 3:
         return float("nan")
     low, high = np.percentile(sizes, [5, 95])
@@ -106,32 +98,39 @@ def outward(scene: Scene) -> float:
     Near 0 where they stand around something, 1 where they look the same way, large where they stand in the
     middle. A camera looks at its axis, as far away as its points are in the median.
     """
-    cameras, places = [], []
-    for index, view in enumerate(scene.views):
-        if view.split != "train":
-            continue
-        axis, offset = view.camera.cam_from_world[2, :3], view.camera.cam_from_world[2, 3]
-        depth = scene.points.xyz[_points_of(scene, index)] @ axis + offset
-        depth = depth[depth > 0]
-        if len(depth) >= 5:
-            cameras.append(view.camera.center)
-            places.append(view.camera.center + float(np.median(depth)) * axis)
-    if len(cameras) < 3:
+    looking = _looking_at(scene)
+    if len(looking) < 3:
         return float("nan")
+    cameras = np.array([camera.center for camera, _ in looking])
+    places = cameras + [depth * camera.cam_from_world[2, :3] for camera, depth in looking]
     # the root of the summed variances does not depend on the axes of the world
-    apart, between = (float(np.sqrt(np.var(np.array(a), axis=0).sum())) for a in (cameras, places))
+    apart, between = (float(np.sqrt(a.var(axis=0).sum())) for a in (cameras, places))
     return between / apart if apart > 0 else float("nan")
+
+
+def _looking_at(scene: Scene) -> list[tuple[Camera, float]]:
+    """Train cameras that see five points or more, each with their median depth."""
+    owner, found = _owner(scene), []
+    for index, view in enumerate(scene.views):
+        if view.split == "train":
+            pose = view.camera.cam_from_world
+            xyz = scene.points.xyz[owner[scene.points.track_views == index]]
+            depth = (xyz @ pose[:3, :3].T + pose[:3, 3])[:, 2]
+            depth = depth[depth > 0]
+            if len(depth) >= 5:
+                found.append((view.camera, float(np.median(depth))))
+    return found
 
 
 def reprojection(scene: Scene) -> float:
     """Median distance between where a point was found and where it projects, px of the loaded photos."""
-    found = []
+    owner, found = _owner(scene), []
     for index, view in enumerate(scene.views):
         if view.split != "train":
             continue
         rows = np.flatnonzero(scene.points.track_views == index)
         camera = view.camera
-        xyz = scene.points.xyz[_owner(scene)[rows]]
+        xyz = scene.points.xyz[owner[rows]]
         local = xyz @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
         front = local[:, 2] > 1e-6
         local = local[front]
@@ -207,7 +206,3 @@ def remaining_spread(fits: _Fits) -> float:
 
 def _owner(scene: Scene) -> np.ndarray:
     return np.repeat(np.arange(len(scene.points)), np.diff(scene.points.track_offsets))
-
-
-def _points_of(scene: Scene, index: int) -> np.ndarray:
-    return _owner(scene)[scene.points.track_views == index]

@@ -1,7 +1,7 @@
 """No Gaussians close before a camera: floaters that explain one photo and that no other photo corrects.
 
-What lies in a camera's picture nearer than a share of its nearest SfM points becomes transparent; density
-control then removes it.
+What lies in a camera's picture nearer than a share of its nearest SfM points becomes transparent. While
+density control works, it removes it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.splat.effects.base import Effect
-from ambiguous_wild.splat.effects.placing import in_picture, projected
+from ambiguous_wild.splat.effects.placing import inside, projected
 from ambiguous_wild.splat.effects.tracks import tracks_of
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.step import Step, TrainData
@@ -37,9 +37,8 @@ class NearSpace(Effect):
         for camera, seen in zip(data.cameras, tracks_of(data.scene)):
             depth = xyz[seen] @ camera.cam_from_world[2, :3] + camera.cam_from_world[2, 3]
             depth = depth[depth > 0]
-            if len(depth) < FEW_POINTS:
-                continue
-            self.empty.append((camera, SHARE * float(np.quantile(depth, NEAREST))))
+            if len(depth) >= FEW_POINTS:
+                self.empty.append((camera, SHARE * float(np.quantile(depth, NEAREST))))
 
     @torch.no_grad()
     def after_step(self, step: Step, gaussians: Gaussians) -> None:
@@ -50,7 +49,8 @@ class NearSpace(Effect):
         """[N] bool of means [N, 3]: in the empty space of any camera."""
         found = torch.zeros(len(means), dtype=torch.bool, device=means.device)
         for camera, depth in self.empty:
-            found |= in_picture(means, camera, margin=0.0) & (projected(means, camera)[1] < depth)
+            pixels, z = projected(means, camera)
+            found |= inside(pixels, z, camera, margin=0.0) & (z < depth)
         return found
 
     def facts(self) -> dict[str, Any]:

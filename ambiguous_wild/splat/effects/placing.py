@@ -55,7 +55,11 @@ def projected(means: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
 
 def in_picture(means: Tensor, camera: Camera, margin: float = 0.15) -> Tensor:
     """[N] bool: before the camera and inside its picture, `margin` of a side around it included."""
-    pixels, z = projected(means, camera)
+    return inside(*projected(means, camera), camera, margin)
+
+
+def inside(pixels: Tensor, z: Tensor, camera: Camera, margin: float) -> Tensor:
+    """`in_picture` of what was `projected` already."""
     u, v = pixels[:, 0] / camera.width - 0.5, pixels[:, 1] / camera.height - 0.5
     return (z > 0.01) & (u.abs() <= 0.5 + margin) & (v.abs() <= 0.5 + margin)
 

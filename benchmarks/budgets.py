@@ -6,7 +6,8 @@
 A DIR is a scene folder, FACTOR one of its sizes. Every run is one `aw bench` with its default effects and all
 threads; one runs at a time. Finished runs are kept. Writes benchmarks/results/budgets.json and .md: for each
 capture refinesplat at each budget, how far each is below the best of them, and the other methods at --at.
-The cores at work before each run are kept too: above 0.5 something else ran, and the row is marked.
+The cores at work before each run are kept too (`busy_cores`): above 0.5 something else ran, and the row is
+marked, as it is where the system does not tell.
 """
 
 from __future__ import annotations
@@ -29,6 +30,10 @@ from ambiguous_wild.io.scene_folder import load_scene
 
 RESULTS = Path(__file__).parent / "results" / "budgets"
 QUIET = 0.5  # cores at work, up to which nothing else ran
+STAT = Path("/proc/stat")
+NOTE = "busy-cores.txt"  # beside the run's result
+# of earlier runs: busy cores or, before those were counted, the load average; rows keep it as "load"
+OLD_NOTE = "load.txt"
 OURS = "refinesplat"
 
 
@@ -42,27 +47,27 @@ def folder_of(out: Path, scene: Scene, method: str, budget: str, seed: int) -> P
     return out / f"{scene.train[0].camera.width}px-{budget}" / scene.name / method / f"seed{seed}"
 
 
-def busy_cores() -> float:
-    """Cores at work, over three seconds; where the system does not tell, the load over the last minute."""
+def busy_cores(seconds: float = 3.0) -> float | None:
+    """Cores at work in the next seconds, as a mean; None where the system does not tell."""
 
     def read() -> tuple[int, int]:
-        values = [int(word) for word in Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:9]]
-        return sum(values), values[3] + values[4]
+        values = [int(word) for word in STAT.read_text().split("\n", 1)[0].split()[1:9]]
+        return sum(values), values[3] + values[4]  # idle, and waiting for a disk
 
-    if not Path("/proc/stat").is_file():
-        return os.getloadavg()[0]
+    if not STAT.is_file():
+        return None
     total, idle = read()
-    time.sleep(3)
+    time.sleep(seconds)
     later_total, later_idle = read()
     return (1 - (later_idle - idle) / max(later_total - total, 1)) * (os.cpu_count() or 1)
 
 
-def load_now(patience_s: float = 60.0) -> float:
+def once_quiet(patience_s: float = 60.0) -> float | None:
     """Cores at work once nothing else is, or after so long."""
     end = time.monotonic() + patience_s
-    while (busy := busy_cores()) > QUIET and time.monotonic() < end:
+    while (busy := busy_cores()) is not None and busy > QUIET and time.monotonic() < end:
         time.sleep(3)
-    return round(busy, 2)
+    return None if busy is None else round(busy, 2)
 
 
 def bench(scene: Path, factor: int | None, method: str, budget: str, seed: int, folder: Path) -> str | None:
@@ -70,14 +75,19 @@ def bench(scene: Path, factor: int | None, method: str, budget: str, seed: int, 
     words = ["bench", "--scene", str(scene), "--method", method, "--budget", budget, "--seed", str(seed)]
     words += ["--device", "cpu", "--no-pictures", "--probes", "0", "-o", str(folder.parents[2])]
     words += ["--factor", str(factor)] if factor else []
-    load = load_now()
+    busy = once_quiet()
     done = subprocess.run(
         [sys.executable, "-m", "ambiguous_wild.cli.main", *words], capture_output=True, text=True
     )
     if not (folder / RESULT).is_file():
         return (done.stderr.strip().splitlines() or ["no output"])[-1]
-    write_text(folder / "load.txt", f"{load}\n")
+    if busy is not None:
+        write_text(folder / NOTE, f"{busy}\n")
     return None
+
+
+def noted(path: Path) -> float | None:
+    return float(path.read_text(encoding="utf-8")) if path.is_file() else None
 
 
 def row_of(folder: Path, method: str, budget: str, scene: Scene) -> dict[str, Any] | None:
@@ -86,7 +96,7 @@ def row_of(folder: Path, method: str, budget: str, scene: Scene) -> dict[str, An
     result = read_result(folder / RESULT)
     if result["status"] != "ok":
         return None
-    note = folder / "load.txt"
+    busy, old = noted(folder / NOTE), noted(folder / OLD_NOTE)
     return {
         "scene": scene.name,
         "width": scene.train[0].camera.width,
@@ -95,7 +105,8 @@ def row_of(folder: Path, method: str, budget: str, scene: Scene) -> dict[str, An
         "psnr": fmean(float(row["psnr"]) for row in result["per_image"]),
         "iterations": result["cost"]["iterations"],
         "gaussians": result["cost"]["gaussians"],
-        "load": float(note.read_text(encoding="utf-8")) if note.is_file() else None,
+        "busy_cores": busy,
+        **({"load": old} if busy is None and old is not None else {}),
     }
 
 
@@ -115,13 +126,15 @@ def to_markdown(data: dict[str, Any]) -> str:
         "",
         f"`aw bench --budget`, default effects, seed {data['seed']}, {data['environment']['cores']} cores. "
         'Made by `benchmarks/budgets.py`. "Below best": dB under RefineSplat\'s best budget of the table. '
-        f"(!): more than {QUIET} cores were at work before the run.",
+        f"(!): more than {QUIET} cores were at work before the run, or it is not known how many.",
         "",
         "| capture | width px | method | budget | PSNR | below best | iterations | Gaussians |",
         "|---|---:|---|---:|---:|---:|---:|---:|",
     ]
     for row in data["rows"]:
-        busy = " (!)" if row["load"] is None or row["load"] > QUIET else ""
+        seen = row.get("busy_cores")
+        seen = row.get("load") if seen is None else seen  # of an earlier run
+        busy = " (!)" if seen is None or seen > QUIET else ""
         below = "" if row["below"] is None else f"{row['below']:.2f}"
         cells = [row["scene"], row["width"], row["method"], row["budget"] + busy, f"{row['psnr']:.2f}", below,
                  row["iterations"], row["gaussians"]]  # fmt: skip

@@ -8,12 +8,14 @@ A DIR is a scene folder or a folder of them. Each run is one `aw bench` with one
 same time. Runs are ordinary run folders under --out: finished ones are kept, stopped ones resume. Writes
 benchmarks/results/captures.json, .csv and .md, without paths, and captures-runs.csv with a row per run. A run
 that is in this file with the same configuration and scene is not trained again, even on another machine.
---report-only trains nothing.
+--report-only trains nothing. It makes no plan of effects, but reads the one in a run folder of the scene;
+without one the row is missing.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import os
 import subprocess
 import sys
@@ -37,12 +39,12 @@ from captures_report import (
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.running.cell import Cell
-from ambiguous_wild.harness.running.choosing import Probing
+from ambiguous_wild.harness.running.choosing import PLANNED, Probing, chosen_by
 from ambiguous_wild.harness.running.environment import environment
 from ambiguous_wild.harness.running.grid import cell_folder, plan_cells
 from ambiguous_wild.harness.running.prepare import prepare_cpu
 from ambiguous_wild.harness.running.result_file import RESULT
-from ambiguous_wild.harness.running.run_folder import refuse_other_config
+from ambiguous_wild.harness.running.run_folder import planned_effects, refuse_other_config
 from ambiguous_wild.harness.running.store import read_runs
 from ambiguous_wild.io.atomic import write_json, write_text
 from ambiguous_wild.splat.pace import TrainConfig
@@ -111,6 +113,20 @@ def run_all(cells: Sequence[Cell], book: pd.DataFrame, args: argparse.Namespace)
     return failed
 
 
+def with_recorded_effects(cells: Sequence[Cell], wanted: str, out: Path) -> list[Cell]:
+    """The cells, each with the effects that a recorded plan gives it; without those that lack a plan.
+
+    A plan belongs to the scene: the one in any of its run folders holds for all methods and seeds.
+    """
+    plans: dict[str, tuple[str, ...]] = {}
+    for cell in cells:
+        found = planned_effects(cell_folder(out, cell))
+        if found is not None:
+            plans.setdefault(cell.scene.name, found)
+    chosen = [chosen_by(plans.get(c.scene.name), wanted, c.scene, c.method) for c in cells]
+    return [dataclasses.replace(c, chosen=found) for c, found in zip(cells, chosen) if found is not None]
+
+
 def refuse_other_configs(cells: Sequence[Cell], out: Path) -> None:
     """Raise AwError if a run folder has another configuration: it is neither replaced nor used."""
     for cell in cells:
@@ -147,6 +163,7 @@ def main(words: Sequence[str] | None = None) -> int:
     args = arguments(words)
     train = TrainConfig(iterations=args.iterations)
     plans = Probing(train, args.out / ".cache" / "plans", lambda: prepare_cpu(args.jobs, print), print)
+    recorded = args.report_only and args.effects in PLANNED
     cells = plan_cells(
         args.methods,
         find_scenes(args.captures),
@@ -154,10 +171,11 @@ def main(words: Sequence[str] | None = None) -> int:
         train,
         settings=args.settings,
         device="cpu",
-        effects=args.effects,
+        effects="none" if recorded else args.effects,  # a plan trains probes
         probing=plans,
     )
-    refuse_other_configs(cells, args.out)  # before anything is trained
+    known = with_recorded_effects(cells, args.effects, args.out) if recorded else cells
+    refuse_other_configs(known, args.out)  # before anything is trained
     book_path = args.results.with_name(args.results.name + "-runs.csv")
     book = read_book(book_path)
     failed = [] if args.report_only else run_all(cells, book, args)
@@ -165,10 +183,15 @@ def main(words: Sequence[str] | None = None) -> int:
     runs = read_runs(args.out) if any(cell_folder(args.out, cell).is_dir() for cell in cells) else None
     book = book if runs is None else merged(book, book_of(runs))
     write_text(book_path, book.to_csv(index=False, float_format="%.7g"))
-    book = current(book, cells)
+    book = current(book, known)
     scenes = {cell.scene.name: cell.scene for cell in cells}
     methods = list(dict.fromkeys(cell.method.name for cell in cells))
     rows = tabulate(book, list(scenes), methods, args.seeds)
+    missing = missing_runs(book, runs, list(scenes), methods, args.seeds)
+    told = {(cell.scene.name, cell.method.name) for cell in known}
+    for run in missing:
+        if (run["capture"], run["method"]) not in told:
+            run["why"] = "no run folder records a plan of effects"
     captures = [facts_of(scene) for scene in scenes.values()]
     data = {
         "environment": environment("cpu"),
@@ -181,7 +204,7 @@ def main(words: Sequence[str] | None = None) -> int:
         "captures": captures,
         "rows": rows,
         "summary": summarise(rows, captures),
-        "missing": missing_runs(book, runs, list(scenes), methods, args.seeds),
+        "missing": missing,
     }
     stem = args.results
     write_json(stem.with_name(stem.name + ".json"), data)

@@ -13,7 +13,7 @@ from ambiguous_wild.core import AwError, Camera, Points, Scene, View
 from ambiguous_wild.harness.planning import decide as decide_module
 from ambiguous_wild.harness.planning import evidence as evidence_module
 from ambiguous_wild.harness.planning import probe
-from ambiguous_wild.harness.planning.decide import FEW_PHOTOS, Plan, decide, plan_without_training
+from ambiguous_wild.harness.planning.decide import FEW_PHOTOS, OUTWARD, Plan, decide, plan_without_training
 from ambiguous_wild.harness.planning.evidence import measure
 from ambiguous_wild.harness.planning.file import read_plan
 from ambiguous_wild.harness.planning.probe import Occlusion, summarise, unexplained, with_occlusion
@@ -129,6 +129,9 @@ def test_cameras_in_the_middle_of_a_place_call_for_a_dense_start_and_for_no_empt
     plan = decide("dots", dataclasses.replace(measured(), outward=outward))
     found = {d.effect: d.decision for d in plan.decisions}
     assert (found["near space"], found["dense start"]) == (near, dense)
+    (line,) = (d for d in plan.decisions if d.effect == "dense start")
+    shown = (line.value, line.threshold, line.unit)
+    assert shown == ((outward, OUTWARD, "times") if dense == "on" else (25, FEW_PHOTOS, "photos"))
 
 
 def test_cameras_around_a_thing_look_inward_and_those_in_its_middle_outward():
@@ -139,15 +142,32 @@ def test_cameras_around_a_thing_look_inward_and_those_in_its_middle_outward():
     for view in scene.views:
         camera = dataclasses.replace(view.camera, cam_from_world=turned @ view.camera.cam_from_world)
         views.append(dataclasses.replace(view, camera=camera))
-        xyz.append(view.camera.center + 5.0 * camera.cam_from_world[2, :3] + np.eye(3)[[0, 1, 2, 0, 1]])
+        xyz.append(view.camera.center + 10.0 * camera.cam_from_world[2, :3] + np.eye(3)[[0, 1, 2, 0, 1]])
     count = len(views) * 5
     points = Points(
         np.concatenate(xyz), np.zeros((count, 3), np.uint8), np.zeros(count), np.arange(count + 1),
         np.repeat(np.arange(len(views)), 5).astype(np.int32), np.zeros((count, 2), np.float32),
     )  # fmt: skip
-    assert evidence_module.outward(dataclasses.replace(scene, views=tuple(views), points=points)) > 1.5
-    two = dataclasses.replace(scene, views=tuple(views[:2]), points=points)
-    assert math.isnan(evidence_module.outward(two))
+    scene = dataclasses.replace(scene, views=tuple(views), points=points)
+    assert evidence_module.outward(scene) > OUTWARD
+    assert math.isnan(evidence_module.outward(dataclasses.replace(scene, views=tuple(views[:2]))))
+
+
+@pytest.mark.parametrize("jitter", [0.0, 1e-4])
+def test_cameras_at_one_place_look_neither_inward_nor_outward(jitter):
+    scene, _ = synthetic()
+    views = []
+    for k, view in enumerate(scene.views):  # all turn about the place of the first
+        pose = view.camera.cam_from_world.copy()
+        centre = scene.views[0].camera.center + jitter * np.eye(3)[k % 3]
+        pose[:3, 3] = -pose[:3, :3] @ centre
+        camera = dataclasses.replace(view.camera, cam_from_world=pose)
+        views.append(dataclasses.replace(view, camera=camera))
+    found = dataclasses.replace(
+        measured(), outward=evidence_module.outward(dataclasses.replace(scene, views=tuple(views)))
+    )
+    assert math.isnan(found.outward)
+    assert decide("dots", found).effects() == ()
 
 
 def test_what_stands_before_points_is_no_light_that_differs_by_place(monkeypatch):
@@ -159,6 +179,14 @@ def test_what_stands_before_points_is_no_light_that_differs_by_place(monkeypatch
     assert measure(scene, photos).appearance < decide_module.APPEARANCE / 2
     monkeypatch.setattr(evidence_module, "OUTLYING", math.inf)
     assert measure(scene, photos).appearance > decide_module.APPEARANCE
+
+
+@pytest.mark.parametrize("changed", [2, 3, 4, 8])
+def test_light_of_few_photos_is_not_taken_for_what_stands_before_points(changed):
+    (scene, photos), (_, relit) = synthetic(), synthetic(place=0.4)
+    for k in np.linspace(0, VIEWS - 1, changed).astype(int):
+        photos[k] = relit[k]
+    assert measure(scene, photos).appearance > 1.3 * decide_module.APPEARANCE
 
 
 def test_the_numbers_are_what_was_put_in():

@@ -15,6 +15,10 @@ import pandas as pd
 import pytest
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.planning import probed
+from ambiguous_wild.harness.planning.decide import Decision, Plan
+from ambiguous_wild.harness.running.grid import plan_cells, run_cells
+from ambiguous_wild.splat.pace import TrainConfig
 from tests.tiny_scene import write_tiny_scene
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
@@ -161,6 +165,69 @@ def test_the_script_trains_what_is_missing_and_tabulates(script, report, tmp_pat
 
     with pytest.raises(AwError, match=r"another configuration \(train.iterations was 12, is 14\)"):
         script.main([*words, "--report-only", "--iterations", "14"])
+
+
+@pytest.fixture
+def no_training(script, monkeypatch):
+    """Probes and runs are errors."""
+
+    def never(*args, **more):
+        raise AssertionError("something was trained")
+
+    monkeypatch.setattr(probed, "plan_with_probes", never)
+    monkeypatch.setattr(script, "run_all", never)
+
+
+def planned_run(tmp_path: Path, decision: str = "on") -> Path:
+    """A finished run of 3dgs on the scene "with", planned with that decision on exposure."""
+    scene = write_tiny_scene(tmp_path / "with")
+    line = Decision(
+        "affine exposure", "gains", 0.1, 0.05, "of a code", decision, "they differ", "--effects exposure"
+    )
+    train = TrainConfig(iterations=10)
+    cells = plan_cells(["3dgs"], [scene], [0], train, effects="auto", plan=Plan("with", (line,)))
+    (done,) = run_cells(cells, tmp_path / "runs", pictures=False)
+    assert done.outcome == "trained"
+    return done.folder
+
+
+def report_only(script, tmp_path: Path, *more: str) -> dict:
+    words = ["--captures", tmp_path / "with", "--out", tmp_path / "runs", "--results", tmp_path / "out"]
+    words += ["--iterations", "10", "--report-only", *more]
+    assert script.main([str(word) for word in words]) == 0
+    return json.loads((tmp_path / "out.json").read_text())
+
+
+def test_a_report_takes_the_plan_of_the_runs(script, tmp_path, no_training):
+    planned_run(tmp_path)
+    data = report_only(script, tmp_path, "--effects", "auto", "--methods", "3dgs", "--seeds", "0")
+    (row,) = data["rows"]
+    assert row["psnr"] > 0 and not data["missing"]
+    # the plan is the scene's: of seed 1, too, it says what it would train with
+    data = report_only(script, tmp_path, "--effects", "auto", "--methods", "3dgs", "--seeds", "0", "1")
+    assert [(m["seed"], m["why"]) for m in data["missing"]] == [(1, "not finished")]
+
+
+def test_a_row_without_a_recorded_plan_is_missing(script, tmp_path, no_training):
+    folder = planned_run(tmp_path)
+    (folder / "effects.json").write_text("{")
+    given = ("--methods", "3dgs", "refinesplat", "--seeds", "0")
+    auto = report_only(script, tmp_path, "--effects", "auto", *given)
+    assert [row["psnr"] for row in auto["rows"]] == [None, None]
+    assert [m["why"] for m in auto["missing"]] == ["no run folder records a plan of effects"] * 2
+    shutil.rmtree(folder)  # it had effects, which 3dgs by default has not
+    default = report_only(script, tmp_path, "--effects", "default", *given)
+    assert [row["psnr"] for row in default["rows"]] == [None, None]
+    assert [m["why"] for m in default["missing"]] == ["not finished", auto["missing"][1]["why"]]
+
+
+def test_a_report_refuses_a_run_with_other_effects_than_planned(script, tmp_path, no_training):
+    folder = planned_run(tmp_path)
+    told = json.loads((folder / "effects.json").read_text())
+    told["plan"]["effects"] = ["poses"]
+    (folder / "effects.json").write_text(json.dumps(told))
+    with pytest.raises(AwError, match="another configuration"):
+        report_only(script, tmp_path, "--effects", "auto", "--methods", "3dgs", "--seeds", "0")
 
 
 def test_the_script_as_it_is_typed(tmp_path):

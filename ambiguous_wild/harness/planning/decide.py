@@ -178,11 +178,15 @@ def _dense_start(found: Evidence) -> Decision:
     photos, tracks = found.photos, not math.isnan(found.exposure)
     few, middle = photos <= FEW_PHOTOS, found.outward > OUTWARD
     known = tracks and photos >= LEAST_PHOTOS
-    why = "photos leave much to guess" if few else "enough photos see a surface"
+    decision: Answer = "unknown" if not known else "on" if few or middle else "off"
+    if middle and not few:
+        return Decision(
+            "dense start", "spread of what cameras look at, over theirs", found.outward, OUTWARD, "times",
+            decision, "cameras look outward", "--effects dense",
+        )  # fmt: skip
     return Decision(
-        "dense start", "train photos; on up to the limit", photos or math.nan, FEW_PHOTOS,
-        "photos", "unknown" if not known else "on" if few or middle else "off",
-        "cameras look outward" if middle else why, "--effects dense",
+        "dense start", "train photos; on up to the limit", photos or math.nan, FEW_PHOTOS, "photos",
+        decision, "photos leave much to guess" if few else "enough photos see a surface", "--effects dense",
     )  # fmt: skip
 
 

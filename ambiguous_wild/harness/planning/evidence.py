@@ -17,6 +17,8 @@ from ambiguous_wild.splat.effects.tracks import TrackColours, log_gains, track_c
 LEAST = 50  # observations below which nothing is said
 LEAST_VIEWS = 6  # of a point, to fit four numbers to its colour
 OUTLYING = 4.5  # median deviations from a point's median colour: three standard deviations of noise
+RELIT = 0.5  # share of a photo's points that are far from their medians: more, and its light is another one
+LEAST_APART = 1e-3  # spread of cameras over the depth they look at; below, they stand at one place
 LEAST_SPREAD = 0.01  # code values, or of the logarithm: the median deviation counts as at least so much
 MOST = 20_000  # points whose view dependence is fitted; more do not change a median
 
@@ -96,7 +98,8 @@ def outward(scene: Scene) -> float:
     """Spread of the places that train cameras look at, over that of the cameras themselves.
 
     Near 0 where they stand around something, 1 where they look the same way, large where they stand in the
-    middle. A camera looks at its axis, as far away as its points are in the median.
+    middle. A camera looks at its axis, as far away as its points are in the median. NaN if all stand at one
+    place.
     """
     looking = _looking_at(scene)
     if len(looking) < 3:
@@ -105,7 +108,8 @@ def outward(scene: Scene) -> float:
     places = cameras + [depth * camera.cam_from_world[2, :3] for camera, depth in looking]
     # the root of the summed variances does not depend on the axes of the world
     apart, between = (float(np.sqrt(a.var(axis=0).sum())) for a in (cameras, places))
-    return between / apart if apart > 0 else float("nan")
+    depth = float(np.median([depth for _, depth in looking]))
+    return between / apart if apart > LEAST_APART * depth else float("nan")
 
 
 def _looking_at(scene: Scene) -> list[tuple[Camera, float]]:
@@ -162,21 +166,33 @@ def _fit_points(scene: Scene, colours: TrackColours, values: np.ndarray) -> _Fit
     if len(chosen) > MOST:
         chosen = np.random.default_rng(0).choice(chosen, MOST, replace=False)
     centres = np.array([v.camera.center for v in scene.train])
+    groups = [starts[k] + np.arange(sizes[k]) for k in chosen]
     fits = []
-    for k in chosen:
-        rows = starts[k] + np.flatnonzero(_usual(values[starts[k] : starts[k] + sizes[k]]))
+    for rows in _usual(groups, values, view):
         if len(rows) < LEAST_VIEWS:
             continue
-        direction = centres[view[rows]] - scene.points.xyz[point[starts[k]]]
+        direction = centres[view[rows]] - scene.points.xyz[point[rows[0]]]
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         fits.append(_fit(direction, values[rows]))
     return _Fits(*np.array(fits).reshape(-1, 2).T)
 
 
-def _usual(values: np.ndarray) -> np.ndarray:
-    """[n] bool: not far from the median; a photo in which something stands before the point is."""
-    apart = np.abs(values - np.median(values))
-    return apart <= OUTLYING * max(float(np.median(apart)), LEAST_SPREAD)
+def _usual(groups: Sequence[np.ndarray], values: np.ndarray, view: np.ndarray) -> list[np.ndarray]:
+    """Of the rows of each point those that are not far from its median.
+
+    A photo in which something stands before a point is far from it. But if most points of a photo are, its
+    light is another one, and its rows stay.
+    """
+    if not groups:
+        return []
+    far = []
+    for rows in groups:
+        apart = np.abs(values[rows] - np.median(values[rows]))
+        far.append(apart > OUTLYING * max(float(np.median(apart)), LEAST_SPREAD))
+    of_photo = view[np.concatenate(groups)]
+    count = np.maximum(np.bincount(of_photo), 1)
+    relit = np.bincount(of_photo, np.concatenate(far)) > RELIT * count
+    return [rows[~outlying | relit[view[rows]]] for rows, outlying in zip(groups, far)]
 
 
 def _fit(direction: np.ndarray, values: np.ndarray) -> tuple[float, float]:

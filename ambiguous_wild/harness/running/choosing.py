@@ -5,6 +5,7 @@ Imports no torch before a plan is needed: a misspelt name is answered at once.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from ambiguous_wild.splat.pace import TrainConfig
 
 WORDS = ("default", "auto", "none", "all")
+PLANNED = ("default", "auto")  # the plan of the scene decides
 
 
 @dataclass(frozen=True)
@@ -89,22 +91,44 @@ def choose(
     named = check_wanted(wanted)
     if plan is not None and plan.scene != scene.name:
         raise AwError(f"the plan is of scene {plan.scene}, not of {scene.name}: run 'aw plan {scene.root}'")
-    if wanted not in ("auto", "default"):
+    if wanted not in PLANNED:
         effects = ALL if wanted == "all" else named
         return {m.name: Chosen(effects, "" if wanted == "none" else wanted) for m in methods}
-    # a graft takes none: its name says all that it is made of
-    allowed = {m.name: None if wanted == "auto" else m.auto_effects for m in methods}
-    if plan is None and any(names is None or names for names in allowed.values()):
+    if plan is None and any(_allowed(wanted, method) != () for method in methods):
         plan = _make_plan(scene, probing)
-    out = {}
-    published = published_effects(scene)
-    for name, among in allowed.items():
-        if plan is None or among == ():
-            out[name] = Chosen()
-        else:
-            found = [*plan.effects(among), *(e for e in published if among is None or e in among)]
-            out[name] = Chosen(check_effects(found), "auto", plan)
-    return out
+    found = None if plan is None else plan.effects()
+    chosen = {m.name: chosen_by(found, wanted, scene, m) or Chosen() for m in methods}
+    return {name: dataclasses.replace(c, plan=plan if c.asked else None) for name, c in chosen.items()}
+
+
+def chosen_by(planned: Sequence[str] | None, wanted: str, scene: Scene, method: MethodEntry) -> Chosen | None:
+    """What one method trains with where a plan decides; nothing is planned.
+
+    Args:
+        planned: effects that the plan of the scene calls for; None = there is no plan.
+        wanted: one of `PLANNED`.
+        scene: the scene.
+        method: the method.
+
+    Returns:
+        None where the method needs a plan and there is none.
+
+    Raises:
+        AwError: unknown effect.
+    """
+    among = _allowed(wanted, method)
+    if among == ():
+        return Chosen()
+    if planned is None:
+        return None
+    found = [*planned, *published_effects(scene)]
+    return Chosen(check_effects(e for e in found if among is None or e in among), "auto")
+
+
+def _allowed(wanted: str, method: MethodEntry) -> tuple[str, ...] | None:
+    """The effects among which a plan chooses; None = all."""
+    # a graft takes none: its name says all that it is made of
+    return None if wanted == "auto" else method.auto_effects
 
 
 def _make_plan(scene: Scene, probing: Probing | None) -> Plan:

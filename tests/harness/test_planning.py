@@ -96,13 +96,13 @@ INJECTED = {
 def test_nothing_is_called_for_where_nothing_was_put_in(seed):
     found = decisions(seed=seed)
     off = dict.fromkeys([*INJECTED, "dense start"], "off")
-    assert {name: d.decision for name, d in found.items()} == off | {"near space": "on"}
+    assert {name: d.decision for name, d in found.items()} == off
 
 
 @pytest.mark.parametrize("effect", INJECTED)
 def test_what_was_put_in_is_called_for_and_nothing_else(effect):
     answers = {name: d.decision for name, d in decisions(**INJECTED[effect]).items()}
-    others = {name for name, a in answers.items() if a == "on"} - {effect, "near space"}
+    others = {name for name, a in answers.items() if a == "on"} - {effect}
     assert answers[effect] == "on"
     # a colour that follows the direction or the place leaves its mark on what is read as the other
     assert others <= {"SH degree"} if effect in ("appearance embedding", "pose refinement") else not others
@@ -114,22 +114,18 @@ def test_what_was_put_in_is_called_for_and_nothing_else(effect):
 def test_few_photos_call_for_a_dense_start(photos, answer):
     plan = decide("dots", dataclasses.replace(measured(), photos=photos))
     assert [d.decision for d in plan.decisions if d.effect == "dense start"] == [answer]
-    assert plan.effects() == (("dense", "near") if answer == "on" else ("near",))
+    assert plan.effects() == (("dense",) if answer == "on" else ())
     assert (
         choose("default", synthetic()[0], [get_method("refinesplat")], plan)["refinesplat"].effects
         == plan.effects()
     )
 
 
-@pytest.mark.parametrize(
-    ("outward", "near", "dense"),
-    [(0.1, "on", "off"), (0.8, "on", "off"), (1.1, "off", "off"), (7.0, "off", "on")],
-)
-def test_cameras_in_the_middle_of_a_place_call_for_a_dense_start_and_for_no_empty_space(outward, near, dense):
+@pytest.mark.parametrize(("outward", "dense"), [(0.1, "off"), (1.1, "off"), (7.0, "on")])
+def test_cameras_in_the_middle_of_a_place_call_for_a_dense_start(outward, dense):
     plan = decide("dots", dataclasses.replace(measured(), outward=outward))
-    found = {d.effect: d.decision for d in plan.decisions}
-    assert (found["near space"], found["dense start"]) == (near, dense)
     (line,) = (d for d in plan.decisions if d.effect == "dense start")
+    assert line.decision == dense
     shown = (line.value, line.threshold, line.unit)
     assert shown == ((outward, OUTWARD, "times") if dense == "on" else (25, FEW_PHOTOS, "photos"))
 
@@ -210,7 +206,7 @@ def test_a_plan_survives_its_file(tmp_path):
     write_json(tmp_path / "plan.json", plan.plain())
     again = read_plan(tmp_path / "plan.json")
     assert again.plain() == plan.plain()
-    assert again.effects() == ("antialias", "near")  # a lower degree of the harmonics is never decided on
+    assert again.effects() == ("antialias",)  # a lower degree of the harmonics is never decided on
     assert [d.cost_ms for d in again.decisions if d.effect == "antialiasing"] == [0.5]
     for text in (
         "{half",
@@ -280,8 +276,8 @@ def test_a_baseline_stays_what_its_paper_defines_unless_asked():
     by_default = choose("default", scene, methods, plan)
     assert by_default["3dgs"].effects == by_default["refinesplat@mask=truth"].effects == ()
     assert not by_default["3dgs"].asked  # and its folder says nothing
-    assert by_default["refinesplat"].effects == ("exposure", "antialias", "near")
-    assert choose("auto", scene, methods, plan)["3dgs"].effects == ("exposure", "antialias", "near")
+    assert by_default["refinesplat"].effects == ("exposure", "antialias")
+    assert choose("auto", scene, methods, plan)["3dgs"].effects == ("exposure", "antialias")
     assert choose("none", scene, methods, plan)["refinesplat"].effects == ()
     with pytest.raises(AwError, match="of scene dots, not of other"):
         choose("auto", dataclasses.replace(scene, name="other"), methods, plan)
@@ -311,10 +307,10 @@ def test_a_run_says_what_was_on_and_why_and_ships_the_filtered_model(tiny, tmp_p
     (report,) = run_cells(cells, tmp_path, pictures=False)
     assert report.outcome == "trained", report.error
     said = json.loads((cell_folder(tmp_path, cells[0]) / "effects.json").read_text())
-    assert said["asked"] == "auto" and said["effects"] == ["antialias", "near"]
-    assert {d["effect"] for d in said["plan"]["decisions"]} == {*INJECTED, "dense start", "near space"}
+    assert said["asked"] == "auto" and said["effects"] == ["antialias"]
+    assert {d["effect"] for d in said["plan"]["decisions"]} == {*INJECTED, "dense start"}
     facts = report.result["facts"]
-    assert facts["effects"] == ["antialias", "near"] and facts["protocol"] == "half"
+    assert facts["effects"] == ["antialias"] and facts["protocol"] == "half"
     assert facts["effect_facts"]["antialias"]["filter_size_median"] > 0
     assert not any(math.isnan(row["psnr"]) for row in report.result["per_image"])
     with pytest.raises(AwError, match="effects was"):

@@ -24,8 +24,8 @@ SAMPLING = 1.5
 VIEW_DEPENDENCE = 0.015
 REPROJECTION_PX = 1.0
 # cameras around something have 0.07 to 0.93, a drone's side by side 1.04, those in the middle of a yard 7.1.
-# Near space paid around something, a dense start of 30 photos in the middle of a yard (docs/effects.md)
-INWARD, OUTWARD = 1.0, 2.0
+# a dense start of 30 photos paid in the middle of a yard (docs/effects.md)
+OUTWARD = 2.0
 # captures of 9 to 20 photos gained SSIM by a dense start, those of 30 did not (docs/effects.md)
 LEAST_PHOTOS, FEW_PHOTOS = 3, 24
 
@@ -163,7 +163,6 @@ def decide(scene: str, found: Evidence) -> Plan:
             "--effects poses",
         ),
         _dense_start(found),
-        _near_space(found.outward),
     )  # fmt: skip
     missing = f"cannot be told from {seen}"
     lines = tuple(replace(d, why=missing) if d.decision == "unknown" else d for d in lines)
@@ -187,17 +186,6 @@ def _dense_start(found: Evidence) -> Decision:
     return Decision(
         "dense start", "train photos; on up to the limit", photos or math.nan, FEW_PHOTOS, "photos",
         decision, "photos leave much to guess" if few else "enough photos see a surface", "--effects dense",
-    )  # fmt: skip
-
-
-def _near_space(outward: float) -> Decision:
-    """On where cameras stand around what they see: nothing is close before them."""
-    around = outward <= INWARD
-    return Decision(
-        "near space", "spread of what cameras look at, over theirs; on up to the limit", outward, INWARD,
-        "times", "unknown" if math.isnan(outward) else "on" if around else "off",
-        "nothing belongs close before a camera" if around else "cameras do not look at one place",
-        "--effects near",
     )  # fmt: skip
 
 

@@ -23,8 +23,8 @@ OF_SHINE = 1.7
 SAMPLING = 1.5
 VIEW_DEPENDENCE = 0.015
 REPROJECTION_PX = 1.0
-# cameras around something have 0.07 to 0.93, a drone's side by side 1.04, those in the middle of a yard 7.1.
-# a dense start of 30 photos paid in the middle of a yard (docs/effects.md)
+# cameras around something have 0.07 to 0.93, a drone's side by side 1.04, those in the middle of a yard 7.1:
+# there a dense start of 30 photos paid (docs/effects.md)
 OUTWARD = 2.0
 # captures of 9 to 20 photos gained SSIM by a dense start, those of 30 did not (docs/effects.md)
 LEAST_PHOTOS, FEW_PHOTOS = 3, 24

@@ -113,7 +113,7 @@ def outward(scene: Scene) -> float:
 
 
 def _looking_at(scene: Scene) -> list[tuple[Camera, float]]:
-    """Train cameras that see five points or more, each with their median depth."""
+    """Train cameras that see five points or more, each with the median depth of its points."""
     owner, found = _owner(scene), []
     for index, view in enumerate(scene.views):
         if view.split == "train":
@@ -178,10 +178,10 @@ def _fit_points(scene: Scene, colours: TrackColours, values: np.ndarray) -> _Fit
 
 
 def _usual(groups: Sequence[np.ndarray], values: np.ndarray, view: np.ndarray) -> list[np.ndarray]:
-    """Of the rows of each point those that are not far from its median.
+    """Of each point, the rows whose colour is near the point's median colour.
 
-    A photo in which something stands before a point is far from it. But if most points of a photo are, its
-    light is another one, and its rows stay.
+    A colour far from the median shows something that stands before the point. But where most colours of a
+    photo are far, its light is another one, and its rows stay.
     """
     if not groups:
         return []

@@ -2,11 +2,11 @@
 
     python benchmarks/auto.py --scenes DIR... --out DIR [--iterations 1500] [--seeds 0] [--jobs 2]
 
-A DIR is a scene folder or a folder of them. On each scene RefineSplat is trained with `auto` and with none,
-`near`, `dense`, and what may help there: on a preset the effects it was designed for (colour per photo once
-as exposure, once as appearance), elsewhere `exposure` and `antialias`, each alone and with `dense`. The set
-that `auto` chose is not trained again: the bits are the same. One thread a run. Finished runs are kept.
-Writes benchmarks/results/auto.json and .md.
+A DIR is a scene folder or a folder of them. On each scene RefineSplat is trained with `auto` and with sets of
+the effects among which it chooses: none, `dense`, and what may help there: on a preset what it was designed
+for (colour per photo once as exposure, once as appearance), elsewhere `exposure`, also with `dense`, and
+`antialias`. The set that `auto` chose is not trained again: the bits are the same. One thread a run. Finished
+runs are kept. Writes benchmarks/results/auto.json and .md.
 """
 
 from __future__ import annotations
@@ -23,9 +23,11 @@ from typing import Any
 from captures import find_scenes
 from presets import Stopped, aw, mean_psnr
 
+from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.harness.running.environment import environment
 from ambiguous_wild.harness.running.result_file import RESULT, read_result
 from ambiguous_wild.io.atomic import write_json, write_text
+from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.simulate.presets import PRESETS
 from ambiguous_wild.splat.effects import check_effects
 
@@ -33,24 +35,23 @@ RESULTS = Path(__file__).parent / "results" / "auto"
 METHOD = "refinesplat"
 # what a preset was designed for -> the trainer's effects that answer it
 ANSWERS = {"appearance": ("exposure", "appearance"), "antialiasing": ("antialias",), "pose": ("poses",)}
-ANYWHERE = ("exposure", "antialias")  # tried where nobody designed the scene
+# tried where nobody designed the scene; such scenes have few photos
+ANYWHERE = (("exposure",), ("antialias",), ("exposure", "dense"))
 
 
 def picked_by_hand(scene: str) -> list[str]:
     """Values of --effects."""
-    pairs: list[list[str]] = []
     if scene in PRESETS:
         designed = [ANSWERS[e] for e in PRESETS[scene].designed.effects if e in ANSWERS]
         depth = max((len(answers) for answers in designed), default=0)
         helpful = [[answers[min(k, len(answers) - 1)] for answers in designed] for k in range(depth)]
     else:
-        helpful = [[effect] for effect in ANYWHERE]
-        pairs = [[effect, "dense"] for effect in ANYWHERE]  # such scenes have few photos
-    sets = [[], ["near"], ["dense"], *helpful, *pairs]
+        helpful = [list(effects) for effects in ANYWHERE]
+    sets = [[], ["dense"], *helpful]
     return list(dict.fromkeys(",".join(check_effects(names)) or "none" for names in sets))
 
 
-def train(scene: Path, effects: str, out: Path, iterations: int, seeds: Sequence[int]) -> dict[str, Any]:
+def train(scene: Scene, effects: str, out: Path, iterations: int, seeds: Sequence[int]) -> dict[str, Any]:
     """A run a seed: their test PSNR, the effects that were on, and what was tried before.
 
     Raises:
@@ -58,7 +59,7 @@ def train(scene: Path, effects: str, out: Path, iterations: int, seeds: Sequence
     """
     folder = out / effects.replace(",", "+")
     runs = [folder / scene.name / METHOD / f"seed{seed}" for seed in seeds]
-    words = ["bench", "--method", METHOD, "--scene", str(scene), "--effects", effects, "--threads", "1"]
+    words = ["bench", "--method", METHOD, "--scene", str(scene.root), "--effects", effects, "--threads", "1"]
     words += ["--device", "cpu", "--iterations", str(iterations), "--no-pictures", "-o", str(folder)]
     words += [word for seed in seeds for word in ("--seed", str(seed))]
     aw(*words)  # keeps a finished run of the same configuration and scene, refuses another one
@@ -72,7 +73,7 @@ def train(scene: Path, effects: str, out: Path, iterations: int, seeds: Sequence
     }
 
 
-def measure(scene: Path, out: Path, iterations: int, seeds: Sequence[int]) -> dict[str, Any]:
+def measure(scene: Scene, out: Path, iterations: int, seeds: Sequence[int]) -> dict[str, Any]:
     """All sets on one scene, and auto against the best of the others, in the mean of the seeds."""
     auto = train(scene, "auto", out, iterations, seeds)
     runs = {auto["effects"]: auto["seeds"]}
@@ -135,11 +136,24 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--results", type=Path, default=RESULTS)
     args = parser.parse_args(words)
-    scenes = find_scenes(args.scenes)
+    if args.jobs < 1 or args.iterations < 1 or min(args.seeds) < 0:
+        parser.error("--jobs and --iterations count from 1, --seeds from 0")
+    scenes = [load_scene(root) for root in find_scenes(args.scenes)]
     if len({scene.name for scene in scenes}) < len(scenes):
         parser.error("two scenes have the same name: their runs would share a folder")
+    rows: list[dict[str, Any]] = []
+    failed: list[str] = []
     with ThreadPoolExecutor(args.jobs) as pool:
-        rows = list(pool.map(lambda scene: measure(scene, args.out, args.iterations, args.seeds), scenes))
+        waiting = [pool.submit(measure, scene, args.out, args.iterations, args.seeds) for scene in scenes]
+        for scene, done in zip(scenes, waiting, strict=True):
+            try:
+                rows.append(done.result())
+            except (Stopped, AwError) as error:
+                failed.append(f"{scene.name}: {error}")
+    for line in failed:
+        print(f"failed: {line}", file=sys.stderr)
+    if not rows:
+        return 1
     data = {
         "environment": environment("cpu"),
         "iterations": args.iterations,
@@ -149,11 +163,12 @@ def main(words: Sequence[str] | None = None) -> int:
     write_json(args.results.with_suffix(".json"), data)
     write_text(args.results.with_suffix(".md"), to_markdown(data))
     print(to_markdown(data))
-    return 0
+    return 1 if failed else 0
 
 
 if __name__ == "__main__":
     try:
         sys.exit(main())
-    except Stopped as error:
-        sys.exit(f"error: {error}")
+    except AwError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)

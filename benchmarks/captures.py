@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import json
 import os
 import subprocess
 import sys
@@ -135,6 +136,24 @@ def refuse_other_configs(cells: Sequence[Cell], out: Path) -> None:
             refuse_other_config(folder, cell)
 
 
+def beside(stem: Path, ending: str) -> Path:
+    """A file of the results; the stem may hold dots."""
+    return stem.with_name(stem.name + ending)
+
+
+def refuse_other_captures(cells: Sequence[Cell], stem: Path) -> None:
+    """Raise AwError if the results are there, of other captures: a table is not replaced by another's."""
+    path = beside(stem, ".json")
+    if not path.is_file():
+        return
+    try:
+        told = {capture["name"] for capture in json.loads(path.read_text(encoding="utf-8"))["captures"]}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise AwError(f"{path} is no result of this script ({error}); choose another --results") from error
+    if not told & {cell.scene.name for cell in cells}:
+        raise AwError(f"{path} is of other captures ({', '.join(sorted(told))}); choose another --results")
+
+
 def without_folders(setting: str) -> str:
     """METHOD.KEY=VALUE for publication: of a path only the last name."""
     key, equals, value = setting.partition("=")
@@ -156,6 +175,8 @@ def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
     args = parser.parse_args(words)
     if args.jobs < 1 or args.iterations < 1:
         parser.error("--jobs and --iterations count from 1")
+    if min(args.seeds) < 0:
+        parser.error("--seeds count from 0")
     return args
 
 
@@ -176,14 +197,17 @@ def main(words: Sequence[str] | None = None) -> int:
     )
     known = with_recorded_effects(cells, args.effects, args.out) if recorded else cells
     refuse_other_configs(known, args.out)  # before anything is trained
-    book_path = args.results.with_name(args.results.name + "-runs.csv")
+    refuse_other_captures(cells, args.results)
+    book_path = beside(args.results, "-runs.csv")
     book = read_book(book_path)
     failed = [] if args.report_only else run_all(cells, book, args)
     # without a run folder the book may hold them all
     runs = read_runs(args.out) if any(cell_folder(args.out, cell).is_dir() for cell in cells) else None
     book = book if runs is None else merged(book, book_of(runs))
-    write_text(book_path, book.to_csv(index=False, float_format="%.7g"))
-    book = current(book, known)
+    record, book = book, current(book, known)
+    if args.report_only and book.empty and beside(args.results, ".json").is_file():
+        raise AwError(f"none of these runs is in {args.out} or {book_path}; {args.results}.md is not changed")
+    write_text(book_path, record.to_csv(index=False, float_format="%.7g"))
     scenes = {cell.scene.name: cell.scene for cell in cells}
     methods = list(dict.fromkeys(cell.method.name for cell in cells))
     rows = tabulate(book, list(scenes), methods, args.seeds)
@@ -207,9 +231,9 @@ def main(words: Sequence[str] | None = None) -> int:
         "missing": missing,
     }
     stem = args.results
-    write_json(stem.with_name(stem.name + ".json"), data)
-    write_text(stem.with_name(stem.name + ".csv"), to_csv(rows))
-    write_text(stem.with_name(stem.name + ".md"), to_markdown(data))
+    write_json(beside(stem, ".json"), data)
+    write_text(beside(stem, ".csv"), to_csv(rows))
+    write_text(beside(stem, ".md"), to_markdown(data))
     print(to_markdown(data))
     for line in failed:
         print(f"failed: {line}", file=sys.stderr)
@@ -220,4 +244,5 @@ if __name__ == "__main__":
     try:
         sys.exit(main())
     except AwError as error:
-        sys.exit(f"error: {error}")
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)

@@ -12,16 +12,17 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ambiguous_wild.core import Scene
+from ambiguous_wild.core import AwError, Scene
+from ambiguous_wild.harness.leaderboard.check import TRUTH
 from ambiguous_wild.harness.running.identity import scene_identity
 from ambiguous_wild.harness.running.regions import true_distractor
 from ambiguous_wild.harness.running.store import Runs
 from ambiguous_wild.io.images import read_gray
 from ambiguous_wild.metrics import stats
 
-OURS, PLAIN, EXACT = "refinesplat", "3dgs", "3dgs+truth"
+OURS, PLAIN = "refinesplat", "3dgs"
+EXACT = ("3dgs+truth", "refinesplat@mask=truth")  # trained on exact masks: the better one is the ceiling
 BASELINES = ("robustsplat", "dronesplat")
-REFERENCES = ("3dgs+truth", "3dgs-clean")  # they use the ground truth: not ranked
 GAP_DB = 1.0  # of exact masks over none: below it a share of the gap is noise
 Row = dict[str, Any]
 # key, label, digits
@@ -100,10 +101,17 @@ def book_of(runs: Runs) -> pd.DataFrame:
 
 
 def read_book(path: Path) -> pd.DataFrame:
-    """The recorded runs, without what older records lack; empty if there is no file."""
+    """The recorded runs, without what older records lack; empty if there is no file.
+
+    Raises:
+        AwError: the file is damaged.
+    """
     if not path.is_file():
         return pd.DataFrame(columns=BOOK)
-    return pd.read_csv(path, dtype={"config_hash": str}).reindex(columns=BOOK)
+    try:
+        return pd.read_csv(path, dtype={"config_hash": str}).reindex(columns=BOOK)
+    except ValueError as error:  # ParserError and UnicodeDecodeError are such
+        raise AwError(f"{path} is damaged ({error}); restore or delete it") from error
 
 
 def merged(old: pd.DataFrame, new: pd.DataFrame) -> pd.DataFrame:
@@ -167,6 +175,11 @@ def missing_runs(
     ]
 
 
+def uses_truth(method: str) -> bool:
+    """Whether it trains on the ground truth: a reference, not ranked."""
+    return method == "3dgs-clean" or bool(TRUTH.search(method))
+
+
 def summarise(rows: Sequence[Row], captures: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Share of the gap to exact masks, ranking, masks against baselines, clean captures, model sizes."""
     of = {(row["capture"], row["method"]): row for row in rows}
@@ -177,12 +190,12 @@ def summarise(rows: Sequence[Row], captures: Sequence[dict[str, Any]]) -> dict[s
         found = of.get((capture, method), {}).get(key)
         return math.nan if found is None else float(found)
 
-    gaps = {name: _gap({m: value(name, m, "psnr") for m in (OURS, PLAIN, EXACT)}) for name in names}
+    gaps = {name: _gap({m: value(name, m, "psnr") for m in (OURS, PLAIN, *EXACT)}) for name in names}
     wide = {name: gap for name, gap in gaps.items() if gap["gap_db"] >= GAP_DB}
     # A capture that may belong to the mean makes it missing; one without distractors has no gap to close.
     unknown = [c["name"] for c in captures if c["distractor_share"] and math.isnan(gaps[c["name"]]["gap_db"])]
     means = {m: stats.mean([value(name, m, "psnr") for name in names]) for m in methods}
-    ranked = {m: v for m, v in means.items() if m not in REFERENCES and not math.isnan(v)}
+    ranked = {m: v for m, v in means.items() if not uses_truth(m) and not math.isnan(v)}
     iou = {name: {m: value(name, m, "iou") for m in (OURS, *BASELINES)} for name in names}
     ratios = {name: value(name, OURS, "gaussians") / value(name, BASELINES[0], "gaussians") for name in names}
     clean = [c["name"] for c in captures if c["distractor_share"] == 0.0]
@@ -210,7 +223,8 @@ def summarise(rows: Sequence[Row], captures: Sequence[dict[str, Any]]) -> dict[s
 
 
 def _gap(psnr: dict[str, float]) -> dict[str, float]:
-    gap = psnr[EXACT] - psnr[PLAIN]
+    known = [psnr[m] for m in EXACT if not math.isnan(psnr[m])]
+    gap = max(known, default=math.nan) - psnr[PLAIN]
     return {
         "gap_db": gap,
         "gained_db": psnr[OURS] - psnr[PLAIN],
@@ -219,7 +233,7 @@ def _gap(psnr: dict[str, float]) -> dict[str, float]:
 
 
 def _best(capture: str, methods: Sequence[str], value: Any) -> str | None:
-    found = {m: value(capture, m, "psnr") for m in methods if m not in REFERENCES}
+    found = {m: value(capture, m, "psnr") for m in methods if not uses_truth(m)}
     found = {m: v for m, v in found.items() if not math.isnan(v)}
     return max(found, key=lambda m: found[m]) if found else None
 

@@ -72,7 +72,12 @@ def build_base(data: Path, name: str, factor: int, out: Path) -> Path:
     """The base scene with its test list."""
     root = out / "bases" / name
     chosen, listed = root.with_name(f"{name}.csv"), root.with_name(f"{name}.txt")
-    if chosen.is_file():
+    if chosen.is_file() and (root / "sparse").is_dir():
+        built = load_scene(root).info["loaded_factor"]
+        if built != factor:
+            raise AwError(
+                f"{root} was built at factor {built}, not {factor}; choose another --out or delete it"
+            )
         return root
     photos = data / name / "images"
     source = photos if photos.is_dir() else data / name
@@ -95,7 +100,7 @@ def paste(base: Path, placement: int, cutouts: Path, out: Path) -> Path:
     """One placement of distractors: cut-outs where its number is odd, the scene's texture where even."""
     kind = "cutouts" if placement % 2 else "patches"
     root = out / "scenes" / f"{base.name}-{kind}-{placement}"
-    if not root.is_dir():
+    if not (root / "sparse").is_dir():
         pose = "lying" if base.name in LYING else "standing"
         words = ["--cutouts", str(cutouts)] if kind == "cutouts" else ["--patches"]
         aw("composite", str(base), "-o", str(root), "--seed", str(placement), "--pose", pose, *words)
@@ -111,8 +116,12 @@ def arguments(words: Sequence[str] | None = None) -> tuple[argparse.Namespace, l
     parser.add_argument("--prepare-only", action="store_true")
     args, rest = parser.parse_known_args(words)
     for base in args.bases:
-        if not base.partition("=")[2].isdigit():
+        name, _, factor = base.partition("=")
+        if not factor.isdigit() or int(factor) < 1 or name != Path(name).name:
             parser.error(f"--bases takes NAME=FACTOR, e.g. seneca=5; got {base}")
+    if args.placements < 1:
+        parser.error("--placements counts from 1")
+    captures.arguments(["--captures", ".", "--out", ".", *rest])  # refused now, not after the bases are built
     return args, rest
 
 
@@ -133,4 +142,5 @@ if __name__ == "__main__":
     try:
         sys.exit(main())
     except AwError as error:
-        sys.exit(f"error: {error}")
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)

@@ -156,7 +156,8 @@ def main() -> None:
     try:
         points = plan(args)
     except AwError as error:
-        sys.exit(f"error: {error}")
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
     prepare_cpu(None)
     unique = {(c.method.name, c.scene.name, c.train.seed): c for p in points for c in p.cells}
     reports = run_cells(

@@ -91,7 +91,7 @@ def parse_budget(text: str) -> float:
     metavar="auto|none|all|LIST",
     multiple=True,
     default=("default",),
-    help="Optional effects ('aw plan' explains them); LIST: names with commas. Repeatable: trains each.  "
+    help="Optional effects (docs/effects.md); LIST: names with commas. Repeatable: trains each.  "
     "[default: auto for methods that choose effects (refinesplat), else none]",
 )
 @click.option(

@@ -193,7 +193,7 @@ def bench(
     names = _check_methods([methods] if isinstance(methods, str) else methods, plugins, parts or {}, passes)
     folders = [Path(scenes)] if isinstance(scenes, str | Path) else [Path(scene) for scene in scenes]
     choices = [effects] if isinstance(effects, str) else list(effects)
-    _check_effects(choices, plan, folders)
+    _check_effects(choices, plan, folders, names)
     if iterations is not None and budgets_s:
         raise AwError("iterations and budgets_s exclude each other: a run is as long as one of them says")
     out = Path(output)
@@ -294,14 +294,23 @@ def _check_methods(
     return names
 
 
-def _check_effects(choices: Sequence[str], plan: Plan | Words | None, scenes: Sequence[Path]) -> None:
-    from ambiguous_wild.harness.running.choosing import check_wanted
+def _check_effects(
+    choices: Sequence[str], plan: Plan | Words | None, scenes: Sequence[Path], methods: Sequence[str]
+) -> None:
+    from ambiguous_wild.harness.running.choosing import check_wanted, reads_plan
+    from ambiguous_wild.methods.registry import get_method
 
     for wanted in choices:
         check_wanted(wanted)
     if plan is not None and len(scenes) > 1:
         name = plan if isinstance(plan, str | Path) else plan.scene
         raise AwError(f"--plan {name} is of one scene; bench {len(scenes)} scenes one by one, or without it")
+    if plan is not None and not any(reads_plan(c, get_method(m)) for c in choices for m in methods):
+        name = plan if isinstance(plan, str | Path) else plan.scene
+        raise AwError(
+            f"--plan {name} would not be read: {', '.join(methods)} with --effects {', '.join(choices)}; "
+            "add --effects auto"
+        )
 
 
 def _read_plan(plan: Plan | Words | None) -> Plan | None:

@@ -70,7 +70,11 @@ def test_a_file_that_is_no_plan_is_not_replaced(scene, tmp_path):
         (["plan", "SCENE/nothing"], "there is no scene folder"),
         (["bench", "--method", "3dgs", "--scene", "SCENE", "--effects", "poss"], "did you mean 'poses'"),
         (["bench", "--method", "3dgs", "--scene", "SCENE", "--effects", "all,poses"], "stands alone"),
-        (["bench", "--method", "3dgs", "--scene", "SCENE", "--plan", "gone"], "there is no plan gone"),
+        (["bench", "--method", "refinesplat", "--scene", "SCENE", "--plan", "gone"], "there is no plan gone"),
+        (
+            ["bench", "--method", "3dgs", "--scene", "SCENE", "--plan", "plan.json"],
+            "--plan plan.json would not be read: 3dgs with --effects default; add --effects auto",
+        ),
     ],
 )  # fmt: skip
 def test_mistakes_get_one_line_and_exit_code_2(scene, arguments, message):

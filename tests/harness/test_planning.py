@@ -256,7 +256,9 @@ def test_what_stands_out_must_stay_when_a_longer_probe_has_learnt_the_rest(monke
         yield SimpleNamespace(update=lambda: ticks.append(total))
 
     monkeypatch.setattr(probe, "occlusion", instead)
-    assert probe.stays("scene", ("exposure",), bar=bar).share == share
+    left = probe.stays("scene", ("exposure",), bar=bar)
+    assert left.share == share
+    assert left.iterations == sum(rounds)  # what `aw plan` says it cost
     assert made == [("scene", ("exposure",), n) for n in rounds]
     assert ticks == rounds
 

@@ -305,6 +305,26 @@ def test_a_plan_goes_on_where_it_was_interrupted(scene, tmp_path, monkeypatch):
     assert len(prepared) == 5
 
 
+def test_kept_probes_of_fewer_effects_are_completed(scene, tmp_path, monkeypatch):
+    timed = []
+
+    def costs(data, names, folder):
+        timed.append(tuple(names))
+        return dict.fromkeys(names, 2.0)
+
+    monkeypatch.setattr(probed.trials, "Trials", Counted)
+    monkeypatch.setattr(probed, "step_costs", costs)
+
+    def make(**found):
+        monkeypatch.setattr(probed, "plan_without_training", lambda _: plan_of(**found))
+        return probed.plan_with_probes(scene, TrainConfig(), tmp_path, masks=False, prepare=lambda: None)
+
+    make(exposure=0.2)
+    plan = make(exposure=0.2, sampling=3.0)  # one more effect is worth a probe
+    assert plan.effects() == ("exposure", "antialias")
+    assert timed == [("exposure",), ("antialias",)] and len(list(tmp_path.iterdir())) == 1
+
+
 def test_a_run_under_a_budget_goes_on_with_the_probes_it_began(scene, tmp_path, monkeypatch):
     Counted.trained = ()
     monkeypatch.setattr(probed.trials, "Trials", Counted)

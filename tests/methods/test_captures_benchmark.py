@@ -216,6 +216,9 @@ def test_a_row_without_a_recorded_plan_is_missing(script, tmp_path, no_training)
     assert [row["psnr"] for row in auto["rows"]] == [None, None]
     assert [m["why"] for m in auto["missing"]] == ["no run folder records a plan of effects"] * 2
     shutil.rmtree(folder)  # it had effects, which 3dgs by default has not
+    with pytest.raises(AwError, match="none of these runs is in"):  # a table is not emptied
+        report_only(script, tmp_path, "--effects", "default", *given)
+    (tmp_path / "out.json").unlink()
     default = report_only(script, tmp_path, "--effects", "default", *given)
     assert [row["psnr"] for row in default["rows"]] == [None, None]
     assert [m["why"] for m in default["missing"]] == ["not finished", auto["missing"][1]["why"]]
@@ -230,7 +233,35 @@ def test_a_report_refuses_a_run_with_other_effects_than_planned(script, tmp_path
         report_only(script, tmp_path, "--effects", "auto", "--methods", "3dgs", "--seeds", "0")
 
 
+def test_results_of_other_captures_are_not_replaced(script, tmp_path, no_training):
+    write_tiny_scene(tmp_path / "with")
+    for text, message in (
+        ('{"captures": [{"name": "mine"}]}', r"is of other captures \(mine\); choose another --results"),
+        ("[]", "is no result of this script"),
+    ):
+        (tmp_path / "out.json").write_text(text)
+        with pytest.raises(AwError, match=message):
+            report_only(script, tmp_path)
+        assert (tmp_path / "out.json").read_text() == text and not (tmp_path / "out-runs.csv").exists()
+
+
+def test_a_damaged_record_is_named(report, tmp_path):
+    (tmp_path / "out-runs.csv").write_text('capture,method\n"a,b\nc,d,e,f\n')
+    with pytest.raises(AwError, match=r"out-runs.csv is damaged .* restore or delete it"):
+        report.read_book(tmp_path / "out-runs.csv")
+
+
+def test_what_trains_on_exact_masks_is_no_winner_but_the_ceiling(report):
+    rows = [row("a", "3dgs", 26.0), row("a", "refinesplat", 29.0), row("a", "refinesplat@mask=truth", 31.0)]
+    got = report.summarise(rows, [{"name": "a", "distractor_share": 0.2}])
+    assert got["best"] == got["best_by_capture"]["a"] == "refinesplat"
+    assert got["gap"]["a"] == {"gap_db": 5.0, "gained_db": 3.0, "share": 0.6}
+    better = [*rows, row("a", "3dgs+truth", 32.0)]
+    assert report.summarise(better, [{"name": "a", "distractor_share": 0.2}])["gap"]["a"]["gap_db"] == 6.0
+
+
 def test_the_script_as_it_is_typed(tmp_path):
     words = [sys.executable, BENCHMARKS / "captures.py", "--captures", tmp_path, "--out", tmp_path / "runs"]
     done = subprocess.run([str(word) for word in words], capture_output=True, text=True)
-    assert done.returncode == 1 and "is no scene folder" in done.stderr
+    assert done.returncode == 2 and "is no scene folder" in done.stderr
+    assert done.stderr.count("\n") == 1

@@ -56,8 +56,19 @@ def test_a_base_is_split_once_and_gets_its_placements(composites, tmp_path, monk
     assert ["--patches" in words for words in asked[2:]] == [False, True, False]
     scene = load_scene(tmp_path / "out" / "scenes" / "wall-cutouts-1")
     assert len(scene.test) == 3 and len(scene.train) == len(TRAIN) + len(TEST) - 3
-    with pytest.raises(SystemExit):
-        composites.main([*given[:-1], "wall"])
+    with pytest.raises(AwError, match="built at factor 1, not 2"):
+        composites.main([*given[:-1], "wall=2", "--placements", "3", "--prepare-only"])
+
+
+@pytest.mark.parametrize(
+    "wrong", [["--bases", "wall"], ["--bases", "a/b=2"], ["--bases", "wall=0"], ["--placements", "0"],
+              ["--frobnicate"], ["--jobs", "0"]],
+)  # fmt: skip
+def test_what_is_wrong_is_refused_before_a_base_is_built(composites, tmp_path, monkeypatch, wrong):
+    monkeypatch.setattr(composites, "aw", lambda *words: pytest.fail("something was built"))
+    with pytest.raises(SystemExit) as ended:
+        composites.main(["--data", str(tmp_path), "--out", str(tmp_path / "out"), *wrong])
+    assert ended.value.code == 2
 
 
 def test_what_a_command_says_is_told(composites):

@@ -49,6 +49,7 @@ class Occlusion:
     worst: float  # in the tenth of the photos that have most of it
     # [H, W] bool of every train photo: where the probe cannot explain it, points or not
     patches: tuple[np.ndarray, ...] = field(default=(), repr=False, compare=False)
+    iterations: int = field(default=0, compare=False)  # that it took to find out
 
 
 def small_data(scene: Scene, folder: Path, seed: int = 0) -> TrainData:
@@ -171,7 +172,7 @@ def occlusion(
             patch = unexplained(photo.numpy(), np.clip(rendered.image.numpy(), 0, 1), seen)
             patches.append(patch)
             counted.append(patch & ~supported(scene, places[view], patch.shape))
-        return dataclasses.replace(summarise(counted), patches=tuple(patches))
+        return dataclasses.replace(summarise(counted), patches=tuple(patches), iterations=iterations)
 
 
 def stays(
@@ -191,12 +192,14 @@ def stays(
         effects: see `occlusion`.
         bar: called with total=iterations, a context whose `update` counts one; tqdm is one.
     """
+    spent = 0
     for iterations in (ITERATIONS, SETTLED):
         with bar(total=iterations) as shown:
             found = occlusion(scene, effects, iterations=iterations, tick=shown.update)
+        spent += iterations
         if found.share <= OCCLUSION:
             break
-    return found
+    return dataclasses.replace(found, iterations=spent)
 
 
 def effect_costs(scene: Scene) -> dict[str, float]:

@@ -21,14 +21,7 @@ from ambiguous_wild.harness.planning import trials
 from ambiguous_wild.harness.planning.allowance import ARMS_OF_MASKS, LONGEST_ARM, TIMED, allowance
 from ambiguous_wild.harness.planning.decide import Cost, Plan, plan_without_training
 from ambiguous_wild.harness.planning.gain import Arm, compare
-from ambiguous_wild.harness.planning.probe import (
-    ITERATIONS,
-    OCCLUSION,
-    SETTLED,
-    stays,
-    step_costs,
-    with_occlusion,
-)
+from ambiguous_wild.harness.planning.probe import OCCLUSION, stays, step_costs, with_occlusion
 from ambiguous_wild.harness.planning.tried import candidates, told, try_effects, untried, with_masks_tried
 from ambiguous_wild.harness.running.identity import scene_identity
 from ambiguous_wild.io.atomic import write_json
@@ -161,8 +154,9 @@ def _with_effects(
             kept.write()
         return kept.arms[key]
 
-    if not kept.costs:
-        kept.costs = step_costs(bench.trials.data, names, bench.folder)
+    unknown = [name for name in names if name not in kept.costs]
+    if unknown:
+        kept.costs |= step_costs(bench.trials.data, unknown, bench.folder)
         kept.write()
     plan = try_effects(plan, names, arm, kept.costs, say)
     return plan, length * len(kept.arms) + TIMED * (len(names) + 1)
@@ -199,7 +193,7 @@ def _with_masks(
     plan = with_occlusion(plan, found)
     if found.share < OCCLUSION:
         say(f"{scene.name}: masks off: {100 * found.share:.1f} % of the pixels unexplained")
-        return plan, 0, ITERATIONS
+        return plan, 0, found.iterations
     chosen = bench.trials.chosen
     patches = [torch.from_numpy(found.patches[place]) for place in chosen]
     base, without = (
@@ -210,4 +204,4 @@ def _with_masks(
     answer = next(d.decision for d in plan.decisions if d.effect == "masks")
     said = "too few photos to try" if gain is None else told(gain)
     say(f"{scene.name}: masks {answer}: {100 * found.share:.1f} % of the pixels unexplained, {said}")
-    return plan, ARMS_OF_MASKS * LONGEST_ARM, ITERATIONS + SETTLED
+    return plan, ARMS_OF_MASKS * LONGEST_ARM, found.iterations

@@ -62,7 +62,7 @@ def check_wanted(wanted: str) -> tuple[str, ...]:
         return ()
     names = [name.strip() for name in wanted.split(",") if name.strip()]
     if not names:
-        raise AwError("--effects is empty: write auto, none, all, or names with commas; 'aw plan' lists them")
+        raise AwError("--effects is empty: write auto, none, all, or names with commas (docs/effects.md)")
     mixed = [name for name in names if name in WORDS]
     if mixed:
         raise AwError(f"--effects {wanted!r}: {mixed[0]!r} stands alone")
@@ -94,7 +94,7 @@ def choose(
     if wanted not in PLANNED:
         effects = ALL if wanted == "all" else named
         return {m.name: Chosen(effects, "" if wanted == "none" else wanted) for m in methods}
-    if plan is None and any(_allowed(wanted, method) != () for method in methods):
+    if plan is None and any(reads_plan(wanted, method) for method in methods):
         plan = _make_plan(scene, probing)
     found = None if plan is None else plan.effects()
     chosen = {m.name: chosen_by(found, wanted, scene, m) or Chosen() for m in methods}
@@ -123,6 +123,11 @@ def chosen_by(planned: Sequence[str] | None, wanted: str, scene: Scene, method: 
         return None
     found = [*planned, *published_effects(scene)]
     return Chosen(check_effects(e for e in found if among is None or e in among), "auto")
+
+
+def reads_plan(wanted: str, method: MethodEntry) -> bool:
+    """Whether a plan decides about anything where `--effects` says this."""
+    return wanted in PLANNED and _allowed(wanted, method) != ()
 
 
 def _allowed(wanted: str, method: MethodEntry) -> tuple[str, ...] | None:

@@ -22,7 +22,7 @@ class WhiteBalance:
 
 @dataclass(frozen=True)
 class IsoNoise:
-    """PlannedPhoto and read noise of a small sensor."""
+    """Shot and read noise of a small sensor."""
 
     iso: tuple[float, float] = (800.0, 1600.0)  # drawn anew for every photo
 

@@ -22,7 +22,7 @@ from ambiguous_wild.cli.paths import PathName
     type=float,
     default=0.8,
     show_default=True,
-    help="Share of the train photos that show a distractor.",
+    help="Share of the train photos that show each distractor.",
 )
 @click.option(
     "--pose",

@@ -6,7 +6,9 @@ import ast
 import dataclasses
 import importlib.util
 import inspect
-import re
+import io
+import textwrap
+import tokenize
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +19,6 @@ from ambiguous_wild.methods.traits import Traits, traits_of
 
 COLUMNS = ("method", "masks", "appearance", "density", "extra state", "back ends", "facts from")
 BACK_ENDS = "features", "instances"  # options that name one, see vision/backends.py
-_FIELD = re.compile(r"^    (\w+): .*?#\s*(.*)$")
 
 
 @dataclass(frozen=True)
@@ -61,18 +62,24 @@ def _comments(cls: type) -> dict[str, str]:
         if not dataclasses.is_dataclass(base):
             continue
         try:
-            lines = inspect.getsource(base).splitlines()
+            source = textwrap.dedent(inspect.getsource(base))
         except (OSError, TypeError):  # made at run time, as a graft's
             continue
-        above = ""
-        for line in lines:
-            text = line.strip()
-            match = _FIELD.match(line)
-            if match:
-                found[match[1]] = " ".join(filter(None, (above, match[2])))
-            elif above and (plain := re.match(r"^    (\w+): ", line)):
-                found[plain[1]] = above
-            above = f"{above} {text[1:].strip()}".strip() if text.startswith("#") else ""
+        at = {
+            token.start[0]: token.string.lstrip("#").strip()
+            for token in tokenize.generate_tokens(io.StringIO(source).readline)
+            if token.type == tokenize.COMMENT
+        }
+        alone = {k for k, line in enumerate(source.splitlines(), 1) if line.lstrip().startswith("#")}
+        for node in ast.parse(source).body[0].body:  # type: ignore[attr-defined]
+            if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+                first = node.lineno
+                while first - 1 in alone:
+                    first -= 1
+                last = node.end_lineno or node.lineno
+                said = [at[k] for k in range(first, last + 1) if k in at]
+                if said:
+                    found[node.target.id] = " ".join(said)
     return found
 
 

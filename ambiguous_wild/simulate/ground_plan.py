@@ -17,6 +17,7 @@ class GroundPlan:
     y_m: tuple[float, float]
     wall_m: float  # height
     walls: tuple[str, ...] = SURFACE_NAMES[1:]
+    ceiling: bool = False
 
     @property
     def surfaces(self) -> Mapping[str, tuple[float, float]]:
@@ -30,6 +31,11 @@ class GroundPlan:
         """Centre of the inside."""
         return (self.x_m[0] + self.x_m[1]) / 2, (self.y_m[0] + self.y_m[1]) / 2
 
+    @property
+    def highest_m(self) -> float:
+        """Of a camera."""
+        return self.wall_m - 0.3 if self.ceiling else 3.3
+
     def gap(self, x: float, y: float) -> float:
         """Distance to the nearest wall, m; the open side of the courtyard counts as one. Negative outside."""
         return min(x - self.x_m[0], self.x_m[1] - x, y - self.y_m[0], self.y_m[1] - y)
@@ -37,6 +43,6 @@ class GroundPlan:
 
 PLANS: Mapping[str, GroundPlan] = {
     "courtyard": GroundPlan((16.0, 14.0), (-5.6, 5.6), (-6.0, 4.2), 3.4, SURFACE_NAMES[1:4]),  # open in front
-    "room": GroundPlan((7.2, 6.0), (-3.6, 3.6), (-3.0, 3.0), 2.7),
+    "room": GroundPlan((7.2, 6.0), (-3.6, 3.6), (-3.0, 3.0), 2.7, ceiling=True),
     "yard": GroundPlan((18.0, 16.0), (-9.0, 9.0), (-8.0, 8.0), 5.0),
 }

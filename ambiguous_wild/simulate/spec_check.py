@@ -56,7 +56,7 @@ def check_spec(spec: CaptureSpec) -> CaptureSpec:
     _between("arc_deg", spec.arc_deg, 5, 150 if around else 360)
     _range("occlusion", spec.occlusion, 0, 0.9)
     _range("radius_m", spec.radius_m, 1.5 if around else 0.2, 7)
-    _range("eye_m", spec.eye_m, 0.2, 3.3)
+    _range("eye_m", spec.eye_m, 0.2, plan.highest_m)
     _range("zoom", spec.zoom, 0.5, 4)
     if len(spec.distractors) > MOST:
         raise AwError(f"distractors: at most {MOST}, got {len(spec.distractors)}")

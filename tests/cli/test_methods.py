@@ -72,6 +72,14 @@ def test_every_builtin_method_is_described_in_full() -> None:
     assert "trainings" in shown("t-3dgs+2passes")
 
 
+def test_options_of_refinesplats_masks_are_explained_however_their_lines_are_wrapped() -> None:
+    (one,) = json.loads(shown("refinesplat", "--json"))
+    said = {o["key"]: o["comment"] for o in one["options"]}
+    assert "must have a place in their frame" in said["mask.multiview.seen_by"]  # wrapped by the formatter
+    assert said["first_look.consensus"].startswith("in a crowd")  # on the lines above
+    assert [k for k in said if k.startswith(("mask.", "first_look.")) and not said[k]] == []
+
+
 def test_the_table_agrees_with_what_recipes_build() -> None:
     from ambiguous_wild.methods.traits import BUILTIN_TRAITS
     from ambiguous_wild.splat.density import DensityControl

@@ -98,6 +98,9 @@ def test_a_place_is_named_in_the_file_and_has_limits_of_its_own():
         parse_spec(text.replace("yard", "courtyard"))
     with pytest.raises(AwError, match="arc_deg: between 5 and 150"):
         parse_spec("arc_deg: 360")
+    parse_spec("eye_m: [2.9, 3.2]")
+    with pytest.raises(AwError, match=r"eye_m: between 0\.2 and 2\.4"):  # the room has a ceiling
+        parse_spec("world: {place: room}\neye_m: [2.3, 2.5]")
     with pytest.raises(AwError, match="place"):
         parse_spec("world: {place: beach}")
     with pytest.raises(AwError, match="into a wall of the room"):

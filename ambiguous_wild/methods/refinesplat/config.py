@@ -48,8 +48,12 @@ class MaskConfig:
     least: float | None = (
         None  # and the statistic at least, in its unit: 10 of `structure`, else 4; 0 = printed
     )
-    disagree: float = 3.0  # F: `gate` for the feature distance between photo and render; 0 = printed
-    disagree_units: float = 3.0  # F: and at least this many units of what blur and noise make; 0 = printed
+    disagree: float = (
+        3.0  # features only: `gate` for the feature distance between photo and render; 0 = printed
+    )
+    disagree_units: float = (
+        3.0  # features only: and at least this many units of what blur and noise make; 0 = printed
+    )
     # no threshold above this share of the residual of unrelated pictures (`unrelated_residual`); 0 = printed
     ceiling: float = 0.25  # `structure` only
     ceiling_least: float = 6.0  # `structure` only: the ceiling is at least so many units
@@ -59,16 +63,20 @@ class MaskConfig:
     least_alpha: float = (
         0.5  # below this opacity the model is not learnt yet and gives no evidence; 0 = printed
     )
-    cosine: Literal["calibrated", "plain"] = "calibrated"  # F: in U; `plain` is printed
-    normal_units: float = 10.0  # F: distance in units at which the calibrated cosine is 0
-    box: int = 3  # F: cells, box filter over U / H
+    cosine: Literal["calibrated", "plain"] = "calibrated"  # features only: in U; `plain` is printed
+    normal_units: float = 10.0  # features only: distance in units at which the calibrated cosine is 0
+    box: int = 3  # features only: cells, box filter over U / H
     perturbation: float | None = (
-        None  # F: R = U / (H + this), printed; None: H is a tenth of its mean at least
+        None  # features only: R = U / (H + this), printed; None: H is a tenth of its mean at least
     )
-    spread: Spread = "std"  # F: T_glb = mean + this; `var` is printed; `hard`: T_hard in its place
-    global_hard: float = 10.0  # F: that T_hard, a value of U / H
-    global_gate: float = 6.0  # F: robust deviations above the median that M_global needs; 0 = printed
-    global_units: float = 8.0  # F: and the distance of the cell itself at least; 0 = printed
+    spread: Spread = (
+        "std"  # features only: T_glb = mean + this; `var` is printed; `hard`: T_hard in its place
+    )
+    global_hard: float = 10.0  # features only: that T_hard, a value of U / H
+    global_gate: float = (
+        6.0  # features only: robust deviations above the median that M_global needs; 0 = printed
+    )
+    global_units: float = 8.0  # features only: and the distance of the cell itself at least; 0 = printed
     dilation: int = 1  # px at the photo's resolution, 1 = none; 3, 5 (printed), 7 tried in the paper
     most: float = 0.7  # of a photo is masked at most: the surest pixels go first
     w2: float | None = None  # fixed weight of T_ent's lower subset; None = learnt

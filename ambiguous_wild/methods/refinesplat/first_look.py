@@ -33,7 +33,7 @@ _WINDOW = np.ones((3, 3), np.uint8)  # px of the map around the place where a co
 class FirstLookConfig:
     """Which views are compared, and the largest difference of colour."""
 
-    on: bool = True
+    on: bool = True  # masks before training, from photos and sparse points
     views: int = 16  # nearest train views used
     quantile: float = 0.3  # of their differences: this share of views must show the colour
     threshold: float = 0.02  # difference of colour in [0, 1] above which a pixel is masked at first

@@ -29,7 +29,7 @@ class CompositeConfig:
     """Settings of a composite. The same scene, cut-outs and settings give the same bytes."""
 
     coverage: float = 0.15  # mean share of a train photo's pixels that distractors cover
-    presence: float = 0.8  # share of the train photos that show a cut-out
+    presence: float = 0.8  # share of the train photos that show each cut-out
     pose: Literal["standing", "lying"] = "standing"  # upright; or seen from above, at any angle
     shadow: float = 0.0  # 0 (none) to 1 (black)
     patches: bool = False  # fill the shapes with the scene's own texture

@@ -13,26 +13,32 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
 from captures import find_scenes
-from presets import Stopped, aw, mean_psnr
+from presets import Stopped, aw
 
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.harness.running.environment import environment
 from ambiguous_wild.harness.running.result_file import RESULT, read_result
 from ambiguous_wild.io.atomic import write_json, write_text
 from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.metrics import stats
 from ambiguous_wild.simulate.presets import PRESETS
 from ambiguous_wild.splat.effects import check_effects
 
 RESULTS = Path(__file__).parent / "results" / "auto"
 METHOD = "refinesplat"
+METRICS = {
+    "psnr": "Whole photos.",
+    "psnr_supported": "Pixels whose surface at least three train photos see.",
+}
 # what a preset was designed for -> the trainer's effects that answer it
 ANSWERS = {"appearance": ("exposure", "appearance"), "antialiasing": ("antialias",), "pose": ("poses",)}
 # tried where nobody designed the scene; such scenes have few photos
@@ -52,7 +58,7 @@ def picked_by_hand(scene: str) -> list[str]:
 
 
 def train(scene: Scene, effects: str, out: Path, iterations: int, seeds: Sequence[int]) -> dict[str, Any]:
-    """A run a seed: their test PSNR, the effects that were on, and what was tried before.
+    """A run a seed: their metrics, the effects that were on, and what was tried before.
 
     Raises:
         Stopped: the run failed, or is there with another configuration.
@@ -66,64 +72,80 @@ def train(scene: Scene, effects: str, out: Path, iterations: int, seeds: Sequenc
     told = runs[0] / "effects.json"  # the plan is the same for every seed
     said = json.loads(told.read_text(encoding="utf-8")) if told.is_file() else {}
     decisions = (said.get("plan") or {"decisions": []})["decisions"]
+    images = [read_result(run / RESULT)["per_image"] for run in runs]
     return {
-        "seeds": [mean_psnr(read_result(run / RESULT)) for run in runs],
+        "seeds": {m: [_mean(of_run, m) for of_run in images] for m in METRICS},
         "effects": ",".join(said.get("effects") or []) or "none",
         "tried": {d["effect"]: [d["gain_db"], d["error_db"]] for d in decisions if d["gain_db"] is not None},
     }
 
 
+def _mean(images: Sequence[Mapping[str, Any]], metric: str) -> float:
+    """NaN if any image lacks it."""
+    values = [image.get(metric) for image in images]
+    return stats.mean([math.nan if value is None else value for value in values])
+
+
 def measure(scene: Scene, out: Path, iterations: int, seeds: Sequence[int]) -> dict[str, Any]:
     """All sets on one scene, and auto against the best of the others, in the mean of the seeds."""
     auto = train(scene, "auto", out, iterations, seeds)
-    runs = {auto["effects"]: auto["seeds"]}
+    chosen = auto["effects"]
+    runs = {chosen: auto["seeds"]}
     for name in picked_by_hand(scene.name):
         if name not in runs:
             runs[name] = train(scene, name, out, iterations, seeds)["seeds"]
-    sets = {name: fmean(values) for name, values in runs.items()}
-    best = max(sets, key=lambda name: sets[name])
-    return {
-        "scene": scene.name,
-        "auto": {**auto, "psnr": fmean(auto["seeds"])},
-        "seeds": runs,
-        "sets": sets,
-        "best": best,
-        "below_best_db": sets[best] - sets[auto["effects"]],
-        "over_none_db": sets[auto["effects"]] - sets["none"],
-    }
+    row: dict[str, Any] = {"scene": scene.name, "auto": chosen, "tried": auto["tried"]}
+    for metric in METRICS:
+        sets = {name: fmean(of_set[metric]) for name, of_set in runs.items()}
+        if not any(map(math.isnan, sets.values())):
+            by_seed = {name: of_set[metric] for name, of_set in runs.items()}
+            best = max(sets, key=lambda name: sets[name])
+            below, over = sets[best] - sets[chosen], sets[chosen] - sets["none"]
+            row[metric] = {
+                "seeds": by_seed,
+                "sets": sets,
+                "best": best,
+                "below_best_db": below,
+                "over_none_db": over,
+            }
+    return row
 
 
 def to_markdown(data: dict[str, Any]) -> str:
-    """The results as Markdown."""
-    rows = data["scenes"]
+    """The results as Markdown: a table and a line for each metric."""
+    seeds = ", ".join(map(str, data["seeds"]))
     lines = [
         "# Effects: `auto` against sets picked by hand",
         "",
-        f"{METHOD}, {data['iterations']} iterations, mean of seeds {', '.join(map(str, data['seeds']))}, "
-        "test PSNR in dB",
-        "",
-        "| scene | auto chose | auto | none | best by hand | below it | over none | tried |",
-        "|---|---|---:|---:|---|---:|---:|---|",
+        f"{METHOD}, {data['iterations']} iterations, mean of seeds {seeds}, dB of the test photos.",
     ]
-    for row in rows:
-        auto, sets = row["auto"], row["sets"]
-        tried = "; ".join(
-            f"{name} {gain:+.2f} ± {error:.2f}" for name, (gain, error) in auto["tried"].items()
-        )
-        lines.append(
-            f"| {row['scene']} | {auto['effects']} | {auto['psnr']:.2f} | {sets['none']:.2f} "
-            f"| {row['best']} {sets[row['best']]:.2f} | {row['below_best_db']:.2f} "
-            f"| {row['over_none_db']:+.2f} | {tried} |"
-        )
-    near = sum(row["below_best_db"] <= 0.1 for row in rows)
-    worst = min(rows, key=lambda row: row["over_none_db"])
-    lines += [
-        "",
-        f"Within 0.1 dB of the best on {near} of {len(rows)}; mean below it "
-        f"{fmean(row['below_best_db'] for row in rows):.2f} dB, mean over none "
-        f"{fmean(row['over_none_db'] for row in rows):.2f} dB, least {worst['over_none_db']:+.2f} "
-        f"({worst['scene']}).",
-    ]
+    for metric, about in METRICS.items():
+        rows = [row for row in data["scenes"] if metric in row]
+        if not rows:
+            continue
+        lines += ["", f"## {metric}", "", about, ""]
+        lines.append("| scene | auto chose | auto | none | best by hand | below it | over none | tried |")
+        lines.append("|---|---|---:|---:|---|---:|---:|---|")
+        for row in rows:
+            found = row[metric]
+            sets, best = found["sets"], found["best"]
+            tried = "; ".join(
+                f"{name} {gain:+.2f} ± {error:.2f}" for name, (gain, error) in row["tried"].items()
+            )
+            lines.append(
+                f"| {row['scene']} | {row['auto']} | {sets[row['auto']]:.2f} | {sets['none']:.2f} "
+                f"| {best} {sets[best]:.2f} | {found['below_best_db']:.2f} "
+                f"| {found['over_none_db']:+.2f} | {tried} |"
+            )
+        below = [row[metric]["below_best_db"] for row in rows]
+        worst = min(rows, key=lambda row: row[metric]["over_none_db"])
+        lines += [
+            "",
+            f"Within 0.1 dB of the best on {sum(b <= 0.1 for b in below)} of {len(rows)}; mean below it "
+            f"{fmean(below):.2f} dB, mean over none "
+            f"{fmean(row[metric]['over_none_db'] for row in rows):.2f} dB, least "
+            f"{worst[metric]['over_none_db']:+.2f} ({worst['scene']}).",
+        ]
     return "\n".join(lines) + "\n"
 
 

@@ -1,6 +1,7 @@
 """benchmarks/auto.py: the sets of effects that `auto` is compared with."""
 
 import json
+import math
 
 import pytest
 
@@ -56,28 +57,40 @@ def script(monkeypatch):
                 raise auto.Stopped("aw bench: error: no disk")
             name = "exposure" if effects == "auto" else effects
             values = [PSNR[name] + seed for seed in seeds]
-            return {"seeds": values, "effects": name, "tried": {"exposure": [0.5, 0.1]}}
+            supported = [math.nan if scene.name == "hall" else 30.0 - v for v in values]
+            return {
+                "seeds": {"psnr": values, "psnr_supported": supported},
+                "effects": name,
+                "tried": {"exposure": [0.5, 0.1]},
+            }
 
         monkeypatch.setattr(auto, "train", train)
         yield auto
 
 
 def test_auto_is_compared_with_the_best_set_in_the_mean_of_the_seeds(script, tmp_path):
-    for name in ("hall", "broken"):
+    for name in ("hall", "yard", "broken"):
         write_tiny_scene(tmp_path / name)
-    words = ["--scenes", str(tmp_path / "broken"), str(tmp_path / "hall"), "--out", str(tmp_path / "runs")]
+    words = [
+        "--scenes",
+        *(str(tmp_path / n) for n in ("broken", "hall", "yard")),
+        "--out",
+        str(tmp_path / "runs"),
+    ]
     done = script.main([*words, "--results", str(tmp_path / "auto"), "--seeds", "0", "1"])
     assert done == 1  # of the broken scene
     assert ("hall", "exposure") not in script.trained  # what auto chose is not trained twice
-    (row,) = json.loads((tmp_path / "auto.json").read_text())["scenes"]  # but the other scene is there
-    assert row["best"] == "exposure,dense" and row["sets"]["exposure"] == 22.5
-    assert row["below_best_db"] == pytest.approx(0.5) and row["over_none_db"] == pytest.approx(2.0)
+    hall, yard = json.loads((tmp_path / "auto.json").read_text())["scenes"]  # but the others are there
+    assert hall["psnr"]["best"] == "exposure,dense" and hall["psnr"]["sets"]["exposure"] == 22.5
+    assert hall["psnr"]["below_best_db"] == pytest.approx(0.5)
+    assert hall["psnr"]["over_none_db"] == pytest.approx(2.0)
+    assert "psnr_supported" not in hall and yard["psnr_supported"]["best"] == "none"
     told = (tmp_path / "auto.md").read_text()
     assert (
         "| hall | exposure | 22.50 | 20.50 | exposure,dense 23.00 | 0.50 | +2.00 | exposure +0.50 ± 0.10 |"
         in told
     )
-    assert "Within 0.1 dB of the best on 0 of 1" in told
+    assert "Within 0.1 dB of the best on 0 of 1; mean below it 2.00 dB" in told
 
 
 def test_mistakes_are_told_before_anything_is_trained(script, tmp_path, capsys):

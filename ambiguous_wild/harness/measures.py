@@ -33,6 +33,7 @@ MEASURES: dict[str, Measure] = {
         Measure("lpips_vgg", "LPIPS vgg", "lower", 3),
         Measure("lpips_vgg_01", "LPIPS vgg 01", "lower", 3),
         Measure("flip", "FLIP", "lower", 3),
+        Measure("psnr_affine", "PSNR affine", "higher", 2),
         Measure("psnr_valid", "PSNR valid", "higher", 2),
         Measure("psnr_covered", "PSNR covered", "higher", 2),
         Measure("psnr_uncovered", "PSNR uncovered", "higher", 2),

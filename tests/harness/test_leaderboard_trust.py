@@ -26,6 +26,7 @@ from ambiguous_wild.harness.running.identity import config_identity
 from ambiguous_wild.harness.running.regions import find_regions
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.metrics.affine import psnr_affine
 from ambiguous_wild.metrics.flip import flip
 from tests.harness.board_runs import write_run, write_scene
 
@@ -133,7 +134,8 @@ def measure_everything(run: Path, scene: Path) -> set[str]:
         for row in result["per_image"]:
             render = read_png_rgb((run / "renders/test" / row["name"]).with_suffix(".png"))
             photo = read_png_rgb(photos[row["name"]])
-            row |= {"flip": flip(render, photo)} | regions.psnr(row["name"], render, photo)
+            row |= {"flip": flip(render, photo), "psnr_affine": psnr_affine(render, photo)}
+            row |= regions.psnr(row["name"], render, photo)
 
     change_result(run, more)
     return {k for row in json.loads((run / "metrics.json").read_text())["per_image"] for k in row}
@@ -154,7 +156,7 @@ def hide(scene: Path) -> None:
 def test_every_metric_of_pictures_is_computed_again(one: Path, tmp_path: Path) -> None:
     hide(tmp_path / "wall")
     names = measure_everything(one, tmp_path / "wall")
-    checked = {"flip", "psnr_valid", "psnr_covered", "psnr_uncovered"}
+    checked = {"flip", "psnr_affine", "psnr_valid", "psnr_covered", "psnr_uncovered"}
     assert checked <= names
     assert add(tmp_path / "board", one, "--dry-run").exit_code == 0
     good = (one / "metrics.json").read_text()

@@ -17,6 +17,7 @@ from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.lock import folder_lock
 from ambiguous_wild.io.ply import read_splat_ply
 from ambiguous_wild.methods import MethodEntry, register, registry
+from ambiguous_wild.metrics.affine import psnr_affine
 from ambiguous_wild.metrics.flip import flip
 from ambiguous_wild.metrics.image import psnr
 from ambiguous_wild.splat.pace import TrainConfig
@@ -86,6 +87,7 @@ def test_a_run_folder_holds_everything_and_the_numbers_follow_from_it(scene, tmp
         photo = read_png_rgb(scene / "images" / row["name"])
         assert row["psnr"] == pytest.approx(psnr(drawn, photo))
         assert row["flip"] == pytest.approx(flip(drawn, photo))
+        assert row["psnr_affine"] == pytest.approx(psnr_affine(drawn, photo))
     assert result["masks"] == {"iou": 1.0, "precision": 1.0, "recall": 1.0, "images": 6}
     assert result["cost"]["gaussians"] == len(read_splat_ply(run / "point_cloud.ply")["means"])
     assert "lpips_alex" in result["missing"] or "lpips_alex" in result["per_image"][0]

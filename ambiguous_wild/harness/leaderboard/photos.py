@@ -15,14 +15,12 @@ from ambiguous_wild.harness.running.records import ImageRow, metrics_of
 from ambiguous_wild.harness.running.regions import find_regions
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import read_png_rgb
-from ambiguous_wild.metrics import image as image_metrics
-from ambiguous_wild.metrics.flip import flip
+from ambiguous_wild.metrics.full_image import FULL_IMAGE
 
 TOLERANCE = 1e-6  # the same arithmetic on the same 8-bit pixels; another CPU may round otherwise
 # dB. Which pixels are covered is itself computed: where rounding moves a pixel over the threshold, the mean
 # over thousands of them moves a little.
 REGION_TOLERANCE = {"psnr_covered": 1e-2, "psnr_uncovered": 1e-2, "psnr_supported": 1e-2}
-FULL_IMAGE = image_metrics.METRICS | {"flip": flip}
 
 
 def check_photos(

@@ -19,14 +19,13 @@ from ambiguous_wild.io.images import read_png_rgb, to_uint8, write_png
 from ambiguous_wild.metrics import image as image_metrics
 from ambiguous_wild.metrics import lpips
 from ambiguous_wild.metrics import masks as mask_metrics
-from ambiguous_wild.metrics.flip import flip
+from ambiguous_wild.metrics.full_image import FULL_IMAGE
 from ambiguous_wild.splat import device
 from ambiguous_wild.splat.cpu.compile import threads
 from ambiguous_wild.splat.trainer import Trainer
 
 FPS_ROUNDS = 5
 FPS_SECONDS = 2.0  # of all rounds together: long enough to average over scheduling noise
-FULL_IMAGE = image_metrics.METRICS | {"flip": flip}
 
 
 @dataclass(frozen=True)

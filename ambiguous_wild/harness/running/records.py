@@ -18,6 +18,7 @@ class ImageRow(TypedDict, total=False):
     ssim: float | None
     ssim_inria: float | None
     flip: float | None
+    psnr_affine: float | None
     lpips_alex: float | None
     lpips_vgg: float | None
     lpips_vgg_01: float | None

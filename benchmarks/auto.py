@@ -22,6 +22,7 @@ from statistics import fmean
 from typing import Any
 
 from captures import find_scenes
+from ending import exit_code
 from presets import Stopped, aw
 
 from ambiguous_wild.core import AwError, Scene
@@ -189,8 +190,4 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except AwError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    sys.exit(exit_code(main))

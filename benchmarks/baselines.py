@@ -31,6 +31,7 @@ import cv2
 import numpy as np
 import torch
 from captures import find_scenes
+from ending import exit_code
 from job_queue import Run, archive_of, check_settings, keep, parser_of, restore, run_all
 
 from ambiguous_wild.core import AwError, Scene
@@ -362,8 +363,4 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except AwError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    sys.exit(exit_code(main))

@@ -22,7 +22,9 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from ambiguous_wild.core import AwError, Scene
+from ending import exit_code
+
+from ambiguous_wild.core import Scene
 from ambiguous_wild.harness.running.environment import environment
 from ambiguous_wild.harness.running.result_file import RESULT, read_result
 from ambiguous_wild.io.atomic import write_json, write_text
@@ -183,8 +185,4 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except AwError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    sys.exit(exit_code(main))

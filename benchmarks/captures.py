@@ -37,6 +37,7 @@ from captures_report import (
     to_csv,
     to_markdown,
 )
+from ending import exit_code
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.running.cell import Cell
@@ -48,6 +49,7 @@ from ambiguous_wild.harness.running.result_file import RESULT
 from ambiguous_wild.harness.running.run_folder import planned_effects, refuse_other_config
 from ambiguous_wild.harness.running.store import read_runs
 from ambiguous_wild.io.atomic import write_json, write_text
+from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.pace import TrainConfig
 
 RESULTS = Path(__file__).parent / "results" / "captures"
@@ -141,7 +143,7 @@ def beside(stem: Path, ending: str) -> Path:
     return stem.with_name(stem.name + ending)
 
 
-def refuse_other_captures(cells: Sequence[Cell], stem: Path) -> None:
+def refuse_other_captures(scenes: Iterable[Path], stem: Path) -> None:
     """Raise AwError if the results are there, of other captures: a table is not replaced by another's."""
     path = beside(stem, ".json")
     if not path.is_file():
@@ -150,7 +152,7 @@ def refuse_other_captures(cells: Sequence[Cell], stem: Path) -> None:
         told = {capture["name"] for capture in json.loads(path.read_text(encoding="utf-8"))["captures"]}
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise AwError(f"{path} is no result of this script ({error}); choose another --results") from error
-    if not told & {cell.scene.name for cell in cells}:
+    if told.isdisjoint(load_scene(root, verify=False).name for root in scenes):
         raise AwError(f"{path} is of other captures ({', '.join(sorted(told))}); choose another --results")
 
 
@@ -182,12 +184,16 @@ def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
 
 def main(words: Sequence[str] | None = None) -> int:
     args = arguments(words)
+    scenes_given = find_scenes(args.captures)
+    refuse_other_captures(scenes_given, args.results)  # before a plan trains probes
+    book_path = beside(args.results, "-runs.csv")
+    book = read_book(book_path)
     train = TrainConfig(iterations=args.iterations)
     plans = Probing(train, args.out / ".cache" / "plans", lambda: prepare_cpu(args.jobs, print), print)
     recorded = args.report_only and args.effects in PLANNED
     cells = plan_cells(
         args.methods,
-        find_scenes(args.captures),
+        scenes_given,
         args.seeds,
         train,
         settings=args.settings,
@@ -197,9 +203,6 @@ def main(words: Sequence[str] | None = None) -> int:
     )
     known = with_recorded_effects(cells, args.effects, args.out) if recorded else cells
     refuse_other_configs(known, args.out)  # before anything is trained
-    refuse_other_captures(cells, args.results)
-    book_path = beside(args.results, "-runs.csv")
-    book = read_book(book_path)
     failed = [] if args.report_only else run_all(cells, book, args)
     # without a run folder the book may hold them all
     runs = read_runs(args.out) if any(cell_folder(args.out, cell).is_dir() for cell in cells) else None
@@ -241,8 +244,4 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except AwError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    sys.exit(exit_code(main))

@@ -13,11 +13,11 @@ import numpy as np
 import pandas as pd
 
 from ambiguous_wild.core import AwError, Scene
-from ambiguous_wild.harness.leaderboard.check import TRUTH
 from ambiguous_wild.harness.running.identity import scene_identity
 from ambiguous_wild.harness.running.regions import true_distractor
 from ambiguous_wild.harness.running.store import Runs
 from ambiguous_wild.io.images import read_gray
+from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.metrics import stats
 
 OURS, PLAIN = "refinesplat", "3dgs"
@@ -175,11 +175,6 @@ def missing_runs(
     ]
 
 
-def uses_truth(method: str) -> bool:
-    """Whether it trains on the ground truth: a reference, not ranked."""
-    return method == "3dgs-clean" or bool(TRUTH.search(method))
-
-
 def summarise(rows: Sequence[Row], captures: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Share of the gap to exact masks, ranking, masks against baselines, clean captures, model sizes."""
     of = {(row["capture"], row["method"]): row for row in rows}
@@ -195,7 +190,7 @@ def summarise(rows: Sequence[Row], captures: Sequence[dict[str, Any]]) -> dict[s
     # A capture that may belong to the mean makes it missing; one without distractors has no gap to close.
     unknown = [c["name"] for c in captures if c["distractor_share"] and math.isnan(gaps[c["name"]]["gap_db"])]
     means = {m: stats.mean([value(name, m, "psnr") for name in names]) for m in methods}
-    ranked = {m: v for m, v in means.items() if not uses_truth(m) and not math.isnan(v)}
+    ranked = {m: v for m, v in means.items() if not knows_truth(m) and not math.isnan(v)}
     iou = {name: {m: value(name, m, "iou") for m in (OURS, *BASELINES)} for name in names}
     ratios = {name: value(name, OURS, "gaussians") / value(name, BASELINES[0], "gaussians") for name in names}
     clean = [c["name"] for c in captures if c["distractor_share"] == 0.0]
@@ -233,7 +228,7 @@ def _gap(psnr: dict[str, float]) -> dict[str, float]:
 
 
 def _best(capture: str, methods: Sequence[str], value: Any) -> str | None:
-    found = {m: value(capture, m, "psnr") for m in methods if not uses_truth(m)}
+    found = {m: value(capture, m, "psnr") for m in methods if not knows_truth(m)}
     found = {m: v for m, v in found.items() if not math.isnan(v)}
     return max(found, key=lambda m: found[m]) if found else None
 

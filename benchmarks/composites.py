@@ -20,6 +20,7 @@ from pathlib import Path
 
 import captures
 import numpy as np
+from ending import exit_code
 
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.harness.running.covered import train_looks
@@ -139,8 +140,4 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except AwError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    sys.exit(exit_code(main))

@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 import torch
 from captures import find_scenes
+from ending import exit_code
 from scipy.stats import rankdata
 
 from ambiguous_wild.core import AwError
@@ -235,8 +236,4 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except AwError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    sys.exit(exit_code(main))

@@ -26,8 +26,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from ending import exit_code
 
-from ambiguous_wild.core import AwError
 from ambiguous_wild.io.images import write_png
 from ambiguous_wild.methods.registry import get_method
 from ambiguous_wild.simulate.capture import plan
@@ -229,8 +229,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except AwError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    sys.exit(exit_code(main))

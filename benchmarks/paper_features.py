@@ -26,9 +26,9 @@ from typing import Any
 
 import pandas as pd
 from captures import find_scenes
+from ending import exit_code
 from job_queue import Run, archive_of, check_settings, keep, parser_of, restore, run_all
 
-from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.running.environment import environment
 from ambiguous_wild.harness.running.result_file import RESULT, read_result
 from ambiguous_wild.io.atomic import write_json, write_text
@@ -242,8 +242,4 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except AwError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    sys.exit(exit_code(main))

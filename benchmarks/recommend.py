@@ -16,7 +16,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ambiguous_wild.core import AwError
+from ending import exit_code
+
 from ambiguous_wild.harness.cost.read import CostRun, read_cost_runs
 from ambiguous_wild.harness.cost.recommend import CLOSE_DB, leave_out
 from ambiguous_wild.harness.running.environment import environment
@@ -77,8 +78,4 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except AwError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    sys.exit(exit_code(main))

@@ -49,7 +49,7 @@ def command(
     """Simulate a capture: photos with distractors, clean test photos, and the exact truth.
 
     NAME is a preset of --list. SPEC.yaml describes world, walk, distractors and effects (docs/simulation.md).
-    Missing keys are as in the preset courtyard; a missing list of distractors is empty.
+    Missing keys are as in the preset courtyard; if distractors is missing, there are none.
     """
     from ambiguous_wild.core.errors import AwError, counted
     from ambiguous_wild.simulate.presets import PRESETS, preset, resized

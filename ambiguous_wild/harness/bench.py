@@ -302,11 +302,12 @@ def _check_effects(
 
     for wanted in choices:
         check_wanted(wanted)
-    if plan is not None and len(scenes) > 1:
-        name = plan if isinstance(plan, str | Path) else plan.scene
+    if plan is None:
+        return
+    name = plan if isinstance(plan, str | Path) else plan.scene
+    if len(scenes) > 1:
         raise AwError(f"--plan {name} is of one scene; bench {len(scenes)} scenes one by one, or without it")
-    if plan is not None and not any(reads_plan(c, get_method(m)) for c in choices for m in methods):
-        name = plan if isinstance(plan, str | Path) else plan.scene
+    if not any(reads_plan(c, get_method(m)) for c in choices for m in methods):
         raise AwError(
             f"--plan {name} would not be read: {', '.join(methods)} with --effects {', '.join(choices)}; "
             "add --effects auto"

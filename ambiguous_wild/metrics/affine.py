@@ -1,7 +1,7 @@
 """PSNR of a render whose colours are fitted to the photo: light and exposure are not counted.
 
 Test photos of an automatic camera have exposures of their own, which no model can know. `psnr` compares them
-as brightness; this one forgives one affine colour map a picture.
+as brightness; this metric allows one affine colour map per picture.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from scipy.spatial import QhullError
 from ambiguous_wild.core import Camera
 
 BEHIND = 1.15  # a point deeper than this times the nearest static depth is behind the surface
-_PIXELS = 20_000  # most pixels of a map; results are enlarged to the photo's size
+PIXELS = 20_000  # most pixels of a map; results are enlarged to the photo's size
 _CELLS = 32  # cells along a side; within a cell, points far behind the nearest one are occluded
 _LEAST_POINTS = 8
 _FRAME_PIXELS = 1000  # of a map that counts the cameras that have a place in their frame
@@ -141,5 +141,5 @@ def _in_front(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
 
 
 def _map_size(camera: Camera) -> tuple[int, int]:
-    scale = min(1.0, (_PIXELS / (camera.width * camera.height)) ** 0.5)
+    scale = min(1.0, (PIXELS / (camera.width * camera.height)) ** 0.5)
     return max(round(camera.height * scale), 1), max(round(camera.width * scale), 1)

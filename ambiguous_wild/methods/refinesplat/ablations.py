@@ -125,7 +125,11 @@ ABLATIONS = (
             Variant("no-sparse-points", ("mask.multiview.sparse=false",), "unlearnt surfaces have no depth"),
             Variant("rims", ("mask.multiview.seen_by=0",), "masks where no other photo looks"),
             Variant("no-first-look", ("first_look.on=false",), "no masks before the first renders"),
-            Variant("first-look-first", ("first_look.weight=1",), "not used in later masks"),
+            Variant(
+                "first-look-first",
+                ("first_look.weight=1", "first_look.crowd_weight=1"),
+                "not used in later masks",
+            ),
             Variant("no-memory", ("mask.memory=0",), "the current render only"),
             Variant("no-hold", ("mask.hold=1",), "regions do not grow below the threshold"),
             Variant("identities", ("mask.entropy_weight=0.5",), "scaled by the contrast of identities"),

@@ -7,6 +7,10 @@ surfaces that several photos saw in one place. So the surface behind every pixel
 if enough of them show its colour there. Depth is off by a pixel or two, so a colour may lie anywhere between
 the least and the greatest around the place. Pixels without sparse points around them are kept.
 
+The first answer is noisy, and where distractors stand in most photos it is wrong: the ground behind a crowd
+is shown by few. So the answer of every photo is smoothed along the edges of its colours (guided filter, He
+et al., ECCV 2010), and asked again, without the pixels of other photos that were masked (`rounds`).
+
 Later masks are made from renders, but the first look still scales their evidence (`FirstLookConfig.weight`):
 it does not depend on what the model has learnt.
 """
@@ -24,8 +28,10 @@ from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.methods.refinesplat.agreement import common_offset, quantile_of
 from ambiguous_wild.methods.refinesplat.multiview import nearest_views
-from ambiguous_wild.vision.sparse_surface import BEHIND, in_map, world_points
+from ambiguous_wild.vision.sparse_surface import BEHIND, PIXELS, in_map, world_points
 
+_SETTLED = 0.005  # share of pixels: if fewer change in a round, it is the last
+_EDGE = 0.003  # variance of colours in [0, 1] that is an edge for the filter
 _WINDOW = np.ones((3, 3), np.uint8)  # px of the map around the place where a colour may lie
 
 
@@ -34,25 +40,33 @@ class FirstLookConfig:
     """Which views are compared, and the largest difference of colour."""
 
     on: bool = True  # masks before training, from photos and sparse points
-    views: int = 16  # nearest train views used
+    views: int = 16  # nearest train views used; in a crowd twice as many
     quantile: float = 0.3  # of their differences: this share of views must show the colour
     threshold: float = 0.02  # difference of colour in [0, 1] above which a pixel is masked at first
     normal: float = 3.0  # and above this many times what is normal in the photo
     # in a crowd fewer views show a surface: this many others are enough if no other colour is shown there by
     # more; 0 = not used. Crowd of seed 37, 700 iterations: 18.5 dB, with it 19.3
     consensus: int = 2
-    crowd: float = 0.35  # of a photo: if as much would be masked, it is a crowd
-    known_by: int = 3  # with fewer views that see it, a surface is not judged
+    # of a photo: if as much would be masked, it is a crowd; in the mean of all photos: the scene is crowded
+    crowd: float = 0.35
+    known_by: int = 2  # with fewer views that see it, a surface is not judged
+    # asked again without what the last answers mask in the other photos; 0 = the first answer is the last
+    rounds: int = 8  # at most; they end when the answers hardly change
+    smooth: float = 5.0  # px of a map of 20 000 px, radius of the filter over each answer; 0 = none
     least: float = (
         0.1  # of a photo: if less would be masked, nothing is; so few distractors do no harm at the start
     )
     weight: float = 1.5  # `structure`: later evidence is multiplied or divided by up to this; 1 = unchanged
+    # the same in a crowd, where the first renders show distractors and other photos do not.
+    # Crowds of seeds 37 and 43: WEIGHTS
+    crowd_weight: float = 6.0
 
     def __post_init__(self) -> None:
         check_limits(
             self, "refinesplat.first_look",
-            views=(1, math.inf), quantile=(0, 1), threshold=(0, math.inf), normal=(0, math.inf),
-            known_by=(1, math.inf), consensus=(0, math.inf), crowd=(0, 1), least=(0, 1), weight=(1, math.inf),
+            views=(1, math.inf), quantile=(0, 1), known_by=(1, math.inf), rounds=(0, 100), smooth=(0, 100),
+            crowd=(0, 1), least=(0, 1), weight=(1, math.inf), crowd_weight=(1, math.inf),
+            **dict.fromkeys(("threshold", "normal", "consensus"), (0, math.inf)),
         )  # fmt: skip
 
 
@@ -60,8 +74,9 @@ class FirstLookConfig:
 class FirstLook:
     """What the other photos show at the surfaces of one photo, on a map [h, w] of its frame."""
 
-    passing: np.ndarray  # float32: 1 = distractor, 0 = the others show it too, 0.5 = unknown
-    least: float
+    passing: np.ndarray  # float32 in [0, 1]: 1 = distractor, 0 = the others show it too, 0.5 = unknown
+    least: float  # of the photo: if less would be masked, nothing is
+    weight: float  # of later evidence
 
     def keep(self, shape: tuple[int, int]) -> np.ndarray | None:
         """Pixels that are kept at first, [H, W] bool; None if all are."""
@@ -70,9 +85,9 @@ class FirstLook:
             return None
         return _resized(passing.astype(np.float32), shape) < 0.5
 
-    def factor(self, weight: float, shape: tuple[int, int]) -> np.ndarray:
+    def factor(self, shape: tuple[int, int]) -> np.ndarray:
         """Factor of the evidence of later masks, [H, W] float32 in [1 / weight, weight]."""
-        return np.power(np.float32(weight), 2.0 * _resized(self.passing, shape) - 1.0)
+        return np.power(np.float32(self.weight), 2.0 * _resized(self.passing, shape) - 1.0)
 
 
 def first_look(
@@ -94,20 +109,54 @@ def first_look(
         for photo, inverse in zip(photos, surfaces, strict=True)
     ]
     ranges = [None if s is None else (cv2.erode(s, _WINDOW), cv2.dilate(s, _WINDOW)) for s in small]
-    looks: list[FirstLook | None] = []
-    for view, others in enumerate(nearest_views(cameras, config.views)):
-        inverse, ours = surfaces[view], small[view]
-        if inverse is None or ours is None:
-            looks.append(None)
-            continue
-        world = world_points(cameras[view], inverse)
-        seen = [
-            _seen_by(ours, world, cameras[j], surface, limits)
-            for j in others
-            if (surface := surfaces[j]) is not None and (limits := ranges[j]) is not None
-        ]
-        looks.append(_judge(ours, seen, config))
-    return looks
+    near = nearest_views(cameras, 2 * config.views)
+    views, crowded = config.views, False
+    answers: list[np.ndarray | None] = [None] * len(small)
+    for asked in range(config.rounds + 1):
+        found: list[np.ndarray | None] = []
+        for view, others in enumerate(near):
+            inverse, ours, last = surfaces[view], small[view], answers[view]
+            if inverse is None or ours is None:
+                found.append(None)
+                continue
+            world = world_points(cameras[view], inverse)
+            seen = [
+                _seen_by(ours, world, cameras[j], surface, limits, answers[j])
+                for j in others[:views]
+                if (surface := surfaces[j]) is not None and (limits := ranges[j]) is not None
+            ]
+            answer = _judge(ours, seen, config)
+            if answer is None:
+                found.append(last)
+                continue
+            answer = _smoothed(answer, ours, config.smooth)
+            # half of the last answer: without it, two photos may mask each other in turn
+            found.append(answer if last is None else 0.5 * (answer + last))
+        changed = _changed(answers, found)
+        answers = found
+        if not asked:
+            crowded = _masked_share(answers) >= config.crowd
+            views = 2 * config.views if crowded else config.views
+        elif changed < _SETTLED:
+            break
+    weight = config.crowd_weight if crowded else config.weight
+    return [None if answer is None else FirstLook(answer, config.least, weight) for answer in answers]
+
+
+def _masked_share(answers: Sequence[np.ndarray | None]) -> float:
+    """Share of a photo that is masked, in the mean of all that have an answer."""
+    shares = [float((answer > 0.5).mean()) for answer in answers if answer is not None]
+    return float(np.mean(shares)) if shares else 0.0
+
+
+def _changed(before: Sequence[np.ndarray | None], after: Sequence[np.ndarray | None]) -> float:
+    """Share of the pixels whose answer is another one, over the photos that have two."""
+    both = [
+        float(((a > 0.5) != (b > 0.5)).mean())
+        for a, b in zip(before, after, strict=True)
+        if a is not None and b is not None
+    ]
+    return float(np.mean(both)) if both else 0.0
 
 
 def _small(photo: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -126,9 +175,12 @@ class _Seen:
 
     def outside(self, colour: np.ndarray) -> np.ndarray:
         """Distance of colours [..., 3] to the range, [...]; NaN where it sees nothing."""
-        low, high = self.low + self.offset - colour, colour - self.high - self.offset
-        beyond = np.maximum(np.maximum(low, high), 0.0)
-        return np.where(self.sees, beyond.mean(axis=-1), np.float32(np.nan))
+        own = colour - self.offset
+        beyond = np.maximum(self.low - own, own - self.high)
+        np.maximum(beyond, 0.0, out=beyond)
+        # a sum of three is several times as fast as a mean over the last axis
+        distance = (beyond[..., 0] + beyond[..., 1] + beyond[..., 2]) / np.float32(3.0)
+        return np.where(self.sees, distance, np.float32(np.nan))
 
     def at(self, rows: np.ndarray) -> _Seen:
         return _Seen(self.low[rows], self.high[rows], self.offset, self.sees[rows])
@@ -140,6 +192,7 @@ def _seen_by(
     camera: Camera,
     surface: np.ndarray,  # inverse depth of the other view
     limits: tuple[np.ndarray, np.ndarray],  # least and greatest colours around each of its pixels
+    masked: np.ndarray | None = None,  # its own answer, [h, w]; above 0.5 it shows a distractor
 ) -> _Seen:
     local = world @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
     x, y = in_map(camera, local, surface.shape)
@@ -148,13 +201,23 @@ def _seen_by(
     x, y = (np.where(inside, v, -9.0).astype(np.float32) for v in (x, y))
     nearest = cv2.remap(surface, x, y, cv2.INTER_NEAREST, borderValue=float("nan"))
     sees = inside & ~(nearest * z > BEHIND)
+    if masked is not None:
+        sees &= cv2.remap(masked, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) <= 0.5
     low, high = (cv2.remap(c, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for c in limits)
     offset = common_offset(ours - 0.5 * (low + high), sees)
     return _Seen(low, high, offset, sees)
 
 
-def _judge(ours: np.ndarray, seen: list[_Seen], config: FirstLookConfig) -> FirstLook | None:
-    """A first look from what the others show at the surfaces of a photo; None if nothing is known."""
+def _smoothed(answer: np.ndarray, photo: np.ndarray, smooth: float) -> np.ndarray:
+    """An answer [h, w] that changes only where the colours [h, w, 3] do."""
+    radius = math.ceil(smooth * math.sqrt(answer.size / PIXELS))
+    if radius < 1:
+        return answer
+    return np.clip(cv2.ximgproc.guidedFilter(photo, answer, radius, _EDGE), 0.0, 1.0)
+
+
+def _judge(ours: np.ndarray, seen: list[_Seen], config: FirstLookConfig) -> np.ndarray | None:
+    """1 = distractor, 0 = the others show it too, 0.5 = unknown, [h, w] float32; None if nothing is known."""
     if not seen:
         return None
     stack = np.stack([view.outside(ours) for view in seen])
@@ -169,7 +232,7 @@ def _judge(ours: np.ndarray, seen: list[_Seen], config: FirstLookConfig) -> Firs
     if config.consensus and passing.mean() >= config.crowd:
         at = passing & ((stack <= limit).sum(axis=0) >= config.consensus)
         passing[at] = ~_leads(ours[at], [view.at(at) for view in seen], stack[:, at], limit)
-    return FirstLook(np.where(known, passing, 0.5).astype(np.float32), config.least)
+    return np.where(known, passing, np.float32(0.5)).astype(np.float32)
 
 
 def _leads(ours: np.ndarray, seen: list[_Seen], outside: np.ndarray, limit: float) -> np.ndarray:

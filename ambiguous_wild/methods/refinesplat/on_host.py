@@ -103,7 +103,7 @@ class HostMasks:
                 remember=remember,
             )
             if view in self.looks:
-                evidence *= self.looks[view].factor(self.config.first_look.weight, evidence.shape)
+                evidence *= self.looks[view].factor(evidence.shape)
             if mask.entropy_weight > 0:
                 evidence = scaled_by(evidence, self.compare(step).statistic, mask.entropy_weight)
             maps = Maps(evidence, evidence)

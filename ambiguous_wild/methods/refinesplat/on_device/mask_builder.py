@@ -55,12 +55,11 @@ class DeviceMasks:
         self.pixels = PixelEvidence(photos, cameras, surfaces, config.mask, device, tensors)
         self.labels = Labels(labels, static, self.pixels.unseen_on_host, device)
         # view: [H, W], factor of its evidence; absent if that is 1
-        self.factors: dict[int, Tensor] = {}
-        if config.first_look.weight != 1:
-            self.factors = {
-                view: sized(look.factor(config.first_look.weight, photos[view].shape[:2]), device)
-                for view, look in looks.items()
-            }
+        self.factors = {
+            view: sized(look.factor(photos[view].shape[:2]), device)
+            for view, look in looks.items()
+            if look.weight != 1
+        }
         self.keeps: dict[int, Tensor] = {}  # view: [H, W] float32; of the views that have a mask
         wide, views = torch.float64, len(photos)
         # [views, K] mean evidence of every instance when its mask was last made, NaN where there is none

@@ -4,7 +4,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-import torch
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.methods.refinesplat.first_look import FirstLookConfig, first_look
@@ -215,5 +214,25 @@ def test_in_a_crowd_the_colour_that_most_photos_show_is_the_walls(colours, kept)
 def test_the_same_every_time(views):
     photos, _ = passers()
     config = dataclasses.replace(JUDGE_ALL, views=views, known_by=1)
-    first, second = keeps(photos, config), keeps(photos, config)
-    assert all(torch.equal(torch.from_numpy(a), torch.from_numpy(b)) for a, b in zip(first, second))
+    first, second = looks(photos, config), looks(photos, config)
+    assert all(a.passing.dtype == np.float32 for a in first)
+    assert all(np.array_equal(a.passing, b.passing) for a, b in zip(first, second))
+
+
+def test_photos_without_a_surface_and_of_other_sizes_are_no_trouble():
+    photos, masks = passers()
+    cameras = [camera(view) for view in range(VIEWS)]
+    surfaces = static_surfaces(cameras, points())
+    surfaces[0], surfaces[1] = None, np.full_like(surfaces[1], np.nan)
+    cameras[2] = cameras[2].resized(WIDTH // 2, HEIGHT // 2)
+    photos[2] = photos[2][::2, ::2]
+    surfaces[2] = surfaces[2][::2, ::2]
+    found = first_look(cameras, photos, surfaces, JUDGE_ALL)
+    assert found[0] is None and found[1] is None
+    assert all(np.isfinite(look.passing).all() for look in found[2:])
+    assert share_of(found[2].keep((HEIGHT // 2, WIDTH // 2)), masks[2][::2, ::2]) > 0.8
+    for few in (1, 2):
+        assert (
+            len(first_look(cameras[3 : 3 + few], photos[3 : 3 + few], surfaces[3 : 3 + few], JUDGE_ALL))
+            == few
+        )

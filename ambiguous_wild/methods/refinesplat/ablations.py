@@ -125,6 +125,9 @@ ABLATIONS = (
             Variant("no-sparse-points", ("mask.multiview.sparse=false",), "unlearnt surfaces have no depth"),
             Variant("rims", ("mask.multiview.seen_by=0",), "masks where no other photo looks"),
             Variant("no-first-look", ("first_look.on=false",), "no masks before the first renders"),
+            Variant("first-look-once", ("first_look.rounds=0",), "not asked again"),
+            Variant("first-look-rough", ("first_look.smooth=0",), "not smoothed"),
+            Variant("calm-crowd", ("first_look.crowd_weight=1.5",), "a crowd weighs as elsewhere"),
             Variant(
                 "first-look-first",
                 ("first_look.weight=1", "first_look.crowd_weight=1"),

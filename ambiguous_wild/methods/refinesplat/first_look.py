@@ -5,7 +5,8 @@ photo, the crowd is learnt before the first mask is made, and some of it stays. 
 surfaces that several photos saw in one place. So the surface behind every pixel is taken from them
 (`vision/sparse_surface.py`) and looked up in the other photos; a pixel is kept in the first iterations only
 if enough of them show its colour there. Depth is off by a pixel or two, so a colour may lie anywhere between
-the least and the greatest around the place. Pixels without sparse points around them are kept.
+the least and the greatest around the place. Pixels without sparse points around them are kept, unless the
+filter below carries the answer of their neighbours to them.
 
 The first answer is noisy, and where distractors stand in most photos it is wrong: the ground behind a crowd
 is shown by few. So the answer of every photo is smoothed along the edges of its colours (guided filter, He
@@ -40,25 +41,24 @@ class FirstLookConfig:
     """Which views are compared, and the largest difference of colour."""
 
     on: bool = True  # masks before training, from photos and sparse points
-    views: int = 16  # nearest train views used; in a crowd twice as many
+    views: int = 16  # nearest train views used; twice as many if the first answers show a crowd
     quantile: float = 0.3  # of their differences: this share of views must show the colour
     threshold: float = 0.02  # difference of colour in [0, 1] above which a pixel is masked at first
     normal: float = 3.0  # and above this many times what is normal in the photo
     # in a crowd fewer views show a surface: this many others are enough if no other colour is shown there by
     # more; 0 = not used. Crowd of seed 37, 700 iterations: 18.5 dB, with it 19.3
     consensus: int = 2
-    # of a photo: if as much would be masked, it is a crowd; in the mean of all photos: the scene is crowded
+    # a photo of which as much would be masked shows a crowd; a scene does, if it is as much in the mean
     crowd: float = 0.35
     known_by: int = 2  # with fewer views that see it, a surface is not judged
-    # asked again without what the last answers mask in the other photos; 0 = the first answer is the last
-    rounds: int = 8  # at most; they end when the answers hardly change
+    # how often at most it is asked again, without what the last answers mask in the other photos; it ends
+    # when they hardly change; 0 = never
+    rounds: int = 8
     smooth: float = 5.0  # px of a map of 20 000 px, radius of the filter over each answer; 0 = none
-    least: float = (
-        0.1  # of a photo: if less would be masked, nothing is; so few distractors do no harm at the start
-    )
+    # of a photo: if less would be masked, nothing is; so few distractors do no harm at the start
+    least: float = 0.1
     weight: float = 1.5  # `structure`: later evidence is multiplied or divided by up to this; 1 = unchanged
-    # the same in a crowd, where the first renders show distractors and other photos do not.
-    # Crowds of seeds 37 and 43: WEIGHTS
+    # the weight in a crowd, where the first renders show distractors; other photos show the background
     crowd_weight: float = 6.0
 
     def __post_init__(self) -> None:
@@ -110,7 +110,7 @@ def first_look(
     ]
     ranges = [None if s is None else (cv2.erode(s, _WINDOW), cv2.dilate(s, _WINDOW)) for s in small]
     near = nearest_views(cameras, 2 * config.views)
-    views, crowded = config.views, False
+    views = config.views
     answers: list[np.ndarray | None] = [None] * len(small)
     for asked in range(config.rounds + 1):
         found: list[np.ndarray | None] = []
@@ -135,11 +135,10 @@ def first_look(
         changed = _changed(answers, found)
         answers = found
         if not asked:
-            crowded = _masked_share(answers) >= config.crowd
-            views = 2 * config.views if crowded else config.views
+            views = (2 if _masked_share(answers) >= config.crowd else 1) * config.views
         elif changed < _SETTLED:
             break
-    weight = config.crowd_weight if crowded else config.weight
+    weight = config.crowd_weight if _masked_share(answers) >= config.crowd else config.weight
     return [None if answer is None else FirstLook(answer, config.least, weight) for answer in answers]
 
 
@@ -210,9 +209,9 @@ def _seen_by(
 
 def _smoothed(answer: np.ndarray, photo: np.ndarray, smooth: float) -> np.ndarray:
     """An answer [h, w] that changes only where the colours [h, w, 3] do."""
-    radius = math.ceil(smooth * math.sqrt(answer.size / PIXELS))
-    if radius < 1:
+    if smooth <= 0:
         return answer
+    radius = max(round(smooth * math.sqrt(answer.size / PIXELS)), 1)
     return np.clip(cv2.ximgproc.guidedFilter(photo, answer, radius, _EDGE), 0.0, 1.0)
 
 
@@ -231,11 +230,11 @@ def _judge(ours: np.ndarray, seen: list[_Seen], config: FirstLookConfig) -> np.n
     passing = known & (evidence > limit)
     if config.consensus and passing.mean() >= config.crowd:
         at = passing & ((stack <= limit).sum(axis=0) >= config.consensus)
-        passing[at] = ~_leads(ours[at], [view.at(at) for view in seen], stack[:, at], limit)
+        passing[at] = ~_leads(ours[at], [view.at(at) for view in seen], stack[:, at], limit, config.views)
     return np.where(known, passing, np.float32(0.5)).astype(np.float32)
 
 
-def _leads(ours: np.ndarray, seen: list[_Seen], outside: np.ndarray, limit: float) -> np.ndarray:
+def _leads(ours: np.ndarray, seen: list[_Seen], outside: np.ndarray, limit: float, rivals: int) -> np.ndarray:
     """Whether no colour that others show at a place is shown by more of them than ours, [p] bool.
 
     Args:
@@ -243,10 +242,11 @@ def _leads(ours: np.ndarray, seen: list[_Seen], outside: np.ndarray, limit: floa
         seen: what n others show at these places.
         outside: [n, p] distances of our colours to theirs.
         limit: distance up to which two colours are the same.
+        rivals: of so many views, the nearest, the colours are compared with ours.
     """
     support = (outside <= limit).sum(axis=0)
     most = np.zeros_like(support)
-    for k, rival in enumerate(seen):
+    for k, rival in enumerate(seen[:rivals]):
         colour = 0.5 * (rival.low + rival.high) + rival.offset
         backing = sum((other.outside(colour) <= limit).astype(np.int64) for other in seen)
         most = np.maximum(most, np.where(rival.sees & ~(outside[k] <= limit), backing, 0))

@@ -143,9 +143,16 @@ class RefineSplatMask(PausingMask):
             "masked_share_global": float(mean[2]),
             "t_ent_mean": float(finite.mean()) if len(finite) else None,
             "w2": self.w2,
+            # of a photo, in the mean: what the first look masks
+            "first_look_share": self._first_share,
             # pictures may read identities that the training never used
             "identities": self.inputs.semantics.found.count if self._reads_identities else None,
         }
+
+    @property
+    def _first_share(self) -> float | None:
+        masked = [float((look.passing > 0.5).mean()) for look in self.looks.values()]
+        return float(np.mean(masked)) if masked else None
 
     @property
     def _reads_identities(self) -> bool:

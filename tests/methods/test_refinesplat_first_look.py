@@ -128,7 +128,7 @@ def test_later_evidence_weighs_more_where_others_show_something_else_and_less_wh
 
 
 def crowd(seed: int = 5) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Photos of which people cover half, and where they stand: never twice at one place of the wall."""
+    """Photos of which people at random places cover about half, and where they stand."""
     rng = np.random.default_rng(seed)
     photos, masks = [], []
     for view in range(VIEWS):
@@ -232,7 +232,5 @@ def test_photos_without_a_surface_and_of_other_sizes_are_no_trouble():
     assert all(np.isfinite(look.passing).all() for look in found[2:])
     assert share_of(found[2].keep((HEIGHT // 2, WIDTH // 2)), masks[2][::2, ::2]) > 0.8
     for few in (1, 2):
-        assert (
-            len(first_look(cameras[3 : 3 + few], photos[3 : 3 + few], surfaces[3 : 3 + few], JUDGE_ALL))
-            == few
-        )
+        these = slice(3, 3 + few)
+        assert len(first_look(cameras[these], photos[these], surfaces[these], JUDGE_ALL)) == few

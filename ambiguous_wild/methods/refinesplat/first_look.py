@@ -110,41 +110,39 @@ def first_look(
     ]
     ranges = [None if s is None else (cv2.erode(s, _WINDOW), cv2.dilate(s, _WINDOW)) for s in small]
     near = nearest_views(cameras, 2 * config.views)
-    views = config.views
-    answers: list[np.ndarray | None] = [None] * len(small)
-    for asked in range(config.rounds + 1):
-        found: list[np.ndarray | None] = []
-        for view, others in enumerate(near):
-            inverse, ours, last = surfaces[view], small[view], answers[view]
-            if inverse is None or ours is None:
-                found.append(None)
-                continue
-            world = world_points(cameras[view], inverse)
-            seen = [
-                _seen_by(ours, world, cameras[j], surface, limits, answers[j])
-                for j in others[:views]
-                if (surface := surfaces[j]) is not None and (limits := ranges[j]) is not None
-            ]
-            answer = _judge(ours, seen, config)
-            if answer is None:
-                found.append(last)
-                continue
-            answer = _smoothed(answer, ours, config.smooth)
-            # half of the last answer: without it, two photos may mask each other in turn
-            found.append(answer if last is None else 0.5 * (answer + last))
-        changed = _changed(answers, found)
-        answers = found
-        if not asked:
-            views = (2 if _masked_share(answers) >= config.crowd else 1) * config.views
-        elif changed < _SETTLED:
+
+    def answer(view: int, views: int, before: Sequence[np.ndarray | None]) -> np.ndarray | None:
+        inverse, ours, last = surfaces[view], small[view], before[view]
+        if inverse is None or ours is None:
+            return None
+        # computed again in every round: kept, they would take 0.5 MB a photo
+        world = world_points(cameras[view], inverse)
+        seen = [
+            _seen_by(ours, world, cameras[j], surface, limits, before[j])
+            for j in near[view][:views]
+            if (surface := surfaces[j]) is not None and (limits := ranges[j]) is not None
+        ]
+        found = _judge(ours, seen, config)
+        if found is None:
+            return last
+        found = _smoothed(found, ours, config.smooth)
+        # half of the last answer: without it, two photos may mask each other in turn
+        return found if last is None else 0.5 * (found + last)
+
+    everything = range(len(small))
+    answers = [answer(view, config.views, [None] * len(small)) for view in everything]
+    views = config.views * (2 if masked_share(answers) >= config.crowd else 1)
+    for _ in range(config.rounds):
+        before, answers = answers, [answer(view, views, answers) for view in everything]
+        if _changed(before, answers) < _SETTLED:
             break
-    weight = config.crowd_weight if _masked_share(answers) >= config.crowd else config.weight
-    return [None if answer is None else FirstLook(answer, config.least, weight) for answer in answers]
+    weight = config.crowd_weight if masked_share(answers) >= config.crowd else config.weight
+    return [None if found is None else FirstLook(found, config.least, weight) for found in answers]
 
 
-def _masked_share(answers: Sequence[np.ndarray | None]) -> float:
-    """Share of a photo that is masked, in the mean of all that have an answer."""
-    shares = [float((answer > 0.5).mean()) for answer in answers if answer is not None]
+def masked_share(answers: Sequence[np.ndarray | None]) -> float:
+    """Share of a photo that is masked, in the mean of all that have an answer; 0 if none has."""
+    shares = [float((found > 0.5).mean()) for found in answers if found is not None]
     return float(np.mean(shares)) if shares else 0.0
 
 

@@ -15,7 +15,7 @@ from ambiguous_wild.methods.masking_common import PausingMask, upsampled
 from ambiguous_wild.methods.refinesplat import pictures
 from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.evidence import Judged, Maps, Masks, compare, silence
-from ambiguous_wild.methods.refinesplat.first_look import FirstLook, first_look
+from ambiguous_wild.methods.refinesplat.first_look import FirstLook, first_look, masked_share
 from ambiguous_wild.methods.refinesplat.inputs import FrozenInputs
 from ambiguous_wild.methods.refinesplat.losses import consistency_loss, identity_loss, instance_matrix
 from ambiguous_wild.methods.refinesplat.on_device.mask_builder import DeviceMasks, only_on_host
@@ -144,15 +144,10 @@ class RefineSplatMask(PausingMask):
             "t_ent_mean": float(finite.mean()) if len(finite) else None,
             "w2": self.w2,
             # of a photo, in the mean: what the first look masks
-            "first_look_share": self._first_share,
+            "first_look_share": masked_share([look.passing for look in self.looks.values()]),
             # pictures may read identities that the training never used
             "identities": self.inputs.semantics.found.count if self._reads_identities else None,
         }
-
-    @property
-    def _first_share(self) -> float | None:
-        masked = [float((look.passing > 0.5).mean()) for look in self.looks.values()]
-        return float(np.mean(masked)) if masked else None
 
     @property
     def _reads_identities(self) -> bool:

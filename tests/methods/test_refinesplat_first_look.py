@@ -86,6 +86,17 @@ def test_a_photo_of_other_exposure_is_not_left_out():
     assert all(np.mean(~keep) < 0.05 for keep in keeps(photos))
 
 
+@pytest.mark.parametrize("gain", [False, True])
+def test_photos_of_other_exposures_each_are_no_crowd(gain):
+    photos, masks = passers()
+    rng = np.random.default_rng(2)
+    change = [rng.uniform(0.6, 1.4) if gain else rng.uniform(-0.2, 0.2) for _ in photos]
+    changed = [p * c if gain else p + c for p, c in zip(photos, change)]
+    found = looks(changed, dataclasses.replace(JUDGE_ALL, crowd_weight=4.0))
+    assert {look.weight for look in found} == {JUDGE_ALL.weight}
+    assert wrong(changed, masks, JUDGE_ALL) < wrong(photos, masks, JUDGE_ALL) + 0.02
+
+
 def test_where_nothing_is_known_everything_counts():
     photos, _ = passers()
     assert keeps(photos, cloud=points()[:3]) == [None] * VIEWS

@@ -186,6 +186,16 @@ def test_only_in_a_crowd_the_answers_weigh_as_in_a_crowd():
     assert {look.weight for look in looks(crowd()[0], config)} == {4.0}
 
 
+def test_later_masks_cover_a_few_times_what_the_first_look_masks():
+    found = looks(passers()[0], dataclasses.replace(JUDGE_ALL, most=2.0, most_least=0.1))
+    for look in found:
+        assert look.most == pytest.approx(2.0 * np.mean(look.passing > 0.5))
+    alone = [wall(view) for view in range(VIEWS)]
+    assert {look.most for look in looks(alone, dataclasses.replace(JUDGE_ALL, most_least=0.1))} == {0.1}
+    assert {look.most for look in looks(alone, dataclasses.replace(JUDGE_ALL, most=0))} == {1.0}
+    assert {look.most for look in looks(crowd()[0], dataclasses.replace(JUDGE_ALL, most=9))} == {1.0}
+
+
 def test_a_crowd_that_no_answer_settles_ends_after_the_rounds():
     photos, _ = crowd()
     few = looks(photos, dataclasses.replace(JUDGE_ALL, rounds=2))

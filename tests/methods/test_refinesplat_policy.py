@@ -231,6 +231,23 @@ def test_the_first_look_the_ceiling_and_the_sparse_points_reach_the_masks(scene)
 
 
 @BOTH
+def test_a_mask_is_limited_by_the_photos_first_look(scene, config):
+    limited = dataclasses.replace(
+        config, first_look=dataclasses.replace(config.first_look, most=1.0, most_least=0.05)
+    )
+    shares = []
+    for each in (
+        dataclasses.replace(config, first_look=dataclasses.replace(config.first_look, most=0.0)),
+        limited,
+    ):
+        policy = fresh(scene, each)
+        assert 1 in policy.looks
+        keep = policy.keep(step_of(scene.data, 1, torch.zeros(HEIGHT, WIDTH, 3)))
+        shares.append(float((keep == 0).float().mean()))
+    assert shares[1] <= policy.looks[1].most + 1e-6 < shares[0]
+
+
+@BOTH
 def test_a_render_that_shows_nothing_masks_at_most_the_stated_share(scene, config):
     policy = fresh(scene, config)
     keep = policy.keep(step_of(scene.data, 1, torch.zeros(HEIGHT, WIDTH, 3)))

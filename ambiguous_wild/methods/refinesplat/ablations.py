@@ -127,6 +127,7 @@ ABLATIONS = (
             Variant("no-first-look", ("first_look.on=false",), "no masks before the first renders"),
             Variant("first-look-once", ("first_look.rounds=0",), "not asked again"),
             Variant("first-look-rough", ("first_look.smooth=0",), "not smoothed"),
+            Variant("unbounded", ("first_look.most=0",), "masks of any size, whatever the first look masks"),
             Variant("calm-crowd", ("first_look.crowd_weight=1.5",), "a crowd weighs as elsewhere"),
             Variant(
                 "first-look-first",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -111,6 +112,8 @@ class HostMasks:
             unseen = self.pixels.unseen(view)
         else:
             maps = self.compare(step)
+        if view in self.looks:
+            mask = replace(mask, most=min(mask.most, self.looks[view].most))
         others = [self.judged[v] for v in sorted(self.judged) if v != view]
         labels, static = self.labels[view], self.static[view]
         return maps, make_masks(maps, labels, static, others, self.w2, mask, ceiling, unseen)

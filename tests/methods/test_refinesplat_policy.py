@@ -230,17 +230,6 @@ def test_the_first_look_the_ceiling_and_the_sparse_points_reach_the_masks(scene)
     assert unseen.any() and (keep[unseen] == 1.0).all() and keep.min() == 0.0
 
 
-def test_a_mask_is_limited_by_the_photos_first_look(scene):
-    config = dataclasses.replace(FAST, mask=dataclasses.replace(FAST.mask, ceiling_least=0.0))
-    step = step_of(scene.data, 1, torch.zeros(HEIGHT, WIDTH, 3))  # nothing of what the photo shows
-    shares = {}
-    for limit in (0.0, 1.0):
-        look = dataclasses.replace(config.first_look, most=limit, most_least=0.01)
-        policy = fresh(scene, dataclasses.replace(config, first_look=look))
-        shares[limit] = float((policy.keep(step) == 0).float().mean())
-    assert shares[1.0] <= policy.looks[1].most < shares[0.0], shares
-
-
 @BOTH
 def test_a_render_that_shows_nothing_masks_at_most_the_stated_share(scene, config):
     policy = fresh(scene, config)

@@ -1,0 +1,25 @@
+"""Later masks cover no more of a photo than its first look allows."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from tests.methods.on_device import capture
+from tests.methods.test_refinesplat_policy import FAST, HEIGHT, WIDTH, fresh, step_of
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    yield from capture(tmp_path_factory.mktemp("limit"))
+
+
+def test_a_mask_is_limited_by_the_photos_first_look(scene):
+    mask, shares = dataclasses.replace(FAST.mask, ceiling_least=0.0), []
+    for limit in (0.0, 1.0):
+        look = dataclasses.replace(FAST.first_look, most=limit, most_least=0.01)
+        policy = fresh(scene, dataclasses.replace(FAST, mask=mask, first_look=look))
+        shares.append(
+            (policy.keep(step_of(scene.data, 1, torch.zeros(HEIGHT, WIDTH, 3))) == 0).float().mean()
+        )
+    assert shares[1] <= policy.looks[1].most < shares[0], shares

@@ -196,6 +196,13 @@ def test_later_masks_cover_a_few_times_what_the_first_look_masks():
     assert {look.most for look in looks(crowd()[0], dataclasses.replace(JUDGE_ALL, most=9))} == {1.0}
 
 
+def test_a_first_look_at_a_corner_says_nothing_of_a_masks_size():
+    corner = [p for p in points() if p[0] < -1.9 and p[1] < -1.2]
+    found = looks([wall(view) for view in range(VIEWS)], cloud=np.array(corner))
+    assert any(found)
+    assert all(look is None or look.most == 1.0 for look in found)
+
+
 def test_a_crowd_that_no_answer_settles_ends_after_the_rounds():
     photos, _ = crowd()
     few = looks(photos, dataclasses.replace(JUDGE_ALL, rounds=2))

@@ -20,7 +20,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -31,8 +32,12 @@ from ambiguous_wild.methods.refinesplat.agreement import common_offset, quantile
 from ambiguous_wild.methods.refinesplat.multiview import nearest_views
 from ambiguous_wild.vision.sparse_surface import BEHIND, PIXELS, in_map, world_points
 
+if TYPE_CHECKING:
+    from ambiguous_wild.methods.refinesplat.config import MaskConfig
+
 _SETTLED = 0.005  # share of pixels: if fewer change in a round, it is the last
 _EDGE = 0.003  # variance of colours in [0, 1] that is an edge for the filter
+_FEW = 0.1  # of a photo: if surfaces are known for less, its answer says nothing of a mask's size
 _WINDOW = np.ones((3, 3), np.uint8)  # px of the map around the place where a colour may lie
 
 
@@ -96,6 +101,10 @@ class FirstLook:
         """Factor of the evidence of later masks, [H, W] float32 in [1 / weight, weight]."""
         return np.power(np.float32(self.weight), 2.0 * _resized(self.passing, shape) - 1.0)
 
+    def limited(self, mask: MaskConfig) -> MaskConfig:
+        """How later masks of this photo are made: they cover no more than `most`."""
+        return replace(mask, most=min(mask.most, self.most))
+
 
 def first_look(
     cameras: Sequence[Camera],
@@ -145,14 +154,14 @@ def first_look(
             break
     weight = config.crowd_weight if masked_share(answers) >= config.crowd else config.weight
     return [
-        None if found is None else FirstLook(found, config.least, weight, _most(found, config))
-        for found in answers
+        None if found is None else FirstLook(found, config.least, weight, _most(found, inverse, config))
+        for found, inverse in zip(answers, surfaces, strict=True)
     ]
 
 
-def _most(answer: np.ndarray, config: FirstLookConfig) -> float:
+def _most(answer: np.ndarray, inverse: np.ndarray | None, config: FirstLookConfig) -> float:
     """Share of the photo that later masks may cover."""
-    if config.most <= 0:
+    if config.most <= 0 or inverse is None or np.isfinite(inverse).mean() < _FEW:
         return 1.0
     return min(max(config.most * masked_share([answer]), config.most_least), 1.0)
 

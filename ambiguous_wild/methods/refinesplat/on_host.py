@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -39,6 +38,7 @@ class HostMasks:
     ) -> None:
         self.config, self.looks, self.labels, self.static = config, looks, labels, static
         self.device, self.compare = device, compare
+        self.limited = {view: look.limited(config.mask) for view, look in looks.items()}
         self.pixels = PixelEvidence(
             photos,
             cameras,
@@ -92,7 +92,7 @@ class HostMasks:
             step: of any train view.
             remember: whether the evidence is stored for other views; else nothing is kept.
         """
-        view, mask = step.view, self.config.mask
+        view, mask = step.view, self.limited.get(step.view, self.config.mask)
         ceiling, unseen = math.inf, None
         if mask.statistic == "structure":
             rendered = step.rendered
@@ -112,8 +112,6 @@ class HostMasks:
             unseen = self.pixels.unseen(view)
         else:
             maps = self.compare(step)
-        if view in self.looks:
-            mask = replace(mask, most=min(mask.most, self.looks[view].most))
         others = [self.judged[v] for v in sorted(self.judged) if v != view]
         labels, static = self.labels[view], self.static[view]
         return maps, make_masks(maps, labels, static, others, self.w2, mask, ceiling, unseen)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -61,7 +60,7 @@ class DeviceMasks:
             for view, look in looks.items()
             if look.weight != 1
         }
-        self.limits = {view: look.most for view, look in looks.items()}  # of the photo, that is masked
+        self.limited = {view: look.limited(config.mask) for view, look in looks.items()}
         self.keeps: dict[int, Tensor] = {}  # view: [H, W] float32; of the views that have a mask
         wide, views = torch.float64, len(photos)
         # [views, K] mean evidence of every instance when its mask was last made, NaN where there is none
@@ -109,14 +108,13 @@ class DeviceMasks:
         return Maps(evidence, evidence), Masks(local, global_, keep, judged, cut)
 
     def _make(self, step: Step, *, remember: bool) -> tuple[Tensor, PhotoMasks]:
-        view, rendered, config = step.view, step.rendered, self.config.mask
+        view, rendered = step.view, step.rendered
+        config = self.limited.get(view, self.config.mask)
         evidence, unit = self.pixels.look(
             view, rendered.image.detach(), rendered.alpha.detach(), rendered.depth.detach(), remember=remember
         )
         if view in self.factors:
             evidence = evidence * self.factors[view]
-        if view in self.limits:
-            config = replace(config, most=min(config.most, self.limits[view]))
         w2 = torch.sigmoid(self.theta) if self.fixed_w2 is None else self.fixed_w2
         seen, ceiling = self.pixels.seen[view], self.pixels.ceiling(unit)
         return evidence, make_masks(view, evidence, self.labels, self.means, w2, config, ceiling, seen)

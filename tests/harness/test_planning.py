@@ -317,3 +317,13 @@ def test_a_run_says_what_was_on_and_why_and_ships_the_filtered_model(tiny, tmp_p
     assert not any(math.isnan(row["psnr"]) for row in report.result["per_image"])
     with pytest.raises(AwError, match="effects was"):
         run_cells(plan_cells(["3dgs"], [tiny], [0], SHORT, protocol="half"), tmp_path)
+
+
+def test_options_are_checked_before_a_plan_is_made(tmp_path, monkeypatch):
+    scene = write_tiny_scene(tmp_path / "scene")
+    monkeypatch.setattr("ambiguous_wild.harness.running.grid.choose", pytest.fail)
+    with pytest.raises(AwError, match="most is at least 0, got -1"):
+        plan_cells(
+            ["refinesplat"], [scene], [0], TrainConfig(),
+            settings=["refinesplat.first_look.most=-1"], effects="default",
+        )  # fmt: skip

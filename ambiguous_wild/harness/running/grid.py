@@ -57,7 +57,10 @@ def plan_cells(
     """
     named = _named(methods)
     by_method = _settings_by_method(settings, list(named.values()))
-    entries = [(entry, by_method[name]) for name, entry in named.items()]
+    resolved = [  # before a plan is made: that trains
+        (entry, with_options(entry.options(), by_method[name], f"option of {entry.name}"))
+        for name, entry in named.items()
+    ]
     distinct = list({path.resolve(): path for path in scenes}.values())
     loaded = [load_scene(path, factor=factor) for path in distinct]
     names = [scene.name for scene in loaded]
@@ -70,14 +73,13 @@ def plan_cells(
     cells = []
     for scene in loaded:
         identity = scene_identity(scene)
-        chosen = choose(effects, scene, [entry for entry, _ in entries], plan, probing)
+        chosen = choose(effects, scene, list(named.values()), plan, probing)
         measured = protocol or scene_protocol(scene)
-        for entry, options in entries:
-            resolved = with_options(entry.options(), options, f"option of {entry.name}")
+        for entry, options in resolved:
             for seed in dict.fromkeys(seeds):
                 config = dataclasses.replace(train, seed=seed)
                 cells.append(
-                    Cell(entry, resolved, scene, identity, config, device, chosen[entry.name], measured)
+                    Cell(entry, options, scene, identity, config, device, chosen[entry.name], measured)
                 )
     return cells
 

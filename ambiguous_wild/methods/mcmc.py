@@ -94,14 +94,15 @@ class McmcDensity(DensityControl):
         return True  # noise in every step
 
     def _grow(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> Gaussians:
-        dead = torch.sigmoid(gaussians.opacity_logits) <= self.config.dead_opacity
-        if 0 < (count := int(dead.sum())) < len(gaussians):
-            sources = self._draw(gaussians, optimiser, ~dead, count)
+        free = ~self.spared(gaussians)
+        dead = (torch.sigmoid(gaussians.opacity_logits) <= self.config.dead_opacity) & free
+        if 0 < (count := int(dead.sum())) < int(free.sum()):
+            sources = self._draw(gaussians, optimiser, ~dead & free, count)
             for _, tensor in gaussians.rows():
                 tensor[dead] = tensor[sources]
             gaussians.means[dead] += self._offsets(gaussians.select(sources))
         most = min(len(gaussians) // 20, self.room(step, gaussians))
-        new = gaussians.select(self._draw(gaussians, optimiser, torch.ones_like(dead), most))
+        new = gaussians.select(self._draw(gaussians, optimiser, free, most))
         new.means += self._offsets(new)
         optimiser.append(len(new))
         self.log.grew(len(new), 0, new.means)

@@ -80,7 +80,7 @@ class PupDensity(DensityControl):
             return gaussians, events
         self.done += 1
         share = 1.0 - (1.0 - config.share) ** (1.0 / config.rounds)
-        drop = removed(log_det(self.blocks(step, gaussians)), share)
+        drop = removed(log_det(self.blocks(step, gaussians)), share) & ~self.spared(gaussians)
         if bool(drop.all()):
             return gaussians, events
         optimiser.flush()

@@ -6,7 +6,7 @@ Source: 3D Gaussian Splatting (Kerbl et al. 2023), section 5; constants as in gs
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -92,6 +92,8 @@ class DensityControl:
         self.last_reset = 0  # iteration
         self.resets_done = 0
         self.log = DensityLog()  # for pictures; decides nothing
+        # of means [N, 3] the rows [N] that stay as they are: an effect's; None = all may change
+        self.spares: Callable[[Tensor], Tensor] | None = None
         self._halves: dict[tuple[int, int], Tensor] = {}
 
     def setup(self, data: TrainData) -> None:
@@ -136,6 +138,7 @@ class DensityControl:
             # Lazily stepped rows are brought up to date first: growth copies parameters.
             optimiser.flush()
             self.log.begin(step.iteration)
+            self._ignore(self.spared(gaussians))
             gaussians = self._grow(step, gaussians, optimiser)
             gaussians = self._prune(gaussians, optimiser)
             gaussians = self.after_growth(step, gaussians, optimiser)
@@ -149,6 +152,17 @@ class DensityControl:
             self.last_reset = step.iteration
             events.append("reset")
         return gaussians, events
+
+    def spared(self, gaussians: Gaussians) -> Tensor:
+        """[N] bool: rows that are neither copied nor removed."""
+        if self.spares is None:
+            return torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.device)
+        return self.spares(gaussians.means)
+
+    def _ignore(self, rows: Tensor) -> None:
+        """As if no view had seen these rows since the last round."""
+        for name in self.sums:
+            getattr(self, name)[rows] = 0.0
 
     def reset_opacity(self, gaussians: Gaussians) -> None:
         """Hook: lower the opacities, in place."""
@@ -246,6 +260,7 @@ class DensityControl:
         drop |= ~torch.isfinite(gaussians.means).all(dim=1)
         if self.last_reset:
             drop |= gaussians.log_scales.exp().amax(dim=1) > config.prune_scale * self.extent
+        drop &= ~self.spared(gaussians)
         if not bool(drop.any()) or bool(drop.all()):
             # An empty model cannot learn again: a round that would remove everything removes nothing.
             return gaussians

@@ -27,6 +27,8 @@ from ambiguous_wild.splat.step import Step, TrainData
 # 20.1 dB instead of 21.2 in a yard of 16 photos
 START_SHARE = 2 / 3
 
+# (data, how many at most) -> xyz [M, 3] and rgb [M, 3] uint8
+MorePoints = Callable[[TrainData, int], tuple[np.ndarray, np.ndarray]]
 State = dict[str, Any]  # nested dicts of tensors and plain values, see checkpoint.py
 
 
@@ -141,13 +143,26 @@ class Parts:
     start_scale: float = 1.0  # times 3DGS's
     # the first Gaussians; None = one at every point of the sparse model and of `more_points`
     start: Callable[[TrainData], Gaussians] | None = None
-    # (data, how many at most): xyz [M, 3] and rgb [M, 3] uint8 of further points to start from
-    more_points: Callable[[TrainData, int], tuple[np.ndarray, np.ndarray]] | None = None
+    more_points: MorePoints | None = None  # further points to start from
     blur: float = BLUR  # px^2 added to both variances of a splat
     fields: Fields | None = None  # other fields beside the static one, see fields.py
     # trains on something else than the capture's photos (references on clean ones); None = the capture
     train_data: Callable[[TrainData], TrainData] | None = None
     effects: tuple[Effect, ...] = ()  # optional ones, see effects/; none = that code is never reached
+
+    def with_more_points(self, points: MorePoints) -> Parts:
+        """Starts from these too, after those that it has: each gets the room that is left."""
+        before = self.more_points
+        if before is None:
+            return replace(self, more_points=points)
+
+        def both(data: TrainData, most: int) -> tuple[np.ndarray, np.ndarray]:
+            first = before(data, most)
+            room = most - len(first[0])
+            rest = points(data, room) if room > 0 else (np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+            return np.concatenate([first[0], rest[0]]), np.concatenate([first[1], rest[1]])
+
+        return replace(self, more_points=both)
 
     def first_gaussians(self, data: TrainData, most: int = 0) -> Gaussians:
         """What training starts from.

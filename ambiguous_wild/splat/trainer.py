@@ -75,6 +75,7 @@ class Trainer(Run):
             gaussians = gaussians.carrying({name: row.values for name, row in rows.items()})
         density = parts.density(parts.density_config, data.scene.extent, config.seed)
         density.setup(data)
+        density.spares = None if self.effects is None else self.effects.spares()
         self.field = Field(gaussians, rates_with(rows, self.pace.learning_rates), density)
         self.drawing = Drawing(data, parts, self.field, self.effects)
         parts.mask.setup(data)

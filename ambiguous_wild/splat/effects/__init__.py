@@ -22,6 +22,7 @@ EFFECTS: dict[str, tuple[str, str, str]] = {
     "appearance": ("appearance", "AppearanceEmbedding", "light that changes by photo and place"),
     "antialias": ("smoothing", "SmoothingFilter", "Mip-Splatting's filters, for photos from near and far"),
     "poses": ("poses", "PoseRefinement", "a small correction of every camera's pose"),
+    "skybox": ("skybox", "Skybox", "first Gaussians on a far sphere too, for what lies behind the scene"),
     "dense": ("dense", "DenseStart", "first Gaussians on dense points too, for few photos"),
     "near": ("near", "NearSpace", "no Gaussians close before a camera"),
     "sh0": ("", "", "colours that do not depend on the direction"),

@@ -60,6 +60,10 @@ class Effect:
         """What every Gaussian carries for this effect from the start, by name: `Gaussians.extra`."""
         return {}
 
+    def spared(self, means: Tensor) -> Tensor:
+        """[N] bool of means [N, 3]: rows that density control neither copies nor removes."""
+        return torch.zeros(len(means), dtype=torch.bool, device=means.device)
+
     def camera(self, shot: Shot) -> Camera:
         """The camera of a train photo, at the resolution of the step."""
         return shot.camera

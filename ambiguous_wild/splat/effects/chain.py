@@ -72,6 +72,13 @@ class Chain:
                 found[name] = row
         return found
 
+    def spares(self) -> Callable[[Tensor], Tensor] | None:
+        """Which rows density control leaves alone, from means [N, 3]; None = no effect spares any."""
+        sparing = self._with("spared")
+        if not sparing:
+            return None
+        return lambda means: torch.stack([effect.spared(means) for effect in sparing]).any(dim=0)
+
     def camera(self, shot: Shot) -> Camera:
         """The camera of a train photo as the effects have it."""
         for effect in self._with("camera"):

@@ -85,6 +85,7 @@ class McmcDensity(DensityControl):
         g, events = super().refine(step, gaussians, optimiser)
         noise = torch.from_numpy(self.rng.standard_normal((len(g), 3), dtype=np.float32)).to(g.device)
         gate = torch.sigmoid(100 * (0.005 - torch.sigmoid(g.opacity_logits)))
+        gate = torch.where(self.spared(g), torch.zeros_like(gate), gate)
         half = rotation_matrices(g.quats) * g.log_scales.exp()[:, None, :]  # covariance = half half^T
         pushed = noise * (gate * self.config.noise * optimiser.rates["means"])[:, None]
         g.means += (half @ (half.mT @ pushed[:, :, None])).squeeze(2)

@@ -141,7 +141,10 @@ def test_a_dense_start_leaves_room_to_grow(scene, tmp_path, monkeypatch):
 # -- state ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("names", [*((name,) for name in ALL), ALL, ("sh1",), ("dense",)], ids="+".join)
+STARTS = (("dense",), ("skybox", "dense"))
+
+
+@pytest.mark.parametrize("names", [*((name,) for name in ALL), ALL, ("sh1",), *STARTS], ids="+".join)
 def test_a_resumed_run_equals_an_undisturbed_one(scene, tmp_path, names):
     whole = trainer_for(scene, tmp_path / "whole", names, iterations=140)
     whole.train()

@@ -1,0 +1,147 @@
+"""A skybox: where it lies, what colour it has, and that density control leaves it alone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.methods.registry import get_method
+from ambiguous_wild.splat.data import load_train_data
+from ambiguous_wild.splat.density import DensityConfig
+from ambiguous_wild.splat.effects import skybox, with_effects
+from ambiguous_wild.splat.effects.skybox import COUNT, LEAST, Skybox, sphere_of, spread
+from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.trainer import Trainer
+from tests.tiny_scene import write_tiny_scene
+
+MANY = 1_000_000
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    scene = load_scene(write_tiny_scene(tmp_path_factory.mktemp("data") / "scene", distractors=False))
+    return load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=tmp_path_factory.mktemp("c"))
+
+
+def painted(data, colours, keeps=None):
+    """The capture with photos of one colour each, and masks."""
+    photos = [torch.ones_like(p) * torch.tensor(c) for p, c in zip(data.photos, colours)]
+    return replace(data, photos=photos, user_keep=keeps or [None] * len(photos))
+
+
+def shares(camera, xyz):
+    """[N] bool: before the camera and in its picture."""
+    local = xyz @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+    u, v = (
+        camera.fx * local[:, 0] / local[:, 2] + camera.cx,
+        camera.fy * local[:, 1] / local[:, 2] + camera.cy,
+    )
+    return (local[:, 2] > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+
+
+def test_it_lies_far_behind_cameras_and_points_where_photos_look(data):
+    xyz, rgb = Skybox().points(data, MANY)
+    middle, radius = sphere_of(data.cameras, data.scene.points.xyz)
+    assert xyz.shape == rgb.shape and rgb.dtype == np.uint8 and 0 < len(xyz) < COUNT
+    np.testing.assert_allclose(np.linalg.norm(xyz - middle, axis=1), radius)
+    for camera in data.cameras:
+        centre = -camera.cam_from_world[:3, :3].T @ camera.cam_from_world[:3, 3]
+        assert np.linalg.norm(centre - middle) <= radius / 8 * 1.001
+    looked_at = np.any([shares(camera, xyz) for camera in data.cameras], axis=0)
+    assert looked_at.all()
+
+
+def test_directions_are_spread_evenly():
+    directions = spread(1000)
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1.0)
+    cosines = directions @ directions.T - 2 * np.eye(1000)
+    nearest = np.degrees(np.arccos(cosines.max(axis=1)))
+    assert nearest.min() > 0.7 * nearest.max()
+
+
+def test_its_colour_is_the_median_of_the_photos(data):
+    n = len(data.photos)
+    _, rgb = Skybox().points(painted(data, [(0.2, 0.4, 0.6)] * n), MANY)
+    assert (rgb == [51, 102, 153]).all()
+    odd = [(0.2, 0.4, 0.6)] * n
+    odd[0] = (1.0, 0.0, 0.0)  # a photo of another colour is outvoted wherever three look
+    xyz, rgb = Skybox().points(painted(data, odd), MANY)
+    seen = np.sum([shares(camera, xyz) for camera in data.cameras], axis=0)
+    assert (seen >= 3).any() and (rgb[seen >= 3] == [51, 102, 153]).all()
+
+
+def test_what_the_capture_masks_is_no_background(data):
+    n = len(data.photos)
+    masked = [torch.zeros(p.shape[:2]) for p in data.photos[:1]] + [None] * (n - 1)
+    odd = [(1.0, 0.0, 0.0)] + [(0.2, 0.4, 0.6)] * (n - 1)
+    _, rgb = Skybox().points(painted(data, odd, masked), MANY)
+    assert len(rgb) and (rgb == [51, 102, 153]).all()
+    everything = [torch.zeros(p.shape[:2]) for p in data.photos]
+    assert len(Skybox().points(painted(data, odd, everything), MANY)[0]) == 0
+
+
+def test_with_little_room_it_is_coarser_and_still_all_around(data):
+    whole, _ = Skybox().points(data, MANY)
+    _, radius = sphere_of(data.cameras, data.scene.points.xyz)
+    effect = Skybox()
+    half, _ = effect.points(data, len(whole) - 1)
+    assert effect.facts() == {"points": len(half)} and 0.3 * len(whole) < len(half) < len(whole)
+    spacing = 3.6 / np.sqrt(COUNT / 2)  # of the coarser lattice, with a margin
+    far = (whole[:, None] - half[None]) / radius
+    assert np.linalg.norm(far, axis=2).min(axis=1).max() < 2 * spacing
+    assert len(Skybox().points(data, 0)[0]) == 0
+    tiny = Skybox()
+    count = len(tiny.points(data, 3)[0])
+    assert count <= 3 and LEAST > 0
+
+
+def trainer_for(data, folder, parts, iterations=140, **config):
+    config = TrainConfig(**{"iterations": iterations, "probes": 0} | config)
+    return Trainer(data, with_effects(parts, ("skybox",)), config, folder=folder)
+
+
+def far_rows(trainer):
+    return int(trainer.effects.effects[-1].spared(trainer.gaussians.means).sum())
+
+
+EAGER = {"start": 0.0, "stop": 10_000.0, "every": 1.0, "min_every": 20, "grow_grad": 1e-9}
+
+
+def test_density_control_neither_copies_nor_removes_it(data, tmp_path):
+    parts = Parts(density_config=DensityConfig(**EAGER, prune_opacity=0.2))
+    trainer = trainer_for(data, tmp_path, parts)
+    first, near = far_rows(trainer), len(trainer.gaussians) - far_rows(trainer)
+    assert first == trainer.effects.facts()["skybox"]["points"] > 0
+    trainer.train()
+    assert far_rows(trainer) == first
+    assert len(trainer.gaussians) - first != near  # the others changed
+
+
+def test_without_it_far_gaussians_are_copied(data, tmp_path, monkeypatch):
+    """The test above can fail."""
+    monkeypatch.setattr(skybox.Skybox, "spared", skybox.Effect.spared)
+    parts = Parts(density_config=DensityConfig(**EAGER, prune_opacity=0.2))
+    trainer = trainer_for(data, tmp_path, parts)
+    first = len(Skybox().points(data, MANY)[0])
+    trainer.train()
+    middle, radius = sphere_of(data.cameras, data.scene.points.xyz)
+    away = np.linalg.norm(trainer.gaussians.means.numpy() - middle, axis=1) > radius / 2
+    assert away.sum() != first
+
+
+@pytest.mark.parametrize(
+    "name", ["refinesplat", "mcmc", "pup-3dgs", "absgs", "spotlesssplats", "robustsplat"]
+)
+def test_every_kind_of_density_control_leaves_it_alone(data, tmp_path, name):
+    method = get_method(name)
+    parts = method.build(method.options())
+    eager = {k: v for k, v in EAGER.items() if k != "grow_grad" or name != "mcmc"}  # which it refuses
+    parts = replace(parts, density_config=replace(parts.density_config, **eager))
+    trainer = trainer_for(data, tmp_path, parts, iterations=120)
+    first, most = far_rows(trainer), len(trainer.gaussians)
+    trainer.train()
+    assert far_rows(trainer) == first > 0
+    assert len(trainer.gaussians) != most  # it did act

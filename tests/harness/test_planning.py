@@ -75,8 +75,8 @@ def synthetic(*, exposure=0.0, place=0.0, zoom=1.0, noise_px=0.0, shine=0.0, see
 
 
 def measured(**kw):
-    """As of a capture of many photos; there are few, to be quick."""
-    return dataclasses.replace(measure(*synthetic(**kw)), photos=FEW_PHOTOS + 1)
+    """As of many photos that the scene fills; here are few, to be quick, and dots leave gaps."""
+    return dataclasses.replace(measure(*synthetic(**kw)), photos=FEW_PHOTOS + 1, uncovered=0.0)
 
 
 def decisions(**kw):
@@ -95,7 +95,7 @@ INJECTED = {
 @pytest.mark.parametrize("seed", [0, 1])
 def test_nothing_is_called_for_where_nothing_was_put_in(seed):
     found = decisions(seed=seed)
-    off = dict.fromkeys([*INJECTED, "dense start"], "off")
+    off = dict.fromkeys([*INJECTED, "skybox", "dense start"], "off")
     assert {name: d.decision for name, d in found.items()} == off
 
 
@@ -128,6 +128,31 @@ def test_cameras_in_the_middle_of_a_place_call_for_a_dense_start(outward, dense)
     assert line.decision == dense
     shown = (line.value, line.threshold, line.unit)
     assert shown == ((outward, OUTWARD, "times") if dense == "on" else (25, FEW_PHOTOS, "photos"))
+
+
+@pytest.mark.parametrize(("uncovered", "skybox"), [(0.06, "off"), (0.11, "on"), (math.nan, "unknown")])
+def test_what_lies_behind_the_scene_calls_for_a_skybox(uncovered, skybox):
+    plan = decide("dots", dataclasses.replace(measured(), uncovered=uncovered))
+    assert [d.decision for d in plan.decisions if d.effect == "skybox"] == [skybox]
+    assert plan.effects() == (("skybox",) if skybox == "on" else ())
+    chosen = choose("default", synthetic()[0], [get_method("refinesplat")], plan)["refinesplat"]
+    assert chosen.effects == plan.effects()
+
+
+def test_the_uncovered_share_is_where_no_points_lie():
+    scene, _ = synthetic()
+    share = evidence_module.uncovered(scene)
+    corners = scene.points.xyz[np.abs(scene.points.xyz).max(axis=1) > 0.5]
+    wide = np.concatenate([corners * 40 + [0, 0, 60.0], scene.points.xyz])  # a far wall behind the dots
+    assert 0.3 < share < 0.8
+    count = len(wide)
+    more = dataclasses.replace(
+        scene.points, xyz=wide, rgb=np.zeros((count, 3), np.uint8), error_px=np.zeros(count),
+        track_offsets=np.zeros(count + 1, np.int64), track_views=np.zeros(0, np.int32),
+        track_xy=np.zeros((0, 2), np.float32),
+    )  # fmt: skip
+    assert evidence_module.uncovered(dataclasses.replace(scene, points=more)) < share / 2
+    assert math.isnan(evidence_module.uncovered(dataclasses.replace(scene, views=())))
 
 
 def test_cameras_around_a_thing_look_inward_and_those_in_its_middle_outward():
@@ -196,8 +221,10 @@ def test_a_scene_without_tracks_reads_no_photo_and_says_unknown(tmp_path):
     scene, _ = synthetic()
     empty = dataclasses.replace(scene.points, track_views=np.full_like(scene.points.track_views, -1))
     plan = plan_without_training(dataclasses.replace(scene, points=empty))
-    assert {d.decision for d in plan.decisions} == {"unknown"}
-    assert plan.effects() == ()
+    answers = {d.effect: d.decision for d in plan.decisions}
+    assert answers.pop("skybox") == "on"  # that asks where points lie, not who saw them
+    assert set(answers.values()) == {"unknown"}
+    assert plan.effects() == ("skybox",)
 
 
 def test_a_plan_survives_its_file(tmp_path):
@@ -310,7 +337,7 @@ def test_a_run_says_what_was_on_and_why_and_ships_the_filtered_model(tiny, tmp_p
     assert report.outcome == "trained", report.error
     said = json.loads((cell_folder(tmp_path, cells[0]) / "effects.json").read_text())
     assert said["asked"] == "auto" and said["effects"] == ["antialias"]
-    assert {d["effect"] for d in said["plan"]["decisions"]} == {*INJECTED, "dense start"}
+    assert {d["effect"] for d in said["plan"]["decisions"]} == {*INJECTED, "skybox", "dense start"}
     facts = report.result["facts"]
     assert facts["effects"] == ["antialias"] and facts["protocol"] == "half"
     assert facts["effect_facts"]["antialias"]["filter_size_median"] > 0

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 from ambiguous_wild.core import Scene
-from ambiguous_wild.harness.planning.evidence import Evidence, has_tracks, measure
+from ambiguous_wild.harness.planning.evidence import Evidence, has_tracks, measure, uncovered
 
 Answer = Literal["on", "off", "unknown"]
 SCHEMA = 1
@@ -28,6 +28,8 @@ REPROJECTION_PX = 1.0
 OUTWARD = 2.0
 # captures of 9 to 20 photos gained SSIM by a dense start, those of 30 did not (docs/effects.md)
 LEAST_PHOTOS, FEW_PHOTOS = 3, 24
+# simulated courtyards, rooms and yards have 0.01 to 0.06, real captures 0.11 to 0.66 (docs/effects.md)
+UNCOVERED = 0.08
 
 
 @dataclass(frozen=True)
@@ -132,6 +134,7 @@ def decide(scene: str, found: Evidence) -> Plan:
     smooth = answer(found.sampling, SAMPLING)
     bent = answer(found.view_dependence, VIEW_DEPENDENCE)
     moved = answer(found.reprojection_px, REPROJECTION_PX)
+    behind = answer(found.uncovered, UNCOVERED)
     lines: tuple[Decision, ...] = (
         Decision(
             "appearance embedding", "spread at a point after gain and shine", by_place,
@@ -161,6 +164,12 @@ def decide(scene: str, found: Evidence) -> Plan:
             REPROJECTION_PX, "px", moved,
             "poses are off by more than the photos can hide" if moved == "on" else "poses fit the photos",
             "--effects poses",
+        ),
+        Decision(
+            "skybox", "share of the photos where no SfM points lie", found.uncovered, UNCOVERED,
+            "of the pixels", behind,
+            "something lies behind the scene" if behind == "on" else "the scene fills the photos",
+            "--effects skybox",
         ),
         _dense_start(found),
     )  # fmt: skip
@@ -195,8 +204,9 @@ def plan_without_training(scene: Scene) -> Plan:
     Raises:
         AwError: a photo cannot be read.
     """
-    nothing = Evidence(*(math.nan,) * 5, observations=0, photos=len(scene.train))
     if not has_tracks(scene):
+        count, bare = len(scene.train), uncovered(scene)
+        nothing = Evidence(*(math.nan,) * 5, observations=0, photos=count, uncovered=bare)
         return decide(scene.name, nothing)
     from ambiguous_wild.io.images import load_image_float
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from ambiguous_wild.core import Camera, Scene
 from ambiguous_wild.splat.effects.tracks import TrackColours, log_gains, track_colours
+from ambiguous_wild.vision.sparse_surface import static_surfaces
 
 LEAST = 50  # observations below which nothing is said
 LEAST_VIEWS = 6  # of a point, to fit four numbers to its colour
@@ -20,6 +21,7 @@ OUTLYING = 4.5  # median deviations from a point's median colour: three standard
 RELIT = 0.5  # share of a photo's points that are far from their medians: more, and its light is another one
 LEAST_APART = 1e-3  # spread of cameras over the depth they look at; below, they stand at one place
 LEAST_SPREAD = 0.01  # code values, or of the logarithm: the median deviation counts as at least so much
+MOST_PHOTOS = 64  # whose uncovered share is taken
 MOST = 20_000  # points whose view dependence is fitted; more do not change a median
 
 
@@ -35,6 +37,7 @@ class Evidence:
     observations: int  # in train photos, usable for colour
     photos: int = 0  # that train; 0 = not counted
     outward: float = math.nan  # spread of what the train cameras look at, over their own
+    uncovered: float = math.nan  # share of the train photos where no SfM points lie
 
 
 def measure(scene: Scene, photos: Sequence[np.ndarray]) -> Evidence:
@@ -58,6 +61,7 @@ def measure(scene: Scene, photos: Sequence[np.ndarray]) -> Evidence:
         observations=len(colours.point),
         photos=len(scene.train),
         outward=outward(scene),
+        uncovered=uncovered(scene),
     )
 
 
@@ -110,6 +114,19 @@ def outward(scene: Scene) -> float:
     apart, between = (float(np.sqrt(a.var(axis=0).sum())) for a in (cameras, places))
     depth = float(np.median([depth for _, depth in looking]))
     return between / apart if apart > LEAST_APART * depth else float("nan")
+
+
+def uncovered(scene: Scene) -> float:
+    """Share of the train photos' pixels with no SfM points around them, in the mean of up to 64 photos.
+
+    There the photos show what lies behind the scene. Tracks are not needed. NaN without points.
+    """
+    cameras = [view.camera for view in scene.train]
+    cameras = cameras[:: max(-(-len(cameras) // MOST_PHOTOS), 1)]
+    if not cameras or not len(scene.points):
+        return float("nan")
+    surfaces = static_surfaces(cameras, scene.points.xyz)
+    return float(np.mean([1.0 if s is None else np.isnan(s).mean() for s in surfaces]))
 
 
 def _looking_at(scene: Scene) -> list[tuple[Camera, float]]:

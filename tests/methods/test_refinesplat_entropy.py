@@ -8,6 +8,7 @@ import torch
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.methods.refinesplat import masking
+from ambiguous_wild.methods.refinesplat.config import MaskConfig
 from ambiguous_wild.methods.refinesplat.entropy import contrast, entropy, surprise
 from ambiguous_wild.methods.refinesplat.threshold import LearntWeight, objective, soft_threshold, t_ent
 
@@ -255,13 +256,33 @@ def test_a_fixed_global_threshold_and_the_adaptive_one_by_hand():
 
 
 def test_the_mask_is_bounded_and_the_surest_pixels_go():
-    evidence = np.arange(100.0).reshape(10, 10)
-    keep = masking.keep_map(np.ones((10, 10), bool), 0.6, evidence)
-    assert (keep == 0).sum() <= 60
-    assert (keep.ravel()[:40] == 1).all()
+    evidence, config = np.arange(100.0).reshape(10, 10), MaskConfig(most=0.6, fill=0.0, dilation=1)
+    mask = masking.grown(np.ones((10, 10), bool), config, evidence)
+    assert mask.sum() == 59 and not mask.ravel()[:40].any()
     small = evidence > 80
-    assert np.array_equal(masking.keep_map(small, 0.6, evidence), 1.0 - small)
-    assert (masking.keep_map(np.ones((4, 4), bool), 0.5, np.zeros((4, 4))) == 1).all()
+    assert np.array_equal(masking.grown(small, config, evidence), small)
+    assert not masking.grown(np.ones((4, 4), bool), config, np.zeros((4, 4))).any()
+
+
+def test_gaps_of_a_cut_mask_are_filled():
+    block = np.zeros((40, 40), bool)
+    block[5:25, 5:25] = True
+    gap = np.zeros_like(block)
+    gap[10:14, 10:14] = True
+    evidence = np.where(block & ~gap, 5.0, 1.0)
+    evidence[0, 0] = 4.0  # the cut is open: it is the first that is not masked
+    config = MaskConfig(most=385 / 1600, fill=0.05, dilation=1)
+    assert np.array_equal(masking.grown(np.ones((40, 40), bool), config, evidence), block)
+
+
+def test_gaps_are_not_filled_where_nearly_all_would_be_masked():
+    lines = np.zeros((40, 40), bool)
+    lines[::3], lines[:, ::3] = True, True  # 1 - (2 / 3)^2 of the pixels
+    evidence = np.where(lines, 5.0, 1.0)
+    evidence[1, 1] = 4.0
+    config = MaskConfig(most=(lines.sum() + 1) / 1600, fill=0.05, dilation=1)
+    assert masking.fill_holes(lines, 0.05).mean() > 0.9
+    assert np.array_equal(masking.grown(np.ones((40, 40), bool), config, evidence), lines)
 
 
 def test_dilation_is_a_square():

@@ -153,17 +153,19 @@ def make_masks(
         global_ = _global(maps, pixels, cut.threshold, config) & ~masking.local_mask(labels, static)
     else:
         global_ = np.zeros(labels.shape, bool)
-    final = local | global_
+    final, judging = local | global_, pixels
     if config.combine == "fused" and config.use_local and config.use_global:
         of_pixel = np.r_[0.0, np.nan_to_num(means)][np.clip(labels, 0, count)]
         # a pixel without an instance is judged alone
-        both = np.where(labels > 0, np.sqrt(pixels * of_pixel), pixels)
-        final = masking.hysteresis(both, config.hold * cut.threshold, cut.threshold)
+        judging = np.where(labels > 0, np.sqrt(pixels * of_pixel), pixels)
+        final = masking.hysteresis(judging, config.hold * cut.threshold, cut.threshold)
         final &= ~masking.local_mask(labels, static)
-    final = masking.dilate(masking.fill_holes(final, config.fill), config.dilation)
     if unseen is not None:
         final &= ~unseen
-    return Masks(local, global_, masking.keep_map(final, config.most, pixels), judged, cut)
+    final = masking.grown(final, config, judging)
+    if unseen is not None:
+        final &= ~unseen
+    return Masks(local, global_, (~final).astype(np.float32), judged, cut)
 
 
 def _global(maps: Maps, pixels: np.ndarray, threshold: float, config: MaskConfig) -> np.ndarray:

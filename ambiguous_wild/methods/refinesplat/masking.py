@@ -1,18 +1,22 @@
 """Local, global and final masks (RefineSplat, Eqs. 3-7) from maps on the feature grid.
 
-Masks here are bool, True = transient, until `keep_map`: keep = 1 - M_final. Statistics are in float64.
+Masks here are bool, True = transient; keep = 1 - M_final. Statistics are in float64.
 """
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import cv2
 import numpy as np
 
 from ambiguous_wild.core.errors import unknown
 
+if TYPE_CHECKING:
+    from ambiguous_wild.methods.refinesplat.config import MaskConfig
+
 Spread = Literal["var", "std", "robust", "hard"]
+GAPS = 1.25  # times its limit: as large may a mask be whose gaps are filled
 _COS_FLOOR = -1.0 + 1e-3  # U stays below 2000
 
 
@@ -141,18 +145,21 @@ def fill_holes(mask: np.ndarray, share: float) -> np.ndarray:
     return mask | small[regions]
 
 
-def keep_map(transient: np.ndarray, most: float, evidence: np.ndarray | None = None) -> np.ndarray:
-    """keep = 1 - M_final [H, W] float32; of a too large mask only the surest pixels are masked.
+def grown(transient: np.ndarray, config: MaskConfig, evidence: np.ndarray) -> np.ndarray:
+    """M_final [H, W] bool of what passed the threshold: no larger than allowed, gaps filled, dilated.
+
+    Of a too large mask the surest pixels are masked. Their gaps are filled too, because a mask with specks
+    lets a distractor through; the mask may be a quarter larger then (`GAPS`).
 
     Args:
         transient: [H, W] bool.
-        most: largest share of the photo that may be masked.
-        evidence: [H, W], larger = surer; without it a too large mask is dropped.
+        config: `most`, the largest share of the photo that is masked; `fill`, `dilation`.
+        evidence: [H, W], larger = surer.
     """
-    if transient.mean() > most:
-        if evidence is None:
-            return np.ones(transient.shape, dtype=np.float32)
-        inside = np.sort(evidence[transient])
-        cut = inside[len(inside) - max(int(most * transient.size), 1)]
-        transient = transient & (evidence > cut)
-    return (~transient).astype(np.float32)
+    if transient.mean() <= config.most:
+        return dilate(fill_holes(transient, config.fill), config.dilation)
+    inside = np.sort(evidence[transient])
+    cut = inside[len(inside) - max(int(config.most * transient.size), 1)]
+    surest = transient & (evidence > cut)
+    larger = dilate(fill_holes(surest, config.fill), config.dilation)
+    return larger if larger.mean() <= GAPS * config.most else surest

@@ -14,6 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ambiguous_wild.methods.refinesplat.config import MaskConfig
+from ambiguous_wild.methods.refinesplat.masking import GAPS
 from ambiguous_wild.methods.refinesplat.on_device.components import dilate, fill_holes, hysteresis
 from ambiguous_wild.methods.refinesplat.on_device.threshold import Cut, Pool, pool_of, t_ent
 
@@ -105,28 +106,33 @@ def make_masks(
     nothing = torch.zeros(shape, dtype=torch.bool, device=evidence.device)
     local = labels.on_pixels(view, flagged, shape) if config.use_local else nothing
     weak, strong = config.hold * cut.threshold, cut.threshold
+    judging = evidence
     if config.combine == "fused" and config.use_local and config.use_global:
         of_instance = labels.on_pixels(view, means.nan_to_num(nan=0.0), shape)
         # a pixel without an instance is judged alone
         inside = labels.of_pixel[view].view(shape) > 0
-        both = torch.where(inside, (evidence * of_instance).sqrt_(), evidence)
-        final, global_ = hysteresis(torch.stack([both, evidence.double()]), weak, strong)
+        judging = torch.where(inside, (evidence * of_instance).sqrt_(), evidence)
+        final, global_ = hysteresis(torch.stack([judging, evidence.double()]), weak, strong)
     else:
         global_ = hysteresis(evidence[None], weak, strong)[0] if config.use_global else nothing
         final = local | global_
     if static is not None:
         # the union contains none of them
         final, global_ = final & ~static, global_ & ~static
-    final = dilate(fill_holes(final, config.fill), config.dilation)
     if seen is not None:
         final = final & seen
-    return PhotoMasks(local, global_, keep_map(final, config.most, evidence), means, cut, pool)
+    final = grown(final, config, judging)
+    if seen is not None:
+        final = final & seen
+    return PhotoMasks(local, global_, (~final).float(), means, cut, pool)
 
 
-def keep_map(transient: Tensor, most: float, evidence: Tensor) -> Tensor:
-    """As `masking.keep_map`, float32 [H, W] of bool [H, W]."""
+def grown(transient: Tensor, config: MaskConfig, evidence: Tensor) -> Tensor:
+    """As `masking.grown`, [H, W] bool; the host decides nothing, so that it need not wait."""
     size = transient.numel()
     surest = torch.where(transient, evidence, -torch.inf).flatten().sort(descending=True).values
-    cut = surest[max(int(most * size), 1) - 1]
-    too_many = transient.sum() > most * size
-    return (~(transient & ((evidence > cut) | ~too_many))).float()
+    cut = surest[max(int(config.most * size), 1) - 1]
+    too_many = transient.sum() > config.most * size
+    chosen = transient & ((evidence > cut) | ~too_many)
+    larger = dilate(fill_holes(chosen, config.fill), config.dilation)
+    return torch.where(too_many & (larger.sum() > GAPS * config.most * size), chosen, larger)

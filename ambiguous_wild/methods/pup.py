@@ -80,7 +80,10 @@ class PupDensity(DensityControl):
             return gaussians, events
         self.done += 1
         share = 1.0 - (1.0 - config.share) ** (1.0 / config.rounds)
-        drop = removed(log_det(self.blocks(step, gaussians)), share) & ~self.spared(gaussians)
+        score = log_det(self.blocks(step, gaussians))
+        drop = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.device)
+        free = self.free(~drop, gaussians)
+        drop[free] = removed(score[free], share)  # the share is of those that may be removed
         if bool(drop.all()):
             return gaussians, events
         optimiser.flush()

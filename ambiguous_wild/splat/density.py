@@ -92,7 +92,7 @@ class DensityControl:
         self.last_reset = 0  # iteration
         self.resets_done = 0
         self.log = DensityLog()  # for pictures; decides nothing
-        # of means [N, 3] the rows [N] that stay as they are: an effect's; None = all may change
+        # of means [N, 3] the rows [N] that are neither copied nor removed: an effect's; None = there are none
         self.spares: Callable[[Tensor], Tensor] | None = None
         self._halves: dict[tuple[int, int], Tensor] = {}
 
@@ -138,7 +138,7 @@ class DensityControl:
             # Lazily stepped rows are brought up to date first: growth copies parameters.
             optimiser.flush()
             self.log.begin(step.iteration)
-            self._ignore(self.spared(gaussians))
+            self._ignore_spared(gaussians)
             gaussians = self._grow(step, gaussians, optimiser)
             gaussians = self._prune(gaussians, optimiser)
             gaussians = self.after_growth(step, gaussians, optimiser)
@@ -153,16 +153,16 @@ class DensityControl:
             events.append("reset")
         return gaussians, events
 
-    def spared(self, gaussians: Gaussians) -> Tensor:
-        """[N] bool: rows that are neither copied nor removed."""
-        if self.spares is None:
-            return torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.device)
-        return self.spares(gaussians.means)
+    def free(self, rows: Tensor, gaussians: Gaussians) -> Tensor:
+        """[N] bool: of these rows those that may be copied and removed."""
+        return rows if self.spares is None else rows & ~self.spares(gaussians.means)
 
-    def _ignore(self, rows: Tensor) -> None:
-        """As if no view had seen these rows since the last round."""
-        for name in self.sums:
-            getattr(self, name)[rows] = 0.0
+    def _ignore_spared(self, gaussians: Gaussians) -> None:
+        """As if no view had seen the spared rows since the last round."""
+        if self.spares is not None:
+            rows = self.spares(gaussians.means)
+            for name in self.sums:
+                getattr(self, name)[rows] = 0.0
 
     def reset_opacity(self, gaussians: Gaussians) -> None:
         """Hook: lower the opacities, in place."""
@@ -257,10 +257,9 @@ class DensityControl:
     def _prune(self, gaussians: Gaussians, optimiser: SplatAdam) -> Gaussians:
         config = self.config
         drop = torch.sigmoid(gaussians.opacity_logits) < config.prune_opacity
-        drop |= ~torch.isfinite(gaussians.means).all(dim=1)
         if self.last_reset:
             drop |= gaussians.log_scales.exp().amax(dim=1) > config.prune_scale * self.extent
-        drop &= ~self.spared(gaussians)
+        drop = self.free(drop, gaussians) | ~torch.isfinite(gaussians.means).all(dim=1)
         if not bool(drop.any()) or bool(drop.all()):
             # An empty model cannot learn again: a round that would remove everything removes nothing.
             return gaussians

@@ -143,26 +143,12 @@ class Parts:
     start_scale: float = 1.0  # times 3DGS's
     # the first Gaussians; None = one at every point of the sparse model and of `more_points`
     start: Callable[[TrainData], Gaussians] | None = None
-    more_points: MorePoints | None = None  # further points to start from
+    more_points: tuple[MorePoints, ...] = ()  # further points to start from; each gets the room that is left
     blur: float = BLUR  # px^2 added to both variances of a splat
     fields: Fields | None = None  # other fields beside the static one, see fields.py
     # trains on something else than the capture's photos (references on clean ones); None = the capture
     train_data: Callable[[TrainData], TrainData] | None = None
     effects: tuple[Effect, ...] = ()  # optional ones, see effects/; none = that code is never reached
-
-    def with_more_points(self, points: MorePoints) -> Parts:
-        """Starts from these too, after those that it has: each gets the room that is left."""
-        before = self.more_points
-        if before is None:
-            return replace(self, more_points=points)
-
-        def both(data: TrainData, most: int) -> tuple[np.ndarray, np.ndarray]:
-            first = before(data, most)
-            room = most - len(first[0])
-            rest = points(data, room) if room > 0 else (np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
-            return np.concatenate([first[0], rest[0]]), np.concatenate([first[1], rest[1]])
-
-        return replace(self, more_points=both)
 
     def first_gaussians(self, data: TrainData, most: int = 0) -> Gaussians:
         """What training starts from.
@@ -177,10 +163,11 @@ class Parts:
         if self.start is not None:
             return self.start(data)
         xyz, rgb = data.scene.points.xyz, data.scene.points.rgb
-        room = int(START_SHARE * most) - len(xyz)
-        if self.more_points is not None and room > 0:
-            more = self.more_points(data, room)
-            xyz, rgb = np.concatenate([xyz, more[0]]), np.concatenate([rgb, more[1]])
+        for points in self.more_points:
+            room = int(START_SHARE * most) - len(xyz)
+            if room > 0:
+                more = points(data, room)
+                xyz, rgb = np.concatenate([xyz, more[0]]), np.concatenate([rgb, more[1]])
         found = Gaussians.from_points(
             xyz, rgb, sh_degree=self.sh_degree, opacity=self.start_opacity, device=data.device
         )

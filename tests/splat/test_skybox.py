@@ -107,6 +107,25 @@ def far_rows(trainer):
     return int(trainer.effects.effects[-1].spared(trainer.gaussians.means).sum())
 
 
+def test_pup_removes_its_share_of_those_that_are_no_skybox(data, tmp_path):
+    method = get_method("pup-3dgs")
+    parts = method.build(method.options())
+    config = replace(parts.density_config, stop=0.0, prune_at=0.0, rounds=1, share=0.5)
+    trainer = trainer_for(data, tmp_path, replace(parts, density_config=config), iterations=20)
+    first, others = far_rows(trainer), len(trainer.gaussians) - far_rows(trainer)
+    trainer.train()
+    assert far_rows(trainer) == first
+    assert len(trainer.gaussians) - first == pytest.approx(others / 2, abs=2)
+
+
+def test_what_is_nowhere_is_removed_with_a_skybox_too(data, tmp_path):
+    trainer = trainer_for(data, tmp_path, Parts(density_config=DensityConfig(**EAGER)))
+    trainer.gaussians.means[:2] = torch.tensor([[np.inf] * 3, [np.nan] * 3], dtype=torch.float32)
+    trainer.density._match(trainer.gaussians)
+    kept = trainer.density._prune(trainer.gaussians, trainer.optimiser)
+    assert len(kept) == len(trainer.gaussians) - 2 and torch.isfinite(kept.means).all()
+
+
 EAGER = {"start": 0.0, "stop": 10_000.0, "every": 1.0, "min_every": 20, "grow_grad": 1e-9}
 
 

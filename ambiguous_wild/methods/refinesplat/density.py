@@ -100,7 +100,7 @@ class EntropyAwareDensity(DensityControl):
             return gaussians, events  # one change of rows an iteration
         self.last_judged = step.iteration
         self._match(gaussians)
-        drop = self.support.judge() & ~self.spared(gaussians)
+        drop = self.free(self.support.judge(), gaussians)
         if not bool(drop.any()) or bool(drop.all()):
             return gaussians, events
         optimiser.flush()

@@ -81,7 +81,7 @@ class PruningDensity(SpotLessDensity):
 
     def _prune(self, gaussians: Gaussians, optimiser: SplatAdam) -> Gaussians:
         gaussians = super()._prune(gaussians, optimiser)
-        stay = (self.use_sum >= self.config.least_use) | self.spared(gaussians)
+        stay = ~self.free(~(self.use_sum >= self.config.least_use), gaussians)
         if bool(stay.all()) or not bool(stay.any()):
             return gaussians
         self.log.now.pruned += int((~stay).sum())

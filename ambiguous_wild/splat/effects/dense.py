@@ -7,6 +7,7 @@ al., 2025); we use plane sweeps instead of a matching network.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,7 +30,7 @@ class DenseStart(Effect):
         self.count = 0
 
     def change_parts(self, parts: Parts) -> Parts:
-        return parts.with_more_points(self.points)
+        return replace(parts, more_points=(*parts.more_points, self.points))
 
     def points(self, data: TrainData, most: int) -> tuple[np.ndarray, np.ndarray]:
         """xyz [M, 3] and rgb [M, 3] uint8 of at most so many points."""

@@ -8,6 +8,7 @@ density control leaves it alone: it learns light, not the distractors that stand
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -17,14 +18,16 @@ from torch import Tensor
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.splat.effects.base import Effect
+from ambiguous_wild.splat.effects.placing import inside, projected
 from ambiguous_wild.splat.step import TrainData
 
 if TYPE_CHECKING:
     from ambiguous_wild.splat.parts import Parts
 
-RADIUS = 8.0  # times the distance of the farthest camera, or SfM point, from the middle of the points
+RADIUS = 8.0  # times the distance of the farthest camera, or of 99 % of the SfM points, from their middle
 COUNT = 4000  # on the whole sphere, some 3 degrees apart; those that a photo looks at are used
 LEAST = 100  # with fewer on the whole sphere there is no skybox
+FEWEST = 4  # used: the size of a Gaussian is the distance of its three neighbours
 BLUR = 0.05  # of a photo's longer side, around the place where a colour is read
 PHOTOS = 200  # that colours are read from, at most
 
@@ -38,7 +41,7 @@ class Skybox(Effect):
         self.count = 0
 
     def change_parts(self, parts: Parts) -> Parts:
-        return parts.with_more_points(self.points)
+        return replace(parts, more_points=(*parts.more_points, self.points))
 
     def setup(self, data: TrainData) -> None:
         middle, radius = sphere_of(data.cameras, data.scene.points.xyz)
@@ -52,18 +55,16 @@ class Skybox(Effect):
         """xyz [M, 3] and rgb [M, 3] uint8 of at most so many points."""
         middle, radius = sphere_of(data.cameras, data.scene.points.xyz)
         views = range(0, len(data.photos), -(-len(data.photos) // PHOTOS))
-        count, xyz, rgb = COUNT, np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+        count, self.count = COUNT, 0
         while count >= LEAST:
-            directions = spread(count)
-            colours = _colours(data, views, middle + radius * directions)
-            seen = np.isfinite(colours).all(axis=1)
-            if seen.sum() <= most:
-                xyz = (middle + radius * directions)[seen]
-                rgb = np.clip(np.rint(colours[seen] * 255.0), 0, 255).astype(np.uint8)
-                break
+            xyz = middle + radius * spread(count)
+            looks = [_look(data, view, xyz) for view in views]
+            seen = np.unique(np.concatenate([rows for rows, _, _ in looks]))
+            if FEWEST <= len(seen) <= most:
+                self.count = len(seen)
+                return xyz[seen], _colours(data, views, looks, len(xyz))[seen]
             count //= 2  # coarser, instead of a part of the sphere
-        self.count = len(xyz)
-        return xyz, rgb
+        return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
 
     def facts(self) -> dict[str, Any]:
         return {"points": self.count}
@@ -77,7 +78,7 @@ def sphere_of(cameras: list[Camera], xyz: np.ndarray) -> tuple[np.ndarray, float
         xyz: [M, 3] SfM points; their farthest hundredth may be wrong and is not asked.
     """
     middle = np.median(xyz, axis=0)
-    centres = np.stack([-c.cam_from_world[:3, :3].T @ c.cam_from_world[:3, 3] for c in cameras])
+    centres = np.stack([c.center for c in cameras])
     points = float(np.quantile(np.linalg.norm(xyz - middle, axis=1), 0.99))
     return middle, RADIUS * max(points, float(np.linalg.norm(centres - middle, axis=1).max()))
 
@@ -90,24 +91,28 @@ def spread(count: int) -> np.ndarray:
     return np.stack([flat * np.cos(angle), flat * np.sin(angle), z], axis=1)
 
 
-def _colours(data: TrainData, views: range, xyz: np.ndarray) -> np.ndarray:
-    """Median colour [M, 3] of the photos that look at points [M, 3]; NaN where none does."""
-    found = np.full((len(views), len(xyz), 3), np.nan, np.float32)
-    for row, view in enumerate(views):
-        camera, photo = data.cameras[view], data.photos[view].cpu().numpy()
-        height, width = photo.shape[:2]
-        side = max(int(BLUR * max(width, height)), 1)
-        blurred = cv2.blur(photo, (side, side))
-        local = xyz @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u = (camera.fx * local[:, 0] / local[:, 2] + camera.cx) * width / camera.width
-            v = (camera.fy * local[:, 1] / local[:, 2] + camera.cy) * height / camera.height
-        inside = (local[:, 2] > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
-        rows, u, v = np.flatnonzero(inside), u[inside].astype(int), v[inside].astype(int)
-        keep = data.user_keep[view]
-        if keep is not None:  # what the capture masks is no background
-            kept = keep.cpu().numpy()[v, u] > 0.5
-            rows, u, v = rows[kept], u[kept], v[kept]
-        found[row, rows] = blurred[v, u]
-    with np.errstate(all="ignore"):
-        return np.asarray(np.ma.median(np.ma.masked_invalid(found), axis=0).filled(np.nan))
+def _look(data: TrainData, view: int, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points [M, 3] that a photo shows where the capture does not mask it: their rows, and pixels u, v."""
+    camera = data.cameras[view]
+    pixels, z = projected(torch.from_numpy(xyz), camera)
+    rows = np.flatnonzero(inside(pixels, z, camera, margin=0.0).numpy())
+    u, v = pixels.numpy()[rows].astype(int).T
+    u, v = u.clip(max=camera.width - 1), v.clip(max=camera.height - 1)
+    keep = data.user_keep[view]
+    if keep is not None:  # what the capture masks is no background
+        kept = keep.cpu().numpy()[v, u] > 0.5
+        rows, u, v = rows[kept], u[kept], v[kept]
+    return rows, u, v
+
+
+def _colours(
+    data: TrainData, views: range, looks: list[tuple[np.ndarray, np.ndarray, np.ndarray]], count: int
+) -> np.ndarray:
+    """Median colour [count, 3] uint8 of the photos that look at a point; 0 where none does."""
+    found = np.full((len(views), count, 3), np.nan, np.float32)
+    for k, (view, (rows, u, v)) in enumerate(zip(views, looks, strict=True)):
+        photo = data.photos[view].cpu().numpy()
+        side = max(int(BLUR * max(photo.shape[:2])), 1)
+        found[k, rows] = cv2.blur(photo, (side, side))[v, u]
+    median = np.ma.median(np.ma.masked_invalid(found), axis=0).filled(0.0)
+    return np.clip(np.rint(median * 255.0), 0, 255).astype(np.uint8)

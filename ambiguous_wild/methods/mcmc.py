@@ -76,9 +76,10 @@ class McmcDensity(DensityControl):
     config: McmcConfig
 
     def before_step(self, step: Step, gradients: Gradients) -> Gradients:
-        o, scales = torch.sigmoid(step.gaussians.opacity_logits), step.gaussians.log_scales.exp()
-        d_logits = gradients.opacity_logits + self.config.lambda_opacity / o.numel() * o * (1 - o)
-        d_scales = gradients.log_scales + self.config.lambda_scale / scales.numel() * scales
+        g = step.gaussians
+        o, scales, weights = torch.sigmoid(g.opacity_logits), g.log_scales.exp(), self.weights(g)
+        d_logits = gradients.opacity_logits + self.config.lambda_opacity * weights * o * (1 - o)
+        d_scales = gradients.log_scales + self.config.lambda_scale / 3.0 * weights[:, None] * scales
         return replace(gradients, opacity_logits=d_logits, log_scales=d_scales)
 
     def refine(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> tuple[Gaussians, list[str]]:

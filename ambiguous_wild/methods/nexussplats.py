@@ -250,5 +250,6 @@ class SmallVolumes(DensityControl):
     weight = 0.0
 
     def before_step(self, step: Step, gradients: Gradients) -> Gradients:
-        volume = step.gaussians.log_scales.sum(dim=1, keepdim=True).exp()
-        return replace(gradients, log_scales=gradients.log_scales + self.weight / len(volume) * volume)
+        g = step.gaussians
+        pull = self.weight * self.weights(g) * g.log_scales.sum(dim=1).exp()
+        return replace(gradients, log_scales=gradients.log_scales + pull[:, None])

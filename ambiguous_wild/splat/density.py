@@ -157,6 +157,11 @@ class DensityControl:
         """[N] bool: of these rows those that may be copied and removed."""
         return rows if self.spares is None else rows & ~self.spares(gaussians.means)
 
+    def weights(self, gaussians: Gaussians) -> Tensor:
+        """[N] of a mean over the Gaussians, for losses on them: the spared ones count nothing."""
+        free = self.free(torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.device), gaussians)
+        return free / free.sum().clamp(min=1)
+
     def _ignore_spared(self, gaussians: Gaussians) -> None:
         """As if no view had seen the spared rows since the last round."""
         if self.spares is not None:

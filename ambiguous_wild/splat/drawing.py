@@ -54,6 +54,7 @@ class Drawing:
         if start.density is not None:
             check_needs(start.density.needs, accelerated=device.accelerated(data.device))
             start.density.setup(data)
+            start.density.spares = None if self.effects is None else self.effects.spares()
 
     # -- pictures ---------------------------------------------------------------------------------
 

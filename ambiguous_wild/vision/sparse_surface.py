@@ -38,10 +38,8 @@ def inverse_depth(camera: Camera, points: np.ndarray) -> np.ndarray | None:
     """
     h, w = _map_size(camera)
     xyz = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
-    xyz = xyz[xyz[:, 2] > 0]
     x, y = in_map(camera, xyz, (h, w))
-    # Points a little outside the frame define the surface at its border.
-    near = (x > -0.25 * w) & (x < 1.25 * w) & (y > -0.25 * h) & (y < 1.25 * h)
+    near = _around(x, y, (h, w))
     x, y, z = x[near], y[near], xyz[near, 2]
     front = _in_front(x / w, y / h, z)
     if front.sum() < _LEAST_POINTS:
@@ -52,6 +50,17 @@ def inverse_depth(camera: Camera, points: np.ndarray) -> np.ndarray | None:
         return None
     columns, rows = np.meshgrid(np.arange(w), np.arange(h))
     return surface(columns, rows).astype(np.float32)
+
+
+def has_surface(camera: Camera, points: np.ndarray) -> np.ndarray | None:
+    """Where `inverse_depth` finds a surface, [h, w] bool, from the sparse points [M, 3] around the frame.
+
+    `static_surfaces` chooses for the whole scene, which leaves a photo of a large scene few.
+    """
+    xyz = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+    shape = _map_size(camera)
+    found = inverse_depth(camera, some_points(points[_around(*in_map(camera, xyz, shape), shape)]))
+    return None if found is None else np.isfinite(found)
 
 
 def static_surfaces(cameras: Sequence[Camera], xyz: np.ndarray) -> list[np.ndarray | None]:
@@ -130,6 +139,12 @@ def in_map(camera: Camera, local: np.ndarray, shape: tuple[int, ...]) -> tuple[n
 def inside(x: np.ndarray, y: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Which positions from `in_map` lie inside the map, bool; NaN is outside."""
     return (x >= -0.5) & (x < shape[1] - 0.5) & (y >= -0.5) & (y < shape[0] - 0.5)
+
+
+def _around(x: np.ndarray, y: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Which positions from `in_map` lie in the map or a little outside: those define its border's surface."""
+    h, w = shape
+    return (x > -0.25 * w) & (x < 1.25 * w) & (y > -0.25 * h) & (y < 1.25 * h)
 
 
 def _in_front(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:

@@ -145,14 +145,32 @@ def test_the_uncovered_share_is_where_no_points_lie():
     corners = scene.points.xyz[np.abs(scene.points.xyz).max(axis=1) > 0.5]
     wide = np.concatenate([corners * 40 + [0, 0, 60.0], scene.points.xyz])  # a far wall behind the dots
     assert 0.3 < share < 0.8
-    count = len(wide)
-    more = dataclasses.replace(
-        scene.points, xyz=wide, rgb=np.zeros((count, 3), np.uint8), error_px=np.zeros(count),
+    assert evidence_module.uncovered(with_points(scene, wide)) < share / 2
+    assert math.isnan(evidence_module.uncovered(dataclasses.replace(scene, views=())))
+
+
+def with_points(scene, xyz):
+    count = len(xyz)
+    points = dataclasses.replace(
+        scene.points, xyz=xyz, rgb=np.zeros((count, 3), np.uint8), error_px=np.zeros(count),
         track_offsets=np.zeros(count + 1, np.int64), track_views=np.zeros(0, np.int32),
         track_xy=np.zeros((0, 2), np.float32),
     )  # fmt: skip
-    assert evidence_module.uncovered(dataclasses.replace(scene, points=more)) < share / 2
-    assert math.isnan(evidence_module.uncovered(dataclasses.replace(scene, views=())))
+    return dataclasses.replace(scene, points=points)
+
+
+def test_a_long_strip_is_as_covered_as_a_short_one():
+    scene, _ = synthetic()
+    wall = np.random.default_rng(0).uniform((-9, -9, 3), (9, 9, 3.01), (4000, 3))
+    short = with_points(scene, wall)
+    elsewhere = np.full((400_000, 3), [1000.0, 0.0, 3.0])  # what other photos look at
+    long = with_points(scene, np.concatenate([wall, elsewhere]))
+    assert evidence_module.uncovered(long) == evidence_module.uncovered(short) < 0.05
+
+
+def test_with_hardly_any_points_nothing_is_said_of_the_background():
+    scene, _ = synthetic()
+    assert math.isnan(evidence_module.uncovered(with_points(scene, scene.points.xyz[:5])))
 
 
 def test_cameras_around_a_thing_look_inward_and_those_in_its_middle_outward():

@@ -151,6 +151,20 @@ def test_far_positions_keep_what_24_bits_allow(tmp_path: Path) -> None:
     assert not (tmp_path / "too-far.spz").exists()
 
 
+def test_a_skybox_does_not_spread_the_scene_over_the_chunks_of_a_compressed_ply(tmp_path: Path) -> None:
+    scene, far = model(3000), model(200, seed=1)
+    far["means"] *= 1000.0 / np.linalg.norm(far["means"], axis=1, keepdims=True)
+    both = {name: np.concatenate([scene[name], far[name]]) for name in scene}
+    errors = []
+    for name, arrays in (("alone", scene), ("both", both)):
+        compressed_ply.write_compressed_ply(tmp_path / f"{name}.compressed.ply", arrays)
+        back = compressed_ply.read_compressed_ply(tmp_path / f"{name}.compressed.ply")["means"]
+        near = back[np.linalg.norm(back, axis=1) < 100]
+        gaps = np.linalg.norm(near[:, None] - scene["means"][None, ::10], axis=2)
+        errors.append(np.quantile(gaps.min(axis=0), 0.9))
+    assert errors[1] < 3 * errors[0]
+
+
 def test_gltf_follows_the_extension(tmp_path: Path) -> None:
     given, path = model(6, rest=3), tmp_path / "m.glb"
     gltf.write_gltf(path, given)

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from ambiguous_wild.methods.asymgs_twin import TWIN, HardMask, Twin, TwinConfig
+from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.fields import STATIC
 from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.rendered import Frame
@@ -91,3 +92,12 @@ def test_both_models_learn_and_grow_and_differ(scene, tmp_path):
 
 def test_it_resumes_to_the_same_bits(scene, tmp_path):
     resumed_equals_whole(scene, tmp_path, make)
+
+
+def test_both_models_grow_under_effects_and_keep_their_skybox(scene, tmp_path):
+    trainer = trained(scene, tmp_path, with_effects(make(), ("exposure", "skybox")))
+    other = trainer.drawing.others[TWIN]
+    first = trainer.effects.facts()["skybox"]["points"]
+    assert sum(r.split for r in other.density.log.rounds) > 0 and first > 0
+    for field in (trainer.field, other):
+        assert int(field.density.spares(field.gaussians.means).sum()) == first

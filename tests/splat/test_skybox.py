@@ -1,6 +1,7 @@
 """A skybox: where it lies, what colour it has, and that density control leaves it alone."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,8 +13,10 @@ from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.effects import skybox, with_effects
 from ambiguous_wild.splat.effects.skybox import COUNT, LEAST, Skybox, sphere_of, spread
+from ambiguous_wild.splat.gaussians import PARAMETERS
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.rendered import Gradients
 from ambiguous_wild.splat.trainer import Trainer
 from tests.tiny_scene import write_tiny_scene
 
@@ -116,6 +119,21 @@ def test_pup_removes_its_share_of_those_that_are_no_skybox(data, tmp_path):
     trainer.train()
     assert far_rows(trainer) == first
     assert len(trainer.gaussians) - first == pytest.approx(others / 2, abs=2)
+
+
+@pytest.mark.parametrize("method", ["mcmc", "nexussplats"])
+def test_losses_on_size_and_opacity_leave_it_alone(data, tmp_path, method):
+    found = get_method(method)
+    trainer = trainer_for(data, tmp_path, found.build(found.options()), iterations=20)
+    g = trainer.gaussians
+    zeros = (torch.zeros_like(getattr(g, name)) for name in PARAMETERS)
+    nothing = Gradients(*zeros, screen=torch.zeros(len(g), 2))
+    pulled = trainer.density.before_step(SimpleNamespace(gaussians=g), nothing)
+    far = trainer.density.spares(g.means)
+    assert far.any() and not pulled.log_scales[far].any() and (pulled.log_scales[~far] > 0).all()
+    assert not pulled.opacity_logits[far].any()
+    weights = trainer.density.weights(g)
+    assert float(weights.sum()) == pytest.approx(1.0, abs=1e-5) and not weights[far].any()
 
 
 def test_what_is_nowhere_is_removed_with_a_skybox_too(data, tmp_path):

@@ -168,13 +168,16 @@ def decide(scene: str, found: Evidence) -> Plan:
         Decision(
             "skybox", "share of the photos where no SfM points lie", found.uncovered, UNCOVERED,
             "of the pixels", behind,
-            "something lies behind the scene" if behind == "on" else "the scene fills the photos",
+            "background, or plain walls" if behind == "on" else "SfM found points nearly everywhere",
             "--effects skybox",
         ),
         _dense_start(found),
     )  # fmt: skip
-    missing = f"cannot be told from {seen}"
-    lines = tuple(replace(d, why=missing) if d.decision == "unknown" else d for d in lines)
+    missing = {"skybox": "cannot be told: most photos show too few SfM points"}
+    lines = tuple(
+        replace(d, why=missing.get(d.effect, f"cannot be told from {seen}")) if d.decision == "unknown" else d
+        for d in lines
+    )
     return Plan(scene, lines)
 
 

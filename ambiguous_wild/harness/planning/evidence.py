@@ -13,7 +13,7 @@ import numpy as np
 
 from ambiguous_wild.core import Camera, Scene
 from ambiguous_wild.splat.effects.tracks import TrackColours, log_gains, track_colours
-from ambiguous_wild.vision.sparse_surface import static_surfaces
+from ambiguous_wild.vision.sparse_surface import has_surface
 
 LEAST = 50  # observations below which nothing is said
 LEAST_VIEWS = 6  # of a point, to fit four numbers to its colour
@@ -119,14 +119,17 @@ def outward(scene: Scene) -> float:
 def uncovered(scene: Scene) -> float:
     """Share of the train photos' pixels with no SfM points around them, in the mean of up to 64 photos.
 
-    There the photos show what lies behind the scene. Tracks are not needed. NaN without points.
+    There the photos show what SfM did not find, in most scenes the background. Tracks are not needed.
+    A photo with too few points for a surface counts as bare; NaN if most photos are such.
     """
     cameras = [view.camera for view in scene.train]
     cameras = cameras[:: max(-(-len(cameras) // MOST_PHOTOS), 1)]
     if not cameras or not len(scene.points):
         return float("nan")
-    surfaces = static_surfaces(cameras, scene.points.xyz)
-    return float(np.mean([1.0 if s is None else np.isnan(s).mean() for s in surfaces]))
+    known = [has_surface(camera, scene.points.xyz) for camera in cameras]
+    if 2 * sum(k is None for k in known) > len(known):
+        return float("nan")
+    return float(np.mean([1.0 if k is None else 1.0 - k.mean() for k in known]))
 
 
 def _looking_at(scene: Scene) -> list[tuple[Camera, float]]:

@@ -13,7 +13,7 @@ from torch import Tensor
 from ambiguous_wild.core import AwError, Camera
 from ambiguous_wild.splat.effects.base import Effect, State
 from ambiguous_wild.splat.field import Row
-from ambiguous_wild.splat.fields import frames_of
+from ambiguous_wild.splat.fields import frames_of, renders_of
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.rendered import (
@@ -237,7 +237,7 @@ class Drawn:
         """
         self.image, self.alpha = image, alpha
         self.visible = rendered.visible
-        self.frames = frames_of(rendered)
+        self.frames, self.renders = frames_of(rendered), renders_of(rendered)
         self._inner, self._drawn, self._shot = rendered, drawn, shot
         self._model_pulls, self._frame_pulls, self._posing = model_pulls, frame_pulls, posing
 

@@ -23,7 +23,7 @@ def refuse(parts: Parts, config: TrainConfig, gpus: int) -> None:
         raise AwError(f"--gpus {gpus}: one model is shared by 2 to {MOST} GPUs; one GPU needs no --gpus")
     if parts.effects:
         names = ", ".join(effect.name for effect in parts.effects)
-        raise AwError(f"--gpus {gpus}: effects ({names}) are learnt per photo and not shared yet; {_INSTEAD}")
+        raise AwError(f"--gpus {gpus}: effects ({names}) are not shared between GPUs yet; {_INSTEAD}")
     mask = type(parts.mask)
     if mask.state_dict is not MaskPolicy.state_dict or parts.mask.regularises():
         raise AwError(

@@ -3,10 +3,10 @@
     python benchmarks/auto.py --scenes DIR... --out DIR [--iterations 1500] [--seeds 0] [--jobs 2]
 
 A DIR is a scene folder or a folder of them. On each scene RefineSplat is trained with `auto` and with sets of
-the effects among which it chooses: none, `dense`, and what may help there: on a preset what it was designed
-for (colour per photo once as exposure, once as appearance), elsewhere `exposure`, also with `dense`, and
-`antialias`. The set that `auto` chose is not trained again: the bits are the same. One thread a run. Finished
-runs are kept. Writes benchmarks/results/auto.json and .md.
+the effects among which it chooses: none, `dense`, `skybox`, and what may help there: on a preset what it was
+designed for (colour per photo once as exposure, once as appearance), elsewhere `exposure`, also with `dense`
+and `skybox`, and `antialias`. The set that `auto` chose is not trained again: the bits are the same. One
+thread a run. Finished runs are kept. Writes benchmarks/results/auto.json and .md.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ METRICS = {
 # what a preset was designed for -> the trainer's effects that answer it
 ANSWERS = {"appearance": ("exposure", "appearance"), "antialiasing": ("antialias",), "pose": ("poses",)}
 # tried where nobody designed the scene; such scenes have few photos
-ANYWHERE = (("exposure",), ("antialias",), ("exposure", "dense"))
+ANYWHERE = (("exposure",), ("antialias",), ("exposure", "dense"), ("exposure", "skybox"))
 
 
 def picked_by_hand(scene: str) -> list[str]:
@@ -54,7 +54,7 @@ def picked_by_hand(scene: str) -> list[str]:
         helpful = [[answers[min(k, len(answers) - 1)] for answers in designed] for k in range(depth)]
     else:
         helpful = [list(effects) for effects in ANYWHERE]
-    sets = [[], ["dense"], *helpful]
+    sets = [[], ["dense"], ["skybox"], *helpful]
     return list(dict.fromkeys(",".join(check_effects(names)) or "none" for names in sets))
 
 

@@ -98,6 +98,8 @@ class McmcDensity(DensityControl):
 
     def _grow(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> Gaussians:
         free = self.free(torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.device), gaussians)
+        if not bool(free.any()):
+            return gaussians
         dead = (torch.sigmoid(gaussians.opacity_logits) <= self.config.dead_opacity) & free
         if 0 < (count := int(dead.sum())) < int(free.sum()):
             sources = self._draw(gaussians, optimiser, ~dead & free, count)

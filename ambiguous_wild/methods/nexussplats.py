@@ -89,7 +89,7 @@ class Codes(Learnt):
         self.config = config
 
     def setup(self, data: TrainData) -> None:
-        self.seed = data.seed
+        self.seed, self.points = data.seed, data.sfm_points
         super().setup(data)
 
     def acts(self, hook: str) -> bool:
@@ -109,7 +109,7 @@ class Codes(Learnt):
         return photos | {name: replace(leaf, made_for=NOMINAL_ITERATIONS) for name, leaf in nets.items()}
 
     def rows(self, gaussians: Gaussians) -> Mapping[str, Row]:
-        light = fourier(gaussians.means)
+        light = fourier(gaussians.means, self.points)
         noise = 1e-4 * np.random.default_rng([self.seed, 0x4E]).normal(size=tuple(light.shape))
         light = light + torch.from_numpy(noise.astype(np.float32)).to(light.device)
         doubt = torch.zeros(len(gaussians), CODE, device=gaussians.device)

@@ -83,8 +83,9 @@ class PupDensity(DensityControl):
         score = log_det(self.blocks(step, gaussians))
         drop = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.device)
         free = self.free(~drop, gaussians)
-        drop[free] = removed(score[free], share)  # the share is of those that may be removed
-        if bool(drop.all()):
+        if bool(free.any()):
+            drop[free] = removed(score[free], share)  # the share is of those that may be removed
+        if self.empties(drop, gaussians):
             return gaussians, events
         optimiser.flush()
         self._match(gaussians)

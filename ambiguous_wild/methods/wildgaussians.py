@@ -90,7 +90,7 @@ class WildAppearance(Learnt):
         self.config = config
 
     def setup(self, data: TrainData) -> None:
-        self.seed = data.seed
+        self.seed, self.points = data.seed, data.sfm_points
         super().setup(data)
 
     def leaves(self, data: TrainData, rng: np.random.Generator) -> Mapping[str, Leaf]:
@@ -100,7 +100,7 @@ class WildAppearance(Learnt):
         return {"photo": Leaf(start, self.config.lr_photo, per_photo=True), **net}
 
     def rows(self, gaussians: Gaussians) -> Mapping[str, Row]:
-        start = fourier(gaussians.means)
+        start = fourier(gaussians.means, self.points)
         noise = 1e-4 * np.random.default_rng([self.seed, 0x36]).normal(size=tuple(start.shape))
         start += torch.from_numpy(noise.astype(np.float32)).to(start.device)
         return {"wild_embedding": Row(start, self.config.lr_gaussian)}
@@ -112,11 +112,14 @@ class WildAppearance(Learnt):
         return (1.0 + gain) * visible.base + offset
 
 
-def fourier(means: Tensor) -> Tensor:
-    """[N, 24]: sin(2 pi 2^k x + {0, pi/2}), k = 0..3, of positions scaled by the 97 % quantile to [0, 1]."""
-    centred = means - means.mean(dim=0)
-    spread = torch.quantile(centred.abs(), 0.97, dim=0).clamp(min=1e-6)
-    unit = 0.5 * centred / spread + 0.5
+def fourier(means: Tensor, points: Tensor) -> Tensor:
+    """[N, 24]: sin(2 pi 2^k x + {0, pi/2}), k = 0..3, of positions scaled by the 97 % quantile to [0, 1].
+
+    Centre and quantile are those of the SfM points [M, 3]: a skybox would shrink the scene.
+    """
+    centre = points.mean(dim=0)
+    spread = torch.quantile((points - centre).abs(), 0.97, dim=0).clamp(min=1e-6)
+    unit = 0.5 * (means - centre) / spread + 0.5
     angles = torch.cat([2.0 * torch.pi * 2.0**k * unit for k in range(OCTAVES)], dim=1)
     return torch.cat([angles.sin(), (angles + torch.pi / 2).sin()], dim=1)
 

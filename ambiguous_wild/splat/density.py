@@ -157,6 +157,10 @@ class DensityControl:
         """[N] bool: of these rows those that may be copied and removed."""
         return rows if self.spares is None else rows & ~self.spares(gaussians.means)
 
+    def empties(self, drop: Tensor, gaussians: Gaussians) -> bool:
+        """Whether nothing but spared rows would stay: such a model cannot learn again, so all rows stay."""
+        return not bool(self.free(~drop, gaussians).any())
+
     def weights(self, gaussians: Gaussians) -> Tensor:
         """[N] of a mean over the Gaussians, for losses on them: the spared ones count nothing."""
         free = self.free(torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.device), gaussians)
@@ -265,8 +269,7 @@ class DensityControl:
         if self.last_reset:
             drop |= gaussians.log_scales.exp().amax(dim=1) > config.prune_scale * self.extent
         drop = self.free(drop, gaussians) | ~torch.isfinite(gaussians.means).all(dim=1)
-        if not bool(drop.any()) or bool(drop.all()):
-            # An empty model cannot learn again: a round that would remove everything removes nothing.
+        if not bool(drop.any()) or self.empties(drop, gaussians):
             return gaussians
         self.log.now.pruned += int(drop.sum())
         return self.keep_rows(gaussians, optimiser, ~drop)

@@ -14,6 +14,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.splat.neighbours import nearest_three
 
 # what the renderer reads, in the order of its arguments
+LEAST_POINTS = 4  # to start from: a size is the distance of three neighbours
 PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "sh0", "sh_rest")
 SH_C0 = 0.28209479177387814  # zeroth real spherical harmonic, 1 / (2 sqrt(pi))
 
@@ -149,9 +150,10 @@ class Gaussians:
         Raises:
             AwError: fewer than 4 points.
         """
-        if len(xyz) < 4:
+        if len(xyz) < LEAST_POINTS:
             raise AwError(
-                f"cannot start from {len(xyz)} points: at least 4 are needed; check the sparse model"
+                f"cannot start from {len(xyz)} points: at least {LEAST_POINTS} are needed; "
+                "check the sparse model"
             )
         distances = nearest_three(xyz, device)
         scale = np.sqrt((distances**2).mean(axis=1)).clip(min=min_scale)

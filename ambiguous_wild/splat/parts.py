@@ -18,7 +18,7 @@ from torch import Tensor
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
 from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.fields import Fields
-from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.gaussians import LEAST_POINTS, Gaussians
 from ambiguous_wild.splat.render import BLUR
 from ambiguous_wild.splat.rendered import Cotangents, Gradients
 from ambiguous_wild.splat.step import Step, TrainData
@@ -163,7 +163,7 @@ class Parts:
         if self.start is not None:
             return self.start(data)
         xyz, rgb = data.scene.points.xyz, data.scene.points.rgb
-        for points in self.more_points:
+        for points in self.more_points if len(xyz) >= LEAST_POINTS else ():  # else refused below
             room = int(START_SHARE * most) - len(xyz)
             if room > 0:
                 more = points(data, room)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -28,6 +29,11 @@ class TrainData:
     device: torch.device
     seed: int
     cache_dir: Path  # features and instance masks that survive the run; shared between runs
+
+    @property
+    def sfm_points(self) -> Tensor:
+        """[M, 3] float32 on `device`: where the scene is, whatever else training starts from."""
+        return torch.from_numpy(self.scene.points.xyz.astype(np.float32)).to(self.device)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -80,6 +80,15 @@ def test_a_run_that_fails_is_in_the_report_and_the_next_one_runs(scene, tmp_path
     assert lines[3].startswith("[2/2] 3dgs on scene, seed 1: PSNR ")
 
 
+def test_the_line_of_a_run_says_that_an_effect_had_no_room(scene, tmp_path):
+    heard = [[], []]
+    for lines, most in zip(heard, (100, 100_000)):
+        config = {"effects": "skybox", "max_gaussians": most, "callbacks": Lines(lines.append)}
+        small(scene, tmp_path / str(most), **config)
+    assert "no point of skybox (no room under --max-gaussians?)" in heard[0][-1]
+    assert "no point" not in heard[1][-1]
+
+
 def test_several_choices_of_effects_have_a_folder_each(scene, tmp_path):
     report = small(scene, tmp_path / "runs", effects=["none", "exposure"])
     assert report.folders == (tmp_path / "runs/effects-none", tmp_path / "runs/effects-exposure")

@@ -152,7 +152,7 @@ def test_far_positions_keep_what_24_bits_allow(tmp_path: Path) -> None:
 
 
 def test_a_skybox_does_not_spread_the_scene_over_the_chunks_of_a_compressed_ply(tmp_path: Path) -> None:
-    scene, far = model(3000), model(200, seed=1)
+    scene, far = model(3000), model(900, seed=1)
     far["means"] *= 1000.0 / np.linalg.norm(far["means"], axis=1, keepdims=True)
     both = {name: np.concatenate([scene[name], far[name]]) for name in scene}
     errors = []

@@ -27,7 +27,8 @@ from tests.tiny_scene import write_tiny_scene
 
 def test_fourier_features_by_hand():
     means = torch.tensor([[-1.0, 0.0, 2.0], [1.0, 0.0, -2.0], [0.0, 0.0, 0.0]])
-    found = fourier(means)
+    found = fourier(means, means)
+    assert torch.equal(fourier(means[1:], means), found[1:])  # of what is scaled, the rest has no say
     assert found.shape == (3, GAUSSIAN) == (3, 24)
     spread = np.quantile([1.0, 1.0, 0.0], 0.97)
     unit = 0.5 * 1.0 / spread + 0.5  # of the second point's x

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from ambiguous_wild.core import AwError
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.registry import get_method
 from ambiguous_wild.splat.data import load_train_data
@@ -134,6 +135,35 @@ def test_losses_on_size_and_opacity_leave_it_alone(data, tmp_path, method):
     assert not pulled.opacity_logits[far].any()
     weights = trainer.density.weights(g)
     assert float(weights.sum()) == pytest.approx(1.0, abs=1e-5) and not weights[far].any()
+
+
+def test_pruning_never_leaves_the_skybox_alone(data, tmp_path):
+    trainer = trainer_for(data, tmp_path, Parts(density_config=DensityConfig(**EAGER)))
+    trainer.gaussians.opacity_logits.fill_(-8.0)
+    trainer.density._match(trainer.gaussians)
+    assert len(trainer.density._prune(trainer.gaussians, trainer.optimiser)) == len(trainer.gaussians)
+    method = get_method("pup-3dgs")
+    parts = method.build(method.options())
+    config = replace(parts.density_config, stop=0.0, prune_at=0.0, between=1.0, rounds=3, share=0.999)
+    trainer = trainer_for(data, tmp_path / "pup", replace(parts, density_config=config), iterations=20)
+    trainer.train()
+    assert len(trainer.gaussians) > far_rows(trainer) > 0
+
+
+def test_a_scene_without_points_is_refused_with_a_skybox_too(data, tmp_path):
+    points = data.scene.points
+    none = replace(
+        points, xyz=points.xyz[:3], rgb=points.rgb[:3], error_px=points.error_px[:3],
+        track_offsets=points.track_offsets[:4],
+    )  # fmt: skip
+    with pytest.raises(AwError, match="cannot start from 3 points"):
+        trainer_for(replace(data, scene=replace(data.scene, points=none)), tmp_path, Parts())
+
+
+def test_without_room_nothing_is_spared(data, tmp_path):
+    trainer = trainer_for(data, tmp_path, Parts(density_config=DensityConfig(max_gaussians=100)))
+    assert trainer.effects.facts()["skybox"] == {"points": 0}
+    assert not trainer.density.spares(torch.full((3, 3), 1e6)).any()
 
 
 def test_what_is_nowhere_is_removed_with_a_skybox_too(data, tmp_path):

@@ -173,7 +173,7 @@ def decide(scene: str, found: Evidence) -> Plan:
         ),
         _dense_start(found),
     )  # fmt: skip
-    missing = {"skybox": "cannot be told: most photos show too few SfM points"}
+    missing = {"skybox": "cannot be told: most photos show too few SfM points, or none"}
     lines = tuple(
         replace(d, why=missing.get(d.effect, f"cannot be told from {seen}")) if d.decision == "unknown" else d
         for d in lines

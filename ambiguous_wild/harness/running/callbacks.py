@@ -78,6 +78,9 @@ def outcome_line(report: CellReport) -> str:
         "gaussians": "{:,} Gaussians",
     }
     parts += [text.format(cost[name]) for name, text in known.items() if cost.get(name) is not None]
+    effects: Mapping[str, Mapping[str, Any]] = report.result["facts"].get("effect_facts", {})
+    bare = [name for name, facts in effects.items() if facts.get("points") == 0]
+    parts += [f"no point of {' and '.join(bare)} (no room under --max-gaussians?)"] if bare else []
     timing = timing_of(cost)
     parts += [f"time not ranked: {timing.reason}"] if timing.verdict == "contended" else []
     return ", ".join(parts)

@@ -51,12 +51,12 @@ def along_curve(means: np.ndarray) -> np.ndarray:
     """Row order along a Morton curve of 10 bits an axis, so that neighbours in space are neighbours in the
     file.
 
-    The scene comes first, then what lies more than 4, 16, 64 times as far out as nine tenths of it: a format
+    The scene comes first, then what lies more than 4, 16, 64 times as far out as half of it: a format
     with one range for 256 rows would give a scene mixed with a skybox the skybox's range.
     """
     if not len(means):
         return np.zeros(0, np.intp)
-    low, high = np.quantile(means.astype(np.float64), (0.05, 0.95), axis=0)
+    low, high = np.quantile(means.astype(np.float64), (0.25, 0.75), axis=0)
     half = 0.5 * float((high - low).max())
     x = (means - 0.5 * (low + high)) / (half or 1.0)
     out = np.log(np.abs(x).max(axis=1).clip(min=1.0)) / np.log(4.0)

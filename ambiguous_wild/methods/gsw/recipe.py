@@ -85,11 +85,8 @@ class GswAppearance(Learnt):
         self.config = config
 
     def setup(self, data: TrainData) -> None:
-        self.seed, self.unit, self.all_photos = (
-            data.seed,
-            Unit(data.scene.points.xyz, data.device),
-            data.photos,
-        )
+        self.seed, self.points, self.all_photos = data.seed, data.sfm_points, data.photos
+        self.unit = Unit(data.scene.points.xyz, data.device)
         self.cameras, count = data.cameras, len(data.photos)
         self.chosen = sorted({k * count // min(count, MOST) for k in range(min(count, MOST))})
         self._known: tuple[float, list[Tensor]] | None = None  # maps of those photos, at a nominal iteration
@@ -108,8 +105,8 @@ class GswAppearance(Learnt):
 
     def rows(self, gaussians: Gaussians) -> Mapping[str, Row]:
         rng, means, rate = np.random.default_rng([self.seed, 0x65]), gaussians.means, self.config.lr_places
-        low, high = means.amin(dim=0), means.amax(dim=0)
-        unit = 2.0 * (means - low) / (high - low).clamp(min=1e-9) - 1.0
+        low, high = self.points.amin(dim=0), self.points.amax(dim=0)  # a skybox would shrink the scene
+        unit = (2.0 * (means - low) / (high - low).clamp(min=1e-9) - 1.0).clamp(-1.0, 1.0)
         weights = rng.uniform(size=(FREE * 2, 3))
         weights /= weights.sum(axis=1, keepdims=True)
         mixing = torch.tensor(weights, dtype=torch.float32).to(means.device)

@@ -101,7 +101,7 @@ class EntropyAwareDensity(DensityControl):
         self.last_judged = step.iteration
         self._match(gaussians)
         drop = self.free(self.support.judge(), gaussians)
-        if not bool(drop.any()) or bool(drop.all()):
+        if not bool(drop.any()) or self.empties(drop, gaussians):
             return gaussians, events
         optimiser.flush()
         self.log.now.pruned += int(drop.sum())

@@ -81,8 +81,8 @@ class PruningDensity(SpotLessDensity):
 
     def _prune(self, gaussians: Gaussians, optimiser: SplatAdam) -> Gaussians:
         gaussians = super()._prune(gaussians, optimiser)
-        stay = ~self.free(~(self.use_sum >= self.config.least_use), gaussians)
-        if bool(stay.all()) or not bool(stay.any()):
+        drop = self.free(~(self.use_sum >= self.config.least_use), gaussians)
+        if not bool(drop.any()) or self.empties(drop, gaussians):
             return gaussians
-        self.log.now.pruned += int((~stay).sum())
-        return self.keep_rows(gaussians, optimiser, stay)
+        self.log.now.pruned += int(drop.sum())
+        return self.keep_rows(gaussians, optimiser, ~drop)

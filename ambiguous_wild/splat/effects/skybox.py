@@ -49,6 +49,8 @@ class Skybox(Effect):
         self._inner = 0.5 * radius
 
     def spared(self, means: Tensor) -> Tensor:
+        if not self.count:  # what lies so far out is an outlier of SfM
+            return super().spared(means)
         return torch.linalg.vector_norm(means - self._middle, dim=1) > self._inner
 
     def points(self, data: TrainData, most: int) -> tuple[np.ndarray, np.ndarray]:

@@ -83,8 +83,8 @@ def test_a_run_that_fails_is_in_the_report_and_the_next_one_runs(scene, tmp_path
 def test_the_line_of_a_run_says_that_an_effect_had_no_room(scene, tmp_path):
     heard = [[], []]
     for lines, most in zip(heard, (100, 100_000)):
-        config = {"effects": "skybox", "max_gaussians": most, "callbacks": Lines(lines.append)}
-        small(scene, tmp_path / str(most), **config)
+        train = {"probes": 0, "max_gaussians": most}
+        small(scene, tmp_path / str(most), effects="skybox", train=train, callbacks=Lines(lines.append))
     assert "no point of skybox (no room under --max-gaussians?)" in heard[0][-1]
     assert "no point" not in heard[1][-1]
 

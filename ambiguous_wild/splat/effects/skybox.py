@@ -19,6 +19,7 @@ from torch import Tensor
 from ambiguous_wild.core import Camera
 from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.effects.placing import inside, projected
+from ambiguous_wild.splat.gaussians import LEAST_POINTS
 from ambiguous_wild.splat.step import TrainData
 
 if TYPE_CHECKING:
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 RADIUS = 8.0  # times the distance of the farthest camera, or of 99 % of the SfM points, from their middle
 COUNT = 4000  # on the whole sphere, some 3 degrees apart; those that a photo looks at are used
 LEAST = 100  # with fewer on the whole sphere there is no skybox
-FEWEST = 4  # used: the size of a Gaussian is the distance of its three neighbours
 BLUR = 0.05  # of a photo's longer side, around the place where a colour is read
 PHOTOS = 200  # that colours are read from, at most
 
@@ -62,7 +62,7 @@ class Skybox(Effect):
             xyz = middle + radius * spread(count)
             looks = [_look(data, view, xyz) for view in views]
             seen = np.unique(np.concatenate([rows for rows, _, _ in looks]))
-            if FEWEST <= len(seen) <= most:
+            if LEAST_POINTS <= len(seen) <= most:
                 self.count = len(seen)
                 return xyz[seen], _colours(data, views, looks, len(xyz))[seen]
             count //= 2  # coarser, instead of a part of the sphere

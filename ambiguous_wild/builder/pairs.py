@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 PAIRS = "pairs.txt"  # in the stage's folder: what was matched
+MOTIONS = "motions.npz"  # beside it: the motions of each pair
 OVERLAP = 10  # neighbours on each side
 FAST_EXHAUSTIVE_LIMIT = 25  # photos
 EXHAUSTIVE_LIMIT = 200  # photos; 19 900 pairs, about nine minutes on two cores at 3000 features

@@ -90,23 +90,34 @@ class MatchResult(TypedDict):
 
     matcher: str  # "exhaustive", "sequential" or "retrieval"
     pairs: int  # tried
-    verified: int
+    verified: int  # that show one motion which other pairs confirm
+    planar: int  # of those, where all lies on one plane
 
 
 class ModelSummary(TypedDict):
-    """One of COLMAP's models."""
+    """The model in figures."""
 
-    model: int  # its number and folder
     images: int
     points: int
     error_px: float  # mean reprojection error
     track_length: float  # mean
 
 
+class CameraFact(TypedDict):
+    """A camera as the photos determine it."""
+
+    photos: list[str]  # work names; sources in scene.json
+    focal_px: float
+    focal_sd_px: float | None  # standard deviation; None: unknown
+
+
 class MappingResult(TypedDict):
     """Of the stage `mapping`."""
 
-    models: list[ModelSummary]
+    model: ModelSummary | None
+    left_out: dict[str, str]  # work name of a photo that is not placed -> reason
+    partners: dict[str, int]  # work name -> photos that agree with its place
+    cameras: list[CameraFact]
     plan: str  # "fast", "wider" or "thorough"
 
 
@@ -143,7 +154,6 @@ class ChosenMethods(TypedDict):
     sfm: str  # "fast", "wider" or "thorough"
     matcher: str
     mapper: str
-    model: int
 
 
 class SceneCounts(TypedDict):
@@ -173,6 +183,7 @@ class ScenePhoto(TypedDict):
     blur: float
     mean_luma: float
     features: int
+    partners: int  # photos that agree with its place; 0: not in the scene
     notes: list[str]
     exif: ExifRecord  # without GPS
 
@@ -202,7 +213,7 @@ class BuildRecord(TypedDict):
     counts: SceneCounts
     reprojection_error_px: float
     mean_track_length: float
-    models: list[ModelSummary]
+    cameras: list[CameraFact]
     lost: list[LostPhoto]
     skipped: list[SkippedPhoto]
     warnings: list[str]

@@ -13,22 +13,24 @@ import numpy as np
 from ambiguous_wild.builder.records import (
     BuildInputs,
     BuildRecord,
+    CameraFact,
     ExifRecord,
     FeatureResult,
     MappingResult,
     MaskResult,
     MatchResult,
-    ModelSummary,
     ScenePhoto,
     SceneRecord,
     ScreenedPhoto,
     ScreenResult,
 )
 from ambiguous_wild.builder.settings import BuildSettings
+from ambiguous_wild.builder.sfm import exif_focal
 from ambiguous_wild.core.config import to_plain
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.io.colmap_records import Model
 
+FOCAL_DIFFERENCE = 0.1  # relative; EXIF is rounded to millimetres
 LEAST_PARALLAX_DEG = 1.5  # COLMAP's own limit for a point
 SFM_STAGES = ("features", "matches", "mapping")
 
@@ -39,10 +41,7 @@ def scene_record(
     features: FeatureResult,
     matches: MatchResult,
     mapping: MappingResult,
-    best: int,
     model: Model,
-    others: dict[int, Model],
-    database: Path,
     *,
     train: list[str],
     test: list[str],
@@ -56,8 +55,13 @@ def scene_record(
     from ambiguous_wild.builder.select_model import lost_photos
 
     facts = screened["photos"]
-    lost = lost_photos(facts, model, others, database, features["features"])
-    chosen = next(m for m in mapping["models"] if m["model"] == best)
+    lost = lost_photos(facts, mapping["left_out"], features["features"])
+    summary = mapping["model"]
+    assert summary is not None  # a build without a model has ended before
+    sources = {f["work_name"]: f["source"] for f in facts}
+    cameras: list[CameraFact] = [
+        {**camera, "photos": [sources[name] for name in camera["photos"]]} for camera in mapping["cameras"]
+    ]
     sides = {**dict.fromkeys(train, "train"), **dict.fromkeys(test, "test")}
     only_test, short = point_checks(model, {f["work_name"]: f"{f['stem']}.png" for f in facts}, set(test))
     return {
@@ -73,7 +77,6 @@ def scene_record(
             "sfm": mapping["plan"],
             "matcher": matches["matcher"],
             "mapper": settings.mapper,
-            "model": best,
         },
         "counts": {
             "photos": len(facts) + len(screened["skipped"]),
@@ -82,24 +85,26 @@ def scene_record(
             "train": len(train),
             "test": len(test),
             "cameras": len(model.cameras),
-            "points": chosen["points"],
+            "points": summary["points"],
             "points_seen_in_test_only": only_test,
             "points_of_track_length_2": short,
             "pairs": matches["pairs"],
             "pairs_verified": matches["verified"],
         },
-        "reprojection_error_px": chosen["error_px"],
-        "mean_track_length": chosen["track_length"],
-        "models": mapping["models"],
+        "reprojection_error_px": summary["error_px"],
+        "mean_track_length": summary["track_length"],
+        "cameras": cameras,
         "lost": lost,
         "skipped": screened["skipped"],
         "warnings": [
             *screened["warnings"],
-            *_model_warnings(mapping["models"], best),
+            *_focal_warnings(cameras, facts),
             *_parallax_warnings(model),
             *warnings,
         ],
-        "photos": {f"{f['stem']}.png": _photo(f, sides, features["features"]) for f in facts},
+        "photos": {
+            f"{f['stem']}.png": _photo(f, sides, features["features"], mapping["partners"]) for f in facts
+        },
         "masks": masks,
         "truth": truth,
     }
@@ -178,7 +183,9 @@ def what_changed(
     return ", ".join(parts) or "inputs"
 
 
-def _photo(fact: ScreenedPhoto, sides: dict[str, str], features: dict[str, int]) -> ScenePhoto:
+def _photo(
+    fact: ScreenedPhoto, sides: dict[str, str], features: dict[str, int], partners: dict[str, int]
+) -> ScenePhoto:
     # Scenes are published: GPS positions stay out of them.
     exif = {k: v for k, v in fact["exif"].items() if k not in ("latitude_deg", "longitude_deg", "altitude_m")}
     return {
@@ -190,16 +197,23 @@ def _photo(fact: ScreenedPhoto, sides: dict[str, str], features: dict[str, int])
         "blur": fact["blur"],
         "mean_luma": fact["mean_luma"],
         "features": features.get(fact["work_name"], 0),
+        "partners": partners.get(fact["work_name"], 0),
         "notes": fact["notes"],
         "exif": cast(ExifRecord, exif),
     }
 
 
-def _model_warnings(listing: list[ModelSummary], best: int) -> list[str]:
-    rest = [f"{m['images']} photos" for m in listing if m["model"] != best]
-    if not rest:
+def _focal_warnings(cameras: list[CameraFact], facts: list[ScreenedPhoto]) -> list[str]:
+    """Cameras whose focal length contradicts their photos' EXIF."""
+    stated = {f["source"]: (exif_focal(f), max(f["width"], f["height"])) for f in facts}
+    odd = []
+    for camera in cameras:
+        share, side = stated[camera["photos"][0]]
+        if share is not None and abs(camera["focal_px"] / (share * side) - 1) > FOCAL_DIFFERENCE:
+            odd.append(f"{camera['photos'][0]}: {camera['focal_px']:.0f} px, by EXIF {share * side:.0f}")
+    if not odd:
         return []
-    return [f"the capture split into {len(listing)} models; the largest is used, left out: {', '.join(rest)}"]
+    return [f"focal length of {len(odd)} of {len(cameras)} cameras contradicts EXIF: {shortlist(odd, 2)}"]
 
 
 def _parallax_warnings(model: Model) -> list[str]:

@@ -1,10 +1,9 @@
-"""Choose one of COLMAP's models, explain lost photos, and refuse a failed reconstruction with its cause."""
+"""Explain lost photos, and refuse a failed reconstruction with its cause."""
 
 from __future__ import annotations
 
 import math
 import sqlite3
-from collections import Counter
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -15,8 +14,6 @@ import numpy as np
 from ambiguous_wild.builder.collect import MIN_PHOTOS
 from ambiguous_wild.builder.records import LostPhoto, MatchResult, ModelSummary, ScreenedPhoto
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.io.colmap_model import read_model
-from ambiguous_wild.io.colmap_records import Model
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 MIN_SHARE = 0.3  # of the readable photos; with fewer, most of the place is missing
@@ -33,7 +30,7 @@ class PairFacts:
     tried: int
     verified: int
     inliers: float  # median over verified pairs
-    degenerate: float  # share of verified pairs that a homography explains
+    degenerate: float  # share of verified pairs that show one plane only
     forward: float  # median |t_z| / |t| of the strongest pairs; 1 = straight along the view axis
     angle_deg: float  # median triangulation angle of the strongest pairs
 
@@ -62,20 +59,8 @@ class PairFacts:
         return "matched pairs do not chain; add photos between the ones that fail, or try --max-features 8000"
 
 
-def choose_model(folder: Path, listing: list[ModelSummary]) -> tuple[int, Model]:
-    """The largest model, with its number: most photos, then most points, then the lowest number.
-
-    Raises:
-        AwError: COLMAP found no model.
-    """
-    if not listing:
-        raise AwError("structure from motion found no model; add photos that overlap more")
-    best = max(listing, key=lambda m: (m["images"], m["points"], -m["model"]))
-    return best["model"], read_model(folder / str(best["model"]))
-
-
 def check_registered(
-    listing: list[ModelSummary],
+    model: ModelSummary | None,
     photos: int,
     skipped: int,
     database: Path,
@@ -85,7 +70,7 @@ def check_registered(
     """Refuse a reconstruction that holds too few photos or points to be a scene.
 
     Args:
-        listing: the models.
+        model: None: there is none.
         photos: number of photos that COLMAP got.
         skipped: number of photos left out before.
         database: COLMAP's.
@@ -95,85 +80,51 @@ def check_registered(
     Raises:
         AwError: with the counts, the figures of the matching, the likely cause and what to try.
     """
-    registered = max((m["images"] for m in listing), default=0)
-    points = max((m["points"] for m in listing if m["images"] == registered), default=0)
+    registered, points = (model["images"], model["points"]) if model else (0, 0)
     needed = max(MIN_PHOTOS, math.ceil(MIN_SHARE * photos))
     few = points < MIN_POINTS * registered
     if registered >= needed and not few:
         return
-    facts = pair_facts(database, matches["pairs"])
-    others = sum(m["images"] for m in listing) - registered
-    split = f" ({others} more in {len(listing) - 1} other models)" if len(listing) > 1 else ""
+    facts = pair_facts(database, matches)
     unread = f", {skipped} were left out" if skipped else ""
     found = f"{registered} of {photos} photos" + f" with {points} points" * few
     wanted = f"{needed}" + f" and {MIN_POINTS} points a photo" * few
     raise AwError(
-        f"structure from motion placed {found}{split}{unread}; a scene needs {wanted}: "
+        f"structure from motion placed {found}{unread}; a scene needs {wanted}: "
         f"{facts.sentence()}; likely {facts.reason(photos)}" + "".join(f"; {remark}" for remark in remarks)
     )
 
 
-def pair_facts(database: Path, tried: int) -> PairFacts:
+def pair_facts(database: Path, matches: MatchResult) -> PairFacts:
     """Measure features, matches, and motion between the pairs with the most inliers."""
     with closing(sqlite3.connect(database)) as db:
         features = [r[0] for r in db.execute("SELECT rows FROM keypoints")]
         pairs = db.execute(
-            "SELECT pair_id, rows, config FROM two_view_geometries WHERE rows > 0 ORDER BY rows DESC, pair_id"
+            "SELECT pair_id, rows FROM two_view_geometries WHERE rows > 0 ORDER BY rows DESC, pair_id"
         ).fetchall()
-    # 4, 5, 6: planar, panoramic, planar or panoramic in COLMAP's TwoViewGeometry
-    degenerate = float(np.mean([config in (4, 5, 6) for _, _, config in pairs])) if pairs else math.nan
-    forward, angles = _motion(database, [pair_id for pair_id, _, _ in pairs[:_STRONG_PAIRS]])
+    forward, angles = _motion(database, [pair_id for pair_id, _ in pairs[:_STRONG_PAIRS]])
     return PairFacts(
         features=float(np.median(features)) if features else 0.0,
-        tried=tried,
+        tried=matches["pairs"],
         verified=len(pairs),
-        inliers=float(np.median([rows for _, rows, _ in pairs])) if pairs else 0.0,
-        degenerate=degenerate,
+        inliers=float(np.median([rows for _, rows in pairs])) if pairs else 0.0,
+        degenerate=matches["planar"] / len(pairs) if pairs else math.nan,
         forward=float(np.median(forward)) if forward else math.nan,
         angle_deg=float(np.median(angles)) if angles else math.nan,
     )
 
 
 def lost_photos(
-    facts: list[ScreenedPhoto],
-    chosen: Model,
-    others: dict[int, Model],
-    database: Path,
-    features: dict[str, int],
+    facts: list[ScreenedPhoto], left_out: dict[str, str], features: dict[str, int]
 ) -> list[LostPhoto]:
     """The readable photos that are not in the scene, each with the reason."""
-    inside = {image.name for image in chosen.images.values()}
-    other_model = {i.name: number for number, model in others.items() for i in model.images.values()}
-    partners = _partners(database, inside)
     lost: list[LostPhoto] = []
     for fact in facts:
-        name = fact["work_name"]
-        if name in inside:
-            continue
-        if name in other_model:
-            size = len(others[other_model[name]].images)
-            reason = f"in another model of {size} photos, which shares no points with this one"
-        elif features.get(name, 0) < 50:
-            reason = f"only {features.get(name, 0)} features"
-        elif not partners[name]:
-            reason = "no matches with the photos of the scene"
-        else:
-            reason = f"matches {partners[name]} photos of the scene, with too few inliers to be placed"
-        lost.append({"source": fact["source"], "reason": reason})
+        count = features.get(fact["work_name"], 0)
+        if fact["work_name"] in left_out:
+            reason = left_out[fact["work_name"]] if count >= 50 else f"only {count} features"
+            lost.append({"source": fact["source"], "reason": reason})
     return lost
-
-
-def _partners(database: Path, inside: set[str]) -> Counter[str]:
-    """Per photo the number of photos in the scene that it has a verified pair with."""
-    counts: Counter[str] = Counter()
-    with closing(sqlite3.connect(database)) as db:
-        names = dict(db.execute("SELECT image_id, name FROM images").fetchall())
-        pairs = db.execute("SELECT pair_id FROM two_view_geometries WHERE rows > 0").fetchall()
-    for (pair_id,) in pairs:
-        first, second = (names[i] for i in divmod(pair_id, _MAX_PAIR_ID))
-        counts[first] += second in inside
-        counts[second] += first in inside
-    return counts
 
 
 def _motion(database: Path, pair_ids: list[int]) -> tuple[list[float], list[float]]:

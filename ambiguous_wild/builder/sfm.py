@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 import sqlite3
@@ -13,7 +14,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from ambiguous_wild.builder.pairs import PAIRS
+from ambiguous_wild.builder.pairs import MOTIONS, PAIRS
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import (
     FeatureResult,
@@ -31,6 +32,7 @@ from ambiguous_wild.io.atomic import write_json
 LOG = "colmap.log"
 DATABASE = "database.db"
 _POLL_S = 0.25
+_DIAGONAL_35MM = math.hypot(36.0, 24.0)
 
 
 class SfmCrash(AwError):
@@ -42,7 +44,7 @@ def choose_camera(photos: Sequence[PhotoRecord], wanted: str) -> str:
 
     "single" where size, camera model and focal length are the same in all photos. Photos of one size without
     EXIF count as frames of one camera: internet photos differ in size. "per-device" where EXIF tells two or
-    more photos of one camera from the others.
+    more photos of one camera from the others, or one camera was held upright and across.
     """
     if wanted != "auto":
         return wanted
@@ -57,12 +59,26 @@ def _device(photo: PhotoRecord) -> tuple[Any, ...]:
 
 
 def camera_groups(photos: Sequence[PhotoRecord]) -> list[list[int]]:
-    """Indices of photos that share a camera by EXIF; a photo without make and focal length stands alone."""
+    """Indices of photos that share a camera by EXIF and size.
+
+    A photo without make and focal length stands alone, unless all photos may be of one camera, turned or not.
+    """
+    turned = {(*sorted(device[:2]), *device[2:]) for device in map(_device, photos)}
     groups: dict[tuple[Any, ...], list[int]] = {}
     for index, photo in enumerate(photos):
         known = photo["camera"] and ("focal_mm" in photo["exif"] or "focal_35mm" in photo["exif"])
+        known = known or len(turned) == 1
         groups.setdefault(_device(photo) if known else (index,), []).append(index)
     return list(groups.values())
+
+
+def exif_focal(photo: PhotoRecord) -> float | None:
+    """Focal length over the longer side, from that of a 35 mm camera with the same diagonal; None: not stated."""
+    focal_mm = photo["exif"].get("focal_35mm")
+    if not focal_mm:
+        return None
+    diagonal = math.hypot(photo["width"], photo["height"])
+    return focal_mm / _DIAGONAL_35MM * diagonal / max(photo["width"], photo["height"])
 
 
 def extract_features(
@@ -121,8 +137,9 @@ def match(
     bar: Bar,
     earlier: Path | None = None,
     left_out: Sequence[str] | None = None,
+    posed: bool = False,
 ) -> MatchResult:
-    """Match and verify pairs.
+    """Match pairs, and find the motions that they show.
 
     Args:
         folder: of the result: a database and the list of pairs.
@@ -134,6 +151,7 @@ def match(
         bar: progress.
         earlier: folder of an earlier result whose pairs are kept.
         left_out: work names of the photos that look for partners; None: all.
+        posed: poses are known: only match.
     """
     matcher = plan.matcher
     database = folder / DATABASE
@@ -153,22 +171,29 @@ def match(
         "similar": plan.similar,
         "neighbours": plan.neighbours,
         "only": list(left_out) if left_out is not None else None,
+        "focals": None if posed else {f["work_name"]: x for f in facts if (x := exif_focal(f)) is not None},
         "earlier": str(earlier / PAIRS) if earlier else None,
         "seed": settings.seed,
         "jobs": jobs,
     }
-    run_job(job, folder, lambda: bar.at(_count(database, "two_view_geometries")))
+    run_job(job, folder, lambda: bar.at(_count(database, "matches")))
     bar.finish()
     pairs = every if matcher == "exhaustive" else len(listed.read_text(encoding="utf-8").splitlines())
-    with closing(sqlite3.connect(database)) as db:
-        inliers = [r[0] for r in db.execute("SELECT rows FROM two_view_geometries WHERE rows > 0")]
-    return {"matcher": matcher, "pairs": pairs, "verified": len(inliers)}
+    counts = {"verified": 0, "planar": 0} if posed else json.loads((folder / "pairs.json").read_text())
+    return {"matcher": matcher, "pairs": pairs, **counts}
 
 
 def map_scene(
-    folder: Path, matches: Path, photos: Path, count: int, settings: BuildSettings, plan: SfmPlan, bar: Bar
+    folder: Path,
+    matches: Path,
+    photos: Path,
+    count: int,
+    settings: BuildSettings,
+    plan: SfmPlan,
+    jobs: int,
+    bar: Bar,
 ) -> MappingResult:
-    """Build the models into `folder/0`, `folder/1`, ..."""
+    """Build the model into `folder/0`."""
     progress = folder / "progress"
     bar.start("placing photos", count if settings.mapper == "incremental" else None)
     database = folder / DATABASE
@@ -176,6 +201,7 @@ def map_scene(
     job: MappingJob = {
         "task": "mapping",
         "database": str(database),
+        "motions": str(matches / MOTIONS),
         "photos": str(photos),
         "output": str(folder),
         "progress": str(progress),
@@ -185,13 +211,14 @@ def map_scene(
         "local_refinements": plan.local_refinements,
         "local_cameras": plan.local_cameras,
         "seed": settings.seed,
+        "jobs": jobs,
     }
     run_job(job, folder, lambda: bar.at(_number(progress)))
     bar.finish()
     database.unlink()
     progress.unlink(missing_ok=True)
-    listing = json.loads((folder / "models.json").read_text(encoding="utf-8"))
-    return {"models": listing, "plan": plan.name}
+    found = json.loads((folder / "mapping.json").read_text(encoding="utf-8"))
+    return {**found, "plan": plan.name}
 
 
 def run_job(job: SfmJob, folder: Path, watch: Callable[[], None]) -> None:

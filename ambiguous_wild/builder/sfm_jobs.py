@@ -34,6 +34,7 @@ class MatchJob(TypedDict):
     similar: int
     neighbours: int
     only: list[str] | None  # names that look for partners; None: all
+    focals: dict[str, float] | None  # name -> over the longer side, by EXIF; None: poses are known
     earlier: str | None  # file of pairs that the database holds matched
     seed: int
     jobs: int
@@ -45,6 +46,7 @@ class MappingJob(TypedDict):
 
     task: Literal["mapping"]
     database: str
+    motions: str  # file of the stage before
     photos: str  # folder
     output: str  # folder
     progress: str  # file that holds the number of placed photos
@@ -54,6 +56,7 @@ class MappingJob(TypedDict):
     local_refinements: int
     local_cameras: int
     seed: int
+    jobs: int
     parent: NotRequired[int]
 
 

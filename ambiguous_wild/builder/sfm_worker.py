@@ -11,6 +11,7 @@ from __future__ import annotations
 import ctypes
 import json
 import os
+import shutil
 import signal
 import sys
 from pathlib import Path
@@ -18,7 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from ambiguous_wild.builder.pairs import PAIRS, sequential_pairs
+from ambiguous_wild.builder.pairs import MOTIONS, PAIRS, sequential_pairs
+from ambiguous_wild.builder.placing import Matched, Placement, pipeline_options
 from ambiguous_wild.builder.records import ModelSummary
 from ambiguous_wild.builder.retrieval import embed, pairs_of_tests, retrieval_pairs
 from ambiguous_wild.builder.sfm_jobs import FeatureJob, MappingJob, MatchJob, SfmJob, TriangulationJob
@@ -26,6 +28,7 @@ from ambiguous_wild.builder.sift import features_of
 from ambiguous_wild.io.atomic import write_json
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
+FOCAL_CHANGE = 0.05  # relative, of half of the photos
 _MIN_MODEL = 3  # images; smaller models are not reported
 _PR_SET_PDEATHSIG = 1
 
@@ -78,25 +81,32 @@ def _extract_with_opencv(job: FeatureJob) -> None:
 
 
 def run_matches(job: MatchJob) -> None:
-    """Match and verify pairs: all of them, or those that are likely to overlap."""
+    """Match pairs, all of them or those that are likely to overlap; then find the motions that photos share."""
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu = False
     options.num_threads = job["jobs"]
-    verify = pycolmap.TwoViewGeometryOptions()
-    verify.ransac.random_seed = job["seed"]
+    options.skip_geometric_verification = True
+    database = Path(job["database"])
     if job["matcher"] == "exhaustive":
-        pycolmap.match_exhaustive(job["database"], matching_options=options, verification_options=verify)
+        pycolmap.match_exhaustive(job["database"], matching_options=options)
+    else:
+        listed = database.with_name(PAIRS)
+        known = Path(job["earlier"]).read_text(encoding="utf-8").splitlines() if job["earlier"] else []
+        found = [f"{a} {b}" for a, b in _likely_pairs(job)]
+        # COLMAP leaves alone what is matched already
+        listed.write_text("".join(f"{line}\n" for line in dict.fromkeys(known + found)), encoding="utf-8")
+        pairing = pycolmap.ImportedPairingOptions()
+        pairing.match_list_path = str(listed)
+        pycolmap.match_image_pairs(job["database"], matching_options=options, pairing_options=pairing)
+    if job["focals"] is None:  # poses are known: triangulation takes the matches that fit them
         return
-    listed = Path(job["database"]).with_name(PAIRS)
-    known = Path(job["earlier"]).read_text(encoding="utf-8").splitlines() if job["earlier"] else []
-    found = [f"{a} {b}" for a, b in _likely_pairs(job)]
-    # COLMAP leaves alone what is matched already
-    listed.write_text("".join(f"{line}\n" for line in dict.fromkeys(known + found)), encoding="utf-8")
-    pairing = pycolmap.ImportedPairingOptions()
-    pairing.match_list_path = str(listed)
-    pycolmap.match_image_pairs(
-        job["database"], matching_options=options, pairing_options=pairing, verification_options=verify
-    )
+    matched = Matched.read(database)
+    matched.find_focals(job["focals"], job["jobs"])
+    agreed = matched.find_motions(job["jobs"])
+    matched.write_agreed(database, agreed)
+    matched.save_motions(database.with_name(MOTIONS))
+    planar = [len(matched.motions[pair][number].rotations) > 1 for pair, (number, _) in agreed.items()]
+    write_json(database.with_name("pairs.json"), {"verified": len(agreed), "planar": sum(planar)})
 
 
 def _likely_pairs(job: MatchJob) -> list[tuple[str, str]]:
@@ -131,47 +141,73 @@ def _likely_pairs(job: MatchJob) -> list[tuple[str, str]]:
 
 
 def run_mapping(job: MappingJob) -> None:
-    """Build every model that COLMAP finds; models.json lists them."""
-    output = Path(job["output"])
-    if job["mapper"] == "global":
-        models = _map_globally(job, output)
+    """Build the models that COLMAP finds, then place every photo of the largest anew; `mapping.json` tells."""
+    output, database = Path(job["output"]), Path(job["database"])
+    matched = Matched.read(database)
+    mapper = _map_globally if job["mapper"] == "global" else _map_incrementally
+
+    def largest() -> Any:
+        found = mapper(job, output).values()
+        for folder in output.glob("[0-9]*"):
+            shutil.rmtree(folder)
+        return max(found, key=lambda m: (m.num_reg_images(), m.num_points3D()), default=None)
+
+    model = largest()
+    if model is not None and matched.take_cameras(model) > FOCAL_CHANGE:
+        # poses of pairs were wrong by as much: once more, with the focal length that the model found
+        matched.write_agreed(database, matched.find_motions(job["jobs"]))
+        model = largest() or model
     else:
-        models = _map_incrementally(job, output)
-    listing: list[ModelSummary] = []
-    for number, model in sorted(models.items()):
-        folder = output / str(number)
-        folder.mkdir(exist_ok=True)
-        model.write(str(folder))
-        listing.append(
-            {
-                "model": number,
-                "images": model.num_reg_images(),
-                "points": model.num_points3D(),
-                "error_px": round(model.compute_mean_reprojection_error(), 4),
-                "track_length": round(model.compute_mean_track_length(), 3),
-            }
+        matched.load_motions(Path(job["motions"]))
+    if model is None:
+        reasons = dict.fromkeys(matched.names, "no pair of photos to start from")
+        write_json(
+            output / "mapping.json", {"model": None, "left_out": reasons, "partners": {}, "cameras": []}
         )
-    write_json(output / "models.json", listing)
+        return
+    placement = Placement(matched, database, model, job["seed"])
+    placement.run()
+    left_out = {matched.names[photo]: reason for photo, reason in placement.left_out.items()}
+    model = placement.model
+    model.tear_down()
+    (output / "0").mkdir()
+    model.write(str(output / "0"))
+    summary: ModelSummary = {
+        "images": model.num_reg_images(),
+        "points": model.num_points3D(),
+        "error_px": round(model.compute_mean_reprojection_error(), 4),
+        "track_length": round(model.compute_mean_track_length(), 3),
+    }
+    write_json(
+        output / "mapping.json",
+        {
+            "model": summary,
+            "left_out": dict(sorted(left_out.items())),
+            "partners": {matched.names[k]: len(place.partners) for k, place in placement.places.items()},
+            "cameras": placement.cameras(),
+        },
+    )
 
 
 def run_triangulation(job: TriangulationJob) -> None:
-    """Points from the matches; poses and intrinsics stay as they are."""
-    options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = options.mapper.num_threads = 1
-    options.ba_min_num_residuals_for_cpu_multi_threading = 10**9
-    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = job["seed"]
+    """Points from the matches that fit the poses; these and the intrinsics stay as they are."""
     known = pycolmap.Reconstruction(job["model"])
+    matched = Matched.read(Path(job["database"]))
+    placement = Placement(matched, Path(job["database"]), known, job["seed"])
+    matched.write_verified(Path(job["database"]), matched.fitting(placement.poses))
     found = pycolmap.triangulate_points(
-        known, job["database"], job["photos"], job["output"], options=options, refine_intrinsics=False
+        known,
+        job["database"],
+        job["photos"],
+        job["output"],
+        options=pipeline_options(job["seed"]),
+        refine_intrinsics=False,
     )
     found.write_binary(job["output"])
 
 
 def _map_incrementally(job: MappingJob, output: Path) -> dict[int, Any]:
-    options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = options.mapper.num_threads = 1
-    options.ba_min_num_residuals_for_cpu_multi_threading = 10**9
-    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = job["seed"]
+    options = pipeline_options(job["seed"])
     options.min_model_size = _MIN_MODEL
     options.ba_global_frames_ratio = options.ba_global_points_ratio = job["growth"]
     options.ba_global_max_refinements = job["refinements"]

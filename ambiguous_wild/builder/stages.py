@@ -56,8 +56,9 @@ class SfmStages:
 
     @property
     def placed(self) -> int:
-        """Photos of the largest model."""
-        return max((model["images"] for model in self.mapping.facts["models"]), default=0)
+        """Photos of the model."""
+        model = self.mapping.facts["model"]
+        return model["images"] if model else 0
 
 
 @dataclass
@@ -115,7 +116,7 @@ class Stages:
         mask_stage = self._masks(work, screened)
         sfm = self._sfm(work, screened, mask_stage)
         mapping, features, matches = sfm.mapping, sfm.features, sfm.matches
-        best, model, others = _models(mapping)
+        model = read_model(mapping.folder / "0")
         stems = {f["work_name"]: f["stem"] for f in facts}
         registered = {stems[i.name] for i in model.images.values()}
         train, test, how, split_warnings = split_photos(facts, registered, tests)
@@ -135,10 +136,7 @@ class Stages:
             features.facts,
             matches.facts,
             mapping.facts,
-            best,
             model,
-            others,
-            matches.folder / DATABASE,
             train=train,
             test=test,
             how=how,
@@ -206,7 +204,7 @@ class Stages:
         from ambiguous_wild.builder.select_model import check_registered
 
         check_registered(
-            best.mapping.facts["models"],
+            best.mapping.facts["model"],
             len(facts),
             len(screened.facts["skipped"]),
             best.matches.folder / DATABASE,
@@ -238,7 +236,7 @@ class Stages:
             ),
         )  # fmt: skip
         earlier = before if plan.continues else None
-        left_out = _left_out(earlier.mapping, [f["work_name"] for f in facts]) if earlier else None
+        left_out = sorted(earlier.mapping.facts["left_out"]) if earlier else None
         matches = work.run(
             "matches",
             [features.key, plan.matcher, plan.similar, plan.neighbours, earlier and earlier.matches.key,
@@ -251,7 +249,7 @@ class Stages:
         mapping = work.run(
             "mapping",
             [matches.key, settings.mapper, to_plain(plan), settings.seed],
-            lambda f: map_scene(f, matches.folder, photos, len(facts), settings, plan, self.bar),
+            lambda f: map_scene(f, matches.folder, photos, len(facts), settings, plan, self.jobs, self.bar),
         )
         return SfmStages(features, matches, mapping)
 
@@ -284,23 +282,6 @@ class Stages:
                 bar=self.bar,
             ),
         )
-
-
-def _left_out(mapping: StageResult[MappingResult], names: list[str]) -> list[str]:
-    """Photos that the largest model lacks."""
-    if not mapping.facts["models"]:
-        return names
-    placed = {image.name for image in _models(mapping)[1].images.values()}
-    return [name for name in names if name not in placed]
-
-
-def _models(mapping: StageResult[MappingResult]) -> tuple[int, Model, dict[int, Model]]:
-    from ambiguous_wild.builder.select_model import choose_model
-
-    listing = mapping.facts["models"]
-    best, model = choose_model(mapping.folder, listing)
-    others = {m["model"]: read_model(mapping.folder / str(m["model"])) for m in listing if m["model"] != best}
-    return best, model, others
 
 
 def _file_hashes(folder: Path | None) -> list[list[str]] | None:

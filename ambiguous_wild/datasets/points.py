@@ -121,7 +121,7 @@ def triangulate(
     plan = plans(facts, settings)[0]
     extract_features(folder / "features", photos, facts, settings, plan, jobs, camera, None, bar)
     _set_cameras(folder / "features" / DATABASE, folder / "known", model, used)
-    match(folder / "matches", folder / "features", facts, settings, plan, jobs, bar)
+    match(folder / "matches", folder / "features", facts, settings, plan, jobs, bar, posed=True)
     database = folder / "matches" / DATABASE
     colmap_binary.write_points(folder / "known" / "points3D.bin", no_points())
     job: TriangulationJob = {

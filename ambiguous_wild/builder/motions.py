@@ -1,0 +1,360 @@
+"""Motions between two photos, and which of them is the place's.
+
+A pair of photos may show several rigid motions: the place's, and one of every distractor that both show. The
+distractor may well have most of the matches. But photos of the place agree with each other: the rotation from
+a photo to a second, and on to a third, is that from the first to the third. A motion counts by the triplets of
+photos that it closes, each weighted by the votes of its other two motions.
+
+Several motions a pair, made consistent over all pairs: Arrigoni and Pajdla, "Robust motion segmentation from
+pairwise matches" (ICCV 2019), which labels points; here the motions place the photos.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+LEAST = 15  # matches of a motion
+MOTIONS = 3  # of a pair, at most
+WAYS = 3  # poses that explain one motion: a plane allows two more
+ERROR_PX = 2.0  # of a match to its motion
+CLOSED_DEG = 4.0  # rotation left over around a triplet
+ROUNDS = 4  # of voting
+AGREED_DEG = 5.0  # between a motion and the rotations of its photos
+SWEEPS = 10  # over all photos, at most
+CONFIDENCE, TRIALS = 0.9999, 1000  # of RANSAC
+PLANE_SHARE = 0.7  # of a motion's matches on one plane: its pose has a twin
+FUNDAMENTAL_PX = 1.5  # of a match to its fundamental matrix
+FOCALS = 0.3 * 1.02 ** np.arange(116)  # over the longer side: 118 to 20 degrees of view
+FOCAL_USUAL = 0.8  # of phones and drones about 0.7, of other cameras 0.8 to 1.4
+FOCAL_PAIRS = 10  # a photo, those with most matches
+FOCAL_LEAST = 10  # fundamental matrices that determine a focal length
+FOCAL_MATCHES = 100  # beyond which a matrix does not count more
+FOCAL_UNEQUAL = 0.1  # relative difference of singular values that counts as wrong
+FOCAL_CLEAR = 0.75  # cost of the best focal length over that of the median one
+FOCAL_TURNS = 3  # in which each camera looks for its focal length among the others'
+_CHUNK = 20_000  # triplets voted on at a time
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A rigid motion that some matches of a pair agree on."""
+
+    matches: np.ndarray  # [K] indices of the pair's matches
+    rotations: np.ndarray  # [W, 3, 3] second from first; several where a plane leaves the pose open
+    translations: np.ndarray  # [W, 3] of unit length
+
+
+Pair = tuple[int, int]
+Rays = Sequence[np.ndarray]  # of every photo: [N, 2] features as x / z and y / z in its camera
+
+
+def motions_of_pairs(
+    rays: Rays,
+    focals_px: Sequence[float],
+    matches: Mapping[Pair, np.ndarray],  # (a, b) -> [K, 2] indices of features
+    jobs: int,
+) -> dict[Pair, list[Motion]]:
+    """The motions of every pair, the one with most matches first; the same for any number of jobs."""
+
+    def one(item: tuple[Pair, np.ndarray]) -> list[Motion]:
+        (a, b), rows = item
+        error = ERROR_PX / float(np.sqrt(focals_px[a] * focals_px[b]))
+        return motions(rays[a][rows[:, 0]], rays[b][rows[:, 1]], error)
+
+    cv2.setNumThreads(1)  # a pair a thread
+    todo = sorted(matches.items(), key=lambda item: item[0])
+    with ThreadPoolExecutor(jobs) as pool:
+        return dict(zip((pair for pair, _ in todo), pool.map(one, todo)))
+
+
+def motions(first: np.ndarray, second: np.ndarray, error: float) -> list[Motion]:
+    """Motions of matched features, one after another.
+
+    Args:
+        first: [K, 2] rays in the first photo.
+        second: [K, 2] their matches in the second.
+        error: of a match, in the same units.
+    """
+    left = np.arange(len(first))
+    found: list[Motion] = []
+    while len(found) < MOTIONS and len(left) >= LEAST:
+        a, b = first[left], second[left]
+        try:
+            essential, mask = cv2.findEssentialMat(
+                a, b, np.eye(3), method=cv2.USAC_MAGSAC, prob=CONFIDENCE, threshold=error, maxIters=TRIALS
+            )
+        except cv2.error:  # OpenCV gives up on some degenerate samples
+            break
+        if essential is None or mask is None or np.count_nonzero(mask) < LEAST:
+            break
+        inside = mask.ravel() > 0
+        _, rotation, translation, _ = cv2.recoverPose(essential[:3], a[inside], b[inside], np.eye(3))
+        ways = [(rotation, translation.ravel()), *_twins(a[inside], b[inside], error)][:WAYS]
+        found.append(Motion(left[inside], np.array([r for r, _ in ways]), np.array([t for _, t in ways])))
+        left = left[~inside]
+    return found
+
+
+def _twins(a: np.ndarray, b: np.ndarray, error: float) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The poses that explain matches on one plane; empty where they lie on none."""
+    try:
+        plane, mask = cv2.findHomography(a, b, cv2.USAC_MAGSAC, error, maxIters=TRIALS, confidence=CONFIDENCE)
+    except cv2.error:
+        return []
+    if plane is None or np.count_nonzero(mask) < PLANE_SHARE * len(a):
+        return []
+    inside = mask.ravel() > 0
+    rays = np.column_stack([a[inside], np.ones(inside.sum())])
+    _, rotations, translations, normals = cv2.decomposeHomographyMat(plane, np.eye(3))
+    poses = []
+    for rotation, translation, normal in zip(rotations, translations, normals):
+        length = float(np.linalg.norm(translation))
+        if length > 1e-6 and np.median(rays @ normal.ravel()) > 0:  # the plane lies in front of the camera
+            poses.append((rotation, translation.ravel() / length))
+    return poses
+
+
+def focal_votes(
+    features: Sequence[np.ndarray],  # of every photo: [N, 2] px from the principal point
+    sides_px: Sequence[int],  # longer sides
+    cameras: Sequence[int],  # of every photo the number of its camera
+    usual: Mapping[int, float],  # camera -> focal length over the longer side, as EXIF has it
+    matches: Mapping[Pair, np.ndarray],
+    jobs: int,
+) -> dict[int, float]:
+    """Focal length over the longer side of every camera, as the pairs' fundamental matrices have it.
+
+    An essential matrix has two equal singular values. Of F with the right focal lengths that is true for
+    whatever is rigid; of one fitted to anything else for no focal length in particular. A camera of which the
+    matrices say little, as of a plane, keeps what EXIF says, else gets what the others have, or `FOCAL_USUAL`.
+    """
+    pairs, matrices, weights = _fundamentals(features, sides_px, matches, jobs)
+    ends = np.array([[cameras[a], cameras[b]] for a, b in pairs], int).reshape(-1, 2)
+    others = float(np.median(list(usual.values()))) if usual else FOCAL_USUAL
+    focals = {c: usual.get(c, others) for c in sorted(set(cameras))}
+    unknown = [c for c in focals if c not in usual]
+
+    def best(rows: np.ndarray, moving: Sequence[int]) -> float | None:
+        if len(rows) < FOCAL_LEAST:
+            return None
+        moves = np.isin(ends[rows], moving)
+        fixed = np.array([[focals[c] for c in pair] for pair in ends[rows]])
+        costs = []
+        for focal in FOCALS:
+            first, second = np.where(moves, focal, fixed).T
+            unequal = _inequality(matrices[rows], first, second) / FOCAL_UNEQUAL
+            costs.append(np.average(np.minimum(unequal, 1.0), weights=weights[rows]))
+        lowest = int(np.argmin(costs))
+        clear = costs[lowest] < FOCAL_CLEAR * np.median(costs) and 0 < lowest < len(FOCALS) - 1
+        return float(FOCALS[lowest]) if clear else None
+
+    together = best(np.arange(len(ends)), unknown) if unknown else None
+    if together is not None:
+        focals.update(dict.fromkeys(unknown, together))
+    for _ in range(FOCAL_TURNS if len(focals) > 1 or not unknown else 0):
+        for camera in focals:
+            alone = best(np.flatnonzero((ends == camera).any(axis=1)), [camera])
+            focals[camera] = focals[camera] if alone is None else alone
+    return focals
+
+
+def _fundamentals(
+    features: Sequence[np.ndarray], sides_px: Sequence[int], matches: Mapping[Pair, np.ndarray], jobs: int
+) -> tuple[list[Pair], np.ndarray, np.ndarray]:
+    """Pairs, fundamental matrices [N, 3, 3] in units of the longer sides, weights [N]; some pairs twice."""
+
+    def one(pair: Pair) -> list[tuple[Pair, np.ndarray, int]]:
+        (a, b), rows = pair, matches[pair]
+        first, second = features[a][rows[:, 0]], features[b][rows[:, 1]]
+        found = []
+        while len(found) < MOTIONS - 1 and len(first) >= LEAST:
+            try:
+                matrix, mask = cv2.findFundamentalMat(
+                    first, second, cv2.USAC_MAGSAC, FUNDAMENTAL_PX, CONFIDENCE, TRIALS
+                )
+            except cv2.error:  # OpenCV gives up on some degenerate samples
+                break
+            if matrix is None or matrix.shape != (3, 3) or np.count_nonzero(mask) < LEAST:
+                break
+            scaled = np.diag([sides_px[b]] * 2 + [1]) @ matrix @ np.diag([sides_px[a]] * 2 + [1])
+            found.append((pair, scaled, int(np.count_nonzero(mask))))
+            outside = mask.ravel() == 0
+            first, second = first[outside], second[outside]
+        return found
+
+    cv2.setNumThreads(1)  # a pair a thread
+    strongest = sorted(matches, key=lambda pair: (-len(matches[pair]), pair))[: FOCAL_PAIRS * len(features)]
+    with ThreadPoolExecutor(jobs) as pool:
+        votes = [vote for found in pool.map(one, strongest) for vote in found]
+    return (
+        [pair for pair, _, _ in votes],
+        np.array([matrix for _, matrix, _ in votes]).reshape(-1, 3, 3),
+        np.minimum([count for _, _, count in votes], FOCAL_MATCHES).astype(float),
+    )
+
+
+def _inequality(matrices: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """(s1 - s2) / (s1 + s2) of the singular values of K2' F K1, a matrix of rank two each: [N]."""
+    ones = np.ones_like(first)
+    essential = matrices * np.stack([first, first, ones], -1)[:, None, :]
+    essential = essential * np.stack([second, second, ones], -1)[:, :, None]
+    square = essential @ essential.transpose(0, 2, 1)
+    total = np.trace(square, axis1=1, axis2=2)
+    product = np.sqrt(np.maximum(total**2 - (square**2).sum(axis=(1, 2)), 0.0) / 2)
+    return np.sqrt(np.maximum(total - 2 * product, 0.0) / np.maximum(total + 2 * product, 1e-30))
+
+
+def cycle_votes(pairs: Mapping[Pair, Sequence[Motion]]) -> dict[Pair, np.ndarray]:
+    """Of every motion's ways the share of triplets that it closes: (a, b) -> [M, W] in 0 to 1.
+
+    0 where no triplet can tell. Triplets are weighted by the votes of the other two motions.
+    """
+    known = sorted(pair for pair, found in pairs.items() if found)
+    at = {pair: k for k, pair in enumerate(known)}
+    rotations = np.full((len(known), MOTIONS * WAYS, 3, 3), np.nan)
+    for pair, k in at.items():
+        for m, motion in enumerate(pairs[pair]):
+            start = m * WAYS
+            rotations[k, start : start + len(motion.rotations)] = motion.rotations
+    exists = ~np.isnan(rotations[:, :, 0, 0])
+    edges = _triplets(known, at)
+    closings = [_closed(rotations, edges[i : i + _CHUNK]) for i in range(0, len(edges), _CHUNK)]
+    rows = np.concatenate(closings) if closings else np.zeros((0, 4), np.int32)
+    votes = exists.astype(float)
+    for _ in range(ROUNDS):
+        votes = _vote(votes, exists, edges, rows)
+    return {pair: votes[k].reshape(MOTIONS, WAYS) for pair, k in at.items()}
+
+
+def _triplets(known: Sequence[Pair], at: Mapping[Pair, int]) -> np.ndarray:
+    """[T, 3] pairs (a, b), (b, c), (a, c) with a < b < c, as indices into `known`."""
+    after: dict[int, set[int]] = {}
+    for a, b in known:
+        after.setdefault(a, set()).add(b)
+    found = [(at[a, b], at[b, c], at[a, c]) for a, b in known for c in sorted(after[a] & after.get(b, set()))]
+    return np.array(found, np.intp).reshape(-1, 3)
+
+
+def _closed(rotations: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """[R, 4] row of `edges`, and one motion of each of its pairs, that together close."""
+    first, second, direct = (rotations[edges[:, k]] for k in range(3))
+    around = np.einsum("tbxz,tazy->tabxy", second, first)
+    trace = np.einsum("tabxy,tcxy->tabc", around, direct)
+    # NaN, of what does not exist, is not larger than anything
+    return np.argwhere(trace > _trace(CLOSED_DEG))
+
+
+def _vote(votes: np.ndarray, exists: np.ndarray, edges: np.ndarray, closed: np.ndarray) -> np.ndarray:
+    best = votes.max(axis=1)
+    count, ways = votes.shape
+    gained, possible = np.zeros((count, ways)), np.zeros(count)
+    for k in range(3):
+        p, q = (x for x in range(3) if x != k)
+        np.add.at(possible, edges[:, k], best[edges[:, p]] * best[edges[:, q]])
+        rows = closed[:, 0]
+        weight = votes[edges[rows, p], closed[:, 1 + p]] * votes[edges[rows, q], closed[:, 1 + q]]
+        top = np.zeros((len(edges), ways))
+        np.maximum.at(top, (rows, closed[:, 1 + k]), weight)
+        np.add.at(gained, edges[:, k], top)
+    return np.where(exists & (possible[:, None] > 1e-9), gained / np.maximum(possible[:, None], 1e-9), 0.0)
+
+
+def agreed_motions(
+    pairs: Mapping[Pair, Sequence[Motion]],
+    votes: Mapping[Pair, np.ndarray],  # as `cycle_votes` returns them
+) -> dict[Pair, tuple[int, int]]:
+    """Of every pair the motion, and its way, that turns its photos as most partners of each turn them.
+
+    Rotations are chosen photo by photo: that on which the partners with most votes agree, until none changes.
+    Every photo counts once, however many matches it has. Pairs without such a motion are left out.
+    """
+    ends: dict[
+        int, list[tuple[int, np.ndarray, np.ndarray]]
+    ] = {}  # other, turns from it [K, 3, 3], votes [K]
+    for (a, b), found in votes.items():
+        turns = [
+            (r, found[m, w]) for m, motion in enumerate(pairs[a, b]) for w, r in enumerate(motion.rotations)
+        ]
+        turns = [(r, vote) for r, vote in turns if vote > 0]
+        if turns:
+            forth, weight = np.array([r for r, _ in turns]), np.array([vote for _, vote in turns])
+            ends.setdefault(b, []).append((a, forth, weight))
+            ends.setdefault(a, []).append((b, forth.transpose(0, 2, 1), weight))
+    rotations: dict[int, np.ndarray] = {}
+    for start in sorted(ends, key=lambda k: -sum(weight.max() for _, _, weight in ends[k])):
+        if start not in rotations:
+            rotations[start] = np.eye(3)
+            _grow(start, ends, rotations)
+    for _ in range(SWEEPS):
+        changed = 0
+        for photo in ends:
+            before = rotations[photo]
+            rotations[photo] = _turned(ends[photo], rotations, before)
+            changed += not _alike(before[None], rotations[photo], CLOSED_DEG)[0]
+        if not changed:
+            break
+    agreed = {}
+    for (a, b), found in votes.items():
+        if a in rotations and b in rotations:
+            wanted = rotations[b] @ rotations[a].T
+            fits = [
+                (found[m, w], -m, -w)
+                for m, motion in enumerate(pairs[a, b])
+                for w in np.flatnonzero(_alike(motion.rotations, wanted, AGREED_DEG))
+            ]
+            if fits:
+                _, m, w = max(fits)
+                agreed[a, b] = -m, -int(w)
+    return agreed
+
+
+def _grow(start: int, ends: Mapping[int, list], rotations: dict[int, np.ndarray]) -> None:
+    """Turn the photos that pairs connect with `start`, those with most votes first."""
+    gain: dict[int, float] = {}
+    photo = start
+    while True:
+        for other, _, weight in ends[photo]:
+            if other not in rotations:
+                gain[other] = gain.get(other, 0.0) + float(weight.max())
+        if not gain:
+            return
+        photo = max(gain, key=lambda k: (gain[k], -k))
+        del gain[photo]
+        rotations[photo] = _turned(ends[photo], rotations, np.eye(3))
+
+
+def _turned(ends: Sequence[tuple], rotations: Mapping[int, np.ndarray], otherwise: np.ndarray) -> np.ndarray:
+    """The rotation of a photo on which its turned partners agree best; one motion of each counts."""
+    turns, weights, owners = [], [], []
+    for other, forth, weight in ends:
+        if other in rotations:
+            turns += list(forth @ rotations[other])
+            weights += list(weight)
+            owners += [other] * len(weight)
+    if not turns:
+        return otherwise
+    stack, weight, owner = np.array(turns), np.array(weights), np.unique(owners, return_inverse=True)[1]
+    flat = stack.reshape(-1, 9)
+    alike = flat @ flat.T > _trace(AGREED_DEG)
+    best = np.zeros((len(flat), owner.max() + 1))
+    for column in range(best.shape[1]):
+        mine = owner == column
+        best[:, column] = np.where(alike[:, mine], weight[mine], 0.0).max(axis=1)
+    group = alike[int(np.argmax(best.sum(axis=1)))]
+    left, _, right = np.linalg.svd((stack[group] * weight[group, None, None]).sum(axis=0))
+    return left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+
+
+def _alike(rotations: np.ndarray, wanted: np.ndarray, angle_deg: float) -> np.ndarray:
+    """[N] bool: rotations [N, 3, 3] that differ by less than an angle from one."""
+    return (rotations * wanted).sum(axis=(1, 2)) > _trace(angle_deg)
+
+
+def _trace(angle_deg: float) -> float:
+    """Trace of a rotation by an angle."""
+    return 1.0 + 2.0 * float(np.cos(np.radians(angle_deg)))

@@ -1,0 +1,520 @@
+"""Place every photo where its partners agree, and name those that have no such place.
+
+COLMAP's mapper places a photo where most of its matches fit. Where a distractor has more matches than the
+place, that is wrong, and nothing in the model tells: it is consistent with itself. Partners tell: a photo that
+a distractor placed fits the few photos that show the distractor alike, in a small part of the picture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ambiguous_wild.builder.motions import (
+    LEAST,
+    Motion,
+    Pair,
+    agreed_motions,
+    cycle_votes,
+    focal_votes,
+    motions_of_pairs,
+)
+from ambiguous_wild.builder.records import CameraFact
+from ambiguous_wild.io.safe_pycolmap import pycolmap
+
+FITS_PX = 3.0  # of a match to its epipolar line
+FITS = 0.5  # share of a motion's matches that fit, from which on a partner agrees
+AGREE = 2  # partners of a photo, at least
+AGREE_NEW = 3  # of a photo that COLMAP did not place
+RIVAL = 0.5  # weight of a second place over that of the first, from which on a photo has two places
+ALIKE_DEG, SAME_DEG = 5.0, 1.0  # between rotations that partners imply; between poses that are one place
+SAME_SHARE = 0.1  # of the path's radius, between positions that are one place
+GRID = 12  # cells a side that a photo's matches cover or not
+PLACES = 3  # that are tried for a photo
+RESECTION_PX, RESECTION_LEAST = 6.0, 15  # error and number of the points of a place
+ROUNDS = 8  # of placing anew
+TAKEN_OUT = 2  # times, after which a photo stays out
+LOOSE_PX, TIGHT_PX = 4.0, 2.0  # observations with a larger error are removed, first and last
+COVARIANCE_LIMIT = 400  # photos: the poses' covariance is a dense matrix
+ADJUSTMENTS, STILL = 5, 5e-4  # joint adjustments at most, and share of observations that end them
+
+
+@dataclass
+class Matched:
+    """Photos with features and matched pairs, before any pose; photos are numbered as in `ids`."""
+
+    ids: list[int]  # COLMAP's
+    names: list[str]
+    cameras: list[Any]  # pycolmap.Camera of every photo
+    features: list[np.ndarray]  # [N, 2] px
+    matches: dict[Pair, np.ndarray]  # [K, 2] features of the pair's photos; pairs with `LEAST` at least
+    motions: dict[Pair, list[Motion]] = field(default_factory=dict)
+
+    @classmethod
+    def read(cls, database: Path) -> Matched:
+        """From COLMAP's database, without motions."""
+        db = pycolmap.Database.open(str(database))
+        try:
+            images = sorted(db.read_all_images(), key=lambda image: image.image_id)
+            cameras = {camera.camera_id: camera for camera in db.read_all_cameras()}
+            at = {image.image_id: k for k, image in enumerate(images)}
+            matches = {}
+            for number, rows in zip(*db.read_all_matches()):
+                if len(rows) >= LEAST:
+                    first, second = pycolmap.pair_id_to_image_pair(number)
+                    matches[at[first], at[second]] = np.asarray(rows)
+            return cls(
+                list(at),
+                [image.name for image in images],
+                [cameras[image.camera_id] for image in images],
+                [np.asarray(db.read_keypoints(i))[:, :2].astype(np.float64) for i in at],
+                dict(sorted(matches.items())),
+            )
+        finally:
+            db.close()
+
+    def rays(self) -> list[np.ndarray]:
+        """Of every photo: [N, 2] its features as x / z and y / z, through its camera as it is now."""
+        return [
+            np.asarray(camera.cam_from_img(points)) if len(points) else points
+            for camera, points in zip(self.cameras, self.features)
+        ]
+
+    def focal_px(self, photo: int) -> float:
+        """Focal length of its camera."""
+        return float(self.cameras[photo].mean_focal_length())
+
+    def fit(
+        self, pair: Pair, first: np.ndarray, second: np.ndarray, rays: Sequence[np.ndarray]
+    ) -> np.ndarray:
+        """[K] bool: matches of a pair within `FITS_PX` of their epipolar lines, by Sampson's error.
+
+        Args:
+            pair: of photos.
+            first: [3, 4] pose of its first photo, camera from world.
+            second: of its second.
+            rays: of all photos.
+        """
+        rows = self.matches[pair]
+        essential = _essential(relative_pose(first, second))
+        a, b = (np.column_stack([rays[k][rows[:, c]], np.ones(len(rows))]) for c, k in enumerate(pair))
+        line, back = a @ essential.T, b @ essential
+        size = (line[:, :2] ** 2).sum(axis=1) + (back[:, :2] ** 2).sum(axis=1)
+        error = FITS_PX / np.sqrt(self.focal_px(pair[0]) * self.focal_px(pair[1]))
+        return (b * line).sum(axis=1) ** 2 <= error**2 * np.maximum(size, 1e-30)
+
+    def fitting(self, poses: Mapping[int, np.ndarray]) -> dict[Pair, tuple[np.ndarray, np.ndarray]]:
+        """Of every placed pair its pose, second from first [3, 4], and the matches that fit it."""
+        rays, found = self.rays(), {}
+        for a, b in self.matches:
+            if a in poses and b in poses:
+                rows = np.flatnonzero(self.fit((a, b), poses[a], poses[b], rays))
+                if len(rows) >= LEAST:
+                    found[a, b] = relative_pose(poses[a], poses[b]), rows
+        return found
+
+    def write_verified(self, database: Path, verified: Mapping[Pair, tuple[np.ndarray, np.ndarray]]) -> None:
+        """Replace the verified pairs of the database: pose, second from first [3, 4], and matches."""
+        db = pycolmap.Database.open(str(database))
+        try:
+            db.clear_two_view_geometries()
+            with pycolmap.DatabaseTransaction(db):
+                for (a, b), (pose, rows) in verified.items():
+                    essential = _essential(pose)
+                    first, second = (np.linalg.inv(self.cameras[k].calibration_matrix()) for k in (a, b))
+                    geometry = pycolmap.TwoViewGeometry()
+                    geometry.config = int(pycolmap.TwoViewGeometryConfiguration.CALIBRATED)
+                    geometry.E, geometry.F = essential, second.T @ essential @ first
+                    geometry.cam2_from_cam1 = pycolmap.Rigid3d(pose)
+                    geometry.inlier_matches = np.ascontiguousarray(self.matches[a, b][rows], np.uint32)
+                    db.write_two_view_geometry(self.ids[a], self.ids[b], geometry)
+        finally:
+            db.close()
+
+    def find_focals(self, usual: Mapping[str, float], jobs: int) -> None:
+        """Focal lengths of the cameras, by votes of pairs.
+
+        Args:
+            usual: name -> focal length over the longer side, of photos whose EXIF tells it.
+            jobs: threads.
+        """
+        sides = [max(camera.width, camera.height) for camera in self.cameras]
+        numbers = [camera.camera_id for camera in self.cameras]
+        centred = [f - [c.width / 2, c.height / 2] for f, c in zip(self.features, self.cameras)]
+        stated = {number: usual[name] for number, name in zip(numbers, self.names) if name in usual}
+        focals = focal_votes(centred, sides, numbers, stated, self.matches, jobs)
+        for camera, side in zip(self.cameras, sides):
+            camera.params = [focals[camera.camera_id] * side, *camera.params[1:]]
+
+    def find_motions(self, jobs: int) -> dict[Pair, tuple[int, int]]:
+        """The motions of all pairs, and of the pairs whose photos agree with others the motion and its way."""
+        focals_px = [self.focal_px(k) for k in range(len(self.ids))]
+        self.motions = motions_of_pairs(self.rays(), focals_px, self.matches, jobs)
+        return agreed_motions(self.motions, cycle_votes(self.motions))
+
+    def take_cameras(self, model: Any) -> float:
+        """Cameras of a model; how much focal lengths change, relative, in the median over photos."""
+        before = np.array([self.focal_px(k) for k in range(len(self.ids))])
+        for camera in self.cameras:
+            if camera.camera_id in model.cameras:
+                camera.params = model.cameras[camera.camera_id].params
+        after = np.array([self.focal_px(k) for k in range(len(self.ids))])
+        return float(np.median(np.abs(after / before - 1.0)))
+
+    def write_agreed(self, database: Path, agreed: Mapping[Pair, tuple[int, int]]) -> None:
+        """Cameras, and one motion of every pair that agrees, for COLMAP's mapper."""
+        db = pycolmap.Database.open(str(database))
+        try:
+            for camera in {camera.camera_id: camera for camera in self.cameras}.values():
+                db.update_camera(camera)
+        finally:
+            db.close()
+        verified = {}
+        for pair, (number, way) in agreed.items():
+            motion = self.motions[pair][number]
+            pose = np.column_stack([motion.rotations[way], motion.translations[way]])
+            verified[pair] = pose, motion.matches
+        self.write_verified(database, verified)
+
+    def save_motions(self, path: Path) -> None:
+        """As .npz: of every motion its pair, matches and ways."""
+        every = [(pair, motion) for pair, found in self.motions.items() for motion in found]
+        np.savez(
+            path,
+            pairs=np.array([pair for pair, _ in every], int).reshape(-1, 2),
+            counts=np.array([[len(m.matches), len(m.rotations)] for _, m in every], int).reshape(-1, 2),
+            matches=np.concatenate([np.zeros(0, int), *(m.matches for _, m in every)]),
+            rotations=np.concatenate([np.zeros((0, 3, 3)), *(m.rotations for _, m in every)]),
+            translations=np.concatenate([np.zeros((0, 3)), *(m.translations for _, m in every)]),
+        )
+
+    def load_motions(self, path: Path) -> None:
+        """What `save_motions` wrote."""
+        with np.load(path) as file:
+            cuts = np.cumsum(file["counts"], axis=0)[:-1]
+            matches = np.split(file["matches"], cuts[:, 0])
+            ways = (np.split(file[name], cuts[:, 1]) for name in ("rotations", "translations"))
+            self.motions = {pair: [] for pair in self.matches}
+            for (a, b), *motion in zip(file["pairs"].tolist(), matches, *ways):
+                self.motions[a, b].append(Motion(*motion))
+
+
+@dataclass(frozen=True)
+class Place:
+    """A place of a photo, and what speaks for it."""
+
+    pose: np.ndarray | None  # [3, 4] camera from world; None: only its rotation is known
+    partners: frozenset[int]  # placed photos that agree
+    cells: int  # of `GRID` x `GRID` that their matches cover
+
+    @property
+    def weight(self) -> int:
+        """A distractor may have partners, but covers little of the photo."""
+        return len(self.partners) * self.cells
+
+
+class Placement:
+    """Poses, points and cameras of a capture, placed by the votes of partners."""
+
+    def __init__(self, matched: Matched, database: Path, model: Any, seed: int) -> None:
+        """Begin with COLMAP's model; the database's verified pairs are replaced."""
+        self.matched, self.database, self.model, self.seed = matched, database, model, seed
+        self.pairs: list[list[Pair]] = [[] for _ in matched.ids]  # of every photo
+        for pair in matched.matches:
+            for photo in pair:
+                self.pairs[photo].append(pair)
+        self.poses: dict[int, np.ndarray] = {}  # photo -> [3, 4] camera from world
+        self.places: dict[int, Place] = {}  # of the placed photos
+        self.left_out: dict[int, str] = {}  # photo -> reason
+        self._take_over(model)
+
+    def run(self) -> None:
+        """Place all photos anew, one after another, until all stay."""
+        outs = [0] * len(self.matched.ids)
+        for turn in range(ROUNDS + 1):
+            self._settle(final=False)
+            moved = self._look(outs, only_out=turn == ROUNDS)
+            if not moved:
+                break
+        self._settle(final=True)
+
+    def cameras(self) -> list[CameraFact]:
+        """Focal length of every camera, with its standard deviation where the adjustment gives one."""
+        numbers: dict[int, list[int]] = {}
+        for photo in self.poses:
+            numbers.setdefault(self.matched.cameras[photo].camera_id, []).append(photo)
+        covariance = self._covariance() if len(self.poses) <= COVARIANCE_LIMIT else None
+        facts: list[CameraFact] = []
+        for number, photos in numbers.items():
+            params = self.model.cameras[number].params
+            spread = covariance.get_other_params_cov(params) if covariance else None
+            facts.append(
+                {
+                    "photos": [self.matched.names[photo] for photo in photos],
+                    "focal_px": round(self.matched.focal_px(photos[0]), 2),
+                    "focal_sd_px": None if spread is None else round(float(np.sqrt(spread[0][0])), 2),
+                }
+            )
+        return facts
+
+    def _covariance(self) -> Any:
+        """Of a joint adjustment of the whole model; None where the photos do not determine it."""
+        config = pycolmap.BundleAdjustmentConfig()
+        for number in self.model.reg_image_ids():
+            config.add_image(number)
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+        adjuster = pycolmap.create_default_ceres_bundle_adjuster(adjustment_options(), config, self.model)
+        adjuster.solve()
+        options = pycolmap.BACovarianceOptions(params=pycolmap.BACovarianceOptionsParams.ALL)
+        return pycolmap.estimate_ba_covariance(options, self.model, adjuster)
+
+    def _look(self, outs: list[int], only_out: bool) -> bool:
+        """Judge the places of all photos; whether one moved, came in or was taken out."""
+        rays, points = self.matched.rays(), _Points.read(self.matched, self.model)
+        moves: dict[int, np.ndarray | None] = {}
+        self.places, self.left_out = {}, {}
+        for photo in range(len(self.matched.ids)):
+            now = self.poses.get(photo)
+            best, rival = self._best(photo, now, rays, points)
+            reason = _reason(best, rival, AGREE if now is not None else AGREE_NEW)
+            if reason is None and now is None and (only_out or outs[photo] >= TAKEN_OUT):
+                reason = "its partners do not settle on a place"
+            if reason is not None:
+                self.left_out[photo] = reason
+                if now is not None:
+                    moves[photo] = None
+                    outs[photo] += 1
+                continue
+            self.places[photo] = best
+            if not only_out and not self._same(best.pose, now):
+                moves[photo] = best.pose
+        for photo, pose in moves.items():
+            if pose is None:
+                del self.poses[photo]
+            else:
+                self.poses[photo] = pose
+        return bool(moves)
+
+    def _best(
+        self, photo: int, now: np.ndarray | None, rays: Sequence[np.ndarray], points: _Points
+    ) -> tuple[Place, Place]:
+        """The place with most weight, and the strongest one elsewhere."""
+        places = [] if now is None else [self._judge(photo, now, rays)]
+        places += [self._judge(photo, pose, rays) for pose in self._resections(photo, points)]
+        best = max(places, key=lambda place: place.weight, default=Place(None, frozenset(), 0))
+        elsewhere = [p for p in places if len(p.partners) >= AGREE and not self._same(p.pose, best.pose)]
+        dissent = self._dissent(photo, best.partners)
+        if len(dissent.partners) >= AGREE:
+            elsewhere.append(dissent)
+        return best, max(elsewhere, key=lambda place: place.weight, default=Place(None, frozenset(), 0))
+
+    def _judge(self, photo: int, pose: np.ndarray, rays: Sequence[np.ndarray]) -> Place:
+        """What the placed partners say of a place; one agrees if one of its motions fits."""
+        partners, rows = set(), []
+        for pair in self.pairs[photo]:
+            other = pair[0] + pair[1] - photo
+            if other not in self.poses:
+                continue
+            ends = (pose, self.poses[other]) if pair[0] == photo else (self.poses[other], pose)
+            fits = self.matched.fit(pair, *ends, rays)
+            good = [m.matches for m in self.matched.motions[pair] if fits[m.matches].mean() >= FITS]
+            if good:
+                partners.add(other)
+                rows += [self.matched.matches[pair][m[fits[m]], pair.index(photo)] for m in good]
+        return Place(pose, frozenset(partners), self._cells(photo, rows))
+
+    def _dissent(self, photo: int, agree: frozenset[int]) -> Place:
+        """Where most of the other placed partners see the photo: those whose motions turn it alike."""
+        owners, turns, rows = [], [], []
+        for pair in self.pairs[photo]:
+            other = pair[0] + pair[1] - photo
+            if other not in self.poses or other in agree:
+                continue
+            for motion in self.matched.motions[pair]:
+                for rotation in motion.rotations:
+                    owners.append(other)
+                    turns.append((rotation if pair[1] == photo else rotation.T) @ self.poses[other][:, :3])
+                    rows.append(self.matched.matches[pair][motion.matches, pair.index(photo)])
+        if not owners:
+            return Place(None, frozenset(), 0)
+        stack = np.array(turns).reshape(-1, 9)
+        alike = stack @ stack.T > _trace(ALIKE_DEG)
+        groups = [np.flatnonzero(row) for row in alike]
+        largest = max(groups, key=lambda group: len({owners[k] for k in group}))
+        cells = self._cells(photo, [rows[k] for k in largest])
+        return Place(None, frozenset(owners[k] for k in largest), cells)
+
+    def _same(self, first: np.ndarray | None, second: np.ndarray | None) -> bool:
+        """Whether two poses are one place."""
+        if first is None or second is None:
+            return False
+        turned = float((first[:, :3] * second[:, :3]).sum()) < _trace(SAME_DEG)
+        centres = np.array([-pose[:, :3].T @ pose[:, 3] for pose in (first, second, *self.poses.values())])
+        spread = float(np.median(np.linalg.norm(centres - np.median(centres, axis=0), axis=1)))
+        return not turned and float(np.linalg.norm(centres[0] - centres[1])) < SAME_SHARE * spread
+
+    def _cells(self, photo: int, rows: Sequence[np.ndarray]) -> int:
+        """Cells of a grid over the photo that hold one of these features."""
+        if not rows:
+            return 0
+        camera = self.matched.cameras[photo]
+        share = self.matched.features[photo][np.concatenate(rows)] / [camera.width, camera.height]
+        cell = np.clip((share * GRID).astype(int), 0, GRID - 1)
+        return len(np.unique(cell[:, 0] * GRID + cell[:, 1]))
+
+    def _resections(self, photo: int, points: _Points) -> list[np.ndarray]:
+        """Places of a photo among points that two other photos determine: [3, 4] each."""
+        features, xyz = points.matched_with(photo, self.pairs[photo], self.poses)
+        pixels = self.matched.features[photo][features]
+        options = pycolmap.AbsolutePoseEstimationOptions()
+        options.ransac.max_error = RESECTION_PX
+        options.ransac.random_seed = self.seed
+        found: list[np.ndarray] = []
+        left = np.arange(len(features))
+        while len(found) < PLACES and len(left) >= RESECTION_LEAST:
+            answer = pycolmap.estimate_and_refine_absolute_pose(
+                pixels[left], xyz[left], self.matched.cameras[photo], options
+            )
+            if answer is None or answer["num_inliers"] < RESECTION_LEAST:
+                break
+            found.append(np.asarray(answer["cam_from_world"].matrix()))
+            left = left[~np.asarray(answer["inlier_mask"])]
+        return found
+
+    def _settle(self, *, final: bool) -> None:
+        """Points from all matches that fit the poses, then joint adjustments; at the end until all is still."""
+        matched = self.matched
+        matched.write_verified(self.database, matched.fitting(self.poses))
+        db = pycolmap.Database.open(str(self.database))
+        try:
+            cache = pycolmap.DatabaseCache.create(db, pycolmap.DatabaseCacheOptions(load_all_images=True))
+        finally:
+            db.close()
+        options = pipeline_options(self.seed)
+        model = pycolmap.Reconstruction()
+        model.load(cache)
+        for camera in matched.cameras:
+            model.cameras[camera.camera_id].params = camera.params
+        mapper = pycolmap.IncrementalMapper(cache)
+        mapper.begin_reconstruction(model)
+        for photo, pose in self.poses.items():
+            image = model.images[matched.ids[photo]]
+            image.frame.set_cam_from_world(image.camera_id, pycolmap.Rigid3d(pose))
+            mapper.observation_manager.register_frame(image.frame_id)
+        for photo in self.poses:
+            mapper.triangulate_image(options.triangulation, matched.ids[photo])
+        mapper.complete_and_merge_tracks(options.triangulation)
+        for error in (LOOSE_PX, TIGHT_PX) if final else (LOOSE_PX,):
+            options.mapper.filter_max_reproj_error = error
+            mapper.iterative_global_refinement(
+                ADJUSTMENTS if final else 1,
+                STILL,
+                options.mapper,
+                adjustment_options(),
+                options.triangulation,
+            )
+        mapper.end_reconstruction(False)
+        self._take_over(model)
+
+    def _take_over(self, model: Any) -> None:
+        """Cameras and poses of a model."""
+        self.model = model
+        self.matched.take_cameras(model)
+        self.poses = {
+            k: np.asarray(model.images[i].cam_from_world().matrix())
+            for k, i in enumerate(self.matched.ids)
+            if i in model.images and model.images[i].has_pose
+        }
+
+
+@dataclass
+class _Points:
+    """Points of a model by the features that see them."""
+
+    matched: Matched
+    rows: list[np.ndarray]  # of every photo: [N] row of `xyz` that a feature sees, -1 without a point
+    xyz: np.ndarray  # [P, 3]
+    views: np.ndarray  # [P] photos that see it
+
+    @classmethod
+    def read(cls, matched: Matched, model: Any) -> _Points:
+        at = {number: k for k, number in enumerate(matched.ids)}
+        rows = [np.full(len(f), -1) for f in matched.features]
+        xyz, views = np.zeros((len(model.points3D), 3)), np.zeros(len(model.points3D), int)
+        for row, point in enumerate(model.points3D.values()):
+            xyz[row] = point.xyz
+            elements = point.track.elements
+            views[row] = len({e.image_id for e in elements})
+            for element in elements:
+                rows[at[element.image_id]][element.point2D_idx] = row
+        return cls(matched, rows, xyz, views)
+
+    def matched_with(
+        self, photo: int, pairs: Sequence[Pair], poses: Mapping[int, np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Features of a photo [K], and the points [K, 3] that their matches see, two other photos at least."""
+        own = np.zeros(len(self.xyz), int)
+        own[np.unique(self.rows[photo][self.rows[photo] >= 0])] = 1
+        links = [np.zeros((0, 2), int)]
+        for pair in pairs:
+            side = pair.index(photo)
+            if pair[1 - side] in poses:
+                matches = self.matched.matches[pair].astype(int)
+                seen = self.rows[pair[1 - side]][matches[:, 1 - side]]
+                links.append(np.column_stack([matches[:, side], seen])[seen >= 0])
+        both = np.unique(np.concatenate(links), axis=0)
+        both = both[self.views[both[:, 1]] - own[both[:, 1]] >= 2]
+        return both[:, 0], self.xyz[both[:, 1]]
+
+
+def pipeline_options(seed: int) -> Any:
+    """COLMAP's, on one thread: bundle adjustment sums in the order of its threads."""
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = 1
+    options.ba_min_num_residuals_for_cpu_multi_threading = 10**9
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
+    return options
+
+
+def adjustment_options() -> Any:
+    """Joint adjustment in which a match that does not fit counts little, on one thread as above."""
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    options.ceres.solver_options.num_threads = 1
+    options.ceres.solver_options.max_num_iterations = 50
+    options.ceres.solver_options.function_tolerance = 1e-6
+    options.ceres.min_num_residuals_for_cpu_multi_threading = 10**9
+    return options
+
+
+def relative_pose(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """[3, 4] second camera from the first, of their poses [3, 4] from world."""
+    rotation = second[:, :3] @ first[:, :3].T
+    return np.column_stack([rotation, second[:, 3] - rotation @ first[:, 3]])
+
+
+def _essential(pose: np.ndarray) -> np.ndarray:
+    """[3, 3] of a pose, second from first [3, 4]; its scale does not count."""
+    x, y, z = pose[:, 3] / max(float(np.linalg.norm(pose[:, 3])), 1e-12)
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ pose[:, :3]
+
+
+def _reason(best: Place, rival: Place, needed: int) -> str | None:
+    """Why a photo cannot stay at its best place; None if it can."""
+    if not best.partners:
+        return "no placed photo agrees with it on a place"
+    if len(best.partners) < needed:
+        return f"only {len(best.partners)} placed photos agree with it on a place"
+    if rival.weight > RIVAL * best.weight:
+        return f"two places: {len(best.partners)} photos agree on one, {len(rival.partners)} on another"
+    return None
+
+
+def _trace(angle_deg: float) -> float:
+    """Trace of a rotation by an angle."""
+    return 1.0 + 2.0 * float(np.cos(np.radians(angle_deg)))

@@ -1,9 +1,9 @@
 """Motions between two photos, and which of them is the place's.
 
-A pair of photos may show several rigid motions: the place's, and one of every distractor that both show. The
-distractor may well have most of the matches. But photos of the place agree with each other: the rotation from
-a photo to a second, and on to a third, is that from the first to the third. A motion counts by the triplets of
-photos that it closes, each weighted by the votes of its other two motions.
+A pair of photos may show several rigid motions: the place's, and one of every distractor that both show, which
+may have most of the matches. But photos of the place agree with each other: the rotation from a photo to a
+second, and on to a third, is that from the first to the third. A motion counts by the triplets of photos that
+it closes, each weighted by the votes of its other two motions.
 
 Several motions a pair, made consistent over all pairs: Arrigoni and Pajdla, "Robust motion segmentation from
 pairwise matches" (ICCV 2019), which labels points; here the motions place the photos.
@@ -131,7 +131,7 @@ def focal_votes(
 
     An essential matrix has two equal singular values. Of F with the right focal lengths that is true for
     whatever is rigid; of one fitted to anything else for no focal length in particular. A camera of which the
-    matrices say little, as of a plane, keeps what EXIF says, else gets what the others have, or `FOCAL_USUAL`.
+    matrices say little, as of a plane, keeps what EXIF says, else has that of the others, or `FOCAL_USUAL`.
     """
     pairs, matrices, weights = _fundamentals(features, sides_px, matches, jobs)
     ends = np.array([[cameras[a], cameras[b]] for a, b in pairs], int).reshape(-1, 2)
@@ -171,7 +171,7 @@ def _fundamentals(
     def one(pair: Pair) -> list[tuple[Pair, np.ndarray, int]]:
         (a, b), rows = pair, matches[pair]
         first, second = features[a][rows[:, 0]], features[b][rows[:, 1]]
-        found = []
+        found: list[tuple[Pair, np.ndarray, int]] = []
         while len(found) < MOTIONS - 1 and len(first) >= LEAST:
             try:
                 matrix, mask = cv2.findFundamentalMat(

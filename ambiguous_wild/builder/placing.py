@@ -1,8 +1,8 @@
 """Place every photo where its partners agree, and name those that have no such place.
 
 COLMAP's mapper places a photo where most of its matches fit. Where a distractor has more matches than the
-place, that is wrong, and nothing in the model tells: it is consistent with itself. Partners tell: a photo that
-a distractor placed fits the few photos that show the distractor alike, in a small part of the picture.
+place, that is wrong, and nothing in the model tells: it is consistent with itself. Partners tell: a photo
+that a distractor placed fits the few photos that show the distractor alike, in a small part of the picture.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ RIVAL = 0.5  # weight of a second place over that of the first, from which on a 
 ALIKE_DEG, SAME_DEG = 5.0, 1.0  # between rotations that partners imply; between poses that are one place
 SAME_SHARE = 0.1  # of the path's radius, between positions that are one place
 GRID = 12  # cells a side that a photo's matches cover or not
+LEAST_CELLS = 14  # of them, a tenth of the photo: where less agrees, a distractor may
 PLACES = 3  # that are tried for a photo
 RESECTION_PX, RESECTION_LEAST = 6.0, 15  # error and number of the points of a place
 ROUNDS = 8  # of placing anew
@@ -151,7 +152,7 @@ class Matched:
             camera.params = [focals[camera.camera_id] * side, *camera.params[1:]]
 
     def find_motions(self, jobs: int) -> dict[Pair, tuple[int, int]]:
-        """The motions of all pairs, and of the pairs whose photos agree with others the motion and its way."""
+        """The motions of all pairs; where a pair agrees with others, the number of its motion and way."""
         focals_px = [self.focal_px(k) for k in range(len(self.ids))]
         self.motions = motions_of_pairs(self.rays(), focals_px, self.matches, jobs)
         return agreed_motions(self.motions, cycle_votes(self.motions))
@@ -386,7 +387,7 @@ class Placement:
         return found
 
     def _settle(self, *, final: bool) -> None:
-        """Points from all matches that fit the poses, then joint adjustments; at the end until all is still."""
+        """Points from all matches that fit the poses, then joint adjustments, finally until all is still."""
         matched = self.matched
         matched.write_verified(self.database, matched.fitting(self.poses))
         db = pycolmap.Database.open(str(self.database))
@@ -403,7 +404,9 @@ class Placement:
         mapper.begin_reconstruction(model)
         for photo, pose in self.poses.items():
             image = model.images[matched.ids[photo]]
-            image.frame.set_cam_from_world(image.camera_id, pycolmap.Rigid3d(pose))
+            image.frame.set_cam_from_world(  # type: ignore[union-attr]
+                image.camera_id, pycolmap.Rigid3d(pose)
+            )
             mapper.observation_manager.register_frame(image.frame_id)
         for photo in self.poses:
             mapper.triangulate_image(options.triangulation, matched.ids[photo])
@@ -456,7 +459,7 @@ class _Points:
     def matched_with(
         self, photo: int, pairs: Sequence[Pair], poses: Mapping[int, np.ndarray]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Features of a photo [K], and the points [K, 3] that their matches see, two other photos at least."""
+        """Features of a photo [K], and the points [K, 3] that their matches see, of two others at least."""
         own = np.zeros(len(self.xyz), int)
         own[np.unique(self.rows[photo][self.rows[photo] >= 0])] = 1
         links = [np.zeros((0, 2), int)]
@@ -510,6 +513,8 @@ def _reason(best: Place, rival: Place, needed: int) -> str | None:
         return "no placed photo agrees with it on a place"
     if len(best.partners) < needed:
         return f"only {len(best.partners)} placed photos agree with it on a place"
+    if best.cells < LEAST_CELLS:
+        return f"only a small part of it agrees with {len(best.partners)} placed photos"
     if rival.weight > RIVAL * best.weight:
         return f"two places: {len(best.partners)} photos agree on one, {len(rival.partners)} on another"
     return None

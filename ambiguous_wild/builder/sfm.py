@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from ambiguous_wild.builder.pairs import MOTIONS, PAIRS
 from ambiguous_wild.builder.progress import Bar
@@ -73,7 +73,7 @@ def camera_groups(photos: Sequence[PhotoRecord]) -> list[list[int]]:
 
 
 def exif_focal(photo: PhotoRecord) -> float | None:
-    """Focal length over the longer side, from that of a 35 mm camera with the same diagonal; None: not stated."""
+    """Focal length over the longer side, from the 35 mm equivalent (same diagonal); None: not stated."""
     focal_mm = photo["exif"].get("focal_35mm")
     if not focal_mm:
         return None
@@ -180,7 +180,7 @@ def match(
     bar.finish()
     pairs = every if matcher == "exhaustive" else len(listed.read_text(encoding="utf-8").splitlines())
     counts = {"verified": 0, "planar": 0} if posed else json.loads((folder / "pairs.json").read_text())
-    return {"matcher": matcher, "pairs": pairs, **counts}
+    return cast(MatchResult, {"matcher": matcher, "pairs": pairs, **counts})
 
 
 def map_scene(
@@ -217,8 +217,10 @@ def map_scene(
     bar.finish()
     database.unlink()
     progress.unlink(missing_ok=True)
-    found = json.loads((folder / "mapping.json").read_text(encoding="utf-8"))
-    return {**found, "plan": plan.name}
+    return cast(
+        MappingResult,
+        {**json.loads((folder / "mapping.json").read_text(encoding="utf-8")), "plan": plan.name},
+    )
 
 
 def run_job(job: SfmJob, folder: Path, watch: Callable[[], None]) -> None:

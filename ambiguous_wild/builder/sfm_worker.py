@@ -81,7 +81,7 @@ def _extract_with_opencv(job: FeatureJob) -> None:
 
 
 def run_matches(job: MatchJob) -> None:
-    """Match pairs, all of them or those that are likely to overlap; then find the motions that photos share."""
+    """Match pairs, all of them or those that are likely to overlap; then find the motions of each."""
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu = False
     options.num_threads = job["jobs"]
@@ -141,7 +141,7 @@ def _likely_pairs(job: MatchJob) -> list[tuple[str, str]]:
 
 
 def run_mapping(job: MappingJob) -> None:
-    """Build the models that COLMAP finds, then place every photo of the largest anew; `mapping.json` tells."""
+    """Take the largest of COLMAP's models, place every photo of it anew; `mapping.json` has the facts."""
     output, database = Path(job["output"]), Path(job["database"])
     matched = Matched.read(database)
     mapper = _map_globally if job["mapper"] == "global" else _map_incrementally

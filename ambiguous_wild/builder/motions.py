@@ -1,9 +1,9 @@
 """Motions between two photos, and which of them is the place's.
 
-A pair of photos may show several rigid motions: the place's, and one of every distractor that both show, which
-may have most of the matches. But photos of the place agree with each other: the rotation from a photo to a
-second, and on to a third, is that from the first to the third. A motion counts by the triplets of photos that
-it closes, each weighted by the votes of its other two motions.
+A pair of photos may show several rigid motions: the place's, and one of every distractor that both show,
+which may have most of the matches. But photos of the place agree with each other: the rotation from a photo
+to a second, and on to a third, is that from the first to the third. A motion counts by the triplets of
+photos that it closes, each weighted by the votes of its other two motions.
 
 Several motions a pair, made consistent over all pairs: Arrigoni and Pajdla, "Robust motion segmentation from
 pairwise matches" (ICCV 2019), which labels points; here the motions place the photos.

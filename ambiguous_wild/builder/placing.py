@@ -39,6 +39,7 @@ PLACES = 3  # that are tried for a photo
 RESECTION_PX, RESECTION_LEAST = 6.0, 15  # error and number of the points of a place
 ROUNDS = 8  # of placing anew
 TAKEN_OUT = 2  # times, after which a photo stays out
+BENDS = -0.5, 0.3  # k of SIMPLE_RADIAL, from an action camera to more than any pincushion
 LOOSE_PX, TIGHT_PX = 4.0, 2.0  # observations with a larger error are removed, first and last
 COVARIANCE_LIMIT = 400  # photos: the poses' covariance is a dense matrix
 ADJUSTMENTS, STILL = 5, 5e-4  # joint adjustments at most, and share of observations that end them
@@ -54,6 +55,7 @@ class Matched:
     features: list[np.ndarray]  # [N, 2] px
     matches: dict[Pair, np.ndarray]  # [K, 2] features of the pair's photos; pairs with `LEAST` at least
     motions: dict[Pair, list[Motion]] = field(default_factory=dict)
+    bent: bool = True  # whether the photos determine the lens's distortion; else there is none
 
     @classmethod
     def read(cls, database: Path) -> Matched:
@@ -268,7 +270,9 @@ class Placement:
         for number in self.model.reg_image_ids():
             config.add_image(number)
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-        adjuster = pycolmap.create_default_ceres_bundle_adjuster(adjustment_options(), config, self.model)
+        adjuster = pycolmap.create_default_ceres_bundle_adjuster(
+            adjustment_options(self.matched.bent), config, self.model
+        )
         adjuster.solve()
         options = pycolmap.BACovarianceOptions(params=pycolmap.BACovarianceOptionsParams.ALL)
         return pycolmap.estimate_ba_covariance(options, self.model, adjuster)
@@ -417,10 +421,16 @@ class Placement:
                 ADJUSTMENTS if final else 1,
                 STILL,
                 options.mapper,
-                adjustment_options(),
+                adjustment_options(matched.bent),
                 options.triangulation,
             )
         mapper.end_reconstruction(False)
+        if self.matched.bent and not plausible(model):
+            self.matched.bent = False
+            for camera in self.matched.cameras:
+                camera.params = [*camera.params[:3], 0.0]
+            self._settle(final=final)
+            return
         self._take_over(model)
 
     def _take_over(self, model: Any) -> None:
@@ -483,9 +493,16 @@ def pipeline_options(seed: int) -> Any:
     return options
 
 
-def adjustment_options() -> Any:
+def plausible(model: Any) -> bool:
+    """Whether lenses bend as lenses do: few or flat photos leave distortion free to explain anything."""
+    low, high = BENDS
+    return all(low <= camera.params[-1] <= high for camera in model.cameras.values())
+
+
+def adjustment_options(bent: bool) -> Any:
     """Joint adjustment in which a match that does not fit counts little, on one thread as above."""
     options = pycolmap.BundleAdjustmentOptions()
+    options.refine_extra_params = bent
     options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
     options.ceres.solver_options.num_threads = 1

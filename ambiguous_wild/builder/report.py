@@ -145,8 +145,9 @@ def verdict(info: SceneRecord, size: tuple[int, int], scene: Path) -> str:
     """One line: the counts, and the next command."""
     counts = info["counts"]
     points = f"{counts['points']:,}".replace(",", " ")
+    named = f", {len(info['lost'])} left out without a clear place" if info["lost"] else ""
     return (
-        f"registered {counts['registered']} of {counts['photos']}, {points} points, "
+        f"registered {counts['registered']} of {counts['photos']}{named}, {points} points, "
         f"{info['reprojection_error_px']:.2f} px, {size[0]}x{size[1]} at factor {info['factor']}: ready; "
         f"next: aw bench --method refinesplat --scene {shlex.quote(str(scene))} -o runs"
     )

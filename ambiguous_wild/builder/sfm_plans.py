@@ -11,12 +11,13 @@ from ambiguous_wild.builder.retrieval import NEIGHBOURS
 from ambiguous_wild.builder.settings import BuildSettings
 
 WIDER = 40  # partners of a photo that was left out
+ENOUGH = 0.95  # placed: the rest has no clear place, which more pairs seldom give
 HALF = 0.5  # placed after that: where fewer are, matching everything cannot make it worse
 
 
 @dataclass(frozen=True)
 class SfmPlan:
-    """What an attempt does; `benchmarks/results/build-scene.md` compares them on real captures."""
+    """What an attempt does; `benchmarks/results/poses.md` compares them on real captures."""
 
     name: str  # "fast", "wider" or "thorough"
     sift: str  # whose: "opencv", or "colmap", which takes three to five times as long
@@ -40,8 +41,8 @@ def plans(photos: Sequence[PhotoRecord], settings: BuildSettings) -> list[SfmPla
     if settings.sfm == "fast":
         return [fast]
     if fast.matcher != "retrieval":
-        return [fast, thorough]
-    wider = replace(fast, name="wider", similar=WIDER, neighbours=NEIGHBOURS, continues=True)
+        return [fast, replace(thorough, below=ENOUGH)]
+    wider = replace(fast, name="wider", similar=WIDER, neighbours=NEIGHBOURS, continues=True, below=ENOUGH)
     return [fast, wider, replace(thorough, below=HALF)]
 
 

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from ambiguous_wild.builder.pairs import MOTIONS, PAIRS, sequential_pairs
-from ambiguous_wild.builder.placing import Matched, Placement, pipeline_options
+from ambiguous_wild.builder.placing import Matched, Placement, pipeline_options, plausible
 from ambiguous_wild.builder.records import ModelSummary
 from ambiguous_wild.builder.retrieval import embed, pairs_of_tests, retrieval_pairs
 from ambiguous_wild.builder.sfm_jobs import FeatureJob, MappingJob, MatchJob, SfmJob, TriangulationJob
@@ -147,12 +147,15 @@ def run_mapping(job: MappingJob) -> None:
     mapper = _map_globally if job["mapper"] == "global" else _map_incrementally
 
     def largest() -> Any:
-        found = mapper(job, output).values()
+        found = mapper(job, output, matched.bent).values()
         for folder in output.glob("[0-9]*"):
             shutil.rmtree(folder)
         return max(found, key=lambda m: (m.num_reg_images(), m.num_points3D()), default=None)
 
     model = largest()
+    if model is not None and not plausible(model):
+        matched.bent = False
+        model = largest()
     if model is not None and matched.take_cameras(model) > FOCAL_CHANGE:
         # poses of pairs were wrong by as much: once more, with the focal length that the model found
         matched.write_agreed(database, matched.find_motions(job["jobs"]))
@@ -206,9 +209,10 @@ def run_triangulation(job: TriangulationJob) -> None:
     found.write_binary(job["output"])
 
 
-def _map_incrementally(job: MappingJob, output: Path) -> dict[int, Any]:
+def _map_incrementally(job: MappingJob, output: Path, bent: bool) -> dict[int, Any]:
     options = pipeline_options(job["seed"])
     options.min_model_size = _MIN_MODEL
+    options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = bent
     options.ba_global_frames_ratio = options.ba_global_points_ratio = job["growth"]
     options.ba_global_max_refinements = job["refinements"]
     options.ba_local_max_refinements = job["local_refinements"]
@@ -235,7 +239,7 @@ def _map_incrementally(job: MappingJob, output: Path) -> dict[int, Any]:
     )
 
 
-def _map_globally(job: MappingJob, output: Path) -> dict[int, Any]:
+def _map_globally(job: MappingJob, output: Path, bent: bool) -> dict[int, Any]:
     options = pycolmap.GlobalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1
     options.random_seed = options.mapper.random_seed = job["seed"]
@@ -245,6 +249,7 @@ def _map_globally(job: MappingJob, output: Path) -> dict[int, Any]:
     options.mapper.retriangulation.random_seed = job["seed"]
     adjustment = options.mapper.bundle_adjustment.ceres
     adjustment.use_gpu = False
+    options.mapper.bundle_adjustment.refine_extra_params = bent
     adjustment.min_num_residuals_for_cpu_multi_threading = 10**9
     options.min_model_size = _MIN_MODEL
     return pycolmap.global_mapping(job["database"], job["photos"], str(output), options=options)

@@ -108,19 +108,20 @@ def test_scene_json_keeps_its_keys_and_their_order(scene):
     info = json.loads((scene / "scene.json").read_text())
     assert list(info) == [
         "schema", "schema_version", "name", "license", "factor", "images", "split", "seed", "settings",
-        "chosen", "counts", "reprojection_error_px", "mean_track_length", "models", "lost", "skipped",
+        "chosen", "counts", "reprojection_error_px", "mean_track_length", "cameras", "lost", "skipped",
         "warnings", "photos", "masks", "truth", "build_key", "inputs", "seconds", "files",
     ]  # fmt: skip
     assert set(info) == SceneRecord.__required_keys__
     assert list(info["inputs"]) == ["photos", "masks", "truth", "test_list", "settings", "versions"]
-    assert list(info["chosen"]) == ["camera", "sfm", "matcher", "mapper", "model"]
+    assert list(info["chosen"]) == ["camera", "sfm", "matcher", "mapper"]
     assert list(info["counts"]) == [
         "photos", "readable", "registered", "train", "test", "cameras", "points", "points_seen_in_test_only",
         "points_of_track_length_2", "pairs", "pairs_verified",
     ]  # fmt: skip
-    assert list(info["models"][0]) == ["model", "images", "points", "error_px", "track_length"]
+    assert list(info["cameras"][0]) == ["photos", "focal_px", "focal_sd_px"]
     assert list(info["photos"]["p01.png"]) == [
-        "source", "sha256", "split", "width", "height", "blur", "mean_luma", "features", "notes", "exif",
+        "source", "sha256", "split", "width", "height", "blur", "mean_luma", "features", "partners", "notes",
+        "exif",
     ]  # fmt: skip
 
 

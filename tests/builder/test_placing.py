@@ -1,0 +1,162 @@
+"""Photos are placed right though a distractor has more matches than the place."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from ambiguous_wild.builder.motions import Motion, agreed_motions, cycle_votes, focal_votes, motions
+from ambiguous_wild.builder.pipeline import build_scene
+from ambiguous_wild.builder.placing import Matched, Place, _reason
+from ambiguous_wild.builder.settings import BuildSettings
+from ambiguous_wild.io.colmap_model import read_model
+from tests.builder.capture_maker import FOCAL, eyes, texture, write_capture
+
+TARGET = np.array([0.0, 0.0, 5.2])
+
+
+def angle_deg(rotation: np.ndarray) -> float:
+    return float(np.degrees(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1))))
+
+
+def looking(eye: np.ndarray) -> np.ndarray:
+    """Rotation of the maker's camera, from world."""
+    z = (TARGET - eye) / np.linalg.norm(TARGET - eye)
+    x = np.cross([0.0, 1.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z])
+
+
+def turned(axis: tuple[float, float, float], degrees: float) -> np.ndarray:
+    return cv2.Rodrigues(np.radians(degrees) * np.array(axis) / np.linalg.norm(axis))[0]
+
+
+def seen(points: np.ndarray, rotation: np.ndarray, centre: np.ndarray) -> np.ndarray:
+    """[N, 2] rays of points [N, 3]."""
+    local = (points - centre) @ rotation.T
+    return local[:, :2] / local[:, 2:]
+
+
+@pytest.mark.parametrize(
+    ("count", "size", "corners"),
+    [
+        (8, (170, 190), {0: (40, 60), 5: (50, 70), 7: (40, 90)}),
+        (10, (160, 180), {0: (60, 70), 7: (50, 80), 8: (60, 60), 9: (40, 70)}),
+    ],
+)
+def test_a_distractor_with_most_matches_does_not_place_its_photos(tmp_path, count, size, corners):
+    """COLMAP's mapper alone turns the first photo by more than 20 degrees here."""
+    paths = write_capture(tmp_path / "raw", count)
+    for k, (top, left) in corners.items():
+        photo = cv2.imread(str(paths[k]))
+        pasted = cv2.resize(texture(9), size[::-1], interpolation=cv2.INTER_AREA)
+        photo[top : top + size[0], left : left + size[1]] = pasted
+        cv2.imwrite(str(paths[k]), photo, [cv2.IMWRITE_JPEG_QUALITY, 95])
+    settings = BuildSettings(factor=1, max_features=800)
+    info = build_scene(tmp_path / "raw", tmp_path / "scene", settings, jobs=2).info
+    model = read_model(tmp_path / "scene" / "sparse" / "0")
+    found = {int(i.name[1:3]): i.cam_from_world()[:3, :3] for i in model.images.values()}
+    true = {k: looking(eye) for k, eye in enumerate(eyes(count))}
+    off = {
+        k: np.median([angle_deg((found[k] @ found[j].T) @ (true[k] @ true[j].T).T) for j in found if j != k])
+        for k in found
+    }
+    assert len(found) >= count - 1 and max(off.values()) < 1.0
+    assert {p["source"] for p in info["lost"]} == {f"p{k:02d}.jpg" for k in set(true) - set(found)}
+    assert info["cameras"][0]["focal_px"] == pytest.approx(FOCAL, rel=0.03)
+    placed = [p for p in info["photos"].values() if p["split"]]
+    assert len(placed) == len(found) and all(p["partners"] >= 2 for p in placed)
+
+
+def test_a_pair_holds_the_motion_of_the_place_and_that_of_the_distractor():
+    rng = np.random.default_rng(0)
+    place = rng.uniform([-2, -2, 4], [2, 2, 8], (60, 3))
+    mover = rng.uniform([-1, -1, 3], [1, 1, 4], (140, 3))
+    eye, rotation = np.array([0.6, 0.1, 0.2]), turned((0, 1, 0), 6)
+    other_eye, other = np.array([-0.2, 0.8, 0.1]), turned((0.2, 0.3, 1), 20)
+    first = np.concatenate([seen(place, np.eye(3), np.zeros(3)), seen(mover, np.eye(3), np.zeros(3))])
+    second = np.concatenate([seen(place, rotation, eye), seen(mover, other, other_eye)])
+    found = motions(first, second, 1e-3)
+    assert len(found) >= 2
+    assert angle_deg(found[0].rotations[0] @ other.T) < 0.5 and (found[0].matches >= 60).mean() > 0.95
+    assert angle_deg(found[1].rotations[0] @ rotation.T) < 0.5 and (found[1].matches < 60).mean() > 0.95
+
+
+def test_a_plane_leaves_several_ways_and_the_right_one_is_among_them():
+    rng = np.random.default_rng(1)
+    flat = np.column_stack([rng.uniform(-2, 2, (80, 2)), np.zeros(80)]) @ turned((1, 0.4, 0), 40).T + [
+        0,
+        0,
+        6,
+    ]
+    eye, rotation = np.array([1.5, 0.2, 0.3]), turned((0, 1, 0.1), -12)
+    (found, *_) = motions(seen(flat, np.eye(3), np.zeros(3)), seen(flat, rotation, eye), 1e-3)
+    assert len(found.rotations) > 1
+    assert min(angle_deg(r @ rotation.T) for r in found.rotations) < 0.5
+
+
+def _motion(rotation: np.ndarray, matches: int = 20) -> Motion:
+    return Motion(np.arange(matches), rotation[None], np.array([[1.0, 0.0, 0.0]]))
+
+
+def test_the_motions_that_close_triplets_win_over_more_matches():
+    true = [turned((0.1 * k, 1, 0), 9.0 * k) for k in range(6)]
+    rng = np.random.default_rng(2)
+    pairs = {}
+    for a in range(6):
+        for b in range(a + 1, 6):
+            wrong = _motion(turned(tuple(rng.normal(size=3)), 40), matches=500)
+            pairs[a, b] = [wrong, _motion(true[b] @ true[a].T)]
+    votes = cycle_votes(pairs)
+    assert all(v[1, 0] > 0.9 and v[0, 0] < 0.2 for v in votes.values())
+    assert agreed_motions(pairs, votes) == dict.fromkeys(pairs, (1, 0))
+    pairs[0, 1] = pairs[0, 1][:1]  # of one pair only the distractor is left: it is dropped
+    votes = cycle_votes(pairs)
+    assert set(agreed_motions(pairs, votes)) == set(pairs) - {(0, 1)}
+
+
+@pytest.mark.parametrize("focal", [0.7, 1.4])
+def test_focal_length_by_votes_of_pairs_among_wrong_ones(focal):
+    rng = np.random.default_rng(3)
+    points = rng.uniform([-2, -2, 5], [2, 2, 9], (90, 3))
+    side = 1000
+    poses = [
+        (turned((0.3, 1, 0.1), 5.0 * k - 12), np.array([0.7 * k - 2, 0.3 * (-1) ** k, 0.2 * k]))
+        for k in range(6)
+    ]
+    photos = [focal * side * seen(points, *pose) + rng.normal(0, 0.2, (90, 2)) for pose in poses]
+    for photo in photos:  # a third of the matches fits nothing
+        photo[60:] = rng.uniform(-side / 2, side / 2, (30, 2))
+    rows = np.column_stack([np.arange(90), np.arange(90)])
+    matches = {(a, b): rows for a in range(6) for b in range(a + 1, 6)}
+    found = focal_votes(photos, [side] * 6, [1] * 6, {}, matches, 1)
+    assert found[1] == pytest.approx(focal, rel=0.04)
+    flat = dict.fromkeys(matches, rows[:0])
+    assert focal_votes(photos, [side] * 6, [1] * 6, {1: 0.66}, flat, 1) == {1: 0.66}  # EXIF is all there is
+
+
+def test_a_photo_without_a_clear_place_is_named_with_the_reason():
+    def place(partners: int, cells: int) -> Place:
+        return Place(np.eye(4)[:3], frozenset(range(partners)), cells)
+
+    nowhere = place(0, 0)
+    assert _reason(place(9, 80), place(7, 20), 2) is None
+    assert "two places: 6 photos agree on one, 5 on another" in str(_reason(place(6, 30), place(5, 28), 2))
+    assert "no placed photo" in str(_reason(nowhere, nowhere, 2))
+    assert "only 2 placed photos" in str(_reason(place(2, 60), nowhere, 3))
+    assert "small part" in str(_reason(place(5, 9), nowhere, 2))
+
+
+def test_motions_come_back_from_their_file(tmp_path):
+    matched = Matched(
+        [1, 2, 3], ["a", "b", "c"], [], [], {(0, 1): np.zeros((30, 2)), (1, 2): np.zeros((9, 2))}
+    )
+    matched.motions = {(0, 1): [_motion(turned((1, 0, 0), 5)), _motion(turned((0, 1, 0), 7), 4)], (1, 2): []}
+    matched.save_motions(tmp_path / "m.npz")
+    again = Matched(matched.ids, matched.names, [], [], matched.matches)
+    again.load_motions(tmp_path / "m.npz")
+    assert again.motions[1, 2] == [] and len(again.motions[0, 1]) == 2
+    for one, other in zip(matched.motions[0, 1], again.motions[0, 1]):
+        np.testing.assert_array_equal(one.matches, other.matches)
+        np.testing.assert_array_equal(one.rotations, other.rotations)

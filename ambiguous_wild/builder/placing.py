@@ -271,7 +271,7 @@ class Placement:
             config.add_image(number)
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
         adjuster = pycolmap.create_default_ceres_bundle_adjuster(
-            adjustment_options(self.matched.bent), config, self.model
+            adjustment_options(self.matched.bent, final=True), config, self.model
         )
         adjuster.solve()
         options = pycolmap.BACovarianceOptions(params=pycolmap.BACovarianceOptionsParams.ALL)
@@ -421,7 +421,7 @@ class Placement:
                 ADJUSTMENTS if final else 1,
                 STILL,
                 options.mapper,
-                adjustment_options(matched.bent),
+                adjustment_options(matched.bent, final=final),
                 options.triangulation,
             )
         mapper.end_reconstruction(False)
@@ -499,15 +499,15 @@ def plausible(model: Any) -> bool:
     return all(low <= camera.params[-1] <= high for camera in model.cameras.values())
 
 
-def adjustment_options(bent: bool) -> Any:
+def adjustment_options(bent: bool, *, final: bool) -> Any:
     """Joint adjustment in which a match that does not fit counts little, on one thread as above."""
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_extra_params = bent
     options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
     options.ceres.solver_options.num_threads = 1
-    options.ceres.solver_options.max_num_iterations = 50
-    options.ceres.solver_options.function_tolerance = 1e-6
+    options.ceres.solver_options.max_num_iterations = 50 if final else 10
+    options.ceres.solver_options.function_tolerance = 1e-6 if final else 1e-4
     options.ceres.min_num_residuals_for_cpu_multi_threading = 10**9
     return options
 

@@ -8,25 +8,17 @@ that a distractor placed fits the few photos that show the distractor alike, in 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ambiguous_wild.builder.motions import (
-    LEAST,
-    Motion,
-    Pair,
-    agreed_motions,
-    cycle_votes,
-    focal_votes,
-    motions_of_pairs,
-)
+from ambiguous_wild.builder.matched import Matched
+from ambiguous_wild.builder.motions import Pair
 from ambiguous_wild.builder.records import CameraFact
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
-FITS_PX = 3.0  # of a match to its epipolar line
 FITS = 0.5  # share of a motion's matches that fit, from which on a partner agrees
 AGREE = 2  # partners of a photo, at least
 AGREE_NEW = 3  # of a photo that COLMAP did not place
@@ -43,167 +35,6 @@ BENDS = -0.5, 0.3  # k of SIMPLE_RADIAL, from an action camera to more than any 
 LOOSE_PX, TIGHT_PX = 4.0, 2.0  # observations with a larger error are removed, first and last
 COVARIANCE_LIMIT = 400  # photos: the poses' covariance is a dense matrix
 ADJUSTMENTS, STILL = 5, 5e-4  # joint adjustments at most, and share of observations that end them
-
-
-@dataclass
-class Matched:
-    """Photos with features and matched pairs, before any pose; photos are numbered as in `ids`."""
-
-    ids: list[int]  # COLMAP's
-    names: list[str]
-    cameras: list[Any]  # pycolmap.Camera of every photo
-    features: list[np.ndarray]  # [N, 2] px
-    matches: dict[Pair, np.ndarray]  # [K, 2] features of the pair's photos; pairs with `LEAST` at least
-    motions: dict[Pair, list[Motion]] = field(default_factory=dict)
-    bent: bool = True  # whether the photos determine the lens's distortion; else there is none
-
-    @classmethod
-    def read(cls, database: Path) -> Matched:
-        """From COLMAP's database, without motions."""
-        db = pycolmap.Database.open(str(database))
-        try:
-            images = sorted(db.read_all_images(), key=lambda image: image.image_id)
-            cameras = {camera.camera_id: camera for camera in db.read_all_cameras()}
-            at = {image.image_id: k for k, image in enumerate(images)}
-            matches = {}
-            for number, rows in zip(*db.read_all_matches()):
-                if len(rows) >= LEAST:
-                    first, second = pycolmap.pair_id_to_image_pair(number)
-                    matches[at[first], at[second]] = np.asarray(rows)
-            return cls(
-                list(at),
-                [image.name for image in images],
-                [cameras[image.camera_id] for image in images],
-                [np.asarray(db.read_keypoints(i))[:, :2].astype(np.float64) for i in at],
-                dict(sorted(matches.items())),
-            )
-        finally:
-            db.close()
-
-    def rays(self) -> list[np.ndarray]:
-        """Of every photo: [N, 2] its features as x / z and y / z, through its camera as it is now."""
-        return [
-            np.asarray(camera.cam_from_img(points)) if len(points) else points
-            for camera, points in zip(self.cameras, self.features)
-        ]
-
-    def focal_px(self, photo: int) -> float:
-        """Focal length of its camera."""
-        return float(self.cameras[photo].mean_focal_length())
-
-    def fit(
-        self, pair: Pair, first: np.ndarray, second: np.ndarray, rays: Sequence[np.ndarray]
-    ) -> np.ndarray:
-        """[K] bool: matches of a pair within `FITS_PX` of their epipolar lines, by Sampson's error.
-
-        Args:
-            pair: of photos.
-            first: [3, 4] pose of its first photo, camera from world.
-            second: of its second.
-            rays: of all photos.
-        """
-        rows = self.matches[pair]
-        essential = _essential(relative_pose(first, second))
-        a, b = (np.column_stack([rays[k][rows[:, c]], np.ones(len(rows))]) for c, k in enumerate(pair))
-        line, back = a @ essential.T, b @ essential
-        size = (line[:, :2] ** 2).sum(axis=1) + (back[:, :2] ** 2).sum(axis=1)
-        error = FITS_PX / np.sqrt(self.focal_px(pair[0]) * self.focal_px(pair[1]))
-        return (b * line).sum(axis=1) ** 2 <= error**2 * np.maximum(size, 1e-30)
-
-    def fitting(self, poses: Mapping[int, np.ndarray]) -> dict[Pair, tuple[np.ndarray, np.ndarray]]:
-        """Of every placed pair its pose, second from first [3, 4], and the matches that fit it."""
-        rays, found = self.rays(), {}
-        for a, b in self.matches:
-            if a in poses and b in poses:
-                rows = np.flatnonzero(self.fit((a, b), poses[a], poses[b], rays))
-                if len(rows) >= LEAST:
-                    found[a, b] = relative_pose(poses[a], poses[b]), rows
-        return found
-
-    def write_verified(self, database: Path, verified: Mapping[Pair, tuple[np.ndarray, np.ndarray]]) -> None:
-        """Replace the verified pairs of the database: pose, second from first [3, 4], and matches."""
-        db = pycolmap.Database.open(str(database))
-        try:
-            db.clear_two_view_geometries()
-            with pycolmap.DatabaseTransaction(db):
-                for (a, b), (pose, rows) in verified.items():
-                    essential = _essential(pose)
-                    first, second = (np.linalg.inv(self.cameras[k].calibration_matrix()) for k in (a, b))
-                    geometry = pycolmap.TwoViewGeometry()
-                    geometry.config = int(pycolmap.TwoViewGeometryConfiguration.CALIBRATED)
-                    geometry.E, geometry.F = essential, second.T @ essential @ first
-                    geometry.cam2_from_cam1 = pycolmap.Rigid3d(pose)
-                    geometry.inlier_matches = np.ascontiguousarray(self.matches[a, b][rows], np.uint32)
-                    db.write_two_view_geometry(self.ids[a], self.ids[b], geometry)
-        finally:
-            db.close()
-
-    def find_focals(self, usual: Mapping[str, float], jobs: int) -> None:
-        """Focal lengths of the cameras, by votes of pairs.
-
-        Args:
-            usual: name -> focal length over the longer side, of photos whose EXIF tells it.
-            jobs: threads.
-        """
-        sides = [max(camera.width, camera.height) for camera in self.cameras]
-        numbers = [camera.camera_id for camera in self.cameras]
-        centred = [f - [c.width / 2, c.height / 2] for f, c in zip(self.features, self.cameras)]
-        stated = {number: usual[name] for number, name in zip(numbers, self.names) if name in usual}
-        focals = focal_votes(centred, sides, numbers, stated, self.matches, jobs)
-        for camera, side in zip(self.cameras, sides):
-            camera.params = [focals[camera.camera_id] * side, *camera.params[1:]]
-
-    def find_motions(self, jobs: int) -> dict[Pair, tuple[int, int]]:
-        """The motions of all pairs; where a pair agrees with others, the number of its motion and way."""
-        focals_px = [self.focal_px(k) for k in range(len(self.ids))]
-        self.motions = motions_of_pairs(self.rays(), focals_px, self.matches, jobs)
-        return agreed_motions(self.motions, cycle_votes(self.motions))
-
-    def take_cameras(self, model: Any) -> float:
-        """Cameras of a model; how much focal lengths change, relative, in the median over photos."""
-        before = np.array([self.focal_px(k) for k in range(len(self.ids))])
-        for camera in self.cameras:
-            if camera.camera_id in model.cameras:
-                camera.params = model.cameras[camera.camera_id].params
-        after = np.array([self.focal_px(k) for k in range(len(self.ids))])
-        return float(np.median(np.abs(after / before - 1.0)))
-
-    def write_agreed(self, database: Path, agreed: Mapping[Pair, tuple[int, int]]) -> None:
-        """Cameras, and one motion of every pair that agrees, for COLMAP's mapper."""
-        db = pycolmap.Database.open(str(database))
-        try:
-            for camera in {camera.camera_id: camera for camera in self.cameras}.values():
-                db.update_camera(camera)
-        finally:
-            db.close()
-        verified = {}
-        for pair, (number, way) in agreed.items():
-            motion = self.motions[pair][number]
-            pose = np.column_stack([motion.rotations[way], motion.translations[way]])
-            verified[pair] = pose, motion.matches
-        self.write_verified(database, verified)
-
-    def save_motions(self, path: Path) -> None:
-        """As .npz: of every motion its pair, matches and ways."""
-        every = [(pair, motion) for pair, found in self.motions.items() for motion in found]
-        np.savez(
-            path,
-            pairs=np.array([pair for pair, _ in every], int).reshape(-1, 2),
-            counts=np.array([[len(m.matches), len(m.rotations)] for _, m in every], int).reshape(-1, 2),
-            matches=np.concatenate([np.zeros(0, int), *(m.matches for _, m in every)]),
-            rotations=np.concatenate([np.zeros((0, 3, 3)), *(m.rotations for _, m in every)]),
-            translations=np.concatenate([np.zeros((0, 3)), *(m.translations for _, m in every)]),
-        )
-
-    def load_motions(self, path: Path) -> None:
-        """What `save_motions` wrote."""
-        with np.load(path) as file:
-            cuts = np.cumsum(file["counts"], axis=0)[:-1]
-            matches = np.split(file["matches"], cuts[:, 0])
-            ways = (np.split(file[name], cuts[:, 1]) for name in ("rotations", "translations"))
-            self.motions = {pair: [] for pair in self.matches}
-            for (a, b), *motion in zip(file["pairs"].tolist(), matches, *ways):
-                self.motions[a, b].append(Motion(*motion))
 
 
 @dataclass(frozen=True)
@@ -510,18 +341,6 @@ def adjustment_options(bent: bool, *, final: bool) -> Any:
     options.ceres.solver_options.function_tolerance = 1e-6 if final else 1e-4
     options.ceres.min_num_residuals_for_cpu_multi_threading = 10**9
     return options
-
-
-def relative_pose(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """[3, 4] second camera from the first, of their poses [3, 4] from world."""
-    rotation = second[:, :3] @ first[:, :3].T
-    return np.column_stack([rotation, second[:, 3] - rotation @ first[:, 3]])
-
-
-def _essential(pose: np.ndarray) -> np.ndarray:
-    """[3, 3] of a pose, second from first [3, 4]; its scale does not count."""
-    x, y, z = pose[:, 3] / max(float(np.linalg.norm(pose[:, 3])), 1e-12)
-    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ pose[:, :3]
 
 
 def _reason(best: Place, rival: Place, needed: int) -> str | None:

@@ -19,8 +19,9 @@ from typing import Any
 
 import numpy as np
 
+from ambiguous_wild.builder.matched import Matched
 from ambiguous_wild.builder.pairs import MOTIONS, PAIRS, sequential_pairs
-from ambiguous_wild.builder.placing import Matched, Placement, pipeline_options, plausible
+from ambiguous_wild.builder.placing import Placement, pipeline_options, plausible
 from ambiguous_wild.builder.records import ModelSummary
 from ambiguous_wild.builder.retrieval import embed, pairs_of_tests, retrieval_pairs
 from ambiguous_wild.builder.sfm_jobs import FeatureJob, MappingJob, MatchJob, SfmJob, TriangulationJob

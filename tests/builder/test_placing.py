@@ -6,9 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
+from ambiguous_wild.builder.matched import Matched
 from ambiguous_wild.builder.motions import Motion, agreed_motions, cycle_votes, focal_votes, motions
 from ambiguous_wild.builder.pipeline import build_scene
-from ambiguous_wild.builder.placing import Matched, Place, _reason
+from ambiguous_wild.builder.placing import Place, _reason
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.io.colmap_model import read_model
 from tests.builder.capture_maker import FOCAL, eyes, texture, write_capture

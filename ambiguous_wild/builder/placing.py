@@ -34,7 +34,7 @@ TAKEN_OUT = 2  # times, after which a photo stays out
 BENDS = -0.5, 0.3  # k of SIMPLE_RADIAL, from an action camera to more than any pincushion
 LOOSE_PX, TIGHT_PX = 4.0, 2.0  # observations with a larger error are removed, first and last
 COVARIANCE_LIMIT = 400  # photos: the poses' covariance is a dense matrix
-ADJUSTMENTS, STILL = 5, 5e-4  # joint adjustments at most, and share of observations that end them
+ADJUSTMENTS, STILL = 3, 2e-3  # joint adjustments at most, and share of observations that end them
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,10 @@ COMMANDS = {
         "simulate",
         "Simulate a capture with exact truth: poses, distractor masks, clean photos.",
     ),
-    "composite": ("composite", "Add distractors with exact masks to a scene of real photos."),
+    "composite": (
+        "composite",
+        "Add distractors with exact masks to a scene of real photos, or to plain photos.",
+    ),
     "capture": ("capture", "Select sharp, evenly spaced photos from a video, a folder or a camera."),
     "screen": ("screen", "Check a capture: exposure, white balance, focus, blur, overlap; with advice."),
     "build-scene": (

@@ -1,7 +1,8 @@
-"""Photos of the simulated phone: JPEG, with EXIF of the simulated exposure."""
+"""Photos of captures: JPEG, with EXIF of the simulated exposure or of the source photo."""
 
 from __future__ import annotations
 
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from ambiguous_wild import __version__
 from ambiguous_wild.core.camera import Camera
+from ambiguous_wild.io.exif import Exif
 from ambiguous_wild.simulate.camera_path import focal_px
 from ambiguous_wild.simulate.records import DrawnEffects
 from ambiguous_wild.simulate.spec import CaptureSpec
@@ -79,3 +81,30 @@ def _exposure(drawn: DrawnEffects, rational: Any) -> Any:
     if abs(1 / seconds - whole) < 1e-9 * whole:
         return rational(1, whole)
     return rational(round(seconds * 10**6), 10**6)
+
+
+def write_jpeg(path: Path, pixels: np.ndarray, exif: Exif) -> None:
+    """JPEG at quality 95 without chroma subsampling, with the camera settings of a source photo.
+
+    Args:
+        path: the file.
+        pixels: [H, W, 3] uint8, upright.
+        exif: of the source photo; its orientation and position are left out.
+    """
+    from PIL import Image, TiffImagePlugin
+
+    def rational(value: float) -> Any:
+        fraction = Fraction(value).limit_denominator(100_000)
+        return TiffImagePlugin.IFDRational(fraction.numerator, fraction.denominator)
+
+    tags = Image.Exif()
+    fields = tags.get_ifd(0x8769)
+    texts = {0x010F: exif.make, 0x0110: exif.model, 0x0132: exif.taken_at}
+    tags.update({tag: value for tag, value in texts.items() if value is not None})
+    rationals = {0x829A: exif.exposure_s, 0x829D: exif.f_number, 0x920A: exif.focal_mm}
+    whole = {0x8827: exif.iso, 0xA403: exif.white_balance, 0xA405: exif.focal_35mm}
+    fields.update({tag: rational(value) for tag, value in rationals.items() if value is not None})
+    fields.update({tag: round(value) for tag, value in whole.items() if value is not None})
+    if exif.taken_at is not None:
+        fields[0x9003] = exif.taken_at
+    Image.fromarray(pixels).save(path, quality=95, subsampling=0, exif=tags)

@@ -202,3 +202,50 @@ class CompositeRecord(TypedDict):
     cutouts: list[CutoutRecord]
     occlusion: Spread
     photos: dict[str, CompositePhoto]
+
+
+class PastedPiece(TypedDict):
+    """One distractor in one plain photo."""
+
+    cutout: str
+    photo: str  # that the piece was cut from; empty for cut-outs
+    mirrored: bool
+    x: float  # of its middle, over the photo's width
+    y: float  # of its middle, over the photo's height
+    height: float  # over the photo's height
+
+
+class PastedPhoto(TypedDict):
+    """One training photo of a capture with pasted distractors."""
+
+    source: str  # file name of the clean photo
+    sha256: str  # of the clean photo
+    occlusion: float
+    distractors: list[PastedPiece]
+
+
+class PhotoFolder(TypedDict):
+    """The folder of photos that a capture is made from."""
+
+    name: str
+    photos: int
+
+
+class PastedCutout(TypedDict):
+    """One cut-out of a capture with pasted distractors."""
+
+    name: str
+    sha256: str  # of its file
+
+
+class PastedRecord(TypedDict):
+    """truth/composite.json of a capture with pasted distractors."""
+
+    schema: int
+    version: str
+    source: PhotoFolder
+    config: dict[str, Any]  # `CompositeConfig` without pose and shadow
+    mask: str
+    cutouts: list[PastedCutout]
+    occlusion: Spread
+    photos: dict[str, PastedPhoto]

@@ -74,7 +74,7 @@ def composite(
     config.check()
     root, target = Path(source), Path(output)
     name = check_name("scene name (the folder's)", target.resolve().name)
-    _check_output(root, target)
+    check_folders(root, target)
     if cutouts is None and not config.patches:
         raise AwError("no distractors are given: pass --cutouts FOLDER of PNG files with alpha, or --patches")
     shape_rng, place_rng, patch_rng = (
@@ -93,9 +93,10 @@ def composite(
     return facts
 
 
-def _check_output(root: Path, target: Path) -> None:
+def check_folders(root: Path, target: Path) -> None:
+    """Raise AwError where source and output lie inside each other, or the output exists."""
     if target.resolve().is_relative_to(root.resolve()) or root.resolve().is_relative_to(target.resolve()):
-        raise AwError(f"{target} and the scene {root} lie inside each other; choose another folder for -o")
+        raise AwError(f"{target} and {root} lie inside each other; choose another folder for -o")
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise AwError(f"{target} exists; remove it or choose another folder for -o")
 

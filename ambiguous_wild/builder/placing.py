@@ -8,7 +8,7 @@ that a distractor placed fits the few photos that show the distractor alike, in 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +44,7 @@ class Place:
     pose: np.ndarray | None  # [3, 4] camera from world; None: only its rotation is known
     partners: frozenset[int]  # placed photos that agree
     cells: int  # of `GRID` x `GRID` that their matches cover
+    evidence: Mapping[tuple[Pair, int], np.ndarray] = field(default_factory=dict)  # motion -> its features
 
     @property
     def weight(self) -> int:
@@ -142,7 +143,13 @@ class Placement:
         places = [] if now is None else [self._judge(photo, now, rays)]
         places += [self._judge(photo, pose, rays) for pose in self._resections(photo, points)]
         best = max(places, key=lambda place: place.weight, default=Place(None, frozenset(), 0))
-        elsewhere = [p for p in places if len(p.partners) >= AGREE and not self._same(p.pose, best.pose)]
+        # what fits both, as where a place is found again less precisely, speaks for the best
+        elsewhere = [
+            self._place(photo, p.pose, {k: rows for k, rows in p.evidence.items() if k not in best.evidence})
+            for p in places
+            if p is not best
+        ]
+        elsewhere = [place for place in elsewhere if len(place.partners) >= AGREE]
         dissent = self._dissent(photo, best.partners)
         if len(dissent.partners) >= AGREE:
             elsewhere.append(dissent)
@@ -150,18 +157,24 @@ class Placement:
 
     def _judge(self, photo: int, pose: np.ndarray, rays: Sequence[np.ndarray]) -> Place:
         """What the placed partners say of a place; one agrees if one of its motions fits."""
-        partners, rows = set(), []
+        evidence = {}
         for pair in self.pairs[photo]:
             other = pair[0] + pair[1] - photo
             if other not in self.poses:
                 continue
             ends = (pose, self.poses[other]) if pair[0] == photo else (self.poses[other], pose)
             fits = self.matched.fit(pair, *ends, rays)
-            good = [m.matches for m in self.matched.motions[pair] if fits[m.matches].mean() >= FITS]
-            if good:
-                partners.add(other)
-                rows += [self.matched.matches[pair][m[fits[m]], pair.index(photo)] for m in good]
-        return Place(pose, frozenset(partners), self._cells(photo, rows))
+            for number, motion in enumerate(self.matched.motions[pair]):
+                if fits[motion.matches].mean() >= FITS:
+                    rows = motion.matches[fits[motion.matches]]
+                    evidence[pair, number] = self.matched.matches[pair][rows, pair.index(photo)]
+        return self._place(photo, pose, evidence)
+
+    def _place(
+        self, photo: int, pose: np.ndarray | None, evidence: Mapping[tuple[Pair, int], np.ndarray]
+    ) -> Place:
+        partners = frozenset(a + b - photo for (a, b), _ in evidence)
+        return Place(pose, partners, self._cells(photo, list(evidence.values())), evidence)
 
     def _dissent(self, photo: int, agree: frozenset[int]) -> Place:
         """Where most of the other placed partners see the photo: those whose motions turn it alike."""

@@ -20,7 +20,7 @@ from ambiguous_wild.builder.motions import (
 )
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
-FITS_PX = 3.0  # of a match to its epipolar line
+FITS_PX, FITS_SHARE = (1.5, 3.0), 0.003  # of a match to its epipolar line: share of the longer side, bounded
 
 
 @dataclass
@@ -85,7 +85,10 @@ class Matched:
         a, b = (np.column_stack([rays[k][rows[:, c]], np.ones(len(rows))]) for c, k in enumerate(pair))
         line, back = a @ essential.T, b @ essential
         size = (line[:, :2] ** 2).sum(axis=1) + (back[:, :2] ** 2).sum(axis=1)
-        error = FITS_PX / np.sqrt(self.focal_px(pair[0]) * self.focal_px(pair[1]))
+        side = max(max(self.cameras[k].width, self.cameras[k].height) for k in pair)
+        error = np.clip(FITS_SHARE * side, *FITS_PX) / np.sqrt(
+            self.focal_px(pair[0]) * self.focal_px(pair[1])
+        )
         return (b * line).sum(axis=1) ** 2 <= error**2 * np.maximum(size, 1e-30)
 
     def fitting(self, poses: Mapping[int, np.ndarray]) -> dict[Pair, tuple[np.ndarray, np.ndarray]]:

@@ -22,8 +22,9 @@ from ambiguous_wild.io.safe_pycolmap import pycolmap
 FITS = 0.5  # share of a motion's matches that fit, from which on a partner agrees
 AGREE = 2  # partners of a photo, at least
 AGREE_NEW = 3  # of a photo that COLMAP did not place
-RIVAL = 0.5  # weight of a second place over that of the first, from which on a photo has two places
+RIVAL = 0.7  # weight of a second place over that of the first, from which on a photo has two places
 ALIKE_DEG, SAME_DEG = 5.0, 1.0  # between rotations that partners imply; between poses that are one place
+NEAR_DEG = 3.0  # between poses that may be one place, found twice
 SAME_SHARE = 0.1  # of the path's radius, between positions that are one place
 GRID = 12  # cells a side that a photo's matches cover or not
 LEAST_CELLS = 14  # of them, a tenth of the photo: where less agrees, a distractor may
@@ -143,12 +144,15 @@ class Placement:
         places = [] if now is None else [self._judge(photo, now, rays)]
         places += [self._judge(photo, pose, rays) for pose in self._resections(photo, points)]
         best = max(places, key=lambda place: place.weight, default=Place(None, frozenset(), 0))
-        # what fits both, as where a place is found again less precisely, speaks for the best
-        elsewhere = [
-            self._place(photo, p.pose, {k: rows for k, rows in p.evidence.items() if k not in best.evidence})
-            for p in places
-            if p is not best
-        ]
+        elsewhere = []
+        for place in places:
+            if place is best or self._same(place.pose, best.pose):
+                continue
+            evidence = place.evidence
+            if _turn_deg(place.pose, best.pose) < NEAR_DEG:
+                # perhaps the same place, less precisely: what fits both speaks for the best
+                evidence = {k: rows for k, rows in evidence.items() if k not in best.evidence}
+            elsewhere.append(self._place(photo, place.pose, evidence))
         elsewhere = [place for place in elsewhere if len(place.partners) >= AGREE]
         dissent = self._dissent(photo, best.partners)
         if len(dissent.partners) >= AGREE:
@@ -201,10 +205,10 @@ class Placement:
         """Whether two poses are one place."""
         if first is None or second is None:
             return False
-        turned = float((first[:, :3] * second[:, :3]).sum()) < _trace(SAME_DEG)
         centres = np.array([-pose[:, :3].T @ pose[:, 3] for pose in (first, second, *self.poses.values())])
         spread = float(np.median(np.linalg.norm(centres - np.median(centres, axis=0), axis=1)))
-        return not turned and float(np.linalg.norm(centres[0] - centres[1])) < SAME_SHARE * spread
+        near = _turn_deg(first, second) < SAME_DEG
+        return near and float(np.linalg.norm(centres[0] - centres[1])) < SAME_SHARE * spread
 
     def _cells(self, photo: int, rows: Sequence[np.ndarray]) -> int:
         """Cells of a grid over the photo that hold one of these features."""
@@ -367,6 +371,14 @@ def _reason(best: Place, rival: Place, needed: int) -> str | None:
     if rival.weight > RIVAL * best.weight:
         return f"two places: {len(best.partners)} photos agree on one, {len(rival.partners)} on another"
     return None
+
+
+def _turn_deg(first: np.ndarray | None, second: np.ndarray | None) -> float:
+    """Angle between two poses [3, 4]; 180 where one is unknown."""
+    if first is None or second is None:
+        return 180.0
+    trace = float((first[:, :3] * second[:, :3]).sum())
+    return float(np.degrees(np.arccos(np.clip((trace - 1) / 2, -1.0, 1.0))))
 
 
 def _trace(angle_deg: float) -> float:

@@ -1,0 +1,276 @@
+"""Camera poses of `aw build-scene` against the truth, beside COLMAP's own mappers.
+
+    python benchmarks/poses.py --data DIR --out DIR [--bases monstree ...] [--presets yard ...]
+        [--seeds 0 1 2] [--ways auto thorough colmap colmap-global before-auto ...] [--before CHECKOUT]
+
+--data holds a folder of clean photos a base (its photos, or images/ with them), and cut-outs in cutouts/.
+Distractors are pasted before structure from motion (`aw composite`), cut-outs and pieces of other photos;
+the truth is a careful model of the clean photos. Presets are simulated, with exact truth. Ways that begin
+with "before-" are built by --before, another checkout. Everything that is finished is kept. Writes
+benchmarks/results/poses.json and .md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.running.environment import environment
+from ambiguous_wild.io.atomic import write_json, write_text
+from ambiguous_wild.io.colmap_model import read_model
+
+RESULTS = Path(__file__).parent / "results" / "poses"
+BASES = ("monstree", "sceaux", "seneca", "skull")
+WAYS = ("auto", "thorough", "colmap", "colmap-global")
+TURNED_DEG, MOVED_PERCENT = 1.0, 5.0  # a photo is placed rightly below both
+COLMAP = """
+import sys, zlib, pycolmap
+photos, out, mapper = sys.argv[1:]
+pycolmap.set_random_seed(0)
+extraction = pycolmap.FeatureExtractionOptions(use_gpu=False, max_image_size=1600)
+extraction.sift.max_num_features = 3000
+database = out + "/database.db"
+pycolmap.extract_features(database, photos, extraction_options=extraction)
+pycolmap.match_exhaustive(database, matching_options=pycolmap.FeatureMatchingOptions(use_gpu=False))
+mapping = pycolmap.global_mapping if mapper == "colmap-global" else pycolmap.incremental_mapping
+models = mapping(database, photos, out)
+largest = max(models.values(), key=lambda model: model.num_reg_images())
+largest.write(out)
+"""
+
+Poses = dict[str, tuple[np.ndarray, np.ndarray, float]]  # rotation [3, 3] from world, centre [3], focal px
+
+
+def model_poses(folder: Path) -> Poses:
+    """Of a COLMAP model, by the name of the photo without its ending."""
+    model, found = read_model(folder), {}
+    for image in model.images.values():
+        pose = image.cam_from_world()
+        centre = -pose[:3, :3].T @ pose[:3, 3]
+        focal_px = float(model.cameras[image.camera_id].params[0])
+        found[Path(image.name).stem] = pose[:3, :3], centre, focal_px
+    return found
+
+
+def exact_poses(cameras: Path) -> Poses:
+    """Of a simulated capture."""
+    found = {}
+    for name, camera in json.loads(cameras.read_text(encoding="utf-8")).items():
+        pose = np.array(camera["cam_from_world"])
+        found[Path(name).stem] = pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3], float(camera["fx"])
+    return found
+
+
+def compare(found: Poses, truth: Poses) -> dict[str, Any]:
+    """How many photos stand rightly, and which do not.
+
+    The similarity between the two paths is fitted to the photos whose rotation is right. A photo that the
+    truth lacks is not judged.
+    """
+    names = sorted(set(found) & set(truth))
+    if len(names) < 3:
+        return {"judged": len(names), "right": 0, "wrong": {}}
+    turns = np.array(
+        [truth[n][0].T @ found[n][0] for n in names]
+    )  # world of the truth from that of the model
+    off = _angles_deg(np.einsum("aij,bkj->abik", turns, turns))
+    turned = {n: float(np.median(np.delete(off[k], k))) for k, n in enumerate(names)}
+    fixed = [n for n in names if turned[n] <= TURNED_DEG]
+    fixed = fixed if len(fixed) >= 3 else list(names)
+    for _ in range(len(fixed) - 2):  # without those that would drag the others
+        moved = _moved_percent(names, fixed, found, truth)
+        worst = max(fixed, key=lambda n: moved[n])
+        if moved[worst] <= max(MOVED_PERCENT, 3 * float(np.median([moved[n] for n in fixed]))):
+            break
+        fixed.remove(worst)
+    wrong = {
+        n: [round(turned[n], 2), round(moved[n], 2)]
+        for n in names
+        if turned[n] > TURNED_DEG or moved[n] > MOVED_PERCENT
+    }
+    focal = [100 * (found[n][2] / truth[n][2] - 1) for n in names]
+    return {
+        "judged": len(names),
+        "right": len(names) - len(wrong),
+        "wrong": wrong,  # degrees, percent of the path's radius
+        "position_percent": round(float(np.median(list(moved.values()))), 3),
+        "focal_percent": round(float(np.median(focal)), 3),
+    }
+
+
+def _moved_percent(
+    names: Sequence[str], fixed: Sequence[str], found: Poses, truth: Poses
+) -> dict[str, float]:
+    source, target = (np.array([poses[n][1] for n in fixed]) for poses in (found, truth))
+    mean, goal = source.mean(0), target.mean(0)
+    left, values, right = np.linalg.svd((target - goal).T @ (source - mean))
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+    rotation = left @ np.diag(signs) @ right
+    scale = (values * signs).sum() / max(float(((source - mean) ** 2).sum()), 1e-30)
+    path = np.array([truth[n][1] for n in names])
+    radius = np.linalg.norm(path - path.mean(0), axis=1).max()
+    ends = np.array([scale * rotation @ (found[n][1] - mean) + goal for n in names])
+    return dict(zip(names, (100 * np.linalg.norm(ends - path, axis=1) / radius).tolist()))
+
+
+def _angles_deg(rotations: np.ndarray) -> np.ndarray:
+    return np.degrees(np.arccos(np.clip((np.trace(rotations, axis1=-2, axis2=-1) - 1) / 2, -1, 1)))
+
+
+def aw(*words: object, checkout: Path | None = None) -> str:
+    """One command; "" or the last line of its error."""
+    env = {**os.environ, "PYTHONPATH": str(checkout)} if checkout else None
+    command = [sys.executable, "-m", "ambiguous_wild.cli.main", *map(str, words)]
+    done = subprocess.run(command, env=env, cwd=checkout, capture_output=True, text=True)
+    return "" if done.returncode == 0 else (done.stderr.strip().splitlines() or ["no output"])[-1]
+
+
+def capture_of(name: str, seed: int, kind: str, args: argparse.Namespace) -> tuple[Path, Poses]:
+    """The raw capture and its truth; both are made where they are missing.
+
+    Raises:
+        AwError: a command failed.
+    """
+    if kind == "simulated":
+        raw = args.out / "captures" / f"{name}-{seed}"
+        problem = "" if raw.is_dir() else aw("simulate", name, "--seed", seed, "--width", 480, "-o", raw)
+        if problem:
+            raise AwError(problem)
+        return raw, exact_poses(raw / "truth" / "cameras.json")
+    photos = args.data / name
+    photos = photos / "images" if (photos / "images").is_dir() else photos
+    raw, truth = args.out / "captures" / f"{name}-{kind}-{seed}", args.out / "truth" / name
+    shapes = ("--patches",) if kind == "patches" else ("--cutouts", args.data / "cutouts")
+    careful = ("--sfm", "thorough", "--max-features", 8000, "--factor", 4)
+    problem = "" if raw.is_dir() else aw("composite", photos, "-o", raw, "--seed", seed, *shapes)
+    problem = problem or ("" if truth.is_dir() else aw("build-scene", photos, "-o", truth, *careful))
+    if problem:
+        raise AwError(problem)
+    return raw, model_poses(truth / "sparse" / "0")
+
+
+def build(raw: Path, way: str, args: argparse.Namespace) -> dict[str, Any]:
+    """Where the model lies and what the build says; a refused one has only `refused`."""
+    out = args.out / "builds" / raw.name / way
+    if way.startswith("colmap"):
+        return _build_with_colmap(raw, way, out)
+    refused = out.with_name(f"{way}.refused")
+    if not out.is_dir() and not refused.is_file():
+        sfm = way.removeprefix("before-")
+        checkout = args.before.resolve() if way.startswith("before-") else None
+        problem = aw("build-scene", raw, "-o", out, "--sfm", sfm, "--factor", 1, checkout=checkout)
+        if problem:
+            out.parent.mkdir(parents=True, exist_ok=True)
+            write_text(refused, problem)
+    if refused.is_file():
+        return {"refused": refused.read_text(encoding="utf-8")}
+    info = json.loads((out / "scene.json").read_text(encoding="utf-8"))
+    return {
+        "model": out / "sparse" / "0",
+        "photos": info["counts"]["photos"],
+        "placed": info["counts"]["registered"],
+        "points": info["counts"]["points"],
+        "chosen": info["chosen"]["sfm"],
+        "seconds": {stage: info["seconds"].get(stage) for stage in ("features", "matches", "mapping")},
+    }
+
+
+def _build_with_colmap(raw: Path, way: str, out: Path) -> dict[str, Any]:
+    photos = [p for side in ("train", "test") for p in sorted((raw / side).iterdir())]
+    if not (out / "images.bin").is_file():
+        shutil.rmtree(out, ignore_errors=True)
+        together = out / "photos"
+        together.mkdir(parents=True)
+        for photo in photos:
+            shutil.copyfile(photo, together / photo.name)
+        done = subprocess.run([sys.executable, "-c", COLMAP, together, out, way], capture_output=True)
+        if done.returncode:
+            return {"refused": "COLMAP found no model"}
+    return {"model": out, "photos": len(photos), "placed": len(read_model(out).images)}
+
+
+def markdown(rows: Sequence[dict[str, Any]]) -> str:
+    """A row a capture; of every way: placed rightly / placed, worst wrong angle, position, focal length."""
+    ways = list(dict.fromkeys(row["way"] for row in rows))
+    captures = list(dict.fromkeys(row["capture"] for row in rows))
+    known = {(row["capture"], row["way"]): row for row in rows}
+    head = ["capture", "photos", *ways]
+    lines = [f"| {' | '.join(head)} |", "|---|---:|" + "---|" * len(ways)]
+    for capture in captures:
+        mine = [known.get((capture, way)) for way in ways]
+        photos = max((row.get("photos", 0) for row in mine if row), default=0)
+        lines.append(f"| {capture} | {photos} | {' | '.join(map(_cell, mine))} |")
+    lines += ["", "Each cell: photos placed rightly of those judged; wrong ones, the worst in degrees;"]
+    lines += ["median position error in % of the path's radius; focal length error in %.", ""]
+    for way in ways:
+        mine = [row for row in rows if row["way"] == way and "judged" in row]
+        right, judged = (sum(row[key] for row in mine) for key in ("right", "judged"))
+        wrong = sum(len(row["wrong"]) for row in mine)
+        refused = sum("refused" in row for row in rows if row["way"] == way)
+        lines.append(f"- {way}: {right} of {judged} placed photos right, {wrong} wrong, {refused} refused")
+    return "\n".join(lines) + "\n"
+
+
+def _cell(row: dict[str, Any] | None) -> str:
+    if row is None:
+        return ""
+    if "refused" in row:
+        return "refused"
+    text = f"{row['right']} of {row['judged']}"
+    if row["wrong"]:
+        text += f"; {len(row['wrong'])} wrong, {max(turn for turn, _ in row['wrong'].values()):.1f}"
+    if "position_percent" not in row:
+        return text
+    return f"{text}; {row['position_percent']:.2f} %; {row['focal_percent']:+.2f} %"
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Build and compare what is missing; write both files."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--bases", nargs="*", default=list(BASES))
+    parser.add_argument("--presets", nargs="*", default=[])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--ways", nargs="+", default=list(WAYS))
+    parser.add_argument("--before", type=Path, metavar="CHECKOUT")
+    parser.add_argument("--report-only", action="store_true", help="only what was compared before")
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    args = parser.parse_args(words)
+    if any(way.startswith("before-") for way in args.ways) and args.before is None:
+        parser.error("ways that begin with before- need --before CHECKOUT")
+    kinds = [(n, kind) for n in args.bases for kind in ("cutouts", "patches")]
+    rows = []
+    for name, kind in [*kinds, *((n, "simulated") for n in args.presets)]:
+        for seed in args.seeds:
+            capture = f"{name}-{seed}" if kind == "simulated" else f"{name}-{kind}-{seed}"
+            for way in args.ways:
+                kept = args.out / "rows" / f"{capture}-{way}.json"
+                if not kept.is_file() and not args.report_only:
+                    raw, truth = capture_of(name, seed, kind, args)
+                    row = build(raw, way, args)
+                    model = row.pop("model", None)
+                    row |= compare(model_poses(model), truth) if model else {}
+                    kept.parent.mkdir(parents=True, exist_ok=True)
+                    write_json(kept, {"capture": capture, "way": way, **row})
+                if kept.is_file():
+                    rows.append(json.loads(kept.read_text(encoding="utf-8")))
+    write_json(
+        args.results.with_name(args.results.name + ".json"), {"environment": environment("cpu"), "rows": rows}
+    )
+    write_text(args.results.with_name(args.results.name + ".md"), markdown(rows))
+    print(markdown(rows))
+
+
+if __name__ == "__main__":
+    main()

@@ -174,6 +174,7 @@ def run_mapping(job: MappingJob) -> None:
     left_out = {matched.names[photo]: reason for photo, reason in placement.left_out.items()}
     model = placement.model
     model.tear_down()
+    model.extract_colors_for_all_images(job["photos"])
     (output / "0").mkdir()
     model.write(str(output / "0"))
     summary: ModelSummary = {

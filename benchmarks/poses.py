@@ -44,6 +44,8 @@ pycolmap.extract_features(database, photos, extraction_options=extraction)
 pycolmap.match_exhaustive(database, matching_options=pycolmap.FeatureMatchingOptions(use_gpu=False))
 mapping = pycolmap.global_mapping if mapper == "colmap-global" else pycolmap.incremental_mapping
 models = mapping(database, photos, out)
+if not models:
+    sys.exit(2)
 largest = max(models.values(), key=lambda model: model.num_reg_images())
 largest.write(out)
 """
@@ -79,7 +81,7 @@ def compare(found: Poses, truth: Poses) -> dict[str, Any]:
     """
     names = sorted(set(found) & set(truth))
     if len(names) < 3:
-        return {"judged": len(names), "right": 0, "wrong": {}}
+        return {"known": len(truth), "judged": len(names), "right": 0, "wrong": {}}
     turns = np.array(
         [truth[n][0].T @ found[n][0] for n in names]
     )  # world of the truth from that of the model
@@ -100,6 +102,7 @@ def compare(found: Poses, truth: Poses) -> dict[str, Any]:
     }
     focal = [100 * (found[n][2] / truth[n][2] - 1) for n in names]
     return {
+        "known": len(truth),  # photos
         "judged": len(names),
         "right": len(names) - len(wrong),
         "wrong": wrong,  # degrees, percent of the path's radius
@@ -128,11 +131,18 @@ def _angles_deg(rotations: np.ndarray) -> np.ndarray:
 
 
 def aw(*words: object, checkout: Path | None = None) -> str:
-    """One command; "" or the last line of its error."""
+    """One command; "" or the last line of its refusal.
+
+    Raises:
+        AwError: it failed for another reason.
+    """
     env = {**os.environ, "PYTHONPATH": str(checkout)} if checkout else None
     command = [sys.executable, "-m", "ambiguous_wild.cli.main", *map(str, words)]
     done = subprocess.run(command, env=env, cwd=checkout, capture_output=True, text=True)
-    return "" if done.returncode == 0 else (done.stderr.strip().splitlines() or ["no output"])[-1]
+    last = (done.stderr.strip().splitlines() or ["no output"])[-1]
+    if done.returncode not in (0, 2):
+        raise AwError(f"aw {words[0]} ended with code {done.returncode}: {last}")
+    return last if done.returncode else ""
 
 
 def capture_of(name: str, seed: int, kind: str, args: argparse.Namespace) -> tuple[Path, Poses]:
@@ -193,7 +203,9 @@ def _build_with_colmap(raw: Path, way: str, out: Path) -> dict[str, Any]:
         together.mkdir(parents=True)
         for photo in photos:
             shutil.copyfile(photo, together / photo.name)
-        done = subprocess.run([sys.executable, "-c", COLMAP, together, out, way], capture_output=True)
+        done = subprocess.run([sys.executable, "-c", COLMAP, together, out, way])
+        if done.returncode not in (0, 2):
+            raise AwError(f"COLMAP ended with code {done.returncode} on {raw}")
         if done.returncode:
             return {"refused": "COLMAP found no model"}
     return {"model": out, "photos": len(photos), "placed": len(read_model(out).images)}
@@ -208,16 +220,19 @@ def markdown(rows: Sequence[dict[str, Any]]) -> str:
     lines = [f"| {' | '.join(head)} |", "|---|---:|" + "---|" * len(ways)]
     for capture in captures:
         mine = [known.get((capture, way)) for way in ways]
-        photos = max((row.get("photos", 0) for row in mine if row), default=0)
-        lines.append(f"| {capture} | {photos} | {' | '.join(map(_cell, mine))} |")
+        count = max((row.get("photos", 0) for row in mine if row), default=0)
+        lines.append(f"| {capture} | {count} | {' | '.join(map(_cell, mine))} |")
     lines += ["", "Each cell: photos placed rightly of those judged; wrong ones, the worst in degrees;"]
     lines += ["median position error in % of the path's radius; focal length error in %.", ""]
+    common = [c for c in captures if all((c, way) in known for way in ways)]
+    lines.append(f"Over the {len(common)} captures that every way has:")
+    photos = sum(max(known[c, way].get("known", 0) for way in ways) for c in common)
     for way in ways:
-        mine = [row for row in rows if row["way"] == way and "judged" in row]
-        right, judged = (sum(row[key] for row in mine) for key in ("right", "judged"))
-        wrong = sum(len(row["wrong"]) for row in mine)
-        refused = sum("refused" in row for row in rows if row["way"] == way)
-        lines.append(f"- {way}: {right} of {judged} placed photos right, {wrong} wrong, {refused} refused")
+        of_way = [known[c, way] for c in common]
+        right = sum(row.get("right", 0) for row in of_way)
+        wrong = sum(row.get("judged", 0) - row.get("right", 0) for row in of_way)
+        refused = sum("refused" in row for row in of_way)
+        lines.append(f"- {way}: {right} of {photos} photos right, {wrong} wrong, {refused} captures refused")
     return "\n".join(lines) + "\n"
 
 
@@ -247,6 +262,9 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--report-only", action="store_true", help="only what was compared before")
     parser.add_argument("--results", type=Path, default=RESULTS)
     args = parser.parse_args(words)
+    args.data, args.out = args.data.resolve(), args.out.resolve()  # other checkouts run in their own folder
+    if args.before is not None and not (args.before / "ambiguous_wild").is_dir():
+        parser.error(f"--before {args.before}: no checkout of this project")  # else it would compare itself
     if any(way.startswith("before-") for way in args.ways) and args.before is None:
         parser.error("ways that begin with before- need --before CHECKOUT")
     kinds = [(n, kind) for n in args.bases for kind in ("cutouts", "patches")]

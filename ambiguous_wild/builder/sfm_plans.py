@@ -11,7 +11,7 @@ from ambiguous_wild.builder.retrieval import NEIGHBOURS
 from ambiguous_wild.builder.settings import BuildSettings
 
 WIDER = 40  # partners of a photo that was left out
-ENOUGH = 0.95  # placed: the rest has no clear place, which more pairs seldom give
+ENOUGH = 0.9  # placed: the rest has no clear place, which more pairs seldom give
 HALF = 0.5  # placed after that: where fewer are, matching everything cannot make it worse
 
 

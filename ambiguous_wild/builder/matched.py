@@ -33,7 +33,7 @@ class Matched:
     features: list[np.ndarray]  # [N, 2] px
     matches: dict[Pair, np.ndarray]  # [K, 2] features of the pair's photos; pairs with `LEAST` at least
     motions: dict[Pair, list[Motion]] = field(default_factory=dict)
-    bent: bool = True  # whether the photos determine the lens's distortion; else there is none
+    distorted: bool = True  # whether the lens's distortion is estimated; else there is none
 
     @classmethod
     def read(cls, database: Path) -> Matched:
@@ -139,6 +139,14 @@ class Matched:
         focals_px = [self.focal_px(k) for k in range(len(self.ids))]
         self.motions = motions_of_pairs(self.rays(), focals_px, self.matches, jobs)
         return agreed_motions(self.motions, cycle_votes(self.motions))
+
+    def poses(self, model: Any) -> dict[int, np.ndarray]:
+        """Of the photos that a model places: [3, 4] camera from world."""
+        return {
+            k: np.asarray(model.images[i].cam_from_world().matrix())
+            for k, i in enumerate(self.ids)
+            if i in model.images and model.images[i].has_pose
+        }
 
     def take_cameras(self, model: Any) -> float:
         """Cameras of a model; how much focal lengths change, relative, in the median over photos."""

@@ -50,6 +50,7 @@ class Motion:
 
 
 Pair = tuple[int, int]
+_End = tuple[int, np.ndarray, np.ndarray]  # other photo, rotations from it [K, 3, 3], their votes [K]
 Rays = Sequence[np.ndarray]  # of every photo: [N, 2] features as x / z and y / z in its camera
 
 
@@ -246,7 +247,7 @@ def _closed(rotations: np.ndarray, edges: np.ndarray) -> np.ndarray:
     around = np.einsum("tbxz,tazy->tabxy", second, first)
     trace = np.einsum("tabxy,tcxy->tabc", around, direct)
     # NaN, of what does not exist, is not larger than anything
-    return np.argwhere(trace > _trace(CLOSED_DEG))
+    return np.argwhere(trace > trace_of(CLOSED_DEG))
 
 
 def _vote(votes: np.ndarray, exists: np.ndarray, edges: np.ndarray, closed: np.ndarray) -> np.ndarray:
@@ -273,9 +274,7 @@ def agreed_motions(
     Rotations are chosen photo by photo: that on which the partners with most votes agree, until none changes.
     Every photo counts once, however many matches it has. Pairs without such a motion are left out.
     """
-    ends: dict[
-        int, list[tuple[int, np.ndarray, np.ndarray]]
-    ] = {}  # other, turns from it [K, 3, 3], votes [K]
+    ends: dict[int, list[_End]] = {}
     for (a, b), found in votes.items():
         turns = [
             (r, found[m, w]) for m, motion in enumerate(pairs[a, b]) for w, r in enumerate(motion.rotations)
@@ -313,7 +312,7 @@ def agreed_motions(
     return agreed
 
 
-def _grow(start: int, ends: Mapping[int, list], rotations: dict[int, np.ndarray]) -> None:
+def _grow(start: int, ends: Mapping[int, list[_End]], rotations: dict[int, np.ndarray]) -> None:
     """Turn the photos that pairs connect with `start`, those with most votes first."""
     gain: dict[int, float] = {}
     photo = start
@@ -328,7 +327,7 @@ def _grow(start: int, ends: Mapping[int, list], rotations: dict[int, np.ndarray]
         rotations[photo] = _turned(ends[photo], rotations, np.eye(3))
 
 
-def _turned(ends: Sequence[tuple], rotations: Mapping[int, np.ndarray], otherwise: np.ndarray) -> np.ndarray:
+def _turned(ends: Sequence[_End], rotations: Mapping[int, np.ndarray], otherwise: np.ndarray) -> np.ndarray:
     """The rotation of a photo on which its turned partners agree best; one motion of each counts."""
     turns, weights, owners = [], [], []
     for other, forth, weight in ends:
@@ -340,7 +339,7 @@ def _turned(ends: Sequence[tuple], rotations: Mapping[int, np.ndarray], otherwis
         return otherwise
     stack, weight, owner = np.array(turns), np.array(weights), np.unique(owners, return_inverse=True)[1]
     flat = stack.reshape(-1, 9)
-    alike = flat @ flat.T > _trace(AGREED_DEG)
+    alike = flat @ flat.T > trace_of(AGREED_DEG)
     best = np.zeros((len(flat), owner.max() + 1))
     for column in range(best.shape[1]):
         mine = owner == column
@@ -352,9 +351,9 @@ def _turned(ends: Sequence[tuple], rotations: Mapping[int, np.ndarray], otherwis
 
 def _alike(rotations: np.ndarray, wanted: np.ndarray, angle_deg: float) -> np.ndarray:
     """[N] bool: rotations [N, 3, 3] that differ by less than an angle from one."""
-    return (rotations * wanted).sum(axis=(1, 2)) > _trace(angle_deg)
+    return (rotations * wanted).sum(axis=(1, 2)) > trace_of(angle_deg)
 
 
-def _trace(angle_deg: float) -> float:
+def trace_of(angle_deg: float) -> float:
     """Trace of a rotation by an angle."""
     return 1.0 + 2.0 * float(np.cos(np.radians(angle_deg)))

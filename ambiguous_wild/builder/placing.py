@@ -15,11 +15,12 @@ from typing import Any
 import numpy as np
 
 from ambiguous_wild.builder.matched import Matched
-from ambiguous_wild.builder.motions import Pair
+from ambiguous_wild.builder.motions import Pair, trace_of
 from ambiguous_wild.builder.records import CameraFact
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 FITS = 0.5  # share of a motion's matches that fit, from which on a partner agrees
+LEAST_PHOTOS = 3  # of a model
 AGREE = 2  # partners of a photo, at least
 AGREE_NEW = 3  # of a photo that COLMAP did not place
 RIVAL = 0.7  # weight of a second place over that of the first, from which on a photo has two places
@@ -32,7 +33,7 @@ PLACES = 3  # that are tried for a photo
 RESECTION_PX, RESECTION_LEAST = 6.0, 15  # error and number of the points of a place
 ROUNDS = 8  # of placing anew
 TAKEN_OUT = 2  # times, after which a photo stays out
-BENDS = -0.5, 0.3  # k of SIMPLE_RADIAL, from an action camera to more than any pincushion
+DISTORTIONS = -0.5, 0.3  # k of SIMPLE_RADIAL, from an action camera to more than any pincushion
 LOOSE_PX, TIGHT_PX = 4.0, 2.0  # observations with a larger error are removed, first and last
 COVARIANCE_LIMIT = 400  # photos: the poses' covariance is a dense matrix
 ADJUSTMENTS, STILL = 3, 2e-3  # joint adjustments at most, and share of observations that end them
@@ -74,9 +75,13 @@ class Placement:
         for turn in range(ROUNDS + 1):
             self._settle(final=False)
             moved = self._look(outs, only_out=turn == ROUNDS)
-            if not moved:
+            if not moved or len(self.poses) < LEAST_PHOTOS:
                 break
-        self._settle(final=True)
+        if len(self.poses) >= LEAST_PHOTOS:  # COLMAP does not adjust less
+            self._settle(final=True)
+        for photo in range(len(outs)):
+            if photo not in self.poses:
+                self.left_out.setdefault(photo, "too few of its points are left")
 
     def cameras(self) -> list[CameraFact]:
         """Focal length of every camera, with its standard deviation where the adjustment gives one."""
@@ -104,7 +109,7 @@ class Placement:
             config.add_image(number)
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
         adjuster = pycolmap.create_default_ceres_bundle_adjuster(
-            adjustment_options(self.matched.bent, final=True), config, self.model
+            adjustment_options(self.matched.distorted, final=True), config, self.model
         )
         adjuster.solve()
         options = pycolmap.BACovarianceOptions(params=pycolmap.BACovarianceOptionsParams.ALL)
@@ -195,7 +200,7 @@ class Placement:
         if not owners:
             return Place(None, frozenset(), 0)
         stack = np.array(turns).reshape(-1, 9)
-        alike = stack @ stack.T > _trace(ALIKE_DEG)
+        alike = stack @ stack.T > trace_of(ALIKE_DEG)
         groups = [np.flatnonzero(row) for row in alike]
         largest = max(groups, key=lambda group: len({owners[k] for k in group}))
         cells = self._cells(photo, [rows[k] for k in largest])
@@ -205,10 +210,8 @@ class Placement:
         """Whether two poses are one place."""
         if first is None or second is None:
             return False
-        centres = np.array([-pose[:, :3].T @ pose[:, 3] for pose in (first, second, *self.poses.values())])
-        spread = float(np.median(np.linalg.norm(centres - np.median(centres, axis=0), axis=1)))
-        near = _turn_deg(first, second) < SAME_DEG
-        return near and float(np.linalg.norm(centres[0] - centres[1])) < SAME_SHARE * spread
+        apart = float(np.linalg.norm(_centre(first) - _centre(second)))
+        return _turn_deg(first, second) < SAME_DEG and apart < SAME_SHARE * self.radius
 
     def _cells(self, photo: int, rows: Sequence[np.ndarray]) -> int:
         """Cells of a grid over the photo that hold one of these features."""
@@ -269,12 +272,12 @@ class Placement:
                 ADJUSTMENTS if final else 1,
                 STILL,
                 options.mapper,
-                adjustment_options(matched.bent, final=final),
+                adjustment_options(matched.distorted, final=final),
                 options.triangulation,
             )
         mapper.end_reconstruction(False)
-        if self.matched.bent and not plausible(model):
-            self.matched.bent = False
+        if self.matched.distorted and not plausible(model):
+            self.matched.distorted = False
             for camera in self.matched.cameras:
                 camera.params = [*camera.params[:3], 0.0]
             self._settle(final=final)
@@ -285,11 +288,10 @@ class Placement:
         """Cameras and poses of a model."""
         self.model = model
         self.matched.take_cameras(model)
-        self.poses = {
-            k: np.asarray(model.images[i].cam_from_world().matrix())
-            for k, i in enumerate(self.matched.ids)
-            if i in model.images and model.images[i].has_pose
-        }
+        self.poses = self.matched.poses(model)
+        centres = np.array([_centre(pose) for pose in self.poses.values()]).reshape(-1, 3)
+        apart = np.linalg.norm(centres - np.median(centres, axis=0), axis=1) if len(centres) else np.zeros(1)
+        self.radius = float(np.median(apart))  # of the path
 
 
 @dataclass
@@ -342,15 +344,15 @@ def pipeline_options(seed: int) -> Any:
 
 
 def plausible(model: Any) -> bool:
-    """Whether lenses bend as lenses do: few or flat photos leave distortion free to explain anything."""
-    low, high = BENDS
+    """Whether the distortion is that of a lens: few or flat photos leave it free to explain anything."""
+    low, high = DISTORTIONS
     return all(low <= camera.params[-1] <= high for camera in model.cameras.values())
 
 
-def adjustment_options(bent: bool, *, final: bool) -> Any:
+def adjustment_options(distorted: bool, *, final: bool) -> Any:
     """Joint adjustment in which a match that does not fit counts little, on one thread as above."""
     options = pycolmap.BundleAdjustmentOptions()
-    options.refine_extra_params = bent
+    options.refine_extra_params = distorted
     options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
     options.ceres.solver_options.num_threads = 1
@@ -373,14 +375,14 @@ def _reason(best: Place, rival: Place, needed: int) -> str | None:
     return None
 
 
+def _centre(pose: np.ndarray) -> np.ndarray:
+    """Position of a camera, of its pose [3, 4] from world."""
+    return -pose[:, :3].T @ pose[:, 3]
+
+
 def _turn_deg(first: np.ndarray | None, second: np.ndarray | None) -> float:
     """Angle between two poses [3, 4]; 180 where one is unknown."""
     if first is None or second is None:
         return 180.0
     trace = float((first[:, :3] * second[:, :3]).sum())
     return float(np.degrees(np.arccos(np.clip((trace - 1) / 2, -1.0, 1.0))))
-
-
-def _trace(angle_deg: float) -> float:
-    """Trace of a rotation by an angle."""
-    return 1.0 + 2.0 * float(np.cos(np.radians(angle_deg)))

@@ -21,7 +21,7 @@ import numpy as np
 
 from ambiguous_wild.builder.matched import Matched
 from ambiguous_wild.builder.pairs import MOTIONS, PAIRS, sequential_pairs
-from ambiguous_wild.builder.placing import Placement, pipeline_options, plausible
+from ambiguous_wild.builder.placing import LEAST_PHOTOS, Placement, pipeline_options, plausible
 from ambiguous_wild.builder.records import ModelSummary
 from ambiguous_wild.builder.retrieval import embed, pairs_of_tests, retrieval_pairs
 from ambiguous_wild.builder.sfm_jobs import FeatureJob, MappingJob, MatchJob, SfmJob, TriangulationJob
@@ -30,7 +30,6 @@ from ambiguous_wild.io.atomic import write_json
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 FOCAL_CHANGE = 0.05  # relative, of half of the photos
-_MIN_MODEL = 3  # images; smaller models are not reported
 _PR_SET_PDEATHSIG = 1
 
 
@@ -148,14 +147,14 @@ def run_mapping(job: MappingJob) -> None:
     mapper = _map_globally if job["mapper"] == "global" else _map_incrementally
 
     def largest() -> Any:
-        found = mapper(job, output, matched.bent).values()
+        found = mapper(job, output, matched.distorted).values()
         for folder in output.glob("[0-9]*"):
             shutil.rmtree(folder)
         return max(found, key=lambda m: (m.num_reg_images(), m.num_points3D()), default=None)
 
     model = largest()
     if model is not None and not plausible(model):
-        matched.bent = False
+        matched.distorted = False
         model = largest()
     if model is not None and matched.take_cameras(model) > FOCAL_CHANGE:
         # poses of pairs were wrong by as much: once more, with the focal length that the model found
@@ -163,15 +162,16 @@ def run_mapping(job: MappingJob) -> None:
         model = largest() or model
     else:
         matched.load_motions(Path(job["motions"]))
-    if model is None:
-        reasons = dict.fromkeys(matched.names, "no pair of photos to start from")
-        write_json(
-            output / "mapping.json", {"model": None, "left_out": reasons, "partners": {}, "cameras": []}
-        )
+    left_out = dict.fromkeys(matched.names, "no pair of photos to start from")
+    placement = None
+    if model is not None:
+        placement = Placement(matched, database, model, job["seed"])
+        placement.run()
+        left_out = {matched.names[photo]: reason for photo, reason in placement.left_out.items()}
+    if placement is None or len(placement.poses) < LEAST_PHOTOS:
+        nothing: dict[str, Any] = {"model": None, "left_out": left_out, "partners": {}, "cameras": []}
+        write_json(output / "mapping.json", nothing)
         return
-    placement = Placement(matched, database, model, job["seed"])
-    placement.run()
-    left_out = {matched.names[photo]: reason for photo, reason in placement.left_out.items()}
     model = placement.model
     model.tear_down()
     model.extract_colors_for_all_images(job["photos"])
@@ -198,8 +198,8 @@ def run_triangulation(job: TriangulationJob) -> None:
     """Points from the matches that fit the poses; these and the intrinsics stay as they are."""
     known = pycolmap.Reconstruction(job["model"])
     matched = Matched.read(Path(job["database"]))
-    placement = Placement(matched, Path(job["database"]), known, job["seed"])
-    matched.write_verified(Path(job["database"]), matched.fitting(placement.poses))
+    matched.take_cameras(known)
+    matched.write_verified(Path(job["database"]), matched.fitting(matched.poses(known)))
     found = pycolmap.triangulate_points(
         known,
         job["database"],
@@ -211,10 +211,10 @@ def run_triangulation(job: TriangulationJob) -> None:
     found.write_binary(job["output"])
 
 
-def _map_incrementally(job: MappingJob, output: Path, bent: bool) -> dict[int, Any]:
+def _map_incrementally(job: MappingJob, output: Path, distorted: bool) -> dict[int, Any]:
     options = pipeline_options(job["seed"])
-    options.min_model_size = _MIN_MODEL
-    options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = bent
+    options.min_model_size = LEAST_PHOTOS
+    options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = distorted
     options.ba_global_frames_ratio = options.ba_global_points_ratio = job["growth"]
     options.ba_global_max_refinements = job["refinements"]
     options.ba_local_max_refinements = job["local_refinements"]
@@ -241,7 +241,7 @@ def _map_incrementally(job: MappingJob, output: Path, bent: bool) -> dict[int, A
     )
 
 
-def _map_globally(job: MappingJob, output: Path, bent: bool) -> dict[int, Any]:
+def _map_globally(job: MappingJob, output: Path, distorted: bool) -> dict[int, Any]:
     options = pycolmap.GlobalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1
     options.random_seed = options.mapper.random_seed = job["seed"]
@@ -251,9 +251,9 @@ def _map_globally(job: MappingJob, output: Path, bent: bool) -> dict[int, Any]:
     options.mapper.retriangulation.random_seed = job["seed"]
     adjustment = options.mapper.bundle_adjustment.ceres
     adjustment.use_gpu = False
-    options.mapper.bundle_adjustment.refine_extra_params = bent
+    options.mapper.bundle_adjustment.refine_extra_params = distorted
     adjustment.min_num_residuals_for_cpu_multi_threading = 10**9
-    options.min_model_size = _MIN_MODEL
+    options.min_model_size = LEAST_PHOTOS
     return pycolmap.global_mapping(job["database"], job["photos"], str(output), options=options)
 
 

@@ -6,11 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
+from ambiguous_wild.builder import sfm
 from ambiguous_wild.builder.matched import Matched
 from ambiguous_wild.builder.motions import Motion, agreed_motions, cycle_votes, focal_votes, motions
 from ambiguous_wild.builder.pipeline import build_scene
 from ambiguous_wild.builder.placing import Place, _reason
 from ambiguous_wild.builder.settings import BuildSettings
+from ambiguous_wild.core import AwError
 from ambiguous_wild.io.colmap_model import read_model
 from tests.builder.capture_maker import FOCAL, eyes, texture, write_capture
 
@@ -162,3 +164,19 @@ def test_motions_come_back_from_their_file(tmp_path):
     for one, other in zip(matched.motions[0, 1], again.motions[0, 1]):
         np.testing.assert_array_equal(one.matches, other.matches)
         np.testing.assert_array_equal(one.rotations, other.rotations)
+
+
+def test_a_model_whose_photos_do_not_agree_ends_in_a_refusal(tmp_path, monkeypatch):
+    """Photos are taken out until too few are left: one line, not a crash of COLMAP."""
+    write_capture(tmp_path / "raw", 6)
+    worker = "import sys; from ambiguous_wild.builder import placing, sfm_worker; placing.AGREE = 99; "
+    worker += "placing.AGREE_NEW = 99; sys.argv = ['worker', sys.argv[1]]; sfm_worker.main()"
+    real = sfm.subprocess.Popen
+
+    def strict(command, **options):
+        return real([command[0], "-c", worker, command[-1]], **options)
+
+    monkeypatch.setattr(sfm.subprocess, "Popen", strict)
+    with pytest.raises(AwError, match="placed 0 of 6 photos"):
+        build_scene(tmp_path / "raw", tmp_path / "scene", BuildSettings(max_features=500, sfm="fast"))
+    assert [p.name for p in tmp_path.iterdir()] == ["raw"]

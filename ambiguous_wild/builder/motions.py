@@ -18,6 +18,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from ambiguous_wild.io.safe_pycolmap import pycolmap
+
 LEAST = 15  # matches of a motion
 MOTIONS = 3  # of a pair, at most
 WAYS = 3  # poses that explain one motion: a plane allows two more
@@ -36,6 +38,7 @@ FOCAL_LEAST = 10  # fundamental matrices that determine a focal length
 FOCAL_MATCHES = 100  # beyond which a matrix does not count more
 FOCAL_UNEQUAL = 0.1  # relative difference of singular values that counts as wrong
 FOCAL_CLEAR = 0.75  # cost of the best focal length over that of the median one
+FOCAL_BETTER = 0.85  # or over that of the one it would replace
 FOCAL_TURNS = 3  # in which each camera looks for its focal length among the others'
 _CHUNK = 20_000  # triplets voted on at a time
 
@@ -96,9 +99,25 @@ def motions(first: np.ndarray, second: np.ndarray, error: float) -> list[Motion]
         inside = mask.ravel() > 0
         _, rotation, translation, _ = cv2.recoverPose(essential[:3], a[inside], b[inside], np.eye(3))
         ways = [(rotation, translation.ravel()), *_twins(a[inside], b[inside], error)][:WAYS]
+        ways = [_refined(way, a[inside], b[inside]) for way in ways]
         found.append(Motion(left[inside], np.array([r for r, _ in ways]), np.array([t for _, t in ways])))
         left = left[~inside]
     return found
+
+
+def _refined(
+    way: tuple[np.ndarray, np.ndarray], a: np.ndarray, b: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The pose with the least error: with a long lens, RANSAC's is off by several degrees."""
+    first, second = (np.column_stack([x, np.ones(len(x))]) for x in (a, b))
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    second /= np.linalg.norm(second, axis=1, keepdims=True)
+    start = pycolmap.Rigid3d(np.column_stack(way))
+    found = pycolmap.refine_relative_pose(start, first, second, np.ones(len(a), bool))
+    if found is None:
+        return way
+    pose = np.asarray(found["cam2_from_cam1"].matrix())
+    return pose[:, :3], pose[:, 3]
 
 
 def _twins(a: np.ndarray, b: np.ndarray, error: float) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -151,8 +170,11 @@ def focal_votes(
             unequal = _inequality(matrices[rows], first, second) / FOCAL_UNEQUAL
             costs.append(np.average(np.minimum(unequal, 1.0), weights=weights[rows]))
         lowest = int(np.argmin(costs))
-        clear = costs[lowest] < FOCAL_CLEAR * np.median(costs) and 0 < lowest < len(FOCALS) - 1
-        return float(FOCALS[lowest]) if clear else None
+        now = np.median([focals[camera] for camera in moving])
+        limit = max(
+            FOCAL_CLEAR * np.median(costs), FOCAL_BETTER * costs[int(np.argmin(np.abs(FOCALS - now)))]
+        )
+        return float(FOCALS[lowest]) if costs[lowest] < limit and 0 < lowest < len(FOCALS) - 1 else None
 
     together = best(np.arange(len(ends)), unknown) if unknown else None
     if together is not None:

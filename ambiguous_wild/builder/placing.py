@@ -22,16 +22,17 @@ from ambiguous_wild.io.safe_pycolmap import pycolmap
 FITS = 0.5  # share of a motion's matches that fit, from which on a partner agrees
 LEAST_PHOTOS = 3  # of a model
 AGREE = 2  # partners of a photo, at least
-AGREE_NEW = 3  # of a photo that COLMAP did not place
+AGREE_NEW = 3  # of a photo that COLMAP did not place, if less than `AREA_NEW` of it agrees
 RIVAL = 0.7  # weight of a second place over that of the first, from which on a photo has two places
 ALIKE_DEG, SAME_DEG = 5.0, 1.0  # between rotations that partners imply; between poses that are one place
 NEAR_DEG = 3.0  # between poses that may be one place, found twice
 SAME_SHARE = 0.1  # of the path's radius, between positions that are one place
-GRID = 12  # cells a side that a photo's matches cover or not
-LEAST_CELLS = 14  # of them, a tenth of the photo: where less agrees, a distractor may
+GRID = 12  # cells a side, which a photo's matches cover or not
+LEAST_AREA = 0.12  # of a photo: where less agrees, a distractor may
+AREA_NEW = 0.24
 PLACES = 3  # that are tried for a photo
 RESECTION_PX, RESECTION_LEAST = 6.0, 15  # error and number of the points of a place
-ROUNDS = 8  # of placing anew
+ROUNDS = 8  # of placing anew, besides those that only add photos
 TAKEN_OUT = 2  # times, after which a photo stays out
 DISTORTIONS = -0.5, 0.3  # k of SIMPLE_RADIAL, from an action camera to more than any pincushion
 LOOSE_PX, TIGHT_PX = 4.0, 2.0  # observations with a larger error are removed, first and last
@@ -45,13 +46,13 @@ class Place:
 
     pose: np.ndarray | None  # [3, 4] camera from world; None: only its rotation is known
     partners: frozenset[int]  # placed photos that agree
-    cells: int  # of `GRID` x `GRID` that their matches cover
+    area: float  # share of the photo, where it has features, that their matches cover
     evidence: Mapping[tuple[Pair, int], np.ndarray] = field(default_factory=dict)  # motion -> its features
 
     @property
-    def weight(self) -> int:
+    def weight(self) -> float:
         """A distractor may have partners, but covers little of the photo."""
-        return len(self.partners) * self.cells
+        return len(self.partners) * self.area
 
 
 class Placement:
@@ -64,6 +65,7 @@ class Placement:
         for pair in matched.matches:
             for photo in pair:
                 self.pairs[photo].append(pair)
+        self.cells = [_cells(f, c.width, c.height) for f, c in zip(matched.features, matched.cameras)]
         self.poses: dict[int, np.ndarray] = {}  # photo -> [3, 4] camera from world
         self.places: dict[int, Place] = {}  # of the placed photos
         self.left_out: dict[int, str] = {}  # photo -> reason
@@ -72,11 +74,12 @@ class Placement:
     def run(self) -> None:
         """Place all photos anew, one after another, until all stay."""
         outs = [0] * len(self.matched.ids)
-        for turn in range(ROUNDS + 1):
+        turn, moved = 0, True
+        while moved and turn <= ROUNDS and len(self.poses) >= LEAST_PHOTOS:
             self._settle(final=False)
+            before = set(self.poses)
             moved = self._look(outs, only_out=turn == ROUNDS)
-            if not moved or len(self.poses) < LEAST_PHOTOS:
-                break
+            turn += not set(self.poses) > before
         if len(self.poses) >= LEAST_PHOTOS:  # COLMAP does not adjust less
             self._settle(final=True)
         for photo in range(len(outs)):
@@ -123,7 +126,8 @@ class Placement:
         for photo in range(len(self.matched.ids)):
             now = self.poses.get(photo)
             best, rival = self._best(photo, now, rays, points)
-            reason = _reason(best, rival, AGREE if now is not None else AGREE_NEW)
+            few = now is None and best.area < AREA_NEW
+            reason = _reason(best, rival, AGREE_NEW if few else AGREE)
             if reason is None and now is None and (only_out or outs[photo] >= TAKEN_OUT):
                 reason = "its partners do not settle on a place"
             if reason is not None:
@@ -148,7 +152,7 @@ class Placement:
         """The place with most weight, and the strongest one elsewhere."""
         places = [] if now is None else [self._judge(photo, now, rays)]
         places += [self._judge(photo, pose, rays) for pose in self._resections(photo, points)]
-        best = max(places, key=lambda place: place.weight, default=Place(None, frozenset(), 0))
+        best = max(places, key=lambda place: place.weight, default=Place(None, frozenset(), 0.0))
         elsewhere = []
         for place in places:
             if place is best or self._same(place.pose, best.pose):
@@ -162,7 +166,7 @@ class Placement:
         dissent = self._dissent(photo, best.partners)
         if len(dissent.partners) >= AGREE:
             elsewhere.append(dissent)
-        return best, max(elsewhere, key=lambda place: place.weight, default=Place(None, frozenset(), 0))
+        return best, max(elsewhere, key=lambda place: place.weight, default=Place(None, frozenset(), 0.0))
 
     def _judge(self, photo: int, pose: np.ndarray, rays: Sequence[np.ndarray]) -> Place:
         """What the placed partners say of a place; one agrees if one of its motions fits."""
@@ -183,7 +187,7 @@ class Placement:
         self, photo: int, pose: np.ndarray | None, evidence: Mapping[tuple[Pair, int], np.ndarray]
     ) -> Place:
         partners = frozenset(a + b - photo for (a, b), _ in evidence)
-        return Place(pose, partners, self._cells(photo, list(evidence.values())), evidence)
+        return Place(pose, partners, self._area(photo, list(evidence.values())), evidence)
 
     def _dissent(self, photo: int, agree: frozenset[int]) -> Place:
         """Where most of the other placed partners see the photo: those whose motions turn it alike."""
@@ -198,13 +202,13 @@ class Placement:
                     turns.append((rotation if pair[1] == photo else rotation.T) @ self.poses[other][:, :3])
                     rows.append(self.matched.matches[pair][motion.matches, pair.index(photo)])
         if not owners:
-            return Place(None, frozenset(), 0)
+            return Place(None, frozenset(), 0.0)
         stack = np.array(turns).reshape(-1, 9)
         alike = stack @ stack.T > trace_of(ALIKE_DEG)
         groups = [np.flatnonzero(row) for row in alike]
         largest = max(groups, key=lambda group: len({owners[k] for k in group}))
-        cells = self._cells(photo, [rows[k] for k in largest])
-        return Place(None, frozenset(owners[k] for k in largest), cells)
+        area = self._area(photo, [rows[k] for k in largest])
+        return Place(None, frozenset(owners[k] for k in largest), area)
 
     def _same(self, first: np.ndarray | None, second: np.ndarray | None) -> bool:
         """Whether two poses are one place."""
@@ -213,14 +217,12 @@ class Placement:
         apart = float(np.linalg.norm(_centre(first) - _centre(second)))
         return _turn_deg(first, second) < SAME_DEG and apart < SAME_SHARE * self.radius
 
-    def _cells(self, photo: int, rows: Sequence[np.ndarray]) -> int:
-        """Cells of a grid over the photo that hold one of these features."""
+    def _area(self, photo: int, rows: Sequence[np.ndarray]) -> float:
+        """Share of the cells with features of a grid over the photo that hold one of these features."""
         if not rows:
-            return 0
-        camera = self.matched.cameras[photo]
-        share = self.matched.features[photo][np.concatenate(rows)] / [camera.width, camera.height]
-        cell = np.clip((share * GRID).astype(int), 0, GRID - 1)
-        return len(np.unique(cell[:, 0] * GRID + cell[:, 1]))
+            return 0.0
+        cells = self.cells[photo]
+        return len(np.unique(cells[np.concatenate(rows)])) / len(np.unique(cells))
 
     def _resections(self, photo: int, points: _Points) -> list[np.ndarray]:
         """Places of a photo among points that two other photos determine: [3, 4] each."""
@@ -366,13 +368,21 @@ def _reason(best: Place, rival: Place, needed: int) -> str | None:
     """Why a photo cannot stay at its best place; None if it can."""
     if not best.partners:
         return "no placed photo agrees with it on a place"
+    if len(best.partners) == 1 < needed:
+        return "only one placed photo agrees with it on a place"
     if len(best.partners) < needed:
         return f"only {len(best.partners)} placed photos agree with it on a place"
-    if best.cells < LEAST_CELLS:
+    if best.area < LEAST_AREA:
         return f"only a small part of it agrees with {len(best.partners)} placed photos"
     if rival.weight > RIVAL * best.weight:
         return f"two places: {len(best.partners)} photos agree on one, {len(rival.partners)} on another"
     return None
+
+
+def _cells(features: np.ndarray, width: int, height: int) -> np.ndarray:
+    """[N] cell of a grid over the photo in which each feature [N, 2] lies."""
+    column, row = np.clip(features / [width, height] * GRID, 0, GRID - 1).astype(int).T
+    return column * GRID + row
 
 
 def _centre(pose: np.ndarray) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -122,6 +123,12 @@ def test_the_seed_decides_every_byte(photos: Path, made: Path, tmp_path: Path) -
     assert hashes(tmp_path / "again") == hashes(made)
     composite_photos(photos, tmp_path / "other", CompositeConfig(coverage=0.15, patches=True, seed=4))
     assert hashes(tmp_path / "other") != hashes(made)
+
+
+def test_photos_may_lie_in_images(photos: Path, made: Path, tmp_path: Path) -> None:
+    shutil.copytree(photos, tmp_path / photos.name / "images")
+    composite_photos(tmp_path / photos.name, tmp_path / "out", CONFIG)
+    assert hashes(tmp_path / "out") == hashes(made)
 
 
 def test_the_builder_reads_the_capture(made: Path) -> None:

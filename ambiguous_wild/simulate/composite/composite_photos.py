@@ -122,7 +122,12 @@ def composite_photos(
 
 
 def _list_photos(root: Path) -> list[Path]:
-    paths = sorted(p for p in root.iterdir() if p.suffix.lower() in PHOTO_SUFFIXES and p.name[0] != ".")
+    def of(folder: Path) -> list[Path]:
+        return sorted(p for p in folder.iterdir() if p.suffix.lower() in PHOTO_SUFFIXES and p.name[0] != ".")
+
+    paths = of(root)
+    if not paths and (root / "images").is_dir():
+        paths = of(root / "images")
     if len(paths) < _TEST_EVERY:
         raise AwError(
             f"{root} is no scene and holds {len(paths)} photos itself, at least {_TEST_EVERY} are needed for "

@@ -124,7 +124,7 @@ def test_a_long_lens_still_tells_how_far_the_camera_turned():
     """RANSAC's own pose is off by 2 degrees in the median here."""
     rng, off = np.random.default_rng(5), []
     for _ in range(15):
-        points = rng.uniform(-1, 1, (120, 3)) + [0, 0, 12]
+        points = np.array([0, 0, 12]) + rng.uniform(-1, 1, (120, 3))
         rotation = turned((0.1, 1, 0), 20)
         centre = np.array([0, 0, 12]) - rotation.T @ [0, 0, 12]
         noise = rng.normal(0, 0.5 / 2400, (2, 120, 2))

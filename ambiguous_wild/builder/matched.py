@@ -69,10 +69,10 @@ class Matched:
         """Focal length of its camera."""
         return float(self.cameras[photo].mean_focal_length())
 
-    def fit(
+    def misfit(
         self, pair: Pair, first: np.ndarray, second: np.ndarray, rays: Sequence[np.ndarray]
     ) -> np.ndarray:
-        """[K] bool: matches of a pair within `FITS_PX` of their epipolar lines, by Sampson's error.
+        """[K] distances of a pair's matches from their epipolar lines (Sampson), in units of `FITS_PX`.
 
         Args:
             pair: of photos.
@@ -89,7 +89,13 @@ class Matched:
         error = np.clip(FITS_SHARE * side, *FITS_PX) / np.sqrt(
             self.focal_px(pair[0]) * self.focal_px(pair[1])
         )
-        return (b * line).sum(axis=1) ** 2 <= error**2 * np.maximum(size, 1e-30)
+        return np.abs((b * line).sum(axis=1)) / np.sqrt(np.maximum(size, 1e-30)) / error
+
+    def fit(
+        self, pair: Pair, first: np.ndarray, second: np.ndarray, rays: Sequence[np.ndarray]
+    ) -> np.ndarray:
+        """[K] bool: matches of a pair that fit two poses, as in `misfit`."""
+        return self.misfit(pair, first, second, rays) <= 1.0
 
     def fitting(self, poses: Mapping[int, np.ndarray]) -> dict[Pair, tuple[np.ndarray, np.ndarray]]:
         """Of every placed pair its pose, second from first [3, 4], and the matches that fit it."""
@@ -186,7 +192,7 @@ class Matched:
 
     def load_motions(self, path: Path) -> None:
         """What `save_motions` wrote."""
-        with np.load(path) as file:
+        with np.load(path, allow_pickle=False) as file:
             cuts = np.cumsum(file["counts"], axis=0)[:-1]
             matches = np.split(file["matches"], cuts[:, 0])
             ways = (np.split(file[name], cuts[:, 1]) for name in ("rotations", "translations"))

@@ -127,6 +127,13 @@ class UndistortResult(TypedDict):
     truth: dict[str, int] | None  # part of the truth -> photos that have it
 
 
+class MotionResult(TypedDict):
+    """Of the stage `motion`: features of the train photos."""
+
+    static: int
+    moving: int  # they fit another motion than the place's
+
+
 class DownsampleResult(TypedDict):
     """Of the stage `downsample`."""
 
@@ -170,6 +177,8 @@ class SceneCounts(TypedDict):
     points_of_track_length_2: int
     pairs: int
     pairs_verified: int
+    points_that_stay: int  # features of train photos that fit the place in others
+    points_that_move: int  # that fit another motion
 
 
 class ScenePhoto(TypedDict):

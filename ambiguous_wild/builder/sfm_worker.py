@@ -172,6 +172,7 @@ def run_mapping(job: MappingJob) -> None:
         nothing: dict[str, Any] = {"model": None, "left_out": left_out, "partners": {}, "cameras": []}
         write_json(output / "mapping.json", nothing)
         return
+    matched.save_motions(output / MOTIONS)
     model = placement.model
     model.tear_down()
     model.extract_colors_for_all_images(job["photos"])

@@ -12,7 +12,9 @@ from ambiguous_wild.builder import report
 from ambiguous_wild.builder.collect import Capture
 from ambiguous_wild.builder.downsample import auto_factor, downsample
 from ambiguous_wild.builder.masks import find_masks, lay_out_masks, mask_hashes, mask_warnings
+from ambiguous_wild.builder.moving import write_motion
 from ambiguous_wild.builder.package import SceneParts, package
+from ambiguous_wild.builder.pairs import MOTIONS
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import (
     BuildInputs,
@@ -44,6 +46,7 @@ from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.colmap_records import Model
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import read_png_rgb
+from ambiguous_wild.io.motion_points import FILE
 
 
 @dataclass(frozen=True)
@@ -121,6 +124,17 @@ class Stages:
         registered = {stems[i.name] for i in model.images.values()}
         train, test, how, split_warnings = split_photos(facts, registered, tests)
         flat = self._undistort(work, screened, mask_stage, mapping, model)
+        motion = work.run(
+            "motion",
+            [mapping.key, train],
+            lambda f: write_motion(
+                f,
+                matches.folder / DATABASE,
+                mapping.folder / MOTIONS,
+                mapping.folder / "0",
+                {work_name: f"{stem}.png" for work_name, stem in stems.items() if f"{stem}.png" in train},
+            ),
+        )
         factor = settings.factor or auto_factor([(f["width"], f["height"]) for f in facts])
         small_key, small_folder = flat.key, None
         if factor > 1:
@@ -142,6 +156,7 @@ class Stages:
             how=how,
             factor=factor,
             truth=flat.facts["truth"],
+            motion=motion.facts,
             masks=mask_stage.facts if mask_stage else None,
             warnings=[*mask_warnings(mask_stage.facts if mask_stage else None), *split_warnings],
         )
@@ -159,6 +174,7 @@ class Stages:
             train,
             test,
             [p for p in truth_files if p.is_file()],
+            motion.folder / FILE,
         )
         return self._package(work, small_key, parts, record)
 

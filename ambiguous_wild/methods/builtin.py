@@ -198,6 +198,13 @@ BUILTIN = (
         paper="density control of ForestSplats (arXiv 2503.06179)",
     ),
     MethodEntry(
+        name="3dgs+motion",
+        summary="3dgs without what moves by geometry alone: features that do not fit the place",
+        recipe="ambiguous_wild.methods.motion:build",
+        config="ambiguous_wild.methods.motion:MotionConfig",
+        needs="a scene of 'aw build-scene'",
+    ),
+    MethodEntry(
         name="3dgs+truth",
         summary="reference: 3dgs with the capture's exact masks",
         recipe="ambiguous_wild.methods.truth:build_masked",

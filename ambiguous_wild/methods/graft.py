@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from ambiguous_wild.splat.parts import Parts
 
 PLACES = ("mask", "density", "regulariser", "effects")
-ALIASES = {"none": "3dgs", "truth": "3dgs+truth"}  # of donors
+ALIASES = {"none": "3dgs", "motion": "3dgs+motion", "truth": "3dgs+truth"}  # of donors
 
 
 def graft_name(host: str, donors: Mapping[str, str | None]) -> str:

@@ -23,6 +23,7 @@ class Traits:
 
 BUILTIN_TRAITS = {
     "3dgs": Traits(source="code"),
+    "3dgs+motion": Traits(masks="features that fit another motion than the place's"),
     "3dgs+truth": Traits(masks="exact"),
     "3dgs-clean": Traits(),
     "refinesplat": Traits(

@@ -53,7 +53,16 @@ REUSED = {
     "between features and matches": {"screen", "features"},
     "while COLMAP matches": {"screen", "features"},
     "inside undistortion": {"screen", "features", "matches", "mapping"},
-    "before the rename": {"screen", "features", "matches", "mapping", "undistort", "downsample", "package"},
+    "before the rename": {
+        "screen",
+        "features",
+        "matches",
+        "mapping",
+        "undistort",
+        "motion",
+        "downsample",
+        "package",
+    },
 }
 
 

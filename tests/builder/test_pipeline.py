@@ -116,7 +116,8 @@ def test_scene_json_keeps_its_keys_and_their_order(scene):
     assert list(info["chosen"]) == ["camera", "sfm", "matcher", "mapper"]
     assert list(info["counts"]) == [
         "photos", "readable", "registered", "train", "test", "cameras", "points", "points_seen_in_test_only",
-        "points_of_track_length_2", "pairs", "pairs_verified",
+        "points_of_track_length_2", "pairs", "pairs_verified", "points_that_stay",
+        "points_that_move",
     ]  # fmt: skip
     assert list(info["cameras"][0]) == ["photos", "focal_px", "focal_sd_px"]
     assert list(info["photos"]["p01.png"]) == [
@@ -175,7 +176,7 @@ def test_other_settings_are_refused_by_name_until_overwrite(raw, tmp_path):
     other = BuildSettings(**{**vars(SETTINGS), "factor": 4})
     result = build_scene(raw, out, other, overwrite=True, keep_work=True)
     # Only what depends on the factor ran again.
-    assert set(result.reused) == {"screen", "features", "matches", "mapping", "undistort"}
+    assert set(result.reused) == {"screen", "features", "matches", "mapping", "undistort", "motion"}
     assert (out / "images_4").is_dir()
     assert not (out / "images_2").exists()
     assert first.reused == ()
@@ -258,7 +259,7 @@ def test_a_full_disk_keeps_what_is_done_and_goes_on(raw, scene, tmp_path, monkey
             build_scene(raw, tmp_path / "scene", SETTINGS)
     assert not (tmp_path / "scene").exists()
     result = build_scene(raw, tmp_path / "scene", SETTINGS)
-    assert set(result.reused) == {"screen", "features", "matches", "mapping", "undistort"}
+    assert set(result.reused) == {"screen", "features", "matches", "mapping", "undistort", "motion"}
     assert hashes(result.scene) == hashes(scene)
 
 

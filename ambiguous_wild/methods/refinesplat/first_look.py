@@ -62,6 +62,8 @@ class FirstLookConfig:
     smooth: float = 5.0  # px of a map of 20 000 px, radius of the filter over each answer; 0 = none
     # of a photo: if less would be masked, nothing is; so few distractors do no harm at the start
     least: float = 0.1
+    # how much the features that move or stay (`vision/moving.py`) raise or lower an answer; 0 = not used
+    motion: float = 1.0
     weight: float = 1.5  # `structure`: later evidence is multiplied or divided by up to this; 1 = unchanged
     # the weight in a crowd, where the first renders show distractors; other photos show the background
     crowd_weight: float = 6.0
@@ -77,7 +79,7 @@ class FirstLookConfig:
             views=(1, math.inf), quantile=(0, 1), known_by=(1, math.inf), rounds=(0, 100), smooth=(0, 100),
             crowd=(0, 1), least=(0, 1), weight=(1, math.inf), crowd_weight=(1, math.inf),
             most_least=(0, 1),
-            **dict.fromkeys(("threshold", "normal", "consensus", "most"), (0, math.inf)),
+            **dict.fromkeys(("threshold", "normal", "consensus", "most", "motion"), (0, math.inf)),
         )  # fmt: skip
 
 
@@ -111,6 +113,7 @@ def first_look(
     photos: Sequence[np.ndarray],
     surfaces: Sequence[np.ndarray | None],
     config: FirstLookConfig,
+    moving: Sequence[np.ndarray | None] | None = None,
 ) -> list[FirstLook | None]:
     """The first look at every photo; None for a photo without sparse points or comparable views.
 
@@ -119,6 +122,7 @@ def first_look(
         photos: [H, W, 3] in [0, 1].
         surfaces: inverse depths [h, w] of the sparse points (`static_surfaces`).
         config: how to judge.
+        moving: what moves in each photo (`moving_map`), of its surface's shape; None: nothing is known.
     """
     small = [
         None if inverse is None else _small(photo, inverse.shape)
@@ -127,10 +131,13 @@ def first_look(
     ranges = [None if s is None else (cv2.erode(s, _WINDOW), cv2.dilate(s, _WINDOW)) for s in small]
     near = nearest_views(cameras, 2 * config.views)
 
+    moves = moving if moving is not None and config.motion > 0 else [None] * len(small)
+
     def answer(view: int, views: int, before: Sequence[np.ndarray | None]) -> np.ndarray | None:
-        inverse, ours, last = surfaces[view], small[view], before[view]
+        inverse, ours = surfaces[view], small[view]
         if inverse is None or ours is None:
             return None
+        mine, last = moves[view], None if before is moves else before[view]
         # computed again in every round: kept, they would take 0.5 MB a photo
         world = world_points(cameras[view], inverse)
         seen = [
@@ -142,11 +149,13 @@ def first_look(
         if found is None:
             return last
         found = _smoothed(found, ours, config.smooth)
+        if mine is not None:
+            found = np.clip(found + config.motion * (2.0 * mine - 1.0), 0.0, 1.0, dtype=np.float32)
         # half of the last answer: without it, two photos may mask each other in turn
         return found if last is None else 0.5 * (found + last)
 
     everything = range(len(small))
-    answers = [answer(view, config.views, [None] * len(small)) for view in everything]
+    answers = [answer(view, config.views, moves) for view in everything]
     views = config.views * (2 if masked_share(answers) >= config.crowd else 1)
     for _ in range(config.rounds):
         before, answers = answers, [answer(view, views, answers) for view in everything]

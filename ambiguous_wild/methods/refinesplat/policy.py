@@ -11,6 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ambiguous_wild.io.motion_points import read_motion_points
 from ambiguous_wild.methods.masking_common import PausingMask, upsampled
 from ambiguous_wild.methods.refinesplat import pictures
 from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
@@ -28,6 +29,7 @@ from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.parts import State
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.backends import make_features, make_instances
+from ambiguous_wild.vision.moving import moving_map
 from ambiguous_wild.vision.protocols import Features, Instances
 from ambiguous_wild.vision.segments import GraphSegments
 from ambiguous_wild.vision.sparse_surface import static_surfaces
@@ -61,7 +63,7 @@ class RefineSplatMask(PausingMask):
         photos = [photo.cpu().numpy() for photo in data.photos]
         surfaces = static_surfaces(data.cameras, data.scene.points.xyz)
         if config.first_look.on:
-            found = first_look(data.cameras, photos, surfaces, config.first_look)
+            found = first_look(data.cameras, photos, surfaces, config.first_look, self._moving(surfaces))
             self.looks = {view: look for view, look in enumerate(found) if look is not None}
         self.masks = self._mask_builder(photos, surfaces)
         # view: keep map before masks begin, [H, W] float32; absent if everything is kept
@@ -70,6 +72,17 @@ class RefineSplatMask(PausingMask):
             for view, look in self.looks.items()
             if (keep := look.keep(photos[view].shape[:2])) is not None
         }
+
+    def _moving(self, surfaces: list[np.ndarray | None]) -> list[np.ndarray | None]:
+        """What moves in each photo, of its surface's shape; None where nothing is known."""
+        points = read_motion_points(self.data.scene.root)
+        found: list[np.ndarray | None] = []
+        for view, labels, surface in zip(self.data.scene.train, self.inputs.labels, surfaces, strict=True):
+            known = points.get(view.name)
+            found.append(
+                None if known is None or surface is None else moving_map(known, labels, surface.shape)
+            )
+        return found
 
     def _mask_builder(
         self, photos: list[np.ndarray], surfaces: list[np.ndarray | None]

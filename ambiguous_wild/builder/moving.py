@@ -1,0 +1,135 @@
+"""Features that move: matches that fit another motion of their pair than the place's.
+
+Structure from motion throws these matches away. A distractor that looks like the place, or like itself a
+moment later, is told by nothing else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from ambiguous_wild.builder.matched import Matched
+from ambiguous_wild.builder.motions import LEAST
+from ambiguous_wild.builder.records import MotionResult
+from ambiguous_wild.builder.undistort import make_lens
+from ambiguous_wild.io.colmap_records import ModelCamera
+from ambiguous_wild.io.motion_points import FILE, MotionPoints, write_motion_points
+from ambiguous_wild.io.safe_pycolmap import pycolmap
+
+STATIC_SHARE = 0.5  # of a motion's matches that fit the poses, from which on it is the place's
+CLEARLY = 2.0  # a match that moves is off by more than so many times what fits; `LEAST` of a motion are
+
+
+@dataclass
+class Votes:
+    """Of the features of one photo."""
+
+    static: np.ndarray  # [N] photos
+    moving: np.ndarray  # [N] photos
+    links: list[np.ndarray] = field(default_factory=list)  # [2, L] features that one motion has in common
+
+
+def count_votes(
+    matched: Matched, poses: Mapping[int, np.ndarray], voters: Collection[int]
+) -> dict[int, Votes]:
+    """What the matches of the voters with each other say of their features.
+
+    Args:
+        matched: with motions.
+        poses: photo -> [3, 4] camera from world.
+        voters: photos that are shown; test photos must say nothing of train photos.
+    """
+    rays = matched.rays()
+    votes = {k: Votes(*np.zeros((2, len(matched.features[k])), int)) for k in voters if k in poses}
+    for (a, b), rows in matched.matches.items():
+        if a not in votes or b not in votes:
+            continue
+        off = matched.misfit((a, b), poses[a], poses[b], rays)
+        for motion in matched.motions.get((a, b), []):
+            of_motion = off[motion.matches]
+            if np.mean(of_motion <= 1.0) >= STATIC_SHARE:
+                fitting = rows[motion.matches[of_motion <= 1.0]]
+                votes[a].static[fitting[:, 0]] += 1
+                votes[b].static[fitting[:, 1]] += 1
+            # a motion fitted to the place and to a distractor together has some that are off, too
+            moving = rows[motion.matches[of_motion > CLEARLY]]
+            if len(moving) >= LEAST:
+                for photo, features in ((a, moving[:, 0]), (b, moving[:, 1])):
+                    votes[photo].moving[features] += 1
+                    votes[photo].links.append(np.stack([features[:-1], features[1:]]))
+    return votes
+
+
+def motion_points(
+    matched: Matched, poses: Mapping[int, np.ndarray], names: Mapping[str, str]
+) -> dict[str, MotionPoints]:
+    """Points of the train photos, by their names in the scene; positions in the undistorted photo.
+
+    Args:
+        matched: with motions, and with the model's cameras.
+        poses: photo -> [3, 4] camera from world.
+        names: of the train photos, work name -> name in the scene.
+    """
+    voters = {k: names[name] for k, name in enumerate(matched.names) if name in names}
+    lenses = {}
+    found = {}
+    for photo, votes in count_votes(matched, poses, voters).items():
+        camera = matched.cameras[photo]
+        if camera.camera_id not in lenses:
+            params = tuple(map(float, camera.params))
+            lenses[camera.camera_id] = make_lens(
+                ModelCamera(camera.camera_id, camera.model.name, camera.width, camera.height, params)
+            )
+        lens = lenses[camera.camera_id]
+        some = np.flatnonzero(votes.static + votes.moving)
+        flat = lens.undistort_points(matched.features[photo][some])
+        size = [lens.pinhole.width, lens.pinhole.height]
+        found[voters[photo]] = MotionPoints(
+            (flat / size).astype(np.float32),
+            votes.static[some].clip(max=255).astype(np.uint8),
+            votes.moving[some].clip(max=255).astype(np.uint8),
+            _together(votes)[some],
+        )
+    return found
+
+
+def write_motion(
+    folder: Path, database: Path, motions: Path, model: Path, names: Mapping[str, str]
+) -> MotionResult:
+    """Write the motion points of a scene into the folder of their stage.
+
+    Args:
+        folder: of the stage.
+        database: with features and matches.
+        motions: file of the motions.
+        model: folder of COLMAP's model, with the lenses.
+        names: of the train photos, work name -> name in the scene.
+    """
+    matched, found = Matched.read(database), pycolmap.Reconstruction(str(model))
+    matched.take_cameras(found)
+    matched.load_motions(motions)
+    points = motion_points(matched, matched.poses(found), names)
+    write_motion_points(folder / FILE, points)
+    return {
+        "static": sum(int((~p.moves).sum()) for p in points.values()),
+        "moving": sum(int(p.moves.sum()) for p in points.values()),
+    }
+
+
+def _together(votes: Votes) -> np.ndarray:
+    """[N] int16 motions from 1, by size; 0 = more photos say that the feature does not move."""
+    count, moves = len(votes.static), votes.moving > votes.static
+    links = np.concatenate([np.zeros((2, 0), int), *votes.links], axis=1)
+    links = links[:, moves[links].all(axis=0)]
+    graph = coo_matrix((np.ones(links.shape[1]), links), (count, count))
+    group = connected_components(graph, directed=False)[1]
+    sizes = np.bincount(group[moves], minlength=group.max(initial=0) + 1)
+    rank = np.empty(len(sizes), int)
+    rank[np.argsort(-sizes, kind="stable")] = np.arange(1, len(sizes) + 1)
+    return np.where(moves, rank[group], 0).clip(max=32767).astype(np.int16)

@@ -1,0 +1,62 @@
+"""3DGS with masks of what moves by geometry alone, from the first step on (`--mask motion` elsewhere).
+
+No colour and no feature is compared: a pixel is masked if more photos say of the features around it, and in
+its segment, that they fit another rigid motion than the place's. Where none says anything, it is kept.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.core.config import check_limits
+from ambiguous_wild.io.motion_points import read_motion_points
+from ambiguous_wild.methods.fixed_masks import FixedMasks
+from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.step import TrainData
+from ambiguous_wild.vision.moving import moving_map
+from ambiguous_wild.vision.precompute import instance_labels
+from ambiguous_wild.vision.segments import GraphSegments, SegmentConfig
+
+
+@dataclass(frozen=True)
+class MotionConfig:
+    """Options of `3dgs+motion`."""
+
+    threshold: float = 0.5  # share of the votes around a pixel above which it is masked
+    segments: SegmentConfig = field(default_factory=SegmentConfig)
+
+    def __post_init__(self) -> None:
+        check_limits(self, "motion", threshold=(0, 1))
+
+
+def build(options: MotionConfig) -> Parts:
+    """3DGS with these masks."""
+    return Parts(mask=MotionMask(options))
+
+
+class MotionMask(FixedMasks):
+    """The same masks in every step."""
+
+    def __init__(self, config: MotionConfig) -> None:
+        super().__init__([])
+        self.config = config
+
+    def setup(self, data: TrainData) -> None:
+        points = read_motion_points(data.scene.root)
+        if not points:
+            raise AwError(
+                f"scene {data.scene.name} does not say what moves (no motion.npz): build it from its photos "
+                "with this version of 'aw build-scene'"
+            )
+        names = [view.name for view in data.scene.train]
+        found = instance_labels(GraphSegments(self.config.segments), data.photos, names, data.cache_dir)
+        for name, labels in zip(names, found.labels, strict=True):
+            moves = np.zeros(labels.shape, bool)
+            if name in points:
+                moves = moving_map(points[name], labels, labels.shape) > self.config.threshold
+            self.keeps.append(torch.from_numpy((~moves).astype(np.float32)))
+        super().setup(data)

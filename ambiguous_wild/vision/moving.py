@@ -1,0 +1,48 @@
+"""Where a photo moves: from the features that fit the place in other photos, and those that do not.
+
+Structure from motion leaves matches out that fit another rigid motion than the place's. They lie on
+distractors, also on those that no colour and no structure can tell; matches that fit the place lie
+everywhere else. Between features their neighbours decide, and those in the same segment.
+"""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+
+from ambiguous_wild.io.motion_points import MotionPoints
+from ambiguous_wild.vision.sparse_surface import PIXELS
+
+REACH_PX = 3.0  # of a feature, standard deviation on a map of `PIXELS`
+VOTES = 3  # photos of a feature count at most as much
+SEGMENT_VOTES = 1.0  # of a segment, at most
+UNSURE = 1.0  # votes on either side that leave the answer half open
+
+
+def moving_map(points: MotionPoints, labels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """What moves, [h, w] float32 in [0, 1]: 1 = moves, 0 = stays, 0.5 where no feature says anything.
+
+    Args:
+        points: of the photo.
+        labels: [H, W] int32 segments of the photo, 0 = none.
+        shape: of the map.
+    """
+    h, w = shape
+    segments = cv2.resize(labels, (w, h), interpolation=cv2.INTER_NEAREST)
+    column, row = np.clip(points.xy * [w, h], 0, [w - 1, h - 1]).astype(int).T
+    reach = REACH_PX * math.sqrt(h * w / PIXELS)
+    near, of_segment = [], []
+    for mine, votes in ((points.moves, points.moving), (~points.moves, points.static)):
+        weight = np.where(mine, np.minimum(votes, VOTES), 0).astype(np.float32)
+        at_feature = np.zeros(shape, np.float32)
+        np.add.at(at_feature, (row, column), weight)
+        near.append(cv2.GaussianBlur(at_feature, (0, 0), reach) * np.float32(2.0 * math.pi * reach**2))
+        total = np.bincount(segments[row, column], weight, minlength=int(segments.max()) + 1)
+        total[0] = 0.0
+        of_segment.append(total.astype(np.float32))
+    # a segment may be large and hold both: it says little, which decides where no feature is near
+    less = np.float32(SEGMENT_VOTES) / np.maximum(of_segment[0] + of_segment[1], SEGMENT_VOTES)
+    moving, static = (a + (less * b)[segments] for a, b in zip(near, of_segment))
+    return np.asarray((moving + UNSURE / 2) / (moving + static + UNSURE), np.float32)

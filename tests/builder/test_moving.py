@@ -1,0 +1,161 @@
+"""Features that move: their file, and masks of a distractor that no colour can tell."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from ambiguous_wild.builder.pipeline import build_scene
+from ambiguous_wild.builder.settings import BuildSettings
+from ambiguous_wild.core import AwError
+from ambiguous_wild.io.motion_points import FILE, MotionPoints, read_motion_points, write_motion_points
+from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.methods.motion import MotionConfig, MotionMask
+from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
+from ambiguous_wild.methods.refinesplat.policy import RefineSplatMask
+from ambiguous_wild.splat.data import load_train_data
+from ambiguous_wild.splat.step import TrainData
+from ambiguous_wild.vision.moving import moving_map
+from tests.builder import capture_maker
+from tests.builder.capture_maker import HEIGHT, WIDTH, eyes, render
+
+COUNT, SIDE = 12, 240  # photos; texels of the square that slides
+
+
+def fine_wall(seed: int) -> np.ndarray:
+    """Dots of two pixels on one grey: at the size that colours are compared at, all of it is alike."""
+    rng = np.random.default_rng(seed)
+    image = np.full((512, 512), 128, np.float32)
+    for row, column in rng.integers(6, 506, (1500, 2)):
+        cv2.circle(image, (int(column), int(row)), 3, float(128 + rng.choice([-90, 90])), -1)
+    return np.repeat(np.clip(image, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
+
+
+@pytest.fixture(scope="module")
+def sliding(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, np.ndarray]]:
+    """A scene in which a square of the wall's own texture slides along it, and where it is: [H, W] bool."""
+    folder = tmp_path_factory.mktemp("sliding")
+    raw = folder / "raw"
+    raw.mkdir()
+    wall, where = {seed: fine_wall(seed) for seed in (1, 2, 3)}, {}
+    original = capture_maker.texture
+    try:
+        for k, eye in enumerate(eyes(COUNT)):
+            shown, marked = wall[1].copy(), np.zeros((512, 512, 3), np.uint8)
+            top, left = 60 + 16 * k, 10 + 22 * k
+            shown[top : top + SIDE, left : left + SIDE] = wall[3][:SIDE, :SIDE]
+            marked[top : top + SIDE, left : left + SIDE] = 255
+            photos = []
+            for pixels in (shown, marked):
+                textures = {1: pixels, 2: wall[2] if pixels is shown else 0 * marked}
+                capture_maker.texture = textures.__getitem__
+                photos.append(render(eye, np.array([0.0, 0.0, 5.2])))
+            cv2.imwrite(str(raw / f"p{k:02d}.png"), photos[0])
+            where[f"p{k:02d}.png"] = photos[1][..., 0] > 127
+    finally:
+        capture_maker.texture = original
+    build_scene(raw, folder / "scene", BuildSettings(factor=1, max_features=1500), jobs=2)
+    return folder / "scene", where
+
+
+def train_data(scene: Path, cache: Path) -> TrainData:
+    return load_train_data(load_scene(scene), device=torch.device("cpu"), seed=0, cache_dir=cache)
+
+
+def overlap(masks: dict[str, np.ndarray], where: dict[str, np.ndarray]) -> tuple[float, float]:
+    """Share of the square that is masked, and of the rest."""
+    inside, outside = [], []
+    for name, mask in masks.items():
+        square = cv2.resize(where[name].astype(np.uint8), mask.shape[::-1]) > 0  # undistorted, a pixel less
+        inside.append(mask[square].mean())
+        outside.append(mask[~square].mean())
+    return float(np.mean(inside)), float(np.mean(outside))
+
+
+def first_masks(data: TrainData, motion: float) -> dict[str, np.ndarray]:
+    config = RefineSplatConfig()
+    policy = RefineSplatMask(replace(config, first_look=replace(config.first_look, motion=motion, least=0.0)))
+    policy.setup(data)
+    return {
+        view.name: policy.first[k].numpy() < 0.5
+        if k in policy.first
+        else np.zeros(data.photos[k].shape[:2], bool)
+        for k, view in enumerate(data.scene.train)
+    }
+
+
+def test_a_square_of_the_walls_texture_is_masked_by_its_motion_alone(sliding, tmp_path):
+    scene, where = sliding
+    data = train_data(scene, tmp_path)
+    inside, outside = overlap(first_masks(data, 1.0), where)
+    assert inside > 0.5 and outside < 0.05
+    inside, outside = overlap(first_masks(data, 0.0), where)
+    assert inside < 0.1
+    alone = MotionMask(MotionConfig())
+    alone.setup(data)
+    masks = {view.name: keep.numpy() < 0.5 for view, keep in zip(data.scene.train, alone.keeps)}
+    inside, outside = overlap(masks, where)
+    assert inside > 0.7 and outside < 0.05
+
+
+def test_points_lie_where_they_move(sliding):
+    scene, where = sliding
+    points = read_motion_points(scene)
+    assert set(points) == {view.name for view in load_scene(scene).train}  # test photos say nothing
+    for name, found in points.items():
+        x, y = np.clip(found.xy * [WIDTH, HEIGHT], 0, [WIDTH - 1, HEIGHT - 1]).astype(int).T
+        on = cv2.dilate(where[name].astype(np.uint8), np.ones((5, 5), np.uint8))[y, x] > 0
+        assert on[found.moves].mean() > 0.9 and on[~found.moves].mean() < 0.05
+        assert ((found.motion > 0) == found.moves).all()
+
+
+def test_the_file_comes_back_and_a_damaged_one_is_refused(tmp_path):
+    rng = np.random.default_rng(0)
+    points = {
+        name: MotionPoints(
+            rng.random((count, 2), np.float32),
+            rng.integers(0, 9, count, np.uint8),
+            rng.integers(0, 9, count, np.uint8),
+            rng.integers(0, 3, count, np.int16),
+        )
+        for name, count in (("a.png", 5), ("b.png", 0), ("c.png", 3))
+    }
+    assert read_motion_points(tmp_path) == {}
+    write_motion_points(tmp_path / FILE, points)
+    again = read_motion_points(tmp_path)
+    assert list(again) == list(points)
+    for name, found in again.items():
+        np.testing.assert_array_equal(found.xy, points[name].xy)
+        np.testing.assert_array_equal(found.moving, points[name].moving)
+        np.testing.assert_array_equal(found.motion, points[name].motion)
+    whole = (tmp_path / FILE).read_bytes()
+    for bad in (b"", b"no zip", whole[: len(whole) // 2]):
+        (tmp_path / FILE).write_bytes(bad)
+        with pytest.raises(AwError, match="damaged"):
+            read_motion_points(tmp_path)
+    two = MotionPoints(
+        np.zeros((2, 2), np.float32), np.zeros(1, np.uint8), np.zeros(2, np.uint8), np.zeros(2, np.int16)
+    )
+    write_motion_points(tmp_path / FILE, {"a": two})
+    with pytest.raises(AwError, match="do not fit together"):
+        read_motion_points(tmp_path)
+
+
+def test_nothing_near_says_nothing():
+    points = MotionPoints(
+        np.array([[0.1, 0.1], [0.9, 0.9]], np.float32),
+        np.array([0, 3], np.uint8),
+        np.array([2, 0], np.uint8),
+        np.array([1, 0], np.int16),
+    )
+    labels = np.zeros((100, 120), np.int32)
+    labels[:30, :40] = 1
+    answer = moving_map(points, labels, (100, 120))
+    assert answer[10, 12] > 0.7 and answer[90, 108] < 0.3
+    assert answer[25, 35] > 0.5  # far away, but in the feature's segment
+    assert answer[50, 60] == pytest.approx(0.5, abs=1e-3)

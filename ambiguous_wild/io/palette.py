@@ -10,6 +10,7 @@ _RAMP = np.array(
      [254, 235, 158], [253, 211, 128], [253, 180, 102], [248, 141, 81], [240, 103, 68]], np.float64,
 )  # fmt: skip
 MASKED = (255, 30, 30)  # M_final, or a method's mask
+KEPT = (0, 150, 110)
 LOCAL = (245, 133, 24)
 GLOBAL = (150, 60, 200)
 ADDED = (31, 119, 180)

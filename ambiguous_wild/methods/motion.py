@@ -14,10 +14,11 @@ import torch
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.io.motion_points import read_motion_points
+from ambiguous_wild.io.palette import MASKED, faded, tint
 from ambiguous_wild.methods.fixed_masks import FixedMasks
 from ambiguous_wild.splat.parts import Parts
-from ambiguous_wild.splat.step import TrainData
-from ambiguous_wild.vision.moving import moving_map
+from ambiguous_wild.splat.step import Step, TrainData
+from ambiguous_wild.vision.moving import POINTS, draw_points, moving_map
 from ambiguous_wild.vision.precompute import instance_labels
 from ambiguous_wild.vision.segments import GraphSegments, SegmentConfig
 
@@ -46,7 +47,8 @@ class MotionMask(FixedMasks):
         self.config = config
 
     def setup(self, data: TrainData) -> None:
-        points = read_motion_points(data.scene.root)
+        self.data = data
+        points = self.points = read_motion_points(data.scene.root)
         if not points:
             raise AwError(
                 f"scene {data.scene.name} does not say what moves (no motion.npz): build it from its photos "
@@ -60,3 +62,11 @@ class MotionMask(FixedMasks):
                 moves = moving_map(points[name], labels, labels.shape) > self.config.threshold
             self.keeps.append(torch.from_numpy((~moves).astype(np.float32)))
         super().setup(data)
+
+    def panels(self, step: Step) -> dict[str, np.ndarray]:
+        assert step.view is not None
+        photo = (self.data.photos[step.view].cpu().numpy() * 255 + 0.5).astype(np.uint8)
+        masked = self.keeps[step.view].cpu().numpy() < 0.5
+        found = {f"masked {100 * masked.mean():.0f} %": tint(faded(photo), masked, MASKED)}
+        points = self.points.get(self.data.scene.train[step.view].name)
+        return found if points is None else {POINTS: draw_points(photo, points), **found}

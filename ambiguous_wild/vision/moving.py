@@ -13,8 +13,10 @@ import cv2
 import numpy as np
 
 from ambiguous_wild.io.motion_points import MotionPoints
+from ambiguous_wild.io.palette import KEPT, MASKED, faded
 from ambiguous_wild.vision.sparse_surface import PIXELS
 
+POINTS = "features: green stay, red move"  # caption of `draw_points`
 REACH_PX = 3.0  # of a feature, standard deviation on a map of `PIXELS`
 VOTES = 3  # photos of a feature count at most as much
 SEGMENT_VOTES = 1.0  # of a segment, at most
@@ -46,3 +48,14 @@ def moving_map(points: MotionPoints, labels: np.ndarray, shape: tuple[int, int])
     less = np.float32(SEGMENT_VOTES) / np.maximum(of_segment[0] + of_segment[1], SEGMENT_VOTES)
     moving, static = (a + (less * b)[segments] for a, b in zip(near, of_segment))
     return np.asarray((moving + UNSURE / 2) / (moving + static + UNSURE), np.float32)
+
+
+def draw_points(photo: np.ndarray, points: MotionPoints) -> np.ndarray:
+    """The photo [H, W, 3] uint8 with dots: red where a feature moves, green where it stays."""
+    h, w = photo.shape[:2]
+    size = max(round(max(h, w) / 320), 1)
+    shown = faded(photo)
+    for chosen, colour in ((~points.moves, KEPT), (points.moves, MASKED)):
+        for x, y in (points.xy[chosen] * [w, h]).astype(int).tolist():
+            cv2.circle(shown, (x, y), size, colour, -1)
+    return shown

@@ -12,6 +12,7 @@ from ambiguous_wild.io.atomic import atomic_path
 from ambiguous_wild.io.palette import GLOBAL, LOCAL, MASKED, NEUTRAL, faded, plot_colour, ramp, tint
 from ambiguous_wild.methods.refinesplat import masking
 from ambiguous_wild.splat.step import Step
+from ambiguous_wild.vision.moving import POINTS, draw_points
 
 if TYPE_CHECKING:
     from ambiguous_wild.methods.refinesplat.policy import RefineSplatMask
@@ -39,7 +40,9 @@ def panels(policy: RefineSplatMask, step: Step, *, begun: bool = True) -> dict[s
     of_pixel = np.r_[np.nan, means][np.clip(labels, 0, len(means))]
     final = masks.keep < 0.5
     used = "" if begun else ", not used yet"
+    points = policy.points.get(policy.data.scene.train[step.view].name)
     return {
+        **({} if points is None else {POINTS: draw_points(photo, points)}),
         f"entropy, mean {entropy.mean():.2f}": masking.enlarge(ramp(entropy, 0.0, 1.0), height, width),
         f"instances, {cut}": _outlined(ramp(of_pixel, 0.0, top), labels),
         f"local {100 * masks.local.mean():.0f} %": tint(grey, masks.local, LOCAL),

@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ambiguous_wild.io.motion_points import read_motion_points
+from ambiguous_wild.io.motion_points import MotionPoints, read_motion_points
 from ambiguous_wild.methods.masking_common import PausingMask, upsampled
 from ambiguous_wild.methods.refinesplat import pictures
 from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
@@ -52,6 +52,7 @@ class RefineSplatMask(PausingMask):
         self.features = features or make_features(config.features)
         self.instances = instances or _instances(config)
         self.visits: dict[int, int] = {}  # view: steps since masks began
+        self.points: dict[str, MotionPoints] = {}  # of the scene, by the photo's name
         self.looks: dict[int, FirstLook] = {}  # view: its comparison with other photos, if there is one
 
     def setup(self, data: TrainData) -> None:
@@ -75,7 +76,7 @@ class RefineSplatMask(PausingMask):
 
     def _moving(self, surfaces: list[np.ndarray | None]) -> list[np.ndarray | None]:
         """What moves in each photo, of its surface's shape; None where nothing is known."""
-        points = read_motion_points(self.data.scene.root)
+        points = self.points = read_motion_points(self.data.scene.root)
         found: list[np.ndarray | None] = []
         for view, labels, surface in zip(self.data.scene.train, self.inputs.labels, surfaces, strict=True):
             known = points.get(view.name)

@@ -12,6 +12,7 @@ import torch
 from scipy import ndimage
 
 from ambiguous_wild.harness.ambiguity import measure, sources, summary
+from ambiguous_wild.io.motion_points import FILE, MotionPoints, write_motion_points
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.metrics.ambiguity import COLOUR_METRIC
 from ambiguous_wild.simulate.capture import simulate
@@ -65,6 +66,42 @@ def plant(root: Path, kind: str) -> tuple[Path, Path]:
     for name in ("test_0.png", "test_1.png"):
         cv2.imwrite(str(root / "images" / name), wall[:, :, ::-1])
     return root, objects
+
+
+def points_in(where: tuple[slice, slice], moving: int) -> MotionPoints:
+    """A grid of features in a part of the photo, that move or stay in three others."""
+    y, x = (
+        axis.ravel()
+        for axis in np.mgrid[where[0].start : where[0].stop : 4, where[1].start : where[1].stop : 4]
+    )
+    votes = np.full(len(x), 3, np.uint8)
+    return MotionPoints(
+        np.column_stack([x / W, y / H]).astype(np.float32),
+        votes * np.uint8(not moving),
+        votes * np.uint8(moving),
+        np.full(len(x), moving, np.int16),
+    )
+
+
+def test_each_distractor_is_told_by_what_tells_it(tmp_path):
+    """A piece in the wall's colour is told by its motion alone, where the scene has it."""
+    root, _ = plant(tmp_path / "scene", "colour")
+    scene = load_scene(root, verify=False)
+    masks = sources.find_masks(scene, None, None)
+    background = sources.find_background(scene, None, None, masks)
+    for motion in (None, 1, 0):
+        if motion is not None:
+            pieces = {
+                n: points_in((slice(8, 60), slice(10 + 4 * k, 60 + 4 * k)), motion)
+                for k, n in enumerate(TRAIN)
+            }
+            write_motion_points(root / FILE, pieces)
+        measured, look = measure.measure(scene, masks, background)
+        found = [d for m in measured for d in m.distractors]
+        assert len(found) == len(TRAIN) and {d.colour for d in found} == {False}
+        assert {d.motion for d in found} == {None if motion is None else bool(motion)}
+        told = summary.summarise(scene, measured, look)["told"]
+        assert told["motion"] == (None if motion is None else motion * len(TRAIN))
 
 
 @pytest.mark.parametrize("kind", ["colour", "semantic", "both", "neither"])

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ambiguous_wild.core import AwError, Scene, View
+from ambiguous_wild.harness.ambiguity.evidence import Distractor, distractors
 from ambiguous_wild.harness.ambiguity.sources import Background, Masks, load_mask, stem
 from ambiguous_wild.io.images import load_image_float
+from ambiguous_wild.io.motion_points import read_motion_points
 from ambiguous_wild.metrics import ambiguity as am
 from ambiguous_wild.metrics import semantic as sem
 
@@ -31,6 +33,7 @@ class Measured:
     counts: am.ColourCounts
     histogram: np.ndarray  # [52] int64, residual over the known distractor pixels
     matches: list[sem.RegionMatch]  # of its distractors
+    distractors: list[Distractor]
 
 
 @dataclass(frozen=True)
@@ -97,7 +100,8 @@ def measure(
     segments = GraphSegments()
     statistics = sem.ChannelStatistics()
     named = _object_masks(objects, views) if objects is not None else None
-    moving, static, every, scores = [], [], [], []
+    points = read_motion_points(scene.root)
+    moving, static, every, scores, told = [], [], [], [], []
     for index, view in enumerate(progress(views)):
         photo, distractor = load_photo(view), masks.load(view)
         behind, known = background.load(index, view)
@@ -109,13 +113,15 @@ def measure(
             grid = backend(torch.from_numpy(seen)).numpy()
         statistics.add(grid)
         regions, _ = ndimage.label(hidden)
-        parts = np.where(hidden, 0, segments.labels(torch.from_numpy(seen)))
+        whole = segments.labels(torch.from_numpy(seen))
+        parts = np.where(hidden, 0, whole)
         moving.append(sem.region_means(grid, regions, sem.MIN_SHARE))
         every.append(sem.region_means(grid, parts, sem.MIN_SHARE))
         static.append(every[-1])
         if named is not None:
             things = _objects(features, named, view, hidden)
             static[-1] = sem.region_means(grid, things, sem.MIN_SHARE)
+        told.append(distractors(regions, photo, behind, known, whole, points.get(view.name)))
         scores.append((view.name, counts, np.histogram(residual, BINS)[0]))
     mean, whiten = statistics.whitening()
     whitened = weight_free(features)
@@ -128,7 +134,16 @@ def measure(
     look = Look(
         features, backend, whitened, mean, whiten, moving, static, anchors, usual, objects is not None
     )
-    return [Measured(*score, matches) for score, matches in zip(scores, found)], look
+    measured = []
+    for score, matches, seen_as in zip(scores, found, told):
+        cosines = {match.label: match.cosine for match in matches}
+        sure = not math.isnan(usual)
+        whole_story = [
+            replace(d, features=cosines[d.label] < usual if sure and d.label in cosines else None)
+            for d in seen_as
+        ]
+        measured.append(Measured(*score, matches, whole_story))
+    return measured, look
 
 
 def fitted(scene: Scene, spec: str, cache: Path | None) -> Any:

@@ -121,6 +121,7 @@ _HEADS = {
     "distractor_px": "distractor px",
     "unknown_px": "unknown px",
     "regions": "distractors",
+    "told_by": "each told by",
 }
 
 

@@ -7,6 +7,7 @@ import re
 from typing import Any, TypedDict
 
 from ambiguous_wild.core import Scene
+from ambiguous_wild.harness.ambiguity.evidence import KINDS
 from ambiguous_wild.harness.ambiguity.measure import Look, Measured, feature_family, weight_free
 from ambiguous_wild.metrics import ambiguity as am
 from ambiguous_wild.metrics import semantic as sem
@@ -46,6 +47,17 @@ class ColourScore(Scored):
     mean_residual: float | None
     distractor_px: int
     unknown_px: int  # with an unknown background
+
+
+class Told(TypedDict):
+    """Distractors by the evidence that tells them; None = no distractor could be asked."""
+
+    distractors: int
+    colour: int | None
+    structure: int | None
+    features: int | None
+    motion: int | None
+    nothing: int  # told by none of them
 
 
 class SemanticScore(Scored):
@@ -105,6 +117,7 @@ def summarise(
         "occlusion": {**_interval(covered), "min": min(shares), "max": max(shares)},
         am.COLOUR_METRIC: colour,
         semantic_metric(features): semantic,
+        "told": _told(measured),
     }
 
 
@@ -159,6 +172,31 @@ def _semantic(measured: list[Measured], look: Look, features: str, seed: int) ->
     }
 
 
+def _told(measured: list[Measured]) -> Told:
+    every = [d for m in measured for d in m.distractors]
+
+    def count(kind: str) -> int | None:
+        answers = [answer for d in every if (answer := getattr(d, kind)) is not None]
+        return sum(answers) if answers else None
+
+    return {
+        "distractors": len(every),
+        "colour": count("colour"),
+        "structure": count("structure"),
+        "features": count("features"),
+        "motion": count("motion"),
+        "nothing": sum(not d.told_by for d in every),
+    }
+
+
+def _told_line(told: Told) -> str:
+    known = {kind: told[kind] for kind in KINDS if told[kind] is not None}  # type: ignore[literal-required]
+    parts = ", ".join(f"{kind} tells {count}" for kind, count in known.items())
+    text = f"of {told['distractors']} distractors {parts or 'no evidence tells any'}; "
+    text += f"none of these tells {told['nothing']}"
+    return text if told["motion"] is not None else f"{text} (the scene does not say what moves)"
+
+
 def row(m: Measured, metric: str) -> dict[str, Any]:
     """One line of the table of photos."""
     return {
@@ -170,6 +208,7 @@ def row(m: Measured, metric: str) -> dict[str, Any]:
         "distractor_px": m.counts.distractor,
         "unknown_px": m.counts.unknown,
         "regions": len(m.matches),
+        "told_by": "; ".join(" ".join(d.told_by) or "nothing" for d in m.distractors),
     }
 
 
@@ -194,6 +233,9 @@ def describe(summary: dict[str, Any]) -> list[str]:
             f"with {summary['features']}, a static region scores {look['same_surface']:.2f} against other "
             f"photos of itself and {look['unrelated']:.2f} against unrelated ones; {look['note']}"
         )
+    told: Told | None = summary.get("told")  # absent from older reports
+    if told and told["distractors"]:
+        lines.append(_told_line(told))
     if colour["unknown_px"]:
         share = 100 * colour["unknown_px"] / colour["distractor_px"]
         lines.append(

@@ -208,7 +208,11 @@ def _build_with_colmap(raw: Path, way: str, out: Path) -> dict[str, Any]:
             raise AwError(f"COLMAP ended with code {done.returncode} on {raw}")
         if done.returncode:
             return {"refused": "COLMAP found no model"}
-    return {"model": out, "photos": len(photos), "placed": len(read_model(out).images)}
+    try:
+        placed = len(read_model(out).images)
+    except AwError as error:  # the global mapper may return a camera with a negative focal length
+        return {"refused": str(error)}
+    return {"model": out, "photos": len(photos), "placed": placed}
 
 
 def markdown(rows: Sequence[dict[str, Any]]) -> str:

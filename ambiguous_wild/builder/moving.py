@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from ambiguous_wild.builder.matched import Matched
 from ambiguous_wild.builder.motions import LEAST
 from ambiguous_wild.builder.records import MotionResult
-from ambiguous_wild.builder.undistort import make_lens
+from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.colmap_records import ModelCamera
 from ambiguous_wild.io.motion_points import FILE, MotionPoints, write_motion_points
 from ambiguous_wild.io.safe_pycolmap import pycolmap
@@ -32,7 +32,7 @@ class Votes:
 
     static: np.ndarray  # [N] photos
     moving: np.ndarray  # [N] photos
-    links: list[np.ndarray] = field(default_factory=list)  # [2, L] features that one motion has in common
+    motions: list[np.ndarray] = field(default_factory=list)  # features of each motion that is not the place's
 
 
 def count_votes(
@@ -62,45 +62,42 @@ def count_votes(
             if len(moving) >= LEAST:
                 for photo, features in ((a, moving[:, 0]), (b, moving[:, 1])):
                     votes[photo].moving[features] += 1
-                    votes[photo].links.append(np.stack([features[:-1], features[1:]]))
+                    votes[photo].motions.append(features)
     return votes
 
 
 def motion_points(
-    matched: Matched, poses: Mapping[int, np.ndarray], names: Mapping[str, str]
+    matched: Matched,
+    poses: Mapping[int, np.ndarray],
+    names: Mapping[str, str],
+    pinholes: Mapping[str, ModelCamera],
 ) -> dict[str, MotionPoints]:
-    """Points of the train photos, by their names in the scene; positions in the undistorted photo.
+    """Points of the train photos, by their names in the scene.
 
     Args:
         matched: with motions, and with the model's cameras.
         poses: photo -> [3, 4] camera from world.
         names: of the train photos, work name -> name in the scene.
+        pinholes: of the undistorted photos, by these names.
     """
     voters = {k: names[name] for k, name in enumerate(matched.names) if name in names}
-    lenses = {}
-    found = {}
+    rays, found = matched.rays(), {}
     for photo, votes in count_votes(matched, poses, voters).items():
-        camera = matched.cameras[photo]
-        if camera.camera_id not in lenses:
-            params = tuple(map(float, camera.params))
-            lenses[camera.camera_id] = make_lens(
-                ModelCamera(camera.camera_id, camera.model.name, camera.width, camera.height, params)
-            )
-        lens = lenses[camera.camera_id]
-        some = np.flatnonzero(votes.static + votes.moving)
-        flat = lens.undistort_points(matched.features[photo][some])
-        size = [lens.pinhole.width, lens.pinhole.height]
+        camera = pinholes[voters[photo]]
+        fx, fy, cx, cy = camera.pinhole()
+        xy = (rays[photo] * [fx, fy] + [cx, cy]) / [camera.width, camera.height]
+        # undistortion cuts the rim off
+        some = np.flatnonzero((votes.static + votes.moving > 0) & ((xy >= 0) & (xy <= 1)).all(axis=1))
+        static, moving = (x.clip(max=255).astype(np.uint8) for x in (votes.static, votes.moving))
+        motion = _together(votes, moving > static)
         found[voters[photo]] = MotionPoints(
-            (flat / size).astype(np.float32),
-            votes.static[some].clip(max=255).astype(np.uint8),
-            votes.moving[some].clip(max=255).astype(np.uint8),
-            _together(votes)[some],
+            xy[some].astype(np.float32), static[some], moving[some], motion[some]
         )
     return found
 
 
 def write_motion(
-    folder: Path, database: Path, motions: Path, model: Path, names: Mapping[str, str]
+    folder: Path, database: Path, motions: Path, model: Path, flat: Path, names: Mapping[str, str]
 ) -> MotionResult:
     """Write the motion points of a scene into the folder of their stage.
 
@@ -109,12 +106,15 @@ def write_motion(
         database: with features and matches.
         motions: file of the motions.
         model: folder of COLMAP's model, with the lenses.
+        flat: folder of the model of the undistorted photos.
         names: of the train photos, work name -> name in the scene.
     """
     matched, found = Matched.read(database), pycolmap.Reconstruction(str(model))
     matched.take_cameras(found)
     matched.load_motions(motions)
-    points = motion_points(matched, matched.poses(found), names)
+    undistorted = read_model(flat)
+    pinholes = {image.name: undistorted.cameras[image.camera_id] for image in undistorted.images.values()}
+    points = motion_points(matched, matched.poses(found), names, pinholes)
     write_motion_points(folder / FILE, points)
     return {
         "static": sum(int((~p.moves).sum()) for p in points.values()),
@@ -122,11 +122,11 @@ def write_motion(
     }
 
 
-def _together(votes: Votes) -> np.ndarray:
-    """[N] int16 motions from 1, by size; 0 = more photos say that the feature does not move."""
-    count, moves = len(votes.static), votes.moving > votes.static
-    links = np.concatenate([np.zeros((2, 0), int), *votes.links], axis=1)
-    links = links[:, moves[links].all(axis=0)]
+def _together(votes: Votes, moves: np.ndarray) -> np.ndarray:
+    """[N] int16 motions from 1, by size, of the features that move [N] bool; 0 = does not."""
+    count = len(moves)
+    chains = [features[moves[features]] for features in votes.motions]
+    links = np.concatenate([np.zeros((2, 0), int), *(np.stack([c[:-1], c[1:]]) for c in chains)], axis=1)
     graph = coo_matrix((np.ones(links.shape[1]), links), (count, count))
     group = connected_components(graph, directed=False)[1]
     sizes = np.bincount(group[moves], minlength=group.max(initial=0) + 1)

@@ -76,8 +76,8 @@ class Placement:
         outs = [0] * len(self.matched.ids)
         turn, moved = 0, True
         while moved and turn <= ROUNDS and len(self.poses) >= LEAST_PHOTOS:
-            self._settle(final=False)
             before = set(self.poses)
+            self._settle(final=False)
             moved = self._look(outs, only_out=turn == ROUNDS)
             turn += not set(self.poses) > before
         if len(self.poses) >= LEAST_PHOTOS:  # COLMAP does not adjust less
@@ -253,6 +253,7 @@ class Placement:
         finally:
             db.close()
         options = pipeline_options(self.seed)
+        options.triangulation.ignore_two_view_tracks = not final  # twice the points to begin training with
         model = pycolmap.Reconstruction()
         model.load(cache)
         for camera in matched.cameras:

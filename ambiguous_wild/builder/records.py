@@ -177,8 +177,8 @@ class SceneCounts(TypedDict):
     points_of_track_length_2: int
     pairs: int
     pairs_verified: int
-    points_that_stay: int  # features of train photos that fit the place in others
-    points_that_move: int  # that fit another motion
+    features_that_stay: int  # features of train photos that fit the place in others
+    features_that_move: int  # that fit another motion
 
 
 class ScenePhoto(TypedDict):

@@ -126,12 +126,13 @@ class Stages:
         flat = self._undistort(work, screened, mask_stage, mapping, model)
         motion = work.run(
             "motion",
-            [mapping.key, train],
+            [flat.key, train],
             lambda f: write_motion(
                 f,
                 matches.folder / DATABASE,
                 mapping.folder / MOTIONS,
                 mapping.folder / "0",
+                flat.folder / "sparse" / "0",
                 {work_name: f"{stem}.png" for work_name, stem in stems.items() if f"{stem}.png" in train},
             ),
         )

@@ -78,7 +78,11 @@ def parse_budget(text: str) -> float:
     show_default=True,
     help="auto: coarse-to-fine under a budget, else full.",
 )
-@click.option("--mask", metavar="METHOD", help="Masks of another method; none; or truth: exact masks.")
+@click.option(
+    "--mask",
+    metavar="METHOD",
+    help="Masks of another method; none; motion: what moves; or truth: exact masks.",
+)
 @click.option("--density", metavar="METHOD", help="Density control of another method.")
 @click.option("--regulariser", metavar="METHOD", help="Another method's losses on the render.")
 @click.option("--passes", type=click.IntRange(1, 2), default=1, show_default=True,

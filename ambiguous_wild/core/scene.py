@@ -12,6 +12,7 @@ import numpy as np
 from ambiguous_wild.core.camera import Camera
 
 Split = Literal["train", "test"]
+_FEW_POINTS = 500  # no surface follows from fewer
 
 
 class FileEntry(TypedDict):
@@ -71,6 +72,12 @@ class Points:
 
     def __len__(self) -> int:
         return len(self.xyz)
+
+    @property
+    def sure_xyz(self) -> np.ndarray:
+        """[K, 3] points that three photos or more show, for surfaces; all, where these are few."""
+        sure = np.diff(self.track_offsets) >= 3
+        return self.xyz[sure] if sure.sum() >= _FEW_POINTS else self.xyz
 
 
 @dataclass(frozen=True)

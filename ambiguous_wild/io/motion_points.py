@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,10 @@ from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.atomic import atomic_path
 
 FILE = "motion.npz"  # in the scene's folder
+_MOST_BYTES = 1 << 28  # unpacked: a thousand photos have about 2e7
+# what numpy and zipfile raise for a damaged file, besides their own
+_DAMAGE = (ValueError, LookupError, OSError, EOFError, TypeError, AttributeError, RuntimeError, MemoryError,
+           OverflowError)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -55,21 +60,27 @@ def read_motion_points(scene: Path) -> dict[str, MotionPoints]:
     if not path.is_file():
         return {}
     try:
+        with zipfile.ZipFile(path) as archive:
+            if sum(member.file_size for member in archive.infolist()) > _MOST_BYTES:
+                raise ValueError("it is too large")
         with np.load(path, allow_pickle=False) as file:
-            names, counts = file["names"].tolist(), file["counts"]
-            columns = [
-                _column(file[name], dtype, counts.sum())
-                for name, dtype in (("xy", "f4"), ("static", "u1"), ("moving", "u1"), ("motion", "i2"))
-            ]
-        if columns[0].shape[1:] != (2,) or len(names) != len(counts) or counts.min(initial=0) < 0:
-            raise ValueError("its arrays do not fit together")
-    except (ValueError, KeyError, OSError, EOFError, TypeError, zipfile.BadZipFile) as error:
-        raise AwError(f"{path} is damaged ({error}); remove it, or build the scene again") from error
-    parts = zip(*(np.split(column, np.cumsum(counts)[:-1]) for column in columns))
-    return {str(name): MotionPoints(*part) for name, part in zip(names, parts)}
+            return _read(file)
+    except (*_DAMAGE, zlib.error, zipfile.BadZipFile) as error:
+        raise AwError(f"{path} is damaged ({error}); build the scene again") from error
 
 
-def _column(values: np.ndarray, dtype: str, length: int) -> np.ndarray:
-    if values.dtype != np.dtype(dtype) or len(values) != length:
+def _read(file: Mapping[str, np.ndarray]) -> dict[str, MotionPoints]:
+    names, counts = file["names"], file["counts"]
+    total = int(counts.sum())
+    shapes = {"xy": ("f4", (total, 2)), "static": ("u1", (total,)), "moving": ("u1", (total,)),
+              "motion": ("i2", (total,))}  # fmt: skip
+    columns = [file[name] for name in shapes]
+    fit = names.dtype.kind == "U" and counts.dtype == np.int64 and counts.ndim == 1
+    fit = fit and names.shape == counts.shape and counts.min(initial=0) >= 0
+    fit = fit and len(set(names.tolist())) == len(names)
+    for column, (dtype, shape) in zip(columns, shapes.values()):
+        fit = fit and column.dtype == np.dtype(dtype) and column.shape == shape
+    if not fit or not ((columns[0] >= 0) & (columns[0] <= 1)).all():
         raise ValueError("its arrays do not fit together")
-    return values
+    parts = zip(*(np.split(column, np.cumsum(counts)[:-1]) for column in columns))
+    return {name: MotionPoints(*part) for name, part in zip(names.tolist(), parts)}

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 import torch
 
@@ -18,7 +19,7 @@ from ambiguous_wild.io.palette import MASKED, faded, tint
 from ambiguous_wild.methods.fixed_masks import FixedMasks
 from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.step import Step, TrainData
-from ambiguous_wild.vision.moving import POINTS, draw_points, moving_map
+from ambiguous_wild.vision.moving import POINTS, draw_points, moving_map, small
 from ambiguous_wild.vision.precompute import instance_labels
 from ambiguous_wild.vision.segments import GraphSegments, SegmentConfig
 
@@ -27,11 +28,11 @@ from ambiguous_wild.vision.segments import GraphSegments, SegmentConfig
 class MotionConfig:
     """Options of `3dgs+motion`."""
 
-    threshold: float = 0.5  # share of the votes around a pixel above which it is masked
+    threshold: float = 0.6  # share of the votes around a pixel above which it is masked
     segments: SegmentConfig = field(default_factory=SegmentConfig)
 
     def __post_init__(self) -> None:
-        check_limits(self, "motion", threshold=(0, 1))
+        check_limits(self, "motion", threshold=(0.5, 1))
 
 
 def build(options: MotionConfig) -> Parts:
@@ -49,17 +50,19 @@ class MotionMask(FixedMasks):
     def setup(self, data: TrainData) -> None:
         self.data = data
         points = self.points = read_motion_points(data.scene.root)
-        if not points:
-            raise AwError(
-                f"scene {data.scene.name} does not say what moves (no motion.npz): build it from its photos "
-                "with this version of 'aw build-scene'"
-            )
         names = [view.name for view in data.scene.train]
+        if not any(name in points for name in names):
+            raise AwError(
+                f"scene {data.scene.name} does not say what moves (motion.npz has none of its train photos): "
+                "build it from its photos with this version of 'aw build-scene'"
+            )
         found = instance_labels(GraphSegments(self.config.segments), data.photos, names, data.cache_dir)
+        self.keeps = []
         for name, labels in zip(names, found.labels, strict=True):
             moves = np.zeros(labels.shape, bool)
             if name in points:
-                moves = moving_map(points[name], labels, labels.shape) > self.config.threshold
+                moves = moving_map(points[name], labels, small(labels.shape)) > self.config.threshold
+                moves = cv2.resize(moves.astype(np.uint8), labels.shape[::-1]) > 0
             self.keeps.append(torch.from_numpy((~moves).astype(np.float32)))
         super().setup(data)
 

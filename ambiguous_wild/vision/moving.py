@@ -32,7 +32,7 @@ def moving_map(points: MotionPoints, labels: np.ndarray, shape: tuple[int, int])
         shape: of the map.
     """
     h, w = shape
-    segments = cv2.resize(labels, (w, h), interpolation=cv2.INTER_NEAREST)
+    segments = np.maximum(cv2.resize(labels, (w, h), interpolation=cv2.INTER_NEAREST), 0)
     column, row = np.clip(points.xy * [w, h], 0, [w - 1, h - 1]).astype(int).T
     reach = REACH_PX * math.sqrt(h * w / PIXELS)
     near, of_segment = [], []
@@ -48,6 +48,12 @@ def moving_map(points: MotionPoints, labels: np.ndarray, shape: tuple[int, int])
     less = np.float32(SEGMENT_VOTES) / np.maximum(of_segment[0] + of_segment[1], SEGMENT_VOTES)
     moving, static = (a + (less * b)[segments] for a, b in zip(near, of_segment))
     return np.asarray((moving + UNSURE / 2) / (moving + static + UNSURE), np.float32)
+
+
+def small(shape: tuple[int, ...]) -> tuple[int, int]:
+    """The shape of a map of `PIXELS` at most for a photo [H, W]."""
+    scale = min(1.0, math.sqrt(PIXELS / (shape[0] * shape[1])))
+    return max(round(shape[0] * scale), 1), max(round(shape[1] * scale), 1)
 
 
 def draw_points(photo: np.ndarray, points: MotionPoints) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from ambiguous_wild.builder.moving import Votes, _together
 from ambiguous_wild.builder.pipeline import build_scene
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError
@@ -138,12 +140,30 @@ def test_the_file_comes_back_and_a_damaged_one_is_refused(tmp_path):
         (tmp_path / FILE).write_bytes(bad)
         with pytest.raises(AwError, match="damaged"):
             read_motion_points(tmp_path)
+    for bit in rng.integers(0, 8 * len(whole), 200).tolist():  # never another error
+        flipped = bytearray(whole)
+        flipped[bit // 8] ^= 1 << bit % 8
+        (tmp_path / FILE).write_bytes(flipped)
+        with suppress(AwError):
+            read_motion_points(tmp_path)
+    for xy in (np.nan, -0.1, 1.5):
+        write_motion_points(
+            tmp_path / FILE, {"a.png": replace(points["c.png"], xy=np.full((3, 2), xy, np.float32))}
+        )
+        with pytest.raises(AwError, match="do not fit together"):
+            read_motion_points(tmp_path)
     two = MotionPoints(
         np.zeros((2, 2), np.float32), np.zeros(1, np.uint8), np.zeros(2, np.uint8), np.zeros(2, np.int16)
     )
     write_motion_points(tmp_path / FILE, {"a": two})
     with pytest.raises(AwError, match="do not fit together"):
         read_motion_points(tmp_path)
+
+
+def test_a_feature_that_stays_does_not_cut_a_motion_in_two():
+    votes = Votes(np.array([0, 0, 3, 0, 0, 0]), np.array([1, 1, 1, 1, 0, 1]), [np.array([0, 1, 2, 3])])
+    moves = votes.moving > votes.static
+    assert _together(votes, moves).tolist() == [1, 1, 0, 1, 0, 2]
 
 
 def test_nothing_near_says_nothing():

@@ -116,8 +116,8 @@ def test_scene_json_keeps_its_keys_and_their_order(scene):
     assert list(info["chosen"]) == ["camera", "sfm", "matcher", "mapper"]
     assert list(info["counts"]) == [
         "photos", "readable", "registered", "train", "test", "cameras", "points", "points_seen_in_test_only",
-        "points_of_track_length_2", "pairs", "pairs_verified", "points_that_stay",
-        "points_that_move",
+        "points_of_track_length_2", "pairs", "pairs_verified", "features_that_stay",
+        "features_that_move",
     ]  # fmt: skip
     assert list(info["cameras"][0]) == ["photos", "focal_px", "focal_sd_px"]
     assert list(info["photos"]["p01.png"]) == [

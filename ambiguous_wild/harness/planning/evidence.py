@@ -126,7 +126,7 @@ def uncovered(scene: Scene) -> float:
     cameras = cameras[:: max(-(-len(cameras) // MOST_PHOTOS), 1)]
     if not cameras or not len(scene.points):
         return float("nan")
-    known = [has_surface(camera, scene.points.xyz) for camera in cameras]
+    known = [has_surface(camera, scene.points.sure_xyz) for camera in cameras]
     if 2 * sum(k is None for k in known) > len(known):
         return float("nan")
     return float(np.mean([1.0 if k is None else 1.0 - k.mean() for k in known]))

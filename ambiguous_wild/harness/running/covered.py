@@ -63,7 +63,7 @@ def train_looks(scene: Scene, distractor: DistractorMask) -> dict[str, Looks] | 
     masks = [distractor(view) for view in scene.train]
     exact = any(mask is not None for mask in masks)
     known = [(view, mask) for view, mask in zip(scene.train, masks) if mask is not None or not exact]
-    xyz = some_points(scene.points.xyz)
+    xyz = some_points(scene.points.sure_xyz)
     cameras = [view.camera for view, _ in known]
     depths = [inverse_depth(camera, xyz) for camera in cameras]
     found = {}

@@ -13,6 +13,7 @@ import numpy as np
 from ambiguous_wild.core import Scene
 from ambiguous_wild.core.config import config_hash
 from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.io.motion_points import FILE as MOTION
 
 # Keys of config.yaml that do not decide the result: how often it is saved and probed, what is done about
 # values that are not finite (the result says so where there were any), where the scene lies.
@@ -58,6 +59,8 @@ def scene_identity(scene: Scene) -> str:
             name = view.keep_path.relative_to(scene.root).as_posix()
             if name not in known:
                 known[name] = _digest(view.keep_path)
+    if MOTION not in known and (scene.root / MOTION).is_file():
+        known[MOTION] = _digest(scene.root / MOTION)
     return config_hash({"files": known, "split": split})
 
 

@@ -133,19 +133,23 @@ def first_look(
 
     moves = moving if moving is not None and config.motion > 0 else [None] * len(small)
 
-    def answer(view: int, views: int, before: Sequence[np.ndarray | None]) -> np.ndarray | None:
+    def answer(
+        view: int, views: int, before: Sequence[np.ndarray | None], masked: Sequence[np.ndarray | None]
+    ) -> np.ndarray | None:
         inverse, ours = surfaces[view], small[view]
         if inverse is None or ours is None:
             return None
-        mine, last = moves[view], None if before is moves else before[view]
+        mine, last = moves[view], before[view]
         # computed again in every round: kept, they would take 0.5 MB a photo
         world = world_points(cameras[view], inverse)
         seen = [
-            _seen_by(ours, world, cameras[j], surface, limits, before[j])
+            _seen_by(ours, world, cameras[j], surface, limits, masked[j])
             for j in near[view][:views]
             if (surface := surfaces[j]) is not None and (limits := ranges[j]) is not None
         ]
         found = _judge(ours, seen, config)
+        if found is None and mine is not None:
+            found = np.full(ours.shape[:2], 0.5, np.float32)
         if found is None:
             return last
         found = _smoothed(found, ours, config.smooth)
@@ -155,10 +159,10 @@ def first_look(
         return found if last is None else 0.5 * (found + last)
 
     everything = range(len(small))
-    answers = [answer(view, config.views, moves) for view in everything]
+    answers = [answer(view, config.views, [None] * len(small), moves) for view in everything]
     views = config.views * (2 if masked_share(answers) >= config.crowd else 1)
     for _ in range(config.rounds):
-        before, answers = answers, [answer(view, views, answers) for view in everything]
+        before, answers = answers, [answer(view, views, answers, answers) for view in everything]
         if _changed(before, answers) < _SETTLED:
             break
     weight = config.crowd_weight if masked_share(answers) >= config.crowd else config.weight

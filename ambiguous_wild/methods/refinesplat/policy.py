@@ -62,9 +62,10 @@ class RefineSplatMask(PausingMask):
         if self._reads_identities:
             _ = self.inputs.semantics  # computed now, as a cost of the method before its first step
         photos = [photo.cpu().numpy() for photo in data.photos]
-        surfaces = static_surfaces(data.cameras, data.scene.points.xyz)
+        surfaces = static_surfaces(data.cameras, data.scene.points.sure_xyz)
         if config.first_look.on:
-            found = first_look(data.cameras, photos, surfaces, config.first_look, self._moving(surfaces))
+            moving = self._moving(surfaces) if config.first_look.motion > 0 else None
+            found = first_look(data.cameras, photos, surfaces, config.first_look, moving)
             self.looks = {view: look for view, look in enumerate(found) if look is not None}
         self.masks = self._mask_builder(photos, surfaces)
         # view: keep map before masks begin, [H, W] float32; absent if everything is kept

@@ -16,13 +16,13 @@ from scipy.sparse.csgraph import connected_components
 
 from ambiguous_wild.builder.matched import Matched
 from ambiguous_wild.builder.motions import LEAST
+from ambiguous_wild.builder.placing import FITS
 from ambiguous_wild.builder.records import MotionResult
 from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.colmap_records import ModelCamera
 from ambiguous_wild.io.motion_points import FILE, MotionPoints, write_motion_points
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
-STATIC_SHARE = 0.5  # of a motion's matches that fit the poses, from which on it is the place's
 CLEARLY = 2.0  # a match that moves is off by more than so many times what fits; `LEAST` of a motion are
 
 
@@ -53,7 +53,7 @@ def count_votes(
         off = matched.misfit((a, b), poses[a], poses[b], rays)
         for motion in matched.motions.get((a, b), []):
             of_motion = off[motion.matches]
-            if np.mean(of_motion <= 1.0) >= STATIC_SHARE:
+            if np.mean(of_motion <= 1.0) >= FITS:
                 fitting = rows[motion.matches[of_motion <= 1.0]]
                 votes[a].static[fitting[:, 0]] += 1
                 votes[b].static[fitting[:, 1]] += 1

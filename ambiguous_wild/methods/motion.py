@@ -19,9 +19,10 @@ from ambiguous_wild.io.palette import MASKED, faded, tint
 from ambiguous_wild.methods.fixed_masks import FixedMasks
 from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.step import Step, TrainData
-from ambiguous_wild.vision.moving import POINTS, draw_points, moving_map, small
+from ambiguous_wild.vision.moving import POINTS, draw_points, moving_map
 from ambiguous_wild.vision.precompute import instance_labels
 from ambiguous_wild.vision.segments import GraphSegments, SegmentConfig
+from ambiguous_wild.vision.sparse_surface import map_size
 
 
 @dataclass(frozen=True)
@@ -58,10 +59,10 @@ class MotionMask(FixedMasks):
             )
         found = instance_labels(GraphSegments(self.config.segments), data.photos, names, data.cache_dir)
         self.keeps = []
-        for name, labels in zip(names, found.labels, strict=True):
+        for name, labels, camera in zip(names, found.labels, data.cameras, strict=True):
             moves = np.zeros(labels.shape, bool)
             if name in points:
-                moves = moving_map(points[name], labels, small(labels.shape)) > self.config.threshold
+                moves = moving_map(points[name], labels, map_size(camera)) > self.config.threshold
                 moves = cv2.resize(moves.astype(np.uint8), labels.shape[::-1]) > 0
             self.keeps.append(torch.from_numpy((~moves).astype(np.float32)))
         super().setup(data)

@@ -44,16 +44,10 @@ def moving_map(points: MotionPoints, labels: np.ndarray, shape: tuple[int, int])
         total = np.bincount(segments[row, column], weight, minlength=int(segments.max()) + 1)
         total[0] = 0.0
         of_segment.append(total.astype(np.float32))
-    # a segment may be large and hold both: it says little, which decides where no feature is near
+    # a segment may be large and hold both kinds, so its vote is small: it decides only far from features
     less = np.float32(SEGMENT_VOTES) / np.maximum(of_segment[0] + of_segment[1], SEGMENT_VOTES)
     moving, static = (a + (less * b)[segments] for a, b in zip(near, of_segment))
     return np.asarray((moving + UNSURE / 2) / (moving + static + UNSURE), np.float32)
-
-
-def small(shape: tuple[int, ...]) -> tuple[int, int]:
-    """The shape of a map of `PIXELS` at most for a photo [H, W]."""
-    scale = min(1.0, math.sqrt(PIXELS / (shape[0] * shape[1])))
-    return max(round(shape[0] * scale), 1), max(round(shape[1] * scale), 1)
 
 
 def draw_points(photo: np.ndarray, points: MotionPoints) -> np.ndarray:

@@ -36,7 +36,7 @@ def inverse_depth(camera: Camera, points: np.ndarray) -> np.ndarray | None:
 
     The map covers the camera's frame with at most about 20 000 pixels. None: too few points in the frame.
     """
-    h, w = _map_size(camera)
+    h, w = map_size(camera)
     xyz = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
     x, y = in_map(camera, xyz, (h, w))
     near = _around(x, y, (h, w))
@@ -58,7 +58,7 @@ def has_surface(camera: Camera, points: np.ndarray) -> np.ndarray | None:
     `static_surfaces` chooses for the whole scene, which leaves a photo of a large scene few.
     """
     xyz = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
-    shape = _map_size(camera)
+    shape = map_size(camera)
     found = inverse_depth(camera, some_points(points[_around(*in_map(camera, xyz, shape), shape)]))
     return None if found is None else np.isfinite(found)
 
@@ -155,6 +155,7 @@ def _in_front(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
     return z <= BEHIND * nearest[row, column]
 
 
-def _map_size(camera: Camera) -> tuple[int, int]:
+def map_size(camera: Camera) -> tuple[int, int]:
+    """(h, w) of a map of the camera's frame."""
     scale = min(1.0, (PIXELS / (camera.width * camera.height)) ** 0.5)
     return max(round(camera.height * scale), 1), max(round(camera.width * scale), 1)

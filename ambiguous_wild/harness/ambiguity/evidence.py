@@ -15,7 +15,7 @@ from ambiguous_wild.vision.moving import moving_map
 
 KINDS = ("colour", "structure", "features", "motion")
 TOLD = 0.5  # share of a distractor's pixels from which on an evidence tells it
-CORRELATED = 0.5  # correlation with the background below which a pixel's structure is another
+CORRELATED = 0.5  # with the background; below, the structure at a pixel is another one
 
 
 @dataclass(frozen=True)
@@ -54,14 +54,14 @@ def distractors(
         points: features that move and stay; None: the scene does not say.
     """
     shape = (regions.shape[1], regions.shape[0])
-    differs = correlates = sure = moves = None
+    differs = unlike = sure = moves = None
     if behind is not None:
         differs = am.colour_residual(photo, behind) > am.COLOUR_THRESHOLD
-        correlates = correlation(photo @ GREY, behind @ GREY) < CORRELATED
+        unlike = correlation(photo @ GREY, behind @ GREY) < CORRELATED
         sure = np.ones(differs.shape, bool) if known is None else known
-        differs, correlates, sure = (
+        differs, unlike, sure = (
             cv2.resize(x.astype(np.uint8), shape, interpolation=cv2.INTER_NEAREST) > 0
-            for x in (differs, correlates, sure)
+            for x in (differs, unlike, sure)
         )
     if points is not None:
         moves = moving_map(points, segments, regions.shape)
@@ -75,7 +75,7 @@ def distractors(
                 label,
                 int(pixels),
                 _most(differs, at, sure),
-                _most(correlates, at, sure),
+                _most(unlike, at, sure),
                 None if moves is None or bool(np.all(moves[at] == 0.5)) else _most(moves > 0.5, at, None),
             )
         )

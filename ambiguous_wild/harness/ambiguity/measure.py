@@ -135,14 +135,14 @@ def measure(
         features, backend, whitened, mean, whiten, moving, static, anchors, usual, objects is not None
     )
     measured = []
-    for score, matches, seen_as in zip(scores, found, told):
+    for score, matches, found_in_photo in zip(scores, found, told):
         cosines = {match.label: match.cosine for match in matches}
         sure = not math.isnan(usual)
-        whole_story = [
+        regions_of_photo = [
             replace(d, features=cosines[d.label] < usual if sure and d.label in cosines else None)
-            for d in seen_as
+            for d in found_in_photo
         ]
-        measured.append(Measured(*score, matches, whole_story))
+        measured.append(Measured(*score, matches, regions_of_photo))
     return measured, look
 
 

@@ -192,8 +192,8 @@ def _told(measured: list[Measured]) -> Told:
 def _told_line(told: Told) -> str:
     known = {kind: told[kind] for kind in KINDS if told[kind] is not None}  # type: ignore[literal-required]
     parts = ", ".join(f"{kind} tells {count}" for kind, count in known.items())
-    text = f"of {told['distractors']} distractors {parts or 'no evidence tells any'}; "
-    text += f"none of these tells {told['nothing']}"
+    text = f"distractors: {told['distractors']}; {parts or 'no evidence tells any'}; "
+    text += f"told by nothing: {told['nothing']}"
     return text if told["motion"] is not None else f"{text} (the scene does not say what moves)"
 
 

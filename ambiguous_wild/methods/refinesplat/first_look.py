@@ -131,7 +131,7 @@ def first_look(
     ranges = [None if s is None else (cv2.erode(s, _WINDOW), cv2.dilate(s, _WINDOW)) for s in small]
     near = nearest_views(cameras, 2 * config.views)
 
-    moves = moving if moving is not None and config.motion > 0 else [None] * len(small)
+    moves = moving if moving is not None else [None] * len(small)
 
     def answer(
         view: int, views: int, before: Sequence[np.ndarray | None], masked: Sequence[np.ndarray | None]

@@ -72,4 +72,16 @@ class TriangulationJob(TypedDict):
     parent: NotRequired[int]
 
 
-SfmJob = FeatureJob | MatchJob | MappingJob | TriangulationJob
+class MotionJob(TypedDict):
+    """Find the motions of matched pairs whose cameras are known."""
+
+    task: Literal["motions"]
+    database: str
+    model: str  # folder; cameras, numbered as in the database
+    output: str  # file
+    seed: int
+    jobs: int
+    parent: NotRequired[int]
+
+
+SfmJob = FeatureJob | MatchJob | MappingJob | TriangulationJob | MotionJob

@@ -24,7 +24,14 @@ from ambiguous_wild.builder.pairs import MOTIONS, PAIRS, sequential_pairs
 from ambiguous_wild.builder.placing import LEAST_PHOTOS, Placement, pipeline_options, plausible
 from ambiguous_wild.builder.records import ModelSummary
 from ambiguous_wild.builder.retrieval import embed, pairs_of_tests, retrieval_pairs
-from ambiguous_wild.builder.sfm_jobs import FeatureJob, MappingJob, MatchJob, SfmJob, TriangulationJob
+from ambiguous_wild.builder.sfm_jobs import (
+    FeatureJob,
+    MappingJob,
+    MatchJob,
+    MotionJob,
+    SfmJob,
+    TriangulationJob,
+)
 from ambiguous_wild.builder.sift import features_of
 from ambiguous_wild.io.atomic import write_json
 from ambiguous_wild.io.safe_pycolmap import pycolmap
@@ -212,6 +219,14 @@ def run_triangulation(job: TriangulationJob) -> None:
     found.write_binary(job["output"])
 
 
+def run_motions(job: MotionJob) -> None:
+    """The motions of every matched pair, with known cameras."""
+    matched = Matched.read(Path(job["database"]))
+    matched.take_cameras(pycolmap.Reconstruction(job["model"]))
+    matched.find_motions(job["jobs"])
+    matched.save_motions(Path(job["output"]))
+
+
 def _map_incrementally(job: MappingJob, output: Path, distorted: bool) -> dict[int, Any]:
     options = pipeline_options(job["seed"])
     options.min_model_size = LEAST_PHOTOS
@@ -273,6 +288,8 @@ def main() -> None:
         run_matches(job)
     elif job["task"] == "mapping":
         run_mapping(job)
+    elif job["task"] == "motions":
+        run_motions(job)
     else:
         run_triangulation(job)
 

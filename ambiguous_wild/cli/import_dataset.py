@@ -30,6 +30,7 @@ KINDS = (
     is_flag=True,
     help="Drop points that only test photos see: they leak clean geometry. Published code keeps them.",
 )
+@click.option("--motion", is_flag=True, help="Match the photos to find what moves, for masks (motion.npz).")
 @click.option("--jobs", type=click.IntRange(min=1), help="Threads; the result does not depend on it.")
 @click.option(
     "--seed",
@@ -49,6 +50,7 @@ def command(
     license_: str,
     dataset: str,
     drop_test_only_points: bool,
+    motion: bool,
     jobs: int | None,
     seed: int,
     overwrite: bool,
@@ -62,7 +64,7 @@ def command(
     """
     from ambiguous_wild.datasets.write import ImportSettings, import_scene
 
-    settings = ImportSettings(kind, factor, name, license_, dataset, drop_test_only_points, seed)
+    settings = ImportSettings(kind, factor, name, license_, dataset, drop_test_only_points, seed, motion)
     done = import_scene(source, output, settings, overwrite=overwrite, jobs=jobs, progress=not as_json)
     info = done.info
     if as_json:

@@ -15,7 +15,7 @@ from ambiguous_wild.core import Scene, View
 from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.datasets.foreign import without_suffix
 from ambiguous_wild.datasets.photos import link_file
-from ambiguous_wild.io import colmap_binary
+from ambiguous_wild.io import colmap_binary, motion_points
 from ambiguous_wild.io.atomic import atomic_dir, check_output
 from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage, ModelPoints
@@ -61,7 +61,9 @@ def export_scene(path: Path, form: str, output: Path, *, copy: bool = False) -> 
     check_output(output)
     with atomic_dir(output) as folder:
         place = _copy if copy else link_file
-        left_out = WRITERS[form](scene, folder, place)
+        left_out = [*WRITERS[form](scene, folder, place)]
+    if (scene.root / motion_points.FILE).is_file():
+        left_out.append("features that move (motion.npz)")
     return Exported(output, len(scene.views), len(scene.train), len(scene.test), tuple(left_out))
 
 

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 import sqlite3
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import cast
 
 import numpy as np
 
+from ambiguous_wild.builder.moving import write_motion
+from ambiguous_wild.builder.pairs import MOTIONS
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import ScreenedPhoto
-from ambiguous_wild.builder.settings import BuildSettings
+from ambiguous_wild.builder.settings import BuildSettings, Effort
 from ambiguous_wild.builder.sfm import DATABASE, extract_features, match, run_job
-from ambiguous_wild.builder.sfm_jobs import TriangulationJob
+from ambiguous_wild.builder.sfm_jobs import MotionJob, TriangulationJob
 from ambiguous_wild.builder.sfm_plans import plans
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.scene import Split
@@ -111,19 +114,8 @@ def triangulate(
         The same cameras and poses; no points where fewer than `LEAST_POINTS` were found.
     """
     used = {i.name: i for i in model.images.values() if i.name in split}
-    facts = [
-        cast(ScreenedPhoto, {"work_name": name, "source": name, "side": split[name]}) for name in sorted(used)
-    ]
-    settings = BuildSettings(seed=seed, sfm="thorough")
-    camera = "single" if len(model.cameras) == 1 else "per-image"
-    for part in ("features", "matches", "known", "points"):
-        (folder / part).mkdir(parents=True, exist_ok=True)
-    plan = plans(facts, settings)[0]
-    extract_features(folder / "features", photos, facts, settings, plan, jobs, camera, None, bar)
-    _set_cameras(folder / "features" / DATABASE, folder / "known", model, used)
-    match(folder / "matches", folder / "features", facts, settings, plan, jobs, bar, posed=True)
-    database = folder / "matches" / DATABASE
-    colmap_binary.write_points(folder / "known" / "points3D.bin", no_points())
+    database = _match_posed(folder, model, photos, split, "thorough", seed, jobs, bar)
+    (folder / "points").mkdir()
     job: TriangulationJob = {
         "task": "triangulation",
         "database": str(database),
@@ -148,6 +140,63 @@ def triangulate(
         if name in by_name
     }
     return Model(model.cameras, images, found.points)
+
+
+def find_motion(scene: Path, scratch: Path, train: Sequence[str], *, seed: int, jobs: int, bar: Bar) -> None:
+    """Match the train photos of a scene folder and write what moves in them (motion.npz) into it.
+
+    Args:
+        scene: folder with images/ and sparse/0, undistorted.
+        scratch: for COLMAP's files; emptied first.
+        train: names of the photos.
+        seed: of matching.
+        jobs: threads.
+        bar: progress.
+    """
+    shutil.rmtree(scratch, ignore_errors=True)
+    model = read_model(scene / "sparse" / "0")
+    split: dict[str, Split] = dict.fromkeys(train, "train")
+    database = _match_posed(scratch, model, scene / "images", split, "auto", seed, jobs, bar)
+    job: MotionJob = {
+        "task": "motions",
+        "database": str(database),
+        "model": str(scratch / "known"),
+        "output": str(scratch / MOTIONS),
+        "seed": seed,
+        "jobs": jobs,
+    }
+    bar.start("motions", None)
+    run_job(job, scratch, lambda: None)
+    bar.finish()
+    names = {name: name for name in train}
+    write_motion(scene, database, scratch / MOTIONS, scratch / "known", scene / "sparse" / "0", names)
+
+
+def _match_posed(
+    folder: Path,
+    model: Model,
+    photos: Path,
+    split: Mapping[str, Split],
+    sfm: Effort,
+    seed: int,
+    jobs: int,
+    bar: Bar,
+) -> Path:
+    """COLMAP's database of the photos in `split`, matched, with known cameras; known/ has their poses."""
+    used = {i.name: i for i in model.images.values() if i.name in split}
+    facts = [
+        cast(ScreenedPhoto, {"work_name": name, "source": name, "side": split[name]}) for name in sorted(used)
+    ]
+    settings = BuildSettings(seed=seed, sfm=sfm)
+    camera = "single" if len(model.cameras) == 1 else "per-image"
+    for part in ("features", "matches", "known"):
+        (folder / part).mkdir(parents=True, exist_ok=True)
+    plan = plans(facts, settings)[0]
+    extract_features(folder / "features", photos, facts, settings, plan, jobs, camera, None, bar)
+    _set_cameras(folder / "features" / DATABASE, folder / "known", model, used)
+    match(folder / "matches", folder / "features", facts, settings, plan, jobs, bar, posed=True)
+    colmap_binary.write_points(folder / "known" / "points3D.bin", no_points())
+    return folder / "matches" / DATABASE
 
 
 def _set_cameras(database: Path, known: Path, model: Model, used: Mapping[str, ModelImage]) -> None:

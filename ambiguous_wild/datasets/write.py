@@ -21,7 +21,7 @@ from ambiguous_wild.core.errors import AwError, counted, shortlist
 from ambiguous_wild.core.names import check_name
 from ambiguous_wild.datasets.foreign import SIDES, ForeignScene
 from ambiguous_wild.datasets.photos import PhotoPlan, PlacedPhoto, place_mask, place_photo, plan_photos
-from ambiguous_wild.datasets.points import drop_test_only, random_points, triangulate
+from ambiguous_wild.datasets.points import drop_test_only, find_motion, random_points, triangulate
 from ambiguous_wild.datasets.recognise import read_foreign
 from ambiguous_wild.datasets.suites import differences, suite_of
 from ambiguous_wild.io import colmap_binary
@@ -42,6 +42,7 @@ class ImportSettings:
     dataset: str = ""  # as result tables call it; empty = the layout's
     drop_test_only_points: bool = False  # points that no training photo sees leak the test photos
     seed: int = 0  # of matching and of random points
+    motion: bool = False  # match the photos and keep what moves
 
 
 @dataclass(frozen=True)
@@ -190,6 +191,9 @@ def _fill(
     bar.finish()
     sides = {p.image.name: foreign.split[plan.image.name] for plan, p in zip(plans, placed)}
     scene_model = _write_model(folder, model, placed)
+    if settings.motion:
+        train = sorted(n for n, s in sides.items() if s == "train")
+        find_motion(folder, work / "motion", train, seed=settings.seed, jobs=jobs, bar=bar)
     for side in SIDES:
         lines = sorted(n for n, s in sides.items() if s == side)
         write_text(folder / f"{side}_list.txt", "".join(f"{n}\n" for n in lines))

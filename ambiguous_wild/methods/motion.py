@@ -6,7 +6,7 @@ its segment, that they fit another rigid motion than the place's. Where none say
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -19,9 +19,9 @@ from ambiguous_wild.io.palette import MASKED, faded, tint
 from ambiguous_wild.methods.fixed_masks import FixedMasks
 from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.step import Step, TrainData
-from ambiguous_wild.vision.moving import POINTS, draw_points, moving_map
+from ambiguous_wild.vision.backends import check_instances, make_instances
+from ambiguous_wild.vision.moving import POINTS, draw_points, moving_labels, moving_map
 from ambiguous_wild.vision.precompute import instance_labels
-from ambiguous_wild.vision.segments import GraphSegments, SegmentConfig
 from ambiguous_wild.vision.sparse_surface import map_size
 
 
@@ -30,10 +30,11 @@ class MotionConfig:
     """Options of `3dgs+motion`."""
 
     threshold: float = 0.6  # share of the votes around a pixel above which it is masked
-    segments: SegmentConfig = field(default_factory=SegmentConfig)
+    instances: str = "graph"  # back end of segments, see docs/foundation-models.md
 
     def __post_init__(self) -> None:
         check_limits(self, "motion", threshold=(0.5, 1))
+        check_instances(self.instances)
 
 
 def build(options: MotionConfig) -> Parts:
@@ -55,14 +56,17 @@ class MotionMask(FixedMasks):
         if not any(name in points for name in names):
             raise AwError(
                 f"scene {data.scene.name} does not say what moves (motion.npz has none of its train photos): "
-                "build it from its photos with this version of 'aw build-scene'"
+                "build it from its photos with this version of 'aw build-scene', or make a copy with "
+                "'aw import SCENE -o NEW --motion'"
             )
-        found = instance_labels(GraphSegments(self.config.segments), data.photos, names, data.cache_dir)
-        self.keeps = []
-        for name, labels, camera in zip(names, found.labels, data.cameras, strict=True):
+        config, self.keeps = self.config, []
+        instances = make_instances(config.instances)
+        found = instance_labels(instances, data.photos, names, data.cache_dir)
+        for name, photo, labels, camera in zip(names, data.photos, found.labels, data.cameras, strict=True):
             moves = np.zeros(labels.shape, bool)
             if name in points:
-                moves = moving_map(points[name], labels, map_size(camera)) > self.config.threshold
+                labels = moving_labels(instances, photo, labels, points[name], data.cache_dir)
+                moves = moving_map(points[name], labels, map_size(camera)) > config.threshold
                 moves = cv2.resize(moves.astype(np.uint8), labels.shape[::-1]) > 0
             self.keeps.append(torch.from_numpy((~moves).astype(np.float32)))
         super().setup(data)

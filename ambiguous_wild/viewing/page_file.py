@@ -16,6 +16,7 @@ import numpy as np
 
 from ambiguous_wild.core import AwError, Scene, View
 from ambiguous_wild.io.atomic import check_output, refuse_file, write_text
+from ambiguous_wild.io.motion_points import read_motion_points
 from ambiguous_wild.io.splat_formats.spz import spz_bytes
 from ambiguous_wild.viewing.model import Model
 from ambiguous_wild.viewing.photos import mask_uris, photo_uris
@@ -26,6 +27,7 @@ PAGE = "index.html"
 GENERATOR = '<meta name="generator" content="aw view">'
 MOST_GAUSSIANS = 150_000  # a model in the page, by default: about 6 MB, and what a phone still turns smoothly
 MOST_PHOTO_BYTES = 1_000_000  # of text for all photos
+MOST_POINTS = 20_000  # features that move or stay, over all photos
 MOST_MASK_BYTES = 300_000  # of text for the masks of all models
 SCRIPTS = ("page_data.js", "page_camera.js", "page_panes.js", "page_main.js")
 _HERE = Path(__file__).resolve().parent / "page"
@@ -131,7 +133,10 @@ def page_text(
         "middle": space.middle.tolist(),
         "extent": space.extent,
         "frustum": 0.08 * space.extent,
-        "views": [_view_facts(v, uri) for v, uri in zip(views, photo_uris(views, MOST_PHOTO_BYTES))],
+        "views": [
+            _view_facts(v, uri, points)
+            for v, uri, points in zip(views, photo_uris(views, MOST_PHOTO_BYTES), _points(scene, views))
+        ],
         "models": facts,
         "notes": told,
     }
@@ -154,7 +159,25 @@ def _model_facts(
     }
 
 
-def _view_facts(view: View, photo: str) -> dict[str, Any]:
+def _points(scene: Scene, views: Sequence[View]) -> list[list[int]]:
+    """Of each view, x and y of its features in thousandths of the photo and 1 if it moves, one after another.
+
+    Each photo has the same number at most; those that move come first.
+    """
+    known, most = read_motion_points(scene.root), MOST_POINTS // max(len(views), 1)
+    found: list[list[int]] = []
+    for view in views:
+        points = known.get(view.name)
+        if points is None:
+            found.append([])
+            continue
+        chosen = np.argsort(~points.moves, kind="stable")[:most]
+        xy = (points.xy[chosen] * 999).astype(int)
+        found.append(np.column_stack([xy, points.moves[chosen]]).ravel().tolist())
+    return found
+
+
+def _view_facts(view: View, photo: str, points: list[int]) -> dict[str, Any]:
     camera = view.camera
     return {
         "name": view.name,
@@ -167,6 +190,7 @@ def _view_facts(view: View, photo: str) -> dict[str, Any]:
         "cy": camera.cy,
         "cam_from_world": camera.cam_from_world.ravel().tolist(),
         "photo": photo,
+        "points": points,
     }
 
 

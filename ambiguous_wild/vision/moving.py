@@ -8,12 +8,16 @@ everywhere else. Between features their neighbours decide, and those in the same
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import cv2
 import numpy as np
+from torch import Tensor
 
 from ambiguous_wild.io.motion_points import MotionPoints
 from ambiguous_wild.io.palette import KEPT, MASKED, faded
+from ambiguous_wild.vision.cache import cache_key, cached
+from ambiguous_wild.vision.protocols import Instances, PromptedInstances
 from ambiguous_wild.vision.sparse_surface import PIXELS
 
 POINTS = "features: green stay, red move"  # caption of `draw_points`
@@ -48,6 +52,37 @@ def moving_map(points: MotionPoints, labels: np.ndarray, shape: tuple[int, int])
     less = np.float32(SEGMENT_VOTES) / np.maximum(of_segment[0] + of_segment[1], SEGMENT_VOTES)
     moving, static = (a + (less * b)[segments] for a, b in zip(near, of_segment))
     return np.asarray((moving + UNSURE / 2) / (moving + static + UNSURE), np.float32)
+
+
+def moving_labels(
+    instances: Instances, photo: Tensor, labels: np.ndarray, points: MotionPoints, folder: Path
+) -> np.ndarray:
+    """Segments for `moving_map`, [H, W] int32.
+
+    Features that move together are the prompt of a back end that takes points (SAM), those that stay its
+    negatives: each answer becomes a segment of its own. Other back ends keep their segments.
+
+    Args:
+        instances: back end of the segments.
+        photo: [H, W, 3] in [0, 1].
+        labels: [H, W] int32, its segments.
+        points: of the photo.
+        folder: of the cache.
+    """
+    motions = np.arange(1, int(points.motion.max(initial=0)) + 1)
+    if not isinstance(instances, PromptedInstances) or not len(motions):
+        return labels
+    xy = points.xy * labels.shape[::-1]
+    groups = [xy[points.motion == k] for k in motions]
+
+    def compute() -> dict[str, np.ndarray]:
+        return {"masks": instances.at_points(photo, groups, xy[~points.moves])}
+
+    key = cache_key("moving", instances.name, None, xy, points.motion, photo.detach().cpu().numpy())
+    labels = labels.copy()
+    for mask in cached(folder, key, {"masks": np.bool_}, compute)["masks"]:
+        labels[mask] = labels.max() + 1
+    return labels
 
 
 def draw_points(photo: np.ndarray, points: MotionPoints) -> np.ndarray:

@@ -68,6 +68,17 @@ class NamedInstances(Protocol):
 
 
 @runtime_checkable
+class PromptedInstances(Protocol):
+    """Instances at given points; optional, in addition to `Instances`."""
+
+    name: str
+
+    def at_points(self, photo: Tensor, groups: Sequence[np.ndarray], outside: np.ndarray) -> np.ndarray:
+        """Mask [n, H, W] bool of the instance under each group of points [k, 2] px, not under `outside`."""
+        ...
+
+
+@runtime_checkable
 class SceneInstances(Protocol):
     """Instances with one id per object over all photos; optional, in addition to `Instances`.
 

@@ -7,7 +7,7 @@ masks and duplicates are dropped before the rest is enlarged to the photo's size
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from ambiguous_wild.vision.dino import normalised
 from ambiguous_wild.vision.mask_ops import box_nms, mask_boxes, paint
 from ambiguous_wild.vision.pretrained import Pretrained, load, locate
 
+PROMPTS = 8  # points on an instance at most, and as many beside it
 # SAM 2 checkpoints are of the video model; the image model loads a part of them.
 _CLASSES = {"sam": "SamModel", "sam2": "Sam2Model", "sam2_video": "Sam2Model"}
 
@@ -145,6 +146,33 @@ class SamInstances:
             for offset, low in enumerate(out):
                 result[start + offset] = embedded.enlarged(low)
         return result
+
+    @torch.no_grad()
+    def at_points(self, photo: Tensor, groups: Sequence[np.ndarray], outside: np.ndarray) -> np.ndarray:
+        """Mask [n, H, W] bool of the instance on which each group of points lies.
+
+        Args:
+            photo: [H, W, 3] in [0, 1].
+            groups: of each instance [k, 2] px; some of them, spread, are the prompt.
+            outside: [m, 2] px, points on none of them; the nearest are the prompt's negatives.
+        """
+        embedded = self._embed(photo)
+        masks = np.zeros((len(groups), embedded.height, embedded.width), dtype=bool)
+        for mask, group in zip(masks, groups):
+            inside = group[np.linspace(0, len(group) - 1, min(len(group), PROMPTS)).astype(int)]
+            far = ((outside[:, None] - inside[None]) ** 2).sum(2).min(1, initial=np.inf)
+            points = np.concatenate([inside, outside[np.argsort(far, kind="stable")[:PROMPTS]]])
+            scaled = torch.as_tensor(points * embedded.scale, dtype=torch.float32, device=photo.device)
+            signs = torch.zeros(len(points), dtype=torch.int64, device=photo.device)
+            signs[: len(inside)] = 1
+            out = self.model(
+                **self._prompt(embedded),
+                input_points=scaled[None, None],
+                input_labels=signs[None, None],
+                multimask_output=False,
+            )
+            mask[:] = embedded.enlarged(out.pred_masks[0, 0, 0])
+        return masks
 
     def _decode_points(self, embedded: _Embedded, points: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
         """For each batch, logits [3 n, h, w] on the net's grid and predicted IoU [3 n]."""

@@ -15,6 +15,8 @@ from ambiguous_wild.builder.moving import Votes, _together
 from ambiguous_wild.builder.pipeline import build_scene
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError
+from ambiguous_wild.datasets.export import export_scene
+from ambiguous_wild.datasets.write import ImportSettings, import_scene
 from ambiguous_wild.io.motion_points import FILE, MotionPoints, read_motion_points, write_motion_points
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.motion import MotionConfig, MotionMask
@@ -22,7 +24,7 @@ from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.policy import RefineSplatMask
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.step import TrainData
-from ambiguous_wild.vision.moving import moving_map
+from ambiguous_wild.vision.moving import moving_labels, moving_map
 from tests.builder import capture_maker
 from tests.builder.capture_maker import HEIGHT, WIDTH, eyes, render
 
@@ -116,6 +118,52 @@ def test_points_lie_where_they_move(sliding):
         assert ((found.motion > 0) == found.moves).all()
 
 
+def test_a_scene_from_elsewhere_can_be_asked_what_moves(sliding, tmp_path):
+    scene, where = sliding
+    left_out = export_scene(scene, "nerfstudio", tmp_path / "elsewhere").left_out
+    assert "features that move (motion.npz)" in left_out
+    with pytest.raises(AwError, match="--motion"):
+        imported = import_scene(tmp_path / "elsewhere", tmp_path / "without").scene
+        MotionMask(MotionConfig()).setup(train_data(imported, tmp_path))
+    imported = import_scene(tmp_path / "elsewhere", tmp_path / "with", ImportSettings(motion=True)).scene
+    alone = MotionMask(MotionConfig())
+    data = train_data(imported, tmp_path)
+    alone.setup(data)
+    masks = {Path(v.name).name: keep.numpy() < 0.5 for v, keep in zip(data.scene.train, alone.keeps)}
+    inside, outside = overlap(masks, where)
+    assert inside > 0.7 and outside < 0.05
+
+
+def test_what_moves_is_a_prompt(tmp_path):
+    class Disc:
+        name = "disc"
+
+        def labels(self, photo):
+            return np.zeros(photo.shape[:2], np.int32)
+
+        def at_points(self, photo, groups, outside):
+            np.testing.assert_allclose(groups[0], [[12, 10]])
+            np.testing.assert_allclose(outside, [[108, 90]])
+            mask = np.zeros((1, 100, 120), bool)
+            mask[0, :40, :50] = True
+            return mask
+
+    points = two_points()
+    labels = moving_labels(Disc(), torch.zeros(100, 120, 3), np.ones((100, 120), np.int32), points, tmp_path)
+    assert (labels[:40, :50] == 2).all() and (labels[40:] == 1).all()
+    assert moving_map(points, labels, (100, 120))[38, 48] > 0.6  # far from the feature, in its segment
+
+
+def two_points() -> MotionPoints:
+    """One that moves and one that stays."""
+    return MotionPoints(
+        np.array([[0.1, 0.1], [0.9, 0.9]], np.float32),
+        np.array([0, 3], np.uint8),
+        np.array([2, 0], np.uint8),
+        np.array([1, 0], np.int16),
+    )
+
+
 def test_the_file_comes_back_and_a_damaged_one_is_refused(tmp_path):
     rng = np.random.default_rng(0)
     points = {
@@ -167,12 +215,7 @@ def test_a_feature_that_stays_does_not_cut_a_motion_in_two():
 
 
 def test_nothing_near_says_nothing():
-    points = MotionPoints(
-        np.array([[0.1, 0.1], [0.9, 0.9]], np.float32),
-        np.array([0, 3], np.uint8),
-        np.array([2, 0], np.uint8),
-        np.array([1, 0], np.int16),
-    )
+    points = two_points()
     labels = np.zeros((100, 120), np.int32)
     labels[:30, :40] = 1
     answer = moving_map(points, labels, (100, 120))

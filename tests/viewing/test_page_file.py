@@ -18,6 +18,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.showing.page import Viewer, view_runs
 from ambiguous_wild.harness.showing.read import read_look
 from ambiguous_wild.io.images import write_png
+from ambiguous_wild.io.motion_points import FILE, MotionPoints, write_motion_points
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.io.splat_formats.spz import read_spz
 from ambiguous_wild.viewing import page_file, photos
@@ -34,6 +35,14 @@ HOSTILE = '</script><img src=x onerror="alert(1)">&-->'
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("shown")
     scene = write_tiny_scene(root / "porch")
+    ones = np.ones(2, np.uint8)
+    points = MotionPoints(
+        np.array([[0, 1], [0.5, 0.25]], np.float32),
+        ones,
+        np.array([0, 2], np.uint8),
+        np.array([0, 1], np.int16),
+    )
+    write_motion_points(scene / FILE, {TRAIN[0]: points})
     write_shown_run(root / "runs", scene, "3dgs", noise=20.0)
     write_shown_run(root / "runs", scene, HOSTILE, noise=5.0)
     return root / "runs"
@@ -51,6 +60,8 @@ def test_the_page_holds_models_photos_masks_and_numbers(runs: Path, tmp_path: Pa
     page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
     data = facts(page)
     assert [v["name"] for v in data["views"]] == TEST + TRAIN
+    points = {v["name"]: v["points"] for v in data["views"] if v["points"]}
+    assert points == {TRAIN[0]: [499, 249, 1, 0, 999, 0]}  # what moves comes first
     assert {m["label"] for m in data["models"]} == {"3dgs", HOSTILE}
     for model in data["models"]:
         assert set(model["psnr"]) == set(TEST) and model["mean"] == pytest.approx(

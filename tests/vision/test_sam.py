@@ -94,6 +94,34 @@ def test_boxes_of_the_photo_give_the_instance_inside(checkpoint, photo, kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
+def test_points_give_the_instance_that_they_lie_on(checkpoint, photo, kind):
+    instances = SamInstances(kind, ALL, checkpoint(kind))
+    net = Scene(90, 130, padded=kind == "sam")
+    prompts = []
+
+    def answer(image_embeddings, input_points, input_labels, multimask_output):
+        assert input_labels.shape == input_points.shape[:3] == (1, 1, input_points.shape[2])
+        points = input_points[0, 0] / torch.tensor([net.sx, net.sy])
+        prompts.append((points.numpy(), input_labels[0, 0].tolist()))
+        return SimpleNamespace(pred_masks=net.at(*points[0].tolist())[None, :1, None])
+
+    net.__class__ = type("Prompted", (Scene,), {"__call__": lambda self, **words: answer(**words)})
+    instances._model = net
+    group = np.array([[30.0, 20], [32, 22], [28, 18]])
+    outside = np.array([[120.0, 80], [60, 20], [50, 22], *[[126.0, 85]] * 9])
+    masks = instances.at_points(photo(0, 90, 130), [group, np.tile([[100.0, 60]], (30, 1))], outside)
+    for mask, label in zip(masks, (2, 3), strict=True):
+        expected = truth() == label
+        assert np.count_nonzero(mask & expected) / np.count_nonzero(mask | expected) > 0.85
+    points, signs = prompts[0]
+    assert signs == [1] * 3 + [0] * 8
+    np.testing.assert_allclose(points[:6], [*group, [50, 22], [60, 20], [120, 80]], atol=0.5)
+    assert prompts[1][1] == [1] * 8 + [0] * 8
+    real = SamInstances(kind, ALL, checkpoint(kind)).at_points(photo(1, 96, 130), [group], outside[:0])
+    assert real.shape == (1, 96, 130)
+
+
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("height, width", [(96, 130), (131, 77)])
 def test_the_real_nets_run_and_repeat(checkpoint, photo, kind, height, width):
     image = photo(1, height, width)

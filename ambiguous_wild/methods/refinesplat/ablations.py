@@ -134,6 +134,7 @@ ABLATIONS = (
                 ("first_look.weight=1", "first_look.crowd_weight=1"),
                 "not used in later masks",
             ),
+            Variant("no-motion", ("first_look.motion=0",), "features that move or stay are not asked"),
             Variant("no-memory", ("mask.memory=0",), "the current render only"),
             Variant("no-hold", ("mask.hold=1",), "regions do not grow below the threshold"),
             Variant("identities", ("mask.entropy_weight=0.5",), "scaled by the contrast of identities"),

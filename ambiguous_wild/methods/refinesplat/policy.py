@@ -29,7 +29,7 @@ from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.parts import State
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.backends import make_features, make_instances
-from ambiguous_wild.vision.moving import moving_map
+from ambiguous_wild.vision.moving import moving_labels, moving_map
 from ambiguous_wild.vision.protocols import Features, Instances
 from ambiguous_wild.vision.segments import GraphSegments
 from ambiguous_wild.vision.sparse_surface import static_surfaces
@@ -78,12 +78,12 @@ class RefineSplatMask(PausingMask):
     def _moving(self, surfaces: list[np.ndarray | None]) -> list[np.ndarray | None]:
         """What moves in each photo, of its surface's shape; None where nothing is known."""
         points = self.points = read_motion_points(self.data.scene.root)
-        found: list[np.ndarray | None] = []
-        for view, labels, surface in zip(self.data.scene.train, self.inputs.labels, surfaces, strict=True):
-            known = points.get(view.name)
-            found.append(
-                None if known is None or surface is None else moving_map(known, labels, surface.shape)
-            )
+        data, found = self.data, list[np.ndarray | None]([None] * len(surfaces))
+        for k, (view, surface) in enumerate(zip(data.scene.train, surfaces, strict=True)):
+            known, photo, labels = points.get(view.name), data.photos[k], self.inputs.labels[k]
+            if known is not None and surface is not None:
+                labels = moving_labels(self.instances, photo, labels, known, data.cache_dir)
+                found[k] = moving_map(known, labels, surface.shape)
         return found
 
     def _mask_builder(

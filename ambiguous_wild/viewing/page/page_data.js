@@ -47,7 +47,7 @@ function image(uri) {
   });
 }
 
-/** Paint a view's photo into a canvas; what the method's mask leaves out turns red. */
+/** Paint a view's photo into a canvas: what the method's mask leaves out turns red, features become dots. */
 async function paintPhoto(canvas, view, model) {
   const photo = await image(view.photo);
   canvas.width = photo.naturalWidth;
@@ -55,7 +55,24 @@ async function paintPhoto(canvas, view, model) {
   const context = canvas.getContext("2d", { willReadFrequently: true });
   context.drawImage(photo, 0, 0);
   const mask = state.masks && model && model.masks[view.name];
-  if (!mask) return false;
+  if (mask) await paintMask(canvas, context, mask);
+  if (state.masks) paintPoints(canvas, context, view.points);
+  const painted = mask ? [`mask of ${model.label}`] : [];
+  if (state.masks && view.points.length) painted.push("green features stay, red ones move");
+  return painted.join("; ");
+}
+
+function paintPoints(canvas, context, points) {
+  const radius = Math.max(canvas.width / 320, 1);
+  for (let i = 0; i < points.length; i += 3) {
+    context.fillStyle = points[i + 2] ? "#ff2d20" : "#20c040";
+    context.beginPath();
+    context.arc(points[i] / 999 * canvas.width, points[i + 1] / 999 * canvas.height, radius, 0, 7);
+    context.fill();
+  }
+}
+
+async function paintMask(canvas, context, mask) {
   const keep = await image(mask);
   const pixels = context.getImageData(0, 0, canvas.width, canvas.height);
   context.imageSmoothingEnabled = false;
@@ -68,5 +85,4 @@ async function paintPhoto(canvas, view, model) {
     pixels.data[i + 2] *= 0.45;
   }
   context.putImageData(pixels, 0, 0);
-  return true;
 }

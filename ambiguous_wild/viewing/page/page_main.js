@@ -20,8 +20,8 @@ async function drawPhotos() {
   $("photo").hidden = !view || atPane;
   for (const pane of panes()) await pane.drawPhoto(view, model);
   if (!view || atPane) return;
-  const masked = await paintPhoto($("photo").querySelector("canvas"), view, model);
-  $("photo").querySelector("figcaption").textContent = masked ? `${view.name}, mask of ${model.label}` : view.name;
+  const painted = await paintPhoto($("photo").querySelector("canvas"), view, model);
+  $("photo").querySelector("figcaption").textContent = [view.name, painted].filter(Boolean).join(": ");
 }
 
 function placeFrame() {

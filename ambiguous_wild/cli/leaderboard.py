@@ -224,7 +224,7 @@ def check_command(board: Path, strict: bool, as_json: bool) -> None:
     import dataclasses
 
     from ambiguous_wild.core import AwError
-    from ambiguous_wild.harness.audit.run import to_text
+    from ambiguous_wild.harness.audit.run import text_of
     from ambiguous_wild.harness.leaderboard.check import check
 
     found = check(board)
@@ -233,7 +233,7 @@ def check_command(board: Path, strict: bool, as_json: bool) -> None:
     else:
         for problem in found.problems:
             click.secho(f"wrong: {problem}", fg="red")
-        click.echo(to_text(list(found.findings)), nl=bool(found.findings))
+        click.echo(text_of(list(found.findings)), nl=bool(found.findings))
     counts = f"{len(found.problems)} problems, {len(found.findings)} findings of the audit"
     click.echo(f"{found.runs} runs: {counts}; board {board}", err=True)
     if found.problems:

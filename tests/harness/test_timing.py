@@ -19,7 +19,7 @@ from ambiguous_wild.harness.running.timing import (
     why_not_ranked,
 )
 from ambiguous_wild.harness.tables.comparison import comparison
-from ambiguous_wild.harness.tables.render import to_text
+from ambiguous_wild.harness.tables.plain_formats import to_text
 from tests.harness.fake_runs import fake_result, save
 
 
@@ -106,7 +106,7 @@ def test_tables_rank_only_times_that_compare(tmp_path: Path) -> None:
     table = comparison(
         read_runs(save(tmp_path, *runs)), metrics=["psnr", "train_s", "reference_s", "gaussians"]
     )
-    rows = {row.method: row.cells for row in table.blocks[0].rows}
+    rows = {row.name: row.cells for row in table[0].rows}
     assert [rows[m][1].rank for m in "abc"] == [1, 2, None]
     assert [rows[m][2].rank for m in "abc"] == [1, 2, None]
     text = to_text(table)
@@ -121,18 +121,18 @@ def test_times_of_other_machines_are_ranked_by_reference_seconds(tmp_path: Path)
         run["environment"] = {"cpu": f"CPU {k}", "packages": {}}
         run["cost"] |= {"train_s": 10.0 + k, "reference_s": 9.0 - k}
     table = comparison(read_runs(save(tmp_path, *runs)), metrics=["train_s", "reference_s"])
-    ranks = [[cell.rank for cell in row.cells] for row in table.blocks[0].rows]
+    ranks = [[cell.rank for cell in row.cells] for row in table[0].rows]
     assert ranks == [[None, 2], [None, 1]]
-    assert any("CPU 0, 2 threads, CPU 1, 2 threads" in note for note in table.notes)
+    assert any("CPU 0, 2 threads, CPU 1, 2 threads" in note for note in table[-1].notes)
     runs[1]["cost"]["timing"]["kernel"] = "gpu-1"
     table = comparison(read_runs(save(tmp_path, *runs)), metrics=["reference_s"])
-    assert [row.cells[0].rank for row in table.blocks[0].rows] == [None, None]
+    assert [row.cells[0].rank for row in table[0].rows] == [None, None]
 
 
 def test_the_mean_over_scenes_is_a_range_where_one_scene_is(tmp_path: Path) -> None:
     runs = [fake_result(m, scene) for m in ("a", "b") for scene in ("one", "two")]
     runs[0]["cost"] |= {"train_s": 30.0, "timing": {"verdict": "unknown", "reason": "not measured"}}
     table = comparison(read_runs(save(tmp_path, *runs)), metrics=["train_s"])
-    mean = {row.method: row.cells[0] for row in table.blocks[0].rows}
+    mean = {row.name: row.cells[0] for row in table[0].rows}
     assert mean["a"].ranged and (mean["a"].low, mean["a"].high) == (20.0, 20.0)
     assert mean["b"].rank is None and not mean["b"].ranged  # alone in its column: nothing to rank

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.leaderboard.entry import FIRST, LAST, TIDY, Entry, from_wide, tidy, wide
-from ambiguous_wild.harness.leaderboard.sheet import read_csv, slug, to_csv, unguard
+from ambiguous_wild.harness.leaderboard.sheet import board_csv, read_csv, slug, unguard
 from ambiguous_wild.io.atomic import write_text
 
 ALL = "all"
@@ -92,7 +92,7 @@ def _check_all(board: Path, entries: Sequence[Entry]) -> list[str]:
     path = measured(board) / f"{ALL}.csv"
     if not path.is_file():
         return []
-    found, expected = path.read_bytes(), to_csv(TIDY, tidy(entries)).encode()
+    found, expected = path.read_bytes(), board_csv(TIDY, tidy(entries)).encode()
     if found == expected:
         return []
     differing = sorted(set(found.splitlines()) ^ set(expected.splitlines()))
@@ -120,8 +120,8 @@ def files_of(board: Path, entries: Sequence[Entry]) -> dict[Path, str]:
         names = sorted({e.dataset for e in rows})
         if len(names) > 1:
             raise AwError(f"datasets {names[0]!a} and {names[1]!a} would share {path.name}: spell them alike")
-    files = {path: to_csv(*wide(rows)) for path, rows in sorted(by_file.items())}
-    return files | {measured(board) / f"{ALL}.csv": to_csv(TIDY, tidy(entries))}
+    files = {path: board_csv(*wide(rows)) for path, rows in sorted(by_file.items())}
+    return files | {measured(board) / f"{ALL}.csv": board_csv(TIDY, tidy(entries))}
 
 
 def write_board(board: Path, entries: Sequence[Entry]) -> None:

@@ -201,7 +201,8 @@ def _layouts(
     if found is None:
         return ablation(runs, tuple(metrics))
     if layout == "blocks":
-        return Ties(found).marked(comparison(found, metrics=metrics, scenes=scenes))
+        tables = comparison(found, metrics=metrics, scenes=scenes)
+        return Ties(found).marked(tables, [table.title for table in tables if table.columns[0].scene])
     numbers = read_reported(reported_from) if reported or reported_from else []
     if not datasets:
         datasets = datasets_of(numbers or read_reported(), sorted(set(found.runs["scene"])))

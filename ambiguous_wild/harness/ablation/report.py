@@ -143,7 +143,7 @@ def markdown_of(data: StudyReport, picture: str = "") -> str:
 
 def _table(rows: Sequence[VariantRow], shown: Sequence[tuple[str, str, int]]) -> Table:
     head = ["variant", *(label for _, label, _ in DIFFERENCES), *(label for _, label, _ in shown), "what"]
-    lines = []
+    lines: list[list[str | Cell]] = []
     for row in rows:
         if row["status"] == "ok":
             cells = [_cell(row, "differences", key, digits, sign=True) for key, _, digits in DIFFERENCES]

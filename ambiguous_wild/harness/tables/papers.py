@@ -45,7 +45,7 @@ def paper(
         tables = comparison(
             runs, metrics=metrics or quality_columns(runs), scenes=members, drop_empty=not metrics
         )
-        tables = ties.marked(tables)
+        tables = ties.marked(tables, members)
         by_scene, mean = (tables[1:], tables[:1]) if len(members) > 1 else (tables, [])
         title = begin + (name or (f"{len(members)} scenes" if mean else tables[0].title))
         chunks = [by_scene[i : i + per_table] for i in range(0, len(by_scene), per_table)]
@@ -73,7 +73,8 @@ def means(
             runs, metrics=metrics or quality_columns(runs), scenes=members, drop_empty=not metrics
         )
         heading = f"{name or ('other scenes' if parts else 'all scenes')} ({len(members)})"
-        part = side_by_side("", [(heading, ties.marked(tables)[0])], dataset=name)
+        (mean,) = ties.marked(tables[:1], members)
+        part = side_by_side("", [(heading, mean)], dataset=name)
         parts.append(replace(part, columns=tuple(replace(column, scene="") for column in part.columns)))
         notes |= dict.fromkeys(tables[-1].notes)
     methods = sorted({row.name for part in parts for row in part.rows})

@@ -172,7 +172,7 @@ def shortest(value: float) -> str:
 
 def to_csv(
     head: Sequence[str],
-    rows: Iterable[Sequence[Any]],
+    rows: Iterable[Iterable[Any]],
     *,
     text: Callable[[str], str] = csv_text,
     number: Callable[[float], str] = exact,

@@ -62,9 +62,11 @@ class Ties:
             self._values[key] = means.unstack("method")
         return self._values[key]
 
-    def marked(self, tables: Sequence[Table]) -> list[Table]:
-        """Tables of `comparison` with the cells marked that do not differ from the best of their column."""
-        scenes = [table.columns[0].scene for table in tables if table.columns[0].scene]
+    def marked(self, tables: Sequence[Table], scenes: Sequence[str]) -> list[Table]:
+        """Tables of `comparison` with the cells marked that do not differ from the best of their column.
+
+        `scenes`: that a mean is over.
+        """
         return [
             replace(table, rows=tuple(self._marked(row, table, scenes) for row in table.rows))
             for table in tables

@@ -13,9 +13,14 @@ from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.harness.leaderboard.entry import ALONE, COST, FIRST, LAST, Entry
 from ambiguous_wild.harness.leaderboard.photos import RESTORE, check_photos
-from ambiguous_wild.harness.leaderboard.reproduce import preparation
+from ambiguous_wild.harness.leaderboard.reproduce import (
+    command,
+    hardware,
+    options_hash,
+    preparation,
+    setting,
+)
 from ambiguous_wild.harness.leaderboard.scenes import Scenes
-from ambiguous_wild.harness.leaderboard.settings import command, hardware, options_hash, setting
 from ambiguous_wild.harness.leaderboard.sheet import check_text
 from ambiguous_wild.harness.measures import PARTIAL
 from ambiguous_wild.harness.running.identity import config_identity

@@ -19,9 +19,8 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist, unknown
 from ambiguous_wild.harness.measures import ALWAYS, COST, MEASURES, PARTIAL, Measure, measure
 from ambiguous_wild.harness.running.store import TEXT_OF_RUNS, Runs
-from ambiguous_wild.harness.tables.notes import notes
+from ambiguous_wild.harness.tables.notes import incomparable, notes, untimed
 from ambiguous_wild.harness.tables.table import Cell, Column, Row, State, Table, ranks
-from ambiguous_wild.harness.tables.times import incomparable, untimed
 from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.metrics import stats
 

@@ -38,8 +38,8 @@ from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.harness.running.environment import environment
 from ambiguous_wild.harness.running.result_file import RESULT, read_result
 from ambiguous_wild.harness.running.store import read_runs
-from ambiguous_wild.harness.tables.layouts.build import paper
-from ambiguous_wild.harness.tables.layouts.plain_formats import to_markdown as to_layout
+from ambiguous_wild.harness.tables.papers import paper
+from ambiguous_wild.harness.tables.plain_formats import to_markdown as to_layout
 from ambiguous_wild.io.atomic import write_json, write_text
 from ambiguous_wild.io.images import read_png_rgb, to_uint8
 from ambiguous_wild.io.ply import read_splat_ply

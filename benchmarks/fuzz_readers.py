@@ -97,12 +97,12 @@ def _scene_json(path: Path) -> None:
 
 def _result(path: Path) -> None:
     from ambiguous_wild.harness.tables.comparison import comparison
-    from ambiguous_wild.harness.tables.render import to_csv
+    from ambiguous_wild.harness.tables.plain_formats import to_wide_csv
 
     runs = fuzz_samples.workshop() / "results" / "scene" / "m" / "seed0"
     runs.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(path, runs / "metrics.json")
-    to_csv(comparison(read_runs(fuzz_samples.workshop() / "results")))
+    to_wide_csv(comparison(read_runs(fuzz_samples.workshop() / "results")))
 
 
 def _capture(path: Path) -> None:

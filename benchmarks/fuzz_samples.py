@@ -26,7 +26,7 @@ import yaml
 
 from ambiguous_wild.harness.leaderboard import pictures
 from ambiguous_wild.harness.leaderboard.entry import Entry, wide
-from ambiguous_wild.harness.leaderboard.sheet import to_csv
+from ambiguous_wild.harness.leaderboard.sheet import board_csv
 from ambiguous_wild.io import images, ply
 from ambiguous_wild.simulate import spec_file
 from ambiguous_wild.simulate.presets import preset
@@ -238,7 +238,7 @@ def boards() -> list[bytes]:
         )
         for seed in range(2)
     ]  # fmt: skip
-    return [to_csv(*wide(entries)).encode()]
+    return [board_csv(*wide(entries)).encode()]
 
 
 @functools.cache

@@ -118,9 +118,9 @@ def compared(quiet: Path, loud: Path) -> list[Cell]:
 
 def ranked(folder: Path) -> int:
     """Cells of the grid's table that have a rank in a column of times."""
-    table = comparison(read_runs(folder))
-    timed = [k for k, column in enumerate(table.columns) if column.timed]
-    return sum(row.cells[k].rank is not None for block in table.blocks for row in block.rows for k in timed)
+    tables = comparison(read_runs(folder))
+    timed = [k for k, column in enumerate(tables[0].columns) if column.measure.timed]
+    return sum(row.cells[k].rank is not None for table in tables for row in table.rows for k in timed)
 
 
 def kernel_seconds(folder: Path) -> float:

@@ -16,7 +16,7 @@ from ambiguous_wild.builder.pipeline import build_scene
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.harness.bench import Lines
 from ambiguous_wild.harness.tables.comparison import comparison
-from ambiguous_wild.harness.tables.render import to_markdown, to_text
+from ambiguous_wild.harness.tables.plain_formats import to_markdown, to_text
 from ambiguous_wild.simulate.capture import simulate
 from ambiguous_wild.simulate.presets import preset
 
@@ -56,10 +56,10 @@ def main() -> None:
         print(f"failed: {run.method}: {run.error}")
 
     # 4. The table: quality, cost and masks, a row for each method.
-    table = comparison(report.read(), metrics=["psnr", "ssim", "mask_iou", "train_s", "gaussians"])
-    print(to_text(table))
+    tables = comparison(report.read(), metrics=["psnr", "ssim", "mask_iou", "train_s", "gaussians"])
+    print(to_text(tables))
     path = wanted.output / "table.md"
-    path.write_text(to_markdown(table), encoding="utf-8")
+    path.write_text(to_markdown(tables), encoding="utf-8")
     print(f"wrote {path}")
 
 

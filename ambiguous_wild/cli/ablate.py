@@ -77,7 +77,7 @@ def command(
     from ambiguous_wild.cli.devices import choose_device, prepare_cpu
     from ambiguous_wild.cli.progress import ProgressBar
     from ambiguous_wild.harness.ablation.plan import earlier_groups, plan_study
-    from ambiguous_wild.harness.ablation.report import report, to_markdown, write_report
+    from ambiguous_wild.harness.ablation.report import markdown_of, report, write_report
     from ambiguous_wild.harness.running.grid import run_cells
     from ambiguous_wild.io.atomic import check_output
     from ambiguous_wild.splat.pace import TrainConfig
@@ -111,7 +111,7 @@ def command(
     words = ["aw", *sys.argv[1:], *(word for name in before for word in ("--group", name))]
     data = report(study, output, made_by=shlex.join(words))
     written = write_report(data, output)
-    click.echo(json.dumps(data, indent=2) if as_json else to_markdown(data))
+    click.echo(json.dumps(data, indent=2) if as_json else markdown_of(data))
     click.echo("wrote " + ", ".join(str(path) for path in written), err=True)
     failed = [r for r in reports if r.outcome == "failed"]
     if failed:

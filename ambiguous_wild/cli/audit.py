@@ -30,7 +30,7 @@ def command(tables: tuple[Path, ...], style: str, output: Path | None, strict: b
     their values, implausible SSIM and LPIPS, and wrong ranks. The correct values are not known, so a finding
     is a question to the authors of the table.
     """
-    from ambiguous_wild.harness.audit.run import audit, to_csv, to_markdown, to_text
+    from ambiguous_wild.harness.audit.run import audit, csv_of, markdown_of, text_of
     from ambiguous_wild.harness.audit.table import REPORTED, read_tables
     from ambiguous_wild.io.atomic import write_text
 
@@ -39,7 +39,7 @@ def command(tables: tuple[Path, ...], style: str, output: Path | None, strict: b
     if style == "json":
         text = json.dumps([dataclasses.asdict(f) for f in findings], indent=2, ensure_ascii=False) + "\n"
     else:
-        text = {"text": to_text, "markdown": to_markdown, "csv": to_csv}[style](findings)
+        text = {"text": text_of, "markdown": markdown_of, "csv": csv_of}[style](findings)
     if output is not None:
         write_text(output, text)
     else:

@@ -274,10 +274,10 @@ def _suite(
 
 
 def _print_tables(prepared: PreparedSuite, folder: Path) -> None:
-    from ambiguous_wild.harness.suite import suite_layouts
-    from ambiguous_wild.harness.tables.layouts.plain_formats import to_text
+    from ambiguous_wild.harness.suite import suite_tables
+    from ambiguous_wild.harness.tables.plain_formats import to_text
 
     try:
-        click.echo(to_text(suite_layouts(prepared, folder), color=sys.stdout.isatty()), nl=False)
+        click.echo(to_text(suite_tables(prepared, folder), color=sys.stdout.isatty()), nl=False)
     except AwError as error:  # every run failed, which `finish` tells
         say(str(error))

@@ -91,8 +91,7 @@ def command(
 
 def _recommend(found: Found, scene: Path, budget: str, as_json: bool) -> None:
     from ambiguous_wild.cli.bench import parse_budget
-    from ambiguous_wild.harness.cost.here import speed_here
-    from ambiguous_wild.harness.cost.recommend import in_words, recommend
+    from ambiguous_wild.harness.cost.recommend import in_words, recommend, speed_here
     from ambiguous_wild.harness.cost.report import finite
     from ambiguous_wild.harness.running.identity import scene_identity
     from ambiguous_wild.io.scene_folder import load_scene

@@ -214,17 +214,15 @@ def publish_command(
 
 @command.command("check")
 @_board
-@click.option("--strict", is_flag=True, help="Exit with code 1 if the audit finds anything.")
 @_json
-def check_command(board: Path, strict: bool, as_json: bool) -> None:
-    """Check the board: hashes, duplicates, files that do not match; then audit its numbers.
+def check_command(board: Path, as_json: bool) -> None:
+    """Check the board: hashes, duplicates, pictures, files that do not match.
 
-    A damaged board ends with exit code 2. Findings of the audit are questions, as with 'aw audit'.
+    A damaged board ends with exit code 2.
     """
     import dataclasses
 
     from ambiguous_wild.core import AwError
-    from ambiguous_wild.harness.audit.run import to_text
     from ambiguous_wild.harness.leaderboard.check import check
 
     found = check(board)
@@ -233,10 +231,6 @@ def check_command(board: Path, strict: bool, as_json: bool) -> None:
     else:
         for problem in found.problems:
             click.secho(f"wrong: {problem}", fg="red")
-        click.echo(to_text(list(found.findings)), nl=bool(found.findings))
-    counts = f"{len(found.problems)} problems, {len(found.findings)} findings of the audit"
-    click.echo(f"{found.runs} runs: {counts}; board {board}", err=True)
+    click.echo(f"{found.runs} runs: {len(found.problems)} problems; board {board}", err=True)
     if found.problems:
         sys.exit(AwError.exit_code)
-    if strict and found.findings:
-        sys.exit(1)

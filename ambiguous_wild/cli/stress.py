@@ -74,7 +74,10 @@ def command(
     if style == "json":
         text = json.dumps([o.plain() for o in outcomes], indent=2, allow_nan=False) + "\n"
     elif style == "markdown":
-        text = table.to_markdown(outcomes)
+        from ambiguous_wild.harness.tables.plain_formats import to_markdown
+        from ambiguous_wild.harness.tables.table import text_table
+
+        text = to_markdown([text_table("", table.HEAD, map(table.row, outcomes), words=table.WORDS)])
     else:
         text = "\n".join([table.HEADER, *map(table.to_line, outcomes)]) + "\n"
     if output is not None:

@@ -167,7 +167,7 @@ def score_command(answers: tuple[Path, ...], key: Path, out: Path | None, seed: 
     from ambiguous_wild.io.foreign_files import refuse_foreign_files as refuse_strangers
     from ambiguous_wild.study.answers import read_answers
     from ambiguous_wild.study.key import read_key
-    from ambiguous_wild.study.report import SCORE_FILES, to_markdown, write_scores
+    from ambiguous_wild.study.report import SCORE_FILES, markdown_of, write_scores
     from ambiguous_wild.study.scores import score
 
     known = read_key(key)
@@ -178,6 +178,6 @@ def score_command(answers: tuple[Path, ...], key: Path, out: Path | None, seed: 
     check_output(folder)
     scores = score(known, raters, seed)
     write_scores(scores, folder)
-    click.echo(json.dumps(scores, indent=2, ensure_ascii=False) if as_json else to_markdown(scores))
+    click.echo(json.dumps(scores, indent=2, ensure_ascii=False) if as_json else markdown_of(scores))
     if not as_json:
         click.echo(f"wrote {folder}/scores.md, scores.csv and scores.json")

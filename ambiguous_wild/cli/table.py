@@ -15,7 +15,7 @@ from ambiguous_wild.core.errors import AwError
 
 if TYPE_CHECKING:
     from ambiguous_wild.harness.running.store import Runs
-    from ambiguous_wild.harness.tables.layouts.grid import Layout
+    from ambiguous_wild.harness.tables.table import Table
 
 STYLES = ("text", "markdown", "csv", "latex", "html", "tidy")
 SHEETS = (".png", ".jpg")
@@ -123,16 +123,18 @@ def _read(runs: Path) -> Runs:
 
 
 def _write_tidy(found: Runs, output: Path | None, metrics: Sequence[str], scenes: Sequence[str]) -> None:
-    from ambiguous_wild.harness.tables.tidy import tidy, to_csv
+    from ambiguous_wild.harness.tables.plain_formats import to_csv
+    from ambiguous_wild.harness.tables.tidy import tidy
     from ambiguous_wild.io.atomic import write_text
 
     frame = tidy(found, metrics=metrics, scenes=scenes)
+    text = to_csv(list(frame.columns), frame.itertuples(index=False, name=None))
     for run in found.incomplete:
         click.echo(f"incomplete: {run.folder}: {run.reason}", err=True)
     if output is None:
-        click.echo(to_csv(frame), nl=False)
+        click.echo(text, nl=False)
         return
-    write_text(output, to_csv(frame))
+    write_text(output, text)
     click.echo(f"wrote {output}: {len(frame)} rows", err=True)
 
 
@@ -147,19 +149,37 @@ def _blocks(
 ) -> tuple[str, str]:
     from ambiguous_wild.harness.tables.comparison import comparison
     from ambiguous_wild.harness.tables.fit import fitted
-    from ambiguous_wild.harness.tables.render import RENDERERS, plain, to_text
+    from ambiguous_wild.harness.tables.papers import cost_at_the_end
+    from ambiguous_wild.harness.tables.plain_formats import to_wide_csv
 
-    table = comparison(found, metrics=metrics, scenes=scenes)
+    tables = comparison(found, metrics=metrics, scenes=scenes)
     if style == "text" and not metrics and not everything:
-        table = fitted(table)
+        tables = fitted(tables)
+    scene_count = sum(bool(table.columns[0].scene) for table in tables)
+    counts = {"method": len(tables[0].rows), "scene": scene_count, "column": len(tables[0].columns)}
+    told = ", ".join(f"{n} {what}{'' if n == 1 else 's'}" for what, n in counts.items())
     if style == "csv":
-        for note in (*table.notes, made_by):
-            click.echo(plain(note), err=True)
-    else:
-        table = table.with_note(made_by)
-    text = to_text(table, color=True) if color else RENDERERS[style](table)
-    counts = {"method": len(table.blocks[0].rows), "scene": len(table.scenes), "column": len(table.columns)}
-    return text, ", ".join(f"{n} {what}{'' if n == 1 else 's'}" for what, n in counts.items())
+        _echo_notes(tables, made_by)
+        return to_wide_csv(tables), told
+    tables = [cost_at_the_end(tables)] if style == "latex" else tables
+    return _written([*tables[:-1], tables[-1].with_notes(made_by)], style, color), told
+
+
+def _echo_notes(tables: Sequence[Table], made_by: str) -> None:
+    from ambiguous_wild.harness.tables.plain_formats import plain
+
+    for note in dict.fromkeys([note for table in tables for note in table.notes] + [made_by]):
+        click.echo(plain(note), err=True)
+
+
+def _written(tables: Sequence[Table], style: str, color: bool) -> str:
+    from ambiguous_wild.harness.tables.html_page import to_html
+    from ambiguous_wild.harness.tables.latex import to_latex
+    from ambiguous_wild.harness.tables.plain_formats import to_markdown, to_text
+
+    if style == "text":
+        return to_text(tables, color=color)
+    return {"markdown": to_markdown, "latex": to_latex, "html": to_html}[style](tables)
 
 
 def _layouts(
@@ -171,45 +191,43 @@ def _layouts(
     datasets: dict[str, list[str]],
     reported: bool,
     reported_from: Path | None,
-) -> list[Layout]:
-    from ambiguous_wild.harness.tables.layouts import ablation, build
-    from ambiguous_wild.harness.tables.layouts.reported import datasets_of, read_reported, with_reported
+) -> list[Table]:
+    from ambiguous_wild.harness.tables import papers
+    from ambiguous_wild.harness.tables.ablation import ablation
+    from ambiguous_wild.harness.tables.comparison import comparison
+    from ambiguous_wild.harness.tables.reported import datasets_of, read_reported, with_reported
+    from ambiguous_wild.harness.tables.significance import Ties
 
     if found is None:
-        return ablation.ablation(runs, tuple(metrics))
+        return ablation(runs, tuple(metrics))
     if layout == "blocks":
-        return build.blocks(found, metrics=metrics, scenes=scenes)
+        tables = comparison(found, metrics=metrics, scenes=scenes)
+        return Ties(found).marked(tables, [table.title for table in tables if table.columns[0].scene])
     numbers = read_reported(reported_from) if reported or reported_from else []
     if not datasets:
         datasets = datasets_of(numbers or read_reported(), sorted(set(found.runs["scene"])))
     if layout == "memory":
-        metrics = metrics or build.MEMORY
+        metrics = metrics or papers.MEMORY
     if layout == "means":
-        made = build.means(found, metrics=metrics, scenes=scenes, datasets=datasets)
+        made = papers.means(found, metrics=metrics, scenes=scenes, datasets=datasets)
     else:
         subject = "memory" if layout == "memory" else ""
-        made = build.paper(found, metrics=metrics, scenes=scenes, datasets=datasets, subject=subject)
+        made = papers.paper(found, metrics=metrics, scenes=scenes, datasets=datasets, subject=subject)
     return [with_reported(one, numbers) for one in made] if numbers else made
 
 
-def _laid_out(made: list[Layout], style: str, made_by: str, color: bool, everything: bool) -> tuple[str, str]:
+def _laid_out(made: list[Table], style: str, made_by: str, color: bool, everything: bool) -> tuple[str, str]:
     from ambiguous_wild.harness.tables.fit import divided
-    from ambiguous_wild.harness.tables.layouts import plain_formats
-    from ambiguous_wild.harness.tables.layouts.html_page import to_html
-    from ambiguous_wild.harness.tables.layouts.latex import to_latex
-    from ambiguous_wild.harness.tables.render import plain
+    from ambiguous_wild.harness.tables.plain_formats import to_long_csv
 
     told = f"{len(made)} table{'' if len(made) == 1 else 's'}"
     if style == "csv":
-        for note in dict.fromkeys([note for one in made for note in one.notes] + [made_by]):
-            click.echo(plain(note), err=True)
-        return plain_formats.to_csv(made), told
+        _echo_notes(made, made_by)
+        return to_long_csv(made), told
     made = [one.with_notes(made_by) for one in made]
-    if style == "text":
-        made = made if everything else [part for one in made for part in divided(one)]
-        return plain_formats.to_text(made, color=color), told
-    writers = {"markdown": plain_formats.to_markdown, "latex": to_latex, "html": to_html}
-    return writers[style](made), told
+    if style == "text" and not everything:
+        made = [part for one in made for part in divided(one)]
+    return _written(made, style, color), told
 
 
 def _named(datasets: Sequence[str]) -> dict[str, list[str]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,7 +13,7 @@ from ambiguous_wild.datasets.readers.on_the_go import plain
 from ambiguous_wild.datasets.suites import Suite, find_scenes, scene_id
 
 if TYPE_CHECKING:
-    from ambiguous_wild.harness.tables.layouts.grid import Layout
+    from ambiguous_wild.harness.tables.table import Table
 
 SCENES = ".scenes"  # below the runs: imported scenes
 
@@ -92,7 +92,7 @@ def _ready(
 
 def suite_methods(suite: Suite, reported_from: Path | None = None) -> list[str]:
     """Our methods that tables of the suite's dataset report; 3DGS and RefineSplat where none does."""
-    from ambiguous_wild.harness.tables.layouts.reported import read_reported
+    from ambiguous_wild.harness.tables.reported import read_reported
     from ambiguous_wild.methods.registry import all_methods
 
     numbers = read_reported(reported_from)
@@ -100,7 +100,7 @@ def suite_methods(suite: Suite, reported_from: Path | None = None) -> list[str]:
     return [name for name in all_methods() if plain(name) in reported] or ["3dgs", "refinesplat"]
 
 
-def suite_layouts(prepared: PreparedSuite, runs: Path, reported_from: Path | None = None) -> list[Layout]:
+def suite_tables(prepared: PreparedSuite, runs: Path, reported_from: Path | None = None) -> list[Table]:
     """The tables, each scene set as printed, our runs above the reported rows; nothing is averaged together.
 
     Args:
@@ -112,8 +112,8 @@ def suite_layouts(prepared: PreparedSuite, runs: Path, reported_from: Path | Non
         AwError: no finished run.
     """
     from ambiguous_wild.harness.running.store import read_runs
-    from ambiguous_wild.harness.tables.layouts import build
-    from ambiguous_wild.harness.tables.layouts.reported import read_reported, with_reported
+    from ambiguous_wild.harness.tables.papers import paper
+    from ambiguous_wild.harness.tables.reported import read_reported, with_reported
 
     suite, found = prepared.suite, read_runs(runs)
     known = set(found.runs["scene"]) if len(found.runs) else set()
@@ -123,8 +123,8 @@ def suite_layouts(prepared: PreparedSuite, runs: Path, reported_from: Path | Non
         names = [scene_id(s) for s in scenes if scene_id(s) in known]
         if not names:
             continue
-        for layout in build.paper(found, scenes=names, datasets={suite.dataset: names}):
-            named = dataclasses.replace(layout, title=f"{suite.dataset}, {title}")
+        for table in paper(found, scenes=names, datasets={suite.dataset: names}):
+            named = dataclasses.replace(table, title=f"{suite.dataset}, {title}")
             # A paper's mean is over all scenes of its table: beside a mean over some it would mislead.
             whole = len(names) == len(scenes) and len(suite.tables) == 1
             shown = with_reported(named, numbers)
@@ -132,22 +132,21 @@ def suite_layouts(prepared: PreparedSuite, runs: Path, reported_from: Path | Non
     if not made:
         raise AwError(f"{runs} has no finished run of {suite.name}")
     note = _note(prepared)
-    return [layout.with_notes(note) if note else layout for layout in made]
+    return [table.with_notes(note) if note else table for table in made]
 
 
-def _without_reported_mean(layout: Layout) -> Layout:
-    from ambiguous_wild.harness.tables.layouts.grid import LayoutCell
+def _without_reported_mean(table: Table) -> Table:
+    from ambiguous_wild.harness.tables.table import BLANK
 
-    blank = LayoutCell(state="blank")
-    lines: Sequence = [
-        line
-        if line.kind == "measured"
+    rows = [
+        row
+        if row.kind == "measured"
         else dataclasses.replace(
-            line, entries=tuple(e if c.scene else blank for c, e in zip(layout.columns, line.entries))
+            row, cells=tuple(cell if c.scene else BLANK for c, cell in zip(table.columns, row.cells))
         )
-        for line in layout.lines
+        for row in table.rows
     ]
-    return dataclasses.replace(layout, lines=tuple(lines))
+    return dataclasses.replace(table, rows=tuple(rows))
 
 
 def _note(prepared: PreparedSuite) -> str:

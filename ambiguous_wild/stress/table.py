@@ -51,25 +51,17 @@ def run_all(
     return outcomes
 
 
-def to_markdown(outcomes: Sequence[Outcome]) -> str:
-    """A table with one row per outcome."""
-    lines = [
-        "| case | device | correct result | worst error | tolerance | reason | condition | verdict |",
-        "|---|---|---|---:|---:|---|---:|---|",
-    ]
-    for o in outcomes:
-        cells = (
-            o.key,
-            o.device,
-            o.comes_out,
-            _figure(o.error),
-            _figure(o.tolerance),
-            o.why,
-            "" if o.condition is None else f"{o.condition:.1e}",
-            "passed" if o.passed else "FAILED",
-        )
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+HEAD = ("case", "device", "correct result", "worst error", "tolerance", "reason", "condition", "verdict")
+WORDS = ("device", "correct result", "reason", "verdict")  # columns of words
+
+
+def row(o: Outcome) -> tuple[str, ...]:
+    """The outcome under `HEAD`."""
+    condition = "" if o.condition is None else f"{o.condition:.1e}"
+    verdict = "passed" if o.passed else "FAILED"
+    return (
+        o.key, o.device, o.comes_out, _figure(o.error), _figure(o.tolerance), o.why, condition, verdict
+    )  # fmt: skip
 
 
 def to_line(o: Outcome) -> str:

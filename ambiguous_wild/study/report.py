@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import csv
-import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 from ambiguous_wild.core.errors import counted
-from ambiguous_wild.harness.tables.render import csv_text, markdown_text
+from ambiguous_wild.harness.tables import plain_formats
+from ambiguous_wild.harness.tables.plain_formats import markdown_text
+from ambiguous_wild.harness.tables.table import text_table
 from ambiguous_wild.io.atomic import atomic_dir, write_json, write_text
 from ambiguous_wild.study.key import KIND_PAIR, KIND_PHOTO
 from ambiguous_wild.study.records import (
@@ -44,14 +44,12 @@ def write_scores(scores: Scores, out: Path) -> None:
     """Write scores.json, scores.csv and scores.md into the folder `out`, which is replaced."""
     with atomic_dir(out) as folder:
         write_json(folder / "scores.json", scores)
-        write_text(folder / "scores.md", to_markdown(scores))
-        with open(folder / "scores.csv", "w", newline="", encoding="utf-8") as f:
-            writer = csv.DictWriter(f, COLUMNS, lineterminator="\n", restval="")
-            writer.writeheader()
-            writer.writerows(_rows(scores))
+        write_text(folder / "scores.md", markdown_of(scores))
+        rows = ([row.get(column) for column in COLUMNS] for row in _rows(scores))
+        write_text(folder / "scores.csv", plain_formats.to_csv(COLUMNS, rows))
 
 
-def to_markdown(scores: Scores) -> str:
+def markdown_of(scores: Scores) -> str:
     """The scores as Markdown; names of methods, scenes and raters are escaped."""
     raters = scores["raters"]
     answers = sum(r["answers"] for r in raters)
@@ -136,13 +134,8 @@ def _ambiguity(found: Ambiguity) -> list[str]:
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> list[str]:
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    return lines + ["| " + " | ".join(_cell(str(c)) for c in row) + " |" for row in rows]
-
-
-def _cell(text: str) -> str:
-    """Numbers and intervals unchanged; names escaped."""
-    return text if re.fullmatch(r"[-\d.,%\[\]{}— ]*", text) else markdown_text(text)
+    texts = ([str(value) for value in row] for row in rows)
+    return plain_formats.to_markdown([text_table("", head, texts, words=head)]).splitlines()
 
 
 def _share(share: float | None, cell: Counted) -> str:
@@ -226,5 +219,4 @@ def _intervals(found: Counted) -> dict[str, float | None]:
 
 
 def _row(kind: str, level: str, name: str = "", against: str = "", **numbers: Any) -> dict[str, Any]:
-    shown = {k: "" if v is None else v for k, v in numbers.items()}
-    return {"kind": kind, "level": level, "name": csv_text(name), "against": csv_text(against), **shown}
+    return {"kind": kind, "level": level, "name": name, "against": against, **numbers}

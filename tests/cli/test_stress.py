@@ -44,7 +44,7 @@ def test_a_case_that_fails_is_said_and_exits_with_1(monkeypatch, error):
     assert "FAILED" in done.stdout
     assert "0 of 1 passed" in done.output
     assert aw("--device", "cpu", "--json").exit_code == 1
-    assert "FAILED" in table.to_markdown([run(bad, "cpu")])
+    assert "FAILED" in aw("--device", "cpu", "--format", "markdown").stdout
 
 
 def test_a_case_that_raises_fails_with_its_reason():

@@ -10,7 +10,7 @@ import pytest
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import with_options
 from ambiguous_wild.harness.ablation.plan import plan_study, read_outcomes
-from ambiguous_wild.harness.ablation.report import report, to_markdown, write_report
+from ambiguous_wild.harness.ablation.report import markdown_of, report, write_report
 from ambiguous_wild.harness.running.grid import cell_folder, run_cells
 from ambiguous_wild.harness.running.provenance import reproduce
 from ambiguous_wild.harness.running.result_file import write_result
@@ -157,7 +157,7 @@ def test_what_is_missing_or_failed_is_told_never_dropped(scene, tmp_path):
     assert rows["size", "small"]["status"] == "failed"
     assert rows["size", "small"]["values"]["psnr"]["mean"] is None  # one of two seeds is no mean
     assert rows["other", "to-come"]["status"] == "missing"
-    text = to_markdown(data)
+    text = markdown_of(data)
     assert "- small failed: scene, seed 1: not run" in text
     assert "- peer missing: unknown method" in text
     write_report(data, tmp_path)

@@ -13,7 +13,7 @@ from click.testing import CliRunner
 
 from ambiguous_wild.cli.cost import command
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.cost import here
+from ambiguous_wild.harness.cost import recommend as advice
 from ambiguous_wild.harness.cost.answer import answers
 from ambiguous_wild.harness.cost.curves import curves_of
 from ambiguous_wild.harness.cost.pairs import changes
@@ -238,7 +238,7 @@ def test_the_words_of_a_setting_are_not_those_of_a_stranger(tmp_path: Path) -> N
 def test_the_command_recommends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = write_tiny_scene(tmp_path / "scene")
     grid(tmp_path / "runs", {"one": 0.0, "two": 1.0})
-    monkeypatch.setattr(here, "speed_here", lambda found: 2.0)
+    monkeypatch.setattr(advice, "speed_here", lambda found: 2.0)
     words = [str(tmp_path / "runs"), "--recommend", str(scene), "--budget", "150s"]
     done = CliRunner().invoke(command, words)
     assert done.exit_code == 0, done.output
@@ -259,4 +259,4 @@ def test_the_speed_of_this_machine_is_that_of_its_calibration(monkeypatch: pytes
 
     monkeypatch.setattr(calibration, "calibration", lambda device: Kernel())
     expected = calibration.KERNELS["cpu"].reference_s / 0.5
-    assert here.speed_here(Found((), ())) == pytest.approx(expected)
+    assert advice.speed_here(Found((), ())) == pytest.approx(expected)

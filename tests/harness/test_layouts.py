@@ -19,14 +19,14 @@ from hypothesis import strategies as st
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.measures import MEASURES
 from ambiguous_wild.harness.running.store import Runs, read_runs
+from ambiguous_wild.harness.tables import papers, plain_formats
+from ambiguous_wild.harness.tables.ablation import ablation
 from ambiguous_wild.harness.tables.fit import divided
-from ambiguous_wild.harness.tables.layouts import build, plain_formats
-from ambiguous_wild.harness.tables.layouts.ablation import ablation
-from ambiguous_wild.harness.tables.layouts.grid import Column, Layout, LayoutCell, Line, ranked
-from ambiguous_wild.harness.tables.layouts.html_page import to_html
-from ambiguous_wild.harness.tables.layouts.latex import latex_text, to_latex
-from ambiguous_wild.harness.tables.layouts.reported import datasets_of, read_reported, with_reported
-from ambiguous_wild.harness.tables.layouts.significance import difference_interval
+from ambiguous_wild.harness.tables.html_page import to_html
+from ambiguous_wild.harness.tables.latex import latex_text, to_latex
+from ambiguous_wild.harness.tables.reported import datasets_of, read_reported, with_reported
+from ambiguous_wild.harness.tables.significance import difference_interval
+from ambiguous_wild.harness.tables.table import Cell, Column, Row, Table, ranks
 from ambiguous_wild.metrics import stats
 from tests.harness.fake_runs import failed, fake_result, save
 
@@ -45,10 +45,10 @@ def runs_of(root: Path, *results: dict) -> Runs:  # type: ignore[type-arg]
     return read_runs(save(root, *results))
 
 
-def entry(layout: Layout, method: str, group: str, key: str = "psnr", kind: str = "measured") -> LayoutCell:
-    line = next(line for line in layout.lines if line.name == method and line.kind == kind)
+def entry(layout: Table, method: str, group: str, key: str = "psnr", kind: str = "measured") -> Cell:
+    row = next(row for row in layout.rows if row.name == method and row.kind == kind)
     at = [(c.group, c.measure.key) for c in layout.columns].index((group, key))
-    return line.entries[at]
+    return row.cells[at]
 
 
 def results(*scenes: str) -> list[dict]:  # type: ignore[type-arg]
@@ -61,7 +61,7 @@ def results(*scenes: str) -> list[dict]:  # type: ignore[type-arg]
 
 
 def test_the_papers_layout_has_scenes_side_by_side_and_the_mean_last(tmp_path: Path) -> None:
-    (layout,) = build.paper(runs_of(tmp_path, *results("one", "two")))
+    (layout,) = papers.paper(runs_of(tmp_path, *results("one", "two")))
     assert layout.groups == [("one", 2), ("two", 2), ("Mean", 2)]  # LPIPS is empty: left out
     assert [c.measure.key for c in layout.columns[:2]] == ["psnr", "ssim"]
     assert entry(layout, "a", "one").value == 21.5 and entry(layout, "a", "one").rank == 2
@@ -72,11 +72,11 @@ def test_the_papers_layout_has_scenes_side_by_side_and_the_mean_last(tmp_path: P
 
 
 def test_wide_layouts_become_tables_that_fit(tmp_path: Path) -> None:
-    (layout,) = build.paper(runs_of(tmp_path, *results("one", "two", "three")))
+    (layout,) = papers.paper(runs_of(tmp_path, *results("one", "two", "three")))
     parts = divided(layout, 60)
     assert len(parts) > 1 and [c for p in parts for c in p.columns] == list(layout.columns)
     for part in parts:
-        assert all(len(line.entries) == len(part.columns) for line in part.lines)
+        assert all(len(row.cells) == len(part.columns) for row in part.rows)
         text = plain_formats.to_text([replace(part, notes=())]).splitlines()
         table = text[: next(i for i, line in enumerate(text) if not line.strip())]
         assert max(map(len, table[1:])) <= 60
@@ -87,7 +87,7 @@ def test_wide_layouts_become_tables_that_fit(tmp_path: Path) -> None:
 
 def test_many_scenes_go_into_several_tables_with_one_mean(tmp_path: Path) -> None:
     names = [f"s{i}" for i in range(5)]
-    layouts = build.paper(runs_of(tmp_path, *results(*names)), per_table=2)
+    layouts = papers.paper(runs_of(tmp_path, *results(*names)), per_table=2)
     assert [[g for g, _ in layout.groups] for layout in layouts] == [
         ["s0", "s1"],
         ["s2", "s3"],
@@ -100,15 +100,15 @@ def test_datasets_have_means_of_their_own_and_missing_cells_make_them_missing(tm
     lost = [r for r in results("one", "two", "three") if not (r["method"] == "a" and r["scene"] == "two")]
     runs = runs_of(tmp_path, *lost, failed("b", "three", 2))
     datasets = {"D": ["one", "two"]}
-    (layout,) = build.means(runs, datasets=datasets)
+    (layout,) = papers.means(runs, datasets=datasets)
     assert [g for g, _ in layout.groups] == ["D (2)", "other scenes (1)"]
     assert entry(layout, "a", "D (2)").state == "missing" and entry(layout, "b", "D (2)").value == 26.5
     assert entry(layout, "b", "other scenes (1)").state == "failed"
     assert any("no result: a on two" in note for note in layout.notes)
     with pytest.raises(AwError, match="two datasets"):
-        build.paper(runs, datasets={"D": ["one"], "E": ["one"]})
+        papers.paper(runs, datasets={"D": ["one"], "E": ["one"]})
     with pytest.raises(AwError, match="did you mean 'three'"):
-        build.paper(runs, datasets={"D": ["thre"]})
+        papers.paper(runs, datasets={"D": ["thre"]})
 
 
 def test_one_scene_gives_the_papers_interval() -> None:
@@ -133,10 +133,10 @@ def test_who_is_not_told_apart_from_the_best_is_marked(tmp_path: Path) -> None:
         "close": best + np.array([0.4, -0.5, 0.3, -0.4, -0.2]),
         "below": best - 1.0,  # pictures differ more than methods: only pairs tell them apart
     }
-    (layout,) = build.paper(runs_of(tmp_path, *(fake_result(m, psnr=tuple(v)) for m, v in values.items())))
+    (layout,) = papers.paper(runs_of(tmp_path, *(fake_result(m, psnr=tuple(v)) for m, v in values.items())))
     assert [entry(layout, m, "yard").tie for m in values] == [False, True, False]
     assert "paired bootstrap" in layout.legend[0] and "≈" in plain_formats.to_text([layout])
-    (alone,) = build.paper(
+    (alone,) = papers.paper(
         runs_of(tmp_path / "one", *(fake_result(m, psnr=(p,)) for m, p in (("a", 20.0), ("b", 20.5))))
     )
     assert not entry(alone, "a", "yard").tie  # one picture says nothing
@@ -146,7 +146,7 @@ def test_other_pictures_are_not_paired(tmp_path: Path) -> None:
     other = fake_result("b", psnr=(20.1, 22.1))
     for i, row in enumerate(other["per_image"]):
         row["name"] = f"other{i}.png"
-    (layout,) = build.paper(runs_of(tmp_path, fake_result("a"), other))
+    (layout,) = papers.paper(runs_of(tmp_path, fake_result("a"), other))
     assert not entry(layout, "a", "yard").tie
 
 
@@ -158,33 +158,33 @@ def test_reported_numbers_stand_beside_and_change_nothing(tmp_path: Path) -> Non
     assert datasets == {"Wild": ["yard_one"]}
     runs = runs_of(tmp_path / "runs", *results("yard_one", "two"))
     datasets = {"Wild": ["yard_one", "two"]}
-    (plain_table,) = build.paper(runs, datasets=datasets)
+    (plain_table,) = papers.paper(runs, datasets=datasets)
     layout = with_reported(plain_table, numbers)
-    assert layout.lines[:2] == plain_table.lines
+    assert layout.rows[:2] == plain_table.rows
     shown = entry(layout, "Famous", "yard_one", kind="reported")
     assert shown.printed == "30.10 / 29.00" and math.isnan(shown.value) and shown.rank is None
     assert entry(layout, "Famous", "Mean", kind="reported").printed == "31.25"
     assert entry(layout, "Famous", "two", kind="reported").text(MEASURES["psnr"]) == ""
-    rows = list(csv.DictReader(io.StringIO(plain_formats.to_csv([layout]))))
+    rows = list(csv.DictReader(io.StringIO(plain_formats.to_long_csv([layout]))))
     told = [row for row in rows if row["kind"] == "reported"]
     assert told and all(row["value"] == "" and row["rank"] == "" and row["printed"] for row in told)
     assert all(row["printed"] == "" for row in rows if row["kind"] == "measured")
     for text in (to_latex([layout]), to_html([layout]), plain_formats.to_markdown([layout])):
         assert "reported" in text and "99.00" not in text
-    (memory,) = build.paper(runs, metrics=["model_mb"], datasets=datasets)
+    (memory,) = papers.paper(runs, metrics=["model_mb"], datasets=datasets)
     assert (
         entry(with_reported(memory, numbers), "Famous", "yard_one", "model_mb", "reported").printed
         == "110.50"
     )
-    (elsewhere,) = build.paper(runs, scenes=["two"])
-    assert with_reported(elsewhere, numbers).lines == elsewhere.lines
+    (elsewhere,) = papers.paper(runs, scenes=["two"])
+    assert with_reported(elsewhere, numbers).rows == elsewhere.rows
 
 
 def test_the_projects_own_tables_can_be_shown() -> None:
     numbers = read_reported()
     columns = tuple(Column(s, MEASURES["psnr"], s) for s in ("patio-high", "Trevi Fountain"))
-    layout = with_reported(Layout("t", columns, ()), numbers)
-    assert {line.kind for line in layout.lines} == {"reported"} and len(layout.lines) > 5
+    layout = with_reported(Table("t", columns, ()), numbers)
+    assert {row.kind for row in layout.rows} == {"reported"} and len(layout.rows) > 5
 
 
 def study(folder: Path) -> Path:
@@ -225,10 +225,10 @@ def test_an_ablation_is_a_table_a_group(tmp_path: Path) -> None:
 
 def test_ranks_are_those_of_print() -> None:
     psnr, lpips = MEASURES["psnr"], MEASURES["lpips_alex"]
-    assert ranked([20.001, 20.004, 19.0, math.nan, 18.0, 17.0], psnr) == [1, 1, 3, None, None, None]
-    assert ranked([0.3, 0.1], lpips) == [2, 1]
-    assert ranked([20.0, 20.0], psnr) == [None, None]
-    assert ranked([1.0, 2.0], MEASURES["iterations"]) == [None, None]
+    assert ranks([20.001, 20.004, 19.0, math.nan, 18.0, 17.0], psnr) == [1, 1, 3, None, None, None]
+    assert ranks([0.3, 0.1], lpips) == [2, 1]
+    assert ranks([20.0, 20.0], psnr) == [None, None]
+    assert ranks([1.0, 2.0], MEASURES["iterations"]) == [None, None]
 
 
 class Page(HTMLParser):
@@ -254,8 +254,8 @@ class Page(HTMLParser):
         self.words.append(data)
 
 
-def hostile(tmp_path: Path) -> Layout:
-    (layout,) = build.paper(runs_of(tmp_path, fake_result(HOSTILE, psnr=(20.0,)), fake_result("b")))
+def hostile(tmp_path: Path) -> Table:
+    (layout,) = papers.paper(runs_of(tmp_path, fake_result(HOSTILE, psnr=(20.0,)), fake_result("b")))
     return layout.with_notes(f"made by: aw table {HOSTILE}")
 
 
@@ -294,14 +294,14 @@ def test_text_markdown_and_csv_keep_names_text(tmp_path: Path) -> None:
     rows = [line for line in markdown.splitlines() if line.startswith("|")]
     assert {len(re.findall(r"(?<!\\)\|", row)) for row in rows} == {len(layout.columns) + 2}
     assert "<script" not in markdown
-    cells = list(csv.reader(io.StringIO(plain_formats.to_csv([layout]))))
-    assert {len(row) for row in cells} == {len(plain_formats.HEAD)}
+    cells = list(csv.reader(io.StringIO(plain_formats.to_long_csv([layout]))))
+    assert {len(row) for row in cells} == {len(plain_formats.LONG_HEAD)}
     assert not any(cell.startswith(("=", "+", "@")) for row in cells for cell in row)
 
 
 def test_every_column_is_under_its_heading_in_text(tmp_path: Path) -> None:
     text = plain_formats.to_text(
-        build.paper(runs_of(tmp_path, *results("a scene with a very long name", "two")))
+        papers.paper(runs_of(tmp_path, *results("a scene with a very long name", "two")))
     )
     lines = text.splitlines()
     top, head = lines[1], lines[2]
@@ -310,6 +310,6 @@ def test_every_column_is_under_its_heading_in_text(tmp_path: Path) -> None:
 
 
 def test_a_line_of_notes_says_what_a_reported_row_is() -> None:
-    line = Line("x", (LayoutCell(printed="1.0"),), kind="reported")
-    layout = Layout("t", (Column("s", MEASURES["psnr"], "s"),), (line,))
+    row = Row("x", (Cell(printed="1.0"),), kind="reported")
+    layout = Table("t", (Column("s", MEASURES["psnr"], "s"),), (row,))
     assert any(text.startswith("reported:") for text in layout.legend)

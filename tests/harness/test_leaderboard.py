@@ -17,7 +17,7 @@ from ambiguous_wild.cli.leaderboard import command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.leaderboard.board import read_board
 from ambiguous_wild.harness.leaderboard.check import check
-from ambiguous_wild.harness.leaderboard.sheet import guard, read_csv, to_csv, unguard, unique_slug
+from ambiguous_wild.harness.leaderboard.sheet import board_csv, guard, read_csv, unguard, unique_slug
 from ambiguous_wild.harness.running.identity import config_identity
 from ambiguous_wild.io.images import read_png_rgb, write_png
 from tests.harness.board_runs import write_run, write_scene
@@ -320,7 +320,7 @@ def test_guarded_cells_read_back_and_never_calculate(texts: list[str]) -> None:
 
 
 def test_numbers_in_csv_stay_numbers(tmp_path: Path) -> None:
-    (tmp_path / "t.csv").write_text(to_csv(["a", "b", "c", "d"], [[-0.5, 3.0, None, float("inf")]]))
+    (tmp_path / "t.csv").write_text(board_csv(["a", "b", "c", "d"], [[-0.5, 3.0, None, float("inf")]]))
     assert read_csv(tmp_path / "t.csv", ("a",))[1] == [{"a": "-0.5", "b": "3", "c": "", "d": "inf"}]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import time
@@ -38,7 +37,6 @@ class Machine:
         monkeypatch.setattr(machine, "busy_s", lambda: 1000.0 + self.others + self.own)
         monkeypatch.setattr(machine, "own_s", lambda: 5.0 + self.own)
         monkeypatch.setattr(machine, "cores", lambda: CORES)
-        monkeypatch.setattr(machine, "load", lambda: 1.0)
 
     def work(self, seconds: float, *, threads: int = CORES, others: float = 0.0) -> None:
         self.wall, self.own = self.wall + seconds, self.own + threads * seconds
@@ -256,8 +254,6 @@ def test_what_the_system_does_not_tell_is_unknown(tmp_path, monkeypatch):
     monkeypatch.undo()
     monkeypatch.setattr(machine, "_STAT", tmp_path / "absent")
     assert machine.busy_s() is None
-    monkeypatch.delattr(os, "getloadavg", raising=False)
-    assert machine.load() is None
 
 
 def test_the_kernel_does_the_same_work_every_time():

@@ -5,7 +5,7 @@ from pathlib import Path
 import yaml
 
 from ambiguous_wild.harness.ablation.plan import plan_study
-from ambiguous_wild.harness.ablation.report import report, to_markdown
+from ambiguous_wild.harness.ablation.report import markdown_of, report
 from ambiguous_wild.harness.running.store import read_runs
 from ambiguous_wild.harness.tables.comparison import comparison
 from ambiguous_wild.methods import MethodEntry, register, registry
@@ -20,7 +20,7 @@ def notes_of(root: Path, *methods: tuple[str, dict]) -> list[str]:  # type: igno
         folder = "".join(c if c.isalnum() else "_" for c in name)
         config = {"method": name, "options": options}
         (root / "yard" / folder / "seed0" / "config.yaml").write_text(yaml.safe_dump(config))
-    return list(comparison(read_runs(root)).notes)
+    return list(comparison(read_runs(root))[-1].notes)
 
 
 def test_refinesplat_is_said_to_be_weight_free(tmp_path):
@@ -76,7 +76,7 @@ def test_another_method_in_an_ablation_gets_its_networks_and_the_report_names_th
         assert row.cells[0].options.features == features
         own = "refinesplat-paper@modules-robustsplat"
         assert row.cells[0].method.name == (own if settings else "robustsplat")
-        page = to_markdown(report(study, tmp_path / "runs"))
+        page = markdown_of(report(study, tmp_path / "runs"))
         (line,) = [line for line in page.splitlines() if line.startswith("| robustsplat")]
         assert f"`features={features}`" in line
 
@@ -85,7 +85,7 @@ def test_the_report_of_an_ablation_says_it_too(tmp_path):
     scene = write_tiny_scene(tmp_path / "scene")
     plan = plan_study("refinesplat-paper", [scene], [0], TrainConfig(iterations=9), groups=["alpha1"])
     data = report(plan, tmp_path / "runs")
-    assert "features labhog, instances graph" in to_markdown(data)
+    assert "features labhog, instances graph" in markdown_of(data)
 
 
 def test_a_note_of_a_plugin_may_hold_options(tmp_path, monkeypatch):

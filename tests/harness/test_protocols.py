@@ -41,7 +41,7 @@ def test_a_result_says_what_was_fitted_and_for_how_many_steps(report):
 
 
 def test_a_table_never_shows_them_together_without_saying_so(report):
-    notes = [note for note in comparison(report.read()).notes if note.startswith("test photos")]
+    notes = [note for note in comparison(report.read())[-1].notes if note.startswith("test photos")]
     assert len(notes) == 3
     assert "wildgaussians: colours fitted on the left half" in notes[0]
     assert "gs-w: colours read from the left half" in notes[1]
@@ -57,7 +57,7 @@ def test_results_of_before_are_not_taken_for_plain_ones(report, tmp_path):
         result["facts"].pop("fitted")
         (target / "metrics.json").write_text(json.dumps(result))
     assert set(read_runs(folder).runs["fit"]) == {"unknown"}
-    assert "not recorded" in " ".join(comparison(read_runs(folder)).notes)
+    assert "not recorded" in " ".join(comparison(read_runs(folder))[-1].notes)
 
 
 def test_whole_photos_need_no_note():

@@ -7,8 +7,8 @@ import pytest
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.datasets.suites import differences, find_scenes, get_suite, scene_id, suites
-from ambiguous_wild.harness.suite import prepare_suite, suite_layouts, suite_methods
-from ambiguous_wild.harness.tables.layouts.reported import read_reported
+from ambiguous_wild.harness.suite import prepare_suite, suite_methods, suite_tables
+from ambiguous_wild.harness.tables.reported import read_reported
 from ambiguous_wild.io.scene_folder import read_scene_json
 from tests.command_line import aw
 from tests.datasets import layouts
@@ -66,21 +66,19 @@ def test_reported_numbers_stand_in_their_own_rows(large, tmp_path):
         "-o", tmp_path / "runs", "--probes", "0", "--no-pictures", "--threads", "1",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    (layout,) = suite_layouts(prepared, tmp_path / "runs")
-    measured = [line for line in layout.lines if line.kind == "measured"]
-    reported = [line for line in layout.lines if line.kind == "reported"]
-    assert [line.name for line in measured] == ["3dgs"]
-    assert all(not e.printed for line in measured for e in line.entries)
-    assert all(e.printed or e.state == "blank" for line in reported for e in line.entries)
+    (table,) = suite_tables(prepared, tmp_path / "runs")
+    measured = [row for row in table.rows if row.kind == "measured"]
+    reported = [row for row in table.rows if row.kind == "reported"]
+    assert [row.name for row in measured] == ["3dgs"]
+    assert all(not e.printed for row in measured for e in row.cells)
+    assert all(e.printed or e.state == "blank" for row in reported for e in row.cells)
     numbers = [n for n in read_reported() if n.dataset == "Drone Imagery" and n.scene == "SimingShan"]
     printed = {(n.method, n.metric): n.text for n in numbers if not n.setting}
-    row = next(line for line in reported if line.name == "RefineSplat")
-    psnr = next(i for i, c in enumerate(layout.columns) if c.scene and c.measure.key == "psnr")
-    assert row.entries[psnr].printed == printed["RefineSplat", "psnr"]
+    famous = next(row for row in reported if row.name == "RefineSplat")
+    psnr = next(i for i, c in enumerate(table.columns) if c.scene and c.measure.key == "psnr")
+    assert famous.cells[psnr].printed == printed["RefineSplat", "psnr"]
     # One scene of two: the papers' mean over both would mislead.
-    assert all(
-        not e.printed for line in reported for c, e in zip(layout.columns, line.entries) if not c.scene
-    )
+    assert all(not e.printed for row in reported for c, e in zip(table.columns, row.cells) if not c.scene)
 
 
 def test_scenes_are_found_in_any_spelling(tmp_path):

@@ -12,7 +12,8 @@ from click.testing import CliRunner
 from ambiguous_wild.cli.table import command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.running.store import read_runs
-from ambiguous_wild.harness.tables.tidy import COLUMNS, tidy, to_csv
+from ambiguous_wild.harness.tables.plain_formats import to_csv
+from ambiguous_wild.harness.tables.tidy import COLUMNS, tidy
 from tests.harness.fake_runs import failed, fake_result, save, start
 
 
@@ -42,7 +43,9 @@ def test_a_metric_of_a_part_of_the_picture_has_no_row_where_there_is_no_such_par
 
 def test_csv_keeps_infinity_and_holds_no_formula(tmp_path: Path) -> None:
     save(tmp_path, fake_result("=cmd", psnr=(float("inf"), 20.0)))
-    back = pd.read_csv(io.StringIO(to_csv(tidy(read_runs(tmp_path)))), keep_default_na=False)
+    frame = tidy(read_runs(tmp_path))
+    text = to_csv(list(frame.columns), frame.itertuples(index=False, name=None))
+    back = pd.read_csv(io.StringIO(text), keep_default_na=False)
     assert set(back["method"]) == {"'=cmd"}
     assert "inf" in set(back[back["metric"] == "psnr"]["value"].astype(str))
 

@@ -16,28 +16,42 @@ from hypothesis import strategies as st
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.measures import MEASURES, measure
 from ambiguous_wild.harness.running.store import read_runs
-from ambiguous_wild.harness.tables.comparison import Table, TableCell, comparison
+from ambiguous_wild.harness.tables.comparison import comparison
 from ambiguous_wild.harness.tables.fit import fitted
-from ambiguous_wild.harness.tables.render import (
-    RENDERERS,
+from ambiguous_wild.harness.tables.latex import latex_text
+from ambiguous_wild.harness.tables.latex import to_latex as latex_of
+from ambiguous_wild.harness.tables.papers import cost_at_the_end
+from ambiguous_wild.harness.tables.plain_formats import (
     display_width,
+    markdown_text,
     plain,
-    to_csv,
-    to_latex,
     to_markdown,
     to_text,
+    to_wide_csv,
 )
+from ambiguous_wild.harness.tables.table import Cell, Table
 from tests.harness.fake_runs import failed, fake_result, save, start
 
 HOSTILE = '<script>|\\input{x}$&%#_^~"*`[a](http://b)\x1b[31m\u202e'
 
 
-def cell(table: Table, method: str, key: str, block: int = 0) -> TableCell:
-    row = next(r for r in table.blocks[block].rows if r.method == method)
-    return row.cells[[c.key for c in table.columns].index(key)]
+def cell(tables: list[Table], method: str, key: str, which: int = 0) -> Cell:
+    row = next(r for r in tables[which].rows if r.name == method)
+    return row.cells[keys(tables).index(key)]
 
 
-def table_of(tmp_path: Path, *results: dict, **options) -> Table:  # type: ignore[no-untyped-def, type-arg]
+def keys(tables: list[Table]) -> list[str]:
+    return [c.measure.key for c in tables[0].columns]
+
+
+def to_latex(tables: list[Table]) -> str:
+    return latex_of([cost_at_the_end(tables)])
+
+
+RENDERERS = {"text": to_text, "markdown": to_markdown, "csv": to_wide_csv, "latex": to_latex}
+
+
+def table_of(tmp_path: Path, *results: dict, **options) -> list[Table]:  # type: ignore[no-untyped-def, type-arg]
     return comparison(read_runs(save(tmp_path, *results)), **options)
 
 
@@ -50,7 +64,7 @@ def test_mean_over_images_then_seeds_then_scenes(tmp_path: Path) -> None:
         fake_result("a", "two", 0, (30.0, 30.0, 30.0, 34.0)),
         fake_result("a", "two", 1, (31.0, 31.0, 31.0, 31.0)),
     )
-    assert [b.scene for b in table.blocks] == [None, "one", "two"]
+    assert [t.columns[0].scene for t in table] == ["", "one", "two"]
     assert cell(table, "a", "psnr", 1).value == 17.5
     assert cell(table, "a", "psnr", 1).spread == pytest.approx(np.std([15.0, 20.0], ddof=1))
     assert cell(table, "a", "psnr", 2).value == 31.0
@@ -58,12 +72,12 @@ def test_mean_over_images_then_seeds_then_scenes(tmp_path: Path) -> None:
     assert mean.value == 24.25
     assert mean.spread == pytest.approx(np.std([(15 + 31) / 2, (20 + 31) / 2], ddof=1))
     assert cell(table, "a", "train_s").value == 10.5
-    assert table.blocks[0].rows[0].runs == 4
+    assert table[0].rows[0].runs == 4
 
 
 def test_one_scene_is_one_block_without_spread(tmp_path: Path) -> None:
     table = table_of(tmp_path, fake_result("a"))
-    assert [b.scene for b in table.blocks] == ["yard"]
+    assert [t.columns[0].scene for t in table] == ["yard"]
     assert math.isnan(cell(table, "a", "psnr").spread)
     assert "±" not in to_text(table)
 
@@ -121,7 +135,7 @@ def test_infinite_psnr_stays_visible_everywhere(tmp_path: Path) -> None:
     assert "inf (1)" in to_text(table)
     assert "**inf** (1)" in to_markdown(table)
     assert r"$\infty$" in to_latex(table)
-    assert next(csv.DictReader(io.StringIO(to_csv(table))))["psnr"] == "inf"
+    assert next(csv.DictReader(io.StringIO(to_wide_csv(table))))["psnr"] == "inf"
 
 
 def test_a_mean_over_a_missing_scene_is_missing_and_said(tmp_path: Path) -> None:
@@ -136,7 +150,7 @@ def test_a_mean_over_a_missing_scene_is_missing_and_said(tmp_path: Path) -> None
     assert cell(table, "a", "psnr").rank is None  # alone: nothing to be first of
     assert cell(table, "b", "psnr", 2).state == "absent"
     assert cell(table, "b", "psnr", 1).rank == 1
-    assert "no result: b, c on two; no mean over scenes" in table.notes
+    assert "no result: b, c on two; no mean over scenes" in table[-1].notes
 
 
 def test_a_failed_seed_fails_its_cell(tmp_path: Path) -> None:
@@ -151,13 +165,13 @@ def test_a_failed_seed_fails_its_cell(tmp_path: Path) -> None:
     assert cell(table, "a", "psnr").state == "failed" and cell(table, "a", "psnr", 1).state == "failed"
     assert cell(table, "a", "psnr", 2).state == "ok"
     assert cell(table, "b", "psnr", 1).rank is None
-    assert "failed: a on one, seed 1: loss is not finite" in table.notes
+    assert "failed: a on one, seed 1: loss is not finite" in table[-1].notes
     assert "failed" in to_text(table).splitlines()[3]
 
 
 def test_where_every_run_failed_the_table_says_so(tmp_path: Path) -> None:
     table = table_of(tmp_path, failed("a"), failed("b"))
-    assert {c.state for row in table.blocks[0].rows for c in row.cells} == {"failed"}
+    assert {c.state for row in table[0].rows for c in row.cells} == {"failed"}
     for render in RENDERERS.values():
         assert "failed" in render(table)
 
@@ -173,7 +187,7 @@ def test_a_method_with_an_unfinished_seed_shows_its_mean_but_no_rank(tmp_path: P
     assert cell(table, "a", "psnr", 1).value == 50.0
     ranks = [[cell(table, m, "psnr", block).rank for m in "abc"] for block in range(3)]
     assert ranks == [[None, 1, 2], [None, 1, 2], [1, 2, 3]]  # mean, one, two
-    assert "not ranked: a on one: 1 run of it incomplete" in table.notes
+    assert "not ranked: a on one: 1 run of it incomplete" in table[-1].notes
 
 
 def test_who_knows_the_truth_is_not_ranked(tmp_path: Path) -> None:
@@ -182,14 +196,14 @@ def test_who_knows_the_truth_is_not_ranked(tmp_path: Path) -> None:
     table = table_of(tmp_path, *(fake_result(m, psnr=(p,)) for m, p in (best | rest).items()))
     assert [cell(table, m, "psnr").rank for m in best] == [None] * 3
     assert [cell(table, m, "psnr").rank for m in rest] == [1, 2]
-    (note,) = [n for n in table.notes if n.startswith("oracle (not ranked)")]
+    (note,) = [n for n in table[-1].notes if n.startswith("oracle (not ranked)")]
     assert all(m in note for m in best)
 
 
 def test_missing_metrics_carry_their_reason_once(tmp_path: Path) -> None:
     table = table_of(tmp_path, fake_result("a"), fake_result("b"))
-    assert "lpips_alex" not in [c.key for c in table.columns]  # an empty column says nothing
-    told = [n for n in table.notes if "lpips_alex" in n]
+    assert "lpips_alex" not in keys(table)  # an empty column says nothing
+    told = [n for n in table[-1].notes if "lpips_alex" in n]
     assert told == ["missing: lpips_alex: weights missing: put heads.pth into W"]
 
 
@@ -212,9 +226,9 @@ def test_scenes_where_a_measure_is_undefined_are_left_out_of_its_mean(tmp_path: 
     )
     assert cell(table, "a", "mask_iou").value == 0.8 and cell(table, "b", "mask_iou").value == 0.6
     assert cell(table, "c", "mask_iou").state == "missing"  # it has no masks at all
-    assert [b.scene for b in table.blocks][1] == "clean"
+    assert table[1].title == "clean"
     assert cell(table, "a", "mask_iou", 1).state == "missing"
-    assert "undefined on clean, left out of the mean: mask IoU" in table.notes
+    assert "undefined on clean, left out of the mean: mask IoU" in table[-1].notes
     # A gap that is no such case: no mean.
     (tmp_path / "more").mkdir()
     table = table_of(
@@ -236,47 +250,47 @@ def test_text_fits_the_width_and_names_what_it_leaves_out(width: int, tmp_path: 
     lines = to_text(shown).splitlines()
     aligned = [line for line in lines if line.startswith(("a ", "longer", "method", "─"))]
     assert len(aligned) == 4 and max(map(display_width, aligned)) <= width
-    keys = [c.key for c in shown.columns]
-    assert keys[0] == "psnr" and "lpips_alex" in keys and len(keys) < len(table.columns)
-    (note,) = [n for n in shown.notes if n.startswith("not shown")]
+    left = keys(shown)
+    assert left[0] == "psnr" and "lpips_alex" in left and len(left) < len(table[0].columns)
+    (note,) = [n for n in shown[-1].notes if n.startswith("not shown")]
     named = note.partition(": ")[2].partition("; ")[0].split(", ")
-    assert named == [c.label for c in table.columns if c.key not in keys]
+    assert named == [c.measure.label for c in table[0].columns if c.measure.key not in left]
     # The widest columns of all still leave one.
-    assert [c.key for c in fitted(table, 1).columns] == ["psnr"]
+    assert keys(fitted(table, 1)) == ["psnr"]
 
 
 def test_a_reason_that_concerns_some_names_them(tmp_path: Path) -> None:
     full = [{"name": "0.png", "psnr": 20.0, "ssim": 0.5, "lpips_alex": 0.2}]
     table = table_of(tmp_path, fake_result("a"), fake_result("b", per_image=full, missing={}))
     assert [cell(table, m, "lpips_alex").state for m in "ab"] == ["missing", "ok"]
-    assert any(n.startswith("missing: lpips_alex for a on yard: weights") for n in table.notes)
+    assert any(n.startswith("missing: lpips_alex for a on yard: weights") for n in table[-1].notes)
 
 
 def test_a_null_without_a_reason_is_noted(tmp_path: Path) -> None:
     images = [{"name": "0.png", "psnr": 20.0, "ssim": 0.5}, {"name": "1.png", "psnr": 21.0, "ssim": None}]
     table = table_of(tmp_path, fake_result("a", per_image=images, missing={}), fake_result("b"))
     assert cell(table, "a", "ssim").state == "missing"
-    assert "missing: ssim, no reason given, for 1.png (a on yard)" in table.notes
+    assert "missing: ssim, no reason given, for 1.png (a on yard)" in table[-1].notes
 
 
 @pytest.mark.parametrize("length", [math.inf, None, 1e300])
 def test_a_length_that_is_no_number_of_iterations_is_no_crash(tmp_path: Path, length: float | None) -> None:
     odd = fake_result("b")
     odd["cost"]["iterations"] = length
-    notes = table_of(tmp_path, fake_result("a"), odd).notes
+    notes = table_of(tmp_path, fake_result("a"), odd)[-1].notes
     assert any("differ in length" in note for note in notes) == (length == 1e300)
 
 
 def test_what_cannot_be_compared_is_said(tmp_path: Path) -> None:
     other = fake_result("c", psnr=(1.0, 2.0, 3.0), scene_hash="other", version="0.2.0")
     other["cost"] |= {"device": "cuda", "iterations": 30_000}
-    notes = "\n".join(table_of(tmp_path, fake_result("a"), fake_result("b"), other).notes)
+    notes = "\n".join(table_of(tmp_path, fake_result("a"), fake_result("b"), other)[-1].notes)
     assert "come from 2 versions of the scene" in notes
     assert "different test images of yard" in notes
     assert "trainings differ in length (iterations): a 100, b 100, c 30000" in notes
     assert "different devices: a cpu, b cpu, c cuda" in notes
     assert "different versions of ambiguous_wild: 0.1.0, 0.2.0" in notes
-    alike = table_of(tmp_path / "alike", fake_result("a"), fake_result("b")).notes
+    alike = table_of(tmp_path / "alike", fake_result("a"), fake_result("b"))[-1].notes
     assert not [n for n in alike if "differ" in n or "comparable" in n]
 
 
@@ -294,7 +308,7 @@ def test_columns_and_scenes_can_be_chosen(tmp_path: Path) -> None:
         fake_result("a", s, masks={"iou": 0.5, "recall": 0.6, "images": 2}) for s in ("one", "two", "three")
     ]
     table = table_of(tmp_path, *results, metrics=["mask_iou", "psnr", "psnr"], scenes=["two"])
-    assert [c.key for c in table.columns] == ["mask_iou", "psnr"] and table.scenes == ("two",)
+    assert keys(table) == ["mask_iou", "psnr"] and table[0].title == "two" and len(table) == 1
     assert cell(table, "a", "mask_iou").value == 0.5
     runs = read_runs(tmp_path)
     with pytest.raises(AwError, match="did you mean 'psnr'"):
@@ -308,7 +322,7 @@ def test_a_metric_of_another_takes_its_family(tmp_path: Path) -> None:
     assert measure("psnrish").better is None and measure("psnr") is MEASURES["psnr"]
     images = [{"name": "0.png", "psnr": 20.0, "psnr_distractor": 12.0, "glare": 3.0}]
     table = table_of(tmp_path, fake_result("a", per_image=images), fake_result("b", per_image=images))
-    assert {"psnr_distractor", "glare"} <= {c.key for c in table.columns}
+    assert {"psnr_distractor", "glare"} <= set(keys(table))
 
 
 def test_csv_is_read_back_as_numbers(tmp_path: Path) -> None:
@@ -317,7 +331,7 @@ def test_csv_is_read_back_as_numbers(tmp_path: Path) -> None:
     table = table_of(
         tmp_path, *(fake_result(m, s) for m in ("a", "b") for s in ("one", "two")), failed("c", "one")
     )
-    frame = pd.read_csv(io.StringIO(to_csv(table)))
+    frame = pd.read_csv(io.StringIO(to_wide_csv(table)))
     assert len(frame) == 9 and frame["psnr"].dtype == float
     mean = frame[frame["scene"].isna()].set_index("method")
     assert mean.loc["a", "psnr"] == 21.0 and mean.loc["a", "gaussians"] == 1234
@@ -328,7 +342,7 @@ def test_csv_is_read_back_as_numbers(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["=1+1", "+x", "-x", "@x", " =x", "\t=x"])
 def test_csv_cells_are_no_formulas(name: str, tmp_path: Path) -> None:
     table = table_of(tmp_path, fake_result(name), fake_result("b", psnr=(0.5,)))
-    rows = list(csv.DictReader(io.StringIO(to_csv(table))))
+    rows = list(csv.DictReader(io.StringIO(to_wide_csv(table))))
     assert any(r["method"].startswith("'") and r["method"].endswith(plain(name)) for r in rows)
 
 
@@ -340,19 +354,17 @@ def test_hostile_names_stay_text_in_every_format(tmp_path: Path) -> None:
     markdown = to_markdown(table)
     row = next(line for line in markdown.splitlines() if "script" in line)
     assert "<" not in row and not re.search(r"(?<!\\)\]\(", row) and "http:" not in row
-    assert len(re.findall(r"(?<!\\)\|", row)) == len(table.columns) + 2
+    assert len(re.findall(r"(?<!\\)\|", row)) == len(table[0].columns) + 2
     latex = to_latex(table)
     row = next(line for line in latex.splitlines() if "script" in line)
     assert r"\textbackslash{}input\{x\}" in row and r"\$\&\%\#\_" in row
-    assert len(re.findall(r"(?<!\\)&", row)) == len(table.columns)
-    rows = list(csv.reader(io.StringIO(to_csv(table))))
+    assert len(re.findall(r"(?<!\\)&", row)) == len(table[0].columns)
+    rows = list(csv.reader(io.StringIO(to_wide_csv(table))))
     assert {len(r) for r in rows} == {len(rows[0])}
 
 
 @given(st.text(max_size=30))
 def test_latex_and_markdown_of_any_name_have_no_open_special(name: str) -> None:
-    from ambiguous_wild.harness.tables.render import latex_text, markdown_text
-
     assert "\n" not in latex_text(name) + markdown_text(name)
     rest = re.sub(r"\\text\w+\{\}|\\[&%$#_{}]|\{(?:[\[*]|'')\}", "", latex_text(name))
     assert not re.search(r"[\\&%$#_{}~^\[*]", rest)

@@ -16,10 +16,9 @@ from ambiguous_wild.harness.running.timing import (
     in_reference_seconds,
     seconds_range,
     timing_of,
-    why_not_ranked,
 )
 from ambiguous_wild.harness.tables.comparison import comparison
-from ambiguous_wild.harness.tables.render import to_text
+from ambiguous_wild.harness.tables.plain_formats import to_text
 from tests.harness.fake_runs import fake_result, save
 
 
@@ -28,17 +27,14 @@ def cost(verdict: str = "alone", reason: str = "", kernel: str = "cpu-1", **more
     return {"train_s": 10.0, "reference_s": 20.0, "timing": record} | more
 
 
-def test_only_runs_that_were_alone_are_ranked() -> None:
-    assert timing_of(cost()).ranked and why_not_ranked([cost(), cost()]) == ""
-    busy = cost("contended", "2 runs at once")
-    assert not timing_of(busy).ranked
-    assert why_not_ranked([cost(), busy, busy]) == "2 of 3 runs contended: 2 runs at once"
+def test_the_verdict_of_a_record_and_unknown_without_one() -> None:
+    busy = timing_of(cost("contended", "2 runs at once"))
+    assert (busy.verdict, busy.reason, busy.kernel, busy.reference_s) == (
+        "contended", "2 runs at once", "cpu-1", 20.0
+    )  # fmt: skip
     assert timing_of({"train_s": 3.0}).verdict == "unknown"
-    assert "1 of 2 runs unknown" in why_not_ranked([cost(), {"train_s": 3.0}])
-    assert "cpu-1, gpu-1" in why_not_ranked([cost(), cost(kernel="gpu-1")])
-    assert not timing_of(cost(reference_s=None)).ranked
-    assert why_not_ranked([cost(reference_s=None)])
-    assert not timing_of({"timing": {"verdict": "fast"}}).ranked
+    assert math.isnan(timing_of(cost(reference_s=None)).reference_s)
+    assert timing_of({"timing": {"verdict": "fast"}}).verdict == "unknown"
 
 
 def test_a_range_says_how_far_times_lie_apart() -> None:
@@ -106,7 +102,7 @@ def test_tables_rank_only_times_that_compare(tmp_path: Path) -> None:
     table = comparison(
         read_runs(save(tmp_path, *runs)), metrics=["psnr", "train_s", "reference_s", "gaussians"]
     )
-    rows = {row.method: row.cells for row in table.blocks[0].rows}
+    rows = {row.name: row.cells for row in table[0].rows}
     assert [rows[m][1].rank for m in "abc"] == [1, 2, None]
     assert [rows[m][2].rank for m in "abc"] == [1, 2, None]
     text = to_text(table)
@@ -121,18 +117,18 @@ def test_times_of_other_machines_are_ranked_by_reference_seconds(tmp_path: Path)
         run["environment"] = {"cpu": f"CPU {k}", "packages": {}}
         run["cost"] |= {"train_s": 10.0 + k, "reference_s": 9.0 - k}
     table = comparison(read_runs(save(tmp_path, *runs)), metrics=["train_s", "reference_s"])
-    ranks = [[cell.rank for cell in row.cells] for row in table.blocks[0].rows]
+    ranks = [[cell.rank for cell in row.cells] for row in table[0].rows]
     assert ranks == [[None, 2], [None, 1]]
-    assert any("CPU 0, 2 threads, CPU 1, 2 threads" in note for note in table.notes)
+    assert any("CPU 0, 2 threads, CPU 1, 2 threads" in note for note in table[-1].notes)
     runs[1]["cost"]["timing"]["kernel"] = "gpu-1"
     table = comparison(read_runs(save(tmp_path, *runs)), metrics=["reference_s"])
-    assert [row.cells[0].rank for row in table.blocks[0].rows] == [None, None]
+    assert [row.cells[0].rank for row in table[0].rows] == [None, None]
 
 
 def test_the_mean_over_scenes_is_a_range_where_one_scene_is(tmp_path: Path) -> None:
     runs = [fake_result(m, scene) for m in ("a", "b") for scene in ("one", "two")]
     runs[0]["cost"] |= {"train_s": 30.0, "timing": {"verdict": "unknown", "reason": "not measured"}}
     table = comparison(read_runs(save(tmp_path, *runs)), metrics=["train_s"])
-    mean = {row.method: row.cells[0] for row in table.blocks[0].rows}
+    mean = {row.name: row.cells[0] for row in table[0].rows}
     assert mean["a"].ranged and (mean["a"].low, mean["a"].high) == (20.0, 20.0)
     assert mean["b"].rank is None and not mean["b"].ranged  # alone in its column: nothing to rank

@@ -7,15 +7,16 @@ same scene with the same seed, so that the spread of a difference is not the spr
 
 from __future__ import annotations
 
-import csv
-import io
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 from ambiguous_wild.core.config import to_plain
 from ambiguous_wild.harness.ablation.plan import DIFFERENCES, METRICS, Outcome, Planned, Study, read_outcomes
 from ambiguous_wild.harness.ablation.records import GroupFacts, StudyReport, Summary, VariantRow
+from ambiguous_wild.harness.tables.plain_formats import to_csv, to_markdown
+from ambiguous_wild.harness.tables.table import BLANK, Cell, Table, text_table
 from ambiguous_wild.io.atomic import atomic_path, write_json, write_text
 from ambiguous_wild.methods.describe import BACK_ENDS
 from ambiguous_wild.metrics import stats
@@ -91,15 +92,15 @@ def write_report(data: StudyReport, folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / f"ablation.{kind}" for kind in ("json", "csv", "md")]
     write_json(paths[0], data)
-    write_text(paths[1], to_csv(data))
+    write_text(paths[1], csv_of(data))
     png = folder / "ablation.png"
     if draw(data, png):
         paths.append(png)
-    write_text(paths[2], to_markdown(data, picture=png.name if png in paths else ""))
+    write_text(paths[2], markdown_of(data, picture=png.name if png in paths else ""))
     return paths
 
 
-def to_csv(data: StudyReport) -> str:
+def csv_of(data: StudyReport) -> str:
     """One line a row of the study; empty cells where a value is missing."""
     lines = []
     for row in data["rows"]:
@@ -116,14 +117,10 @@ def to_csv(data: StudyReport) -> str:
         for key, entry in row["differences"].items():
             line |= {f"difference_{key}": entry["mean"], f"difference_{key}_spread": entry["spread"]}
         lines.append(line)
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(lines[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({k: "" if v is None else v for k, v in line.items()} for line in lines)
-    return text.getvalue()
+    return to_csv(list(lines[0]), (line.values() for line in lines))
 
 
-def to_markdown(data: StudyReport, picture: str = "") -> str:
+def markdown_of(data: StudyReport, picture: str = "") -> str:
     """One table a group: quality and cost of each variant."""
     shown = [m for m in METRICS if any(r["values"][m[0]]["mean"] is not None for r in data["rows"])]
     lines = [f"# Ablations of {data['method']}", "", _subtitle(data), ""]
@@ -136,21 +133,25 @@ def to_markdown(data: StudyReport, picture: str = "") -> str:
         lines += [f"## {group['name']}: {group['title']}", ""]
         if group["source"]:
             lines += [f"Paper: {group['source']}.", ""]
-        head = ["variant", *(label for _, label, _ in DIFFERENCES), *(label for _, label, _ in shown), "what"]
-        lines += [_line(head), _line(["---"] + ["---:"] * (len(head) - 2) + ["---"])]
-        for row in rows:
-            if row["status"] == "ok":
-                cells = [_cell(row, "differences", key, digits, sign=True) for key, _, digits in DIFFERENCES]
-                cells += [_cell(row, "values", key, digits) for key, _, digits in shown]
-            else:  # the reason stands below the table
-                cells = [row["status"], *[""] * (len(head) - 3)]
-            lines.append(_line([row["variant"], *cells, _what(row)]))
-        lines.append("")
+        lines += [*to_markdown([_table(rows, shown)]).splitlines(), ""]
         lines += [f"- {r['variant']} {r['status']}: {r['reason']}" for r in rows if r["status"] != "ok"]
         lines += [""] if lines[-1] else []
     if data["made_by"]:
         lines += [f"command: `{data['made_by']}`", ""]
     return "\n".join(lines)
+
+
+def _table(rows: Sequence[VariantRow], shown: Sequence[tuple[str, str, int]]) -> Table:
+    head = ["variant", *(label for _, label, _ in DIFFERENCES), *(label for _, label, _ in shown), "what"]
+    lines: list[list[str | Cell]] = []
+    for row in rows:
+        if row["status"] == "ok":
+            cells = [_cell(row, "differences", key, digits, sign=True) for key, _, digits in DIFFERENCES]
+            cells += [_cell(row, "values", key, digits) for key, _, digits in shown]
+        else:  # the reason stands below the table
+            cells = [row["status"], *[""] * (len(head) - 3)]
+        lines.append([row["variant"], *cells, _what(row)])
+    return text_table("", head, lines, words=("what",))
 
 
 def _subtitle(data: StudyReport) -> str:
@@ -165,14 +166,11 @@ def _subtitle(data: StudyReport) -> str:
     )
 
 
-def _what(row: VariantRow) -> str:
+def _what(row: VariantRow) -> Cell:
     parts = [row["text"], f"`{' '.join(row['settings'])}`" if row["settings"] else ""]
     parts.append(f"same runs as {row['same_as']}" if row["same_as"] else "")
-    return "; ".join(part for part in parts if part)
-
-
-def _line(cells: list[str]) -> str:
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+    text = "; ".join(part for part in parts if part)
+    return Cell(printed=text, markdown=text) if text else BLANK
 
 
 def _cell(

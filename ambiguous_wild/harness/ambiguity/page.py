@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import csv
 import html
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +15,9 @@ from ambiguous_wild.harness.ambiguity import figure
 from ambiguous_wild.harness.ambiguity.measure import Look, Measured, load_photo
 from ambiguous_wild.harness.ambiguity.sources import Background, Masks
 from ambiguous_wild.harness.ambiguity.summary import NO_DISTRACTORS, cosine_column, describe, row
-from ambiguous_wild.harness.tables.render import csv_text
+from ambiguous_wild.harness.tables.html_page import html_table
+from ambiguous_wild.harness.tables.plain_formats import to_csv
+from ambiguous_wild.harness.tables.table import text_table
 from ambiguous_wild.io.atomic import atomic_dir, refuse_file, write_json, write_text
 from ambiguous_wild.metrics import ambiguity as am
 
@@ -51,10 +52,7 @@ def write_report(
     metric = cosine_column(summary["features"])
     rows = [row(m, metric) for m in measured]
     with atomic_dir(out) as folder:
-        with open(folder / "photos.csv", "w", newline="", encoding="utf-8") as f:
-            writer = csv.DictWriter(f, list(rows[0]), lineterminator="\n")
-            writer.writeheader()
-            writer.writerows({**r, "photo": csv_text(r["photo"])} for r in rows)
+        write_text(folder / "photos.csv", to_csv(list(rows[0]), (r.values() for r in rows)))
         write_json(folder / "ambiguity.json", {**summary, "per_photo": rows})
         figure.write_figure(scene, masks, background, measured, look, folder / "ambiguity.png")
         pictures = list(_pictures(scene, masks, background, measured, look))
@@ -100,7 +98,7 @@ body{font:16px/1.45 system-ui,sans-serif;max-width:90em;margin:1.5em auto;paddin
 body{background:var(--back);color:var(--text)}figure{margin:0}figcaption{font-size:13px;opacity:.8}
 img{max-width:100%;height:auto}table{border-collapse:collapse;font-size:14px}
 td,th{padding:3px 9px;text-align:right;border-bottom:1px solid var(--line);white-space:nowrap}
-td:first-child,th:first-child{text-align:left}.wide{overflow-x:auto}.class{font-size:1.25em;font-weight:600}
+th:first-child{text-align:left;font-weight:normal}.wide{overflow-x:auto}.class{font-size:1.25em;font-weight:600}
 .row{display:grid;grid-template-columns:repeat(auto-fit,minmax(15em,1fr));gap:6px;margin-bottom:1.2em}
 .row img{width:100%;display:block}h3{margin:.6em 0 .2em;font-size:1em;overflow-wrap:anywhere}
 .bar{height:.9em;max-width:24rem;background:linear-gradient(90deg,#5fbaa8,#b2e0a2,#ffffbf,#fdb466,#f06744)}
@@ -143,8 +141,8 @@ def page(
         f"<h3>{html.escape(name)}</h3><div class=row>{''.join(_shown(name, *i) for i in images)}</div>"
         for name, images in photos
     )
-    head = "".join(f"<th>{html.escape(_HEADS.get(k, 'semantic: cosine'))}</th>" for k in rows[0])
-    body = "".join("<tr>" + "".join(f"<td>{_cell(v)}</td>" for v in r.values()) + "</tr>" for r in rows)
+    head = [_HEADS.get(key, "semantic: cosine") for key in rows[0]]
+    table = html_table(text_table("", head, ([_cell(value) for value in r.values()] for r in rows)))
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width,initial-scale=1">'
@@ -156,8 +154,7 @@ def page(
         "<div class=bar></div><div class=ends><span>similar</span>"
         f"<span>different</span></div>{shown}"
         f"<h2>Distributions</h2>{_image(picture, 'png', 'masks, maps and distributions')}"
-        f"<h2>Every photo</h2><div class=wide><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody>"
-        "</table></div></body></html>\n"
+        f"<h2>Every photo</h2><div class=wide>{table}</div></body></html>\n"
     )
 
 
@@ -174,4 +171,4 @@ def _image(data: bytes, kind: str, name: str) -> str:
 def _cell(value: Any) -> str:
     if value is None:
         return "–"
-    return html.escape(f"{value:.3f}" if isinstance(value, float) else str(value))
+    return f"{value:.3f}" if isinstance(value, float) else str(value)

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import csv
-import io
-
 from ambiguous_wild.harness.audit import place, repeats, values
 from ambiguous_wild.harness.audit.finding import KINDS, Finding
 from ambiguous_wild.harness.audit.table import Number
-from ambiguous_wild.harness.tables.render import csv_text, markdown_text, plain
+from ambiguous_wild.harness.tables.plain_formats import markdown_text, plain, to_csv
 
 CHECKS = (
     repeats.repeated, values.contradictions, place.exchanged, values.means,
@@ -23,7 +20,7 @@ def audit(numbers: list[Number]) -> list[Finding]:
     return sorted(found, key=lambda f: order.index(f.kind))
 
 
-def to_text(findings: list[Finding]) -> str:
+def text_of(findings: list[Finding]) -> str:
     """Grouped by kind, for a terminal."""
     lines = []
     for kind, meaning in KINDS.items():
@@ -33,7 +30,7 @@ def to_text(findings: list[Finding]) -> str:
     return "\n".join(lines)
 
 
-def to_markdown(findings: list[Finding]) -> str:
+def markdown_of(findings: list[Finding]) -> str:
     """A list by kind."""
     lines = []
     for kind, meaning in KINDS.items():
@@ -43,13 +40,7 @@ def to_markdown(findings: list[Finding]) -> str:
     return "\n".join(lines)
 
 
-def to_csv(findings: list[Finding]) -> str:
-    """One finding a row; text guarded against spreadsheets."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(["kind", "finding", "tables", "where"])
-    for f in findings:
-        writer.writerow(
-            [f.kind, csv_text(f.text), csv_text("; ".join(f.tables)), csv_text("; ".join(f.where))]
-        )
-    return out.getvalue()
+def csv_of(findings: list[Finding]) -> str:
+    """One finding a row."""
+    rows = ((f.kind, f.text, "; ".join(f.tables), "; ".join(f.where)) for f in findings)
+    return to_csv(("kind", "finding", "tables", "where"), rows)

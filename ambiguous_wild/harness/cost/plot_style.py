@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ambiguous_wild.harness.tables.render import plain
+from ambiguous_wild.harness.tables.plain_formats import plain
 from ambiguous_wild.io.atomic import atomic_path
 from ambiguous_wild.io.palette import CATEGORIES, plot_colour
 

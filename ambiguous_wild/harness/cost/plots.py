@@ -24,7 +24,7 @@ from ambiguous_wild.harness.cost.plot_style import (
 )
 from ambiguous_wild.harness.cost.report import PLOTS, CostReport
 from ambiguous_wild.harness.cost.text import Unit, per_minute, time_unit
-from ambiguous_wild.harness.tables.render import plain
+from ambiguous_wild.harness.tables.plain_formats import plain
 from ambiguous_wild.io.palette import CATEGORIES, plot_colour
 from ambiguous_wild.methods.registry import knows_truth
 

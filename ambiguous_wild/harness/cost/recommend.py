@@ -11,14 +11,14 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.harness.cost.curves import Curve, curves_of, summary
-from ambiguous_wild.harness.cost.read import CostRun, why_unranked
+from ambiguous_wild.harness.cost.read import CostRun, Found, why_unranked
 from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.metrics import stats
 
@@ -263,3 +263,30 @@ def in_words(found: Recommendation, scene: str) -> str:
 
 def _time(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds < 120.0 else f"{seconds / 60.0:.3g} min"
+
+
+def speed_here(found: Found, say: Callable[[str], None] = lambda text: None) -> float:
+    """Reference seconds in a second of this machine, by the calibration that the runs were timed with.
+
+    Args:
+        found: the runs; their kernel says on which device.
+        say: told when kernels have to be compiled first.
+
+    Raises:
+        AwError: the runs are of a GPU, and there is none here that can be used.
+    """
+    import torch
+
+    from ambiguous_wild.harness.running.prepare import prepare_cpu
+    from ambiguous_wild.harness.running.step_time import slowness
+    from ambiguous_wild.splat.calibration import KERNELS
+    from ambiguous_wild.splat.gpu.readiness import choose
+
+    kernels = {run.timing.kernel for run in found.runs if not run.error}
+    device = next((device for device, size in KERNELS.items() if size.name in kernels), "cpu")
+    if device == "cpu":
+        prepare_cpu(None, say)
+        torch.set_num_threads(1)
+    else:
+        choose("cuda", say)
+    return 1.0 / slowness(device)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 from collections.abc import Iterable, Sequence
@@ -18,7 +16,7 @@ from ambiguous_wild.harness.cost.front import Point, points
 from ambiguous_wild.harness.cost.pairs import Change, changes
 from ambiguous_wild.harness.cost.reach import Reach, times_to_reach
 from ambiguous_wild.harness.cost.read import CostRun, Found, why_unranked
-from ambiguous_wild.harness.tables.render import csv_text
+from ambiguous_wild.harness.tables.plain_formats import to_csv
 from ambiguous_wild.io.atomic import write_json, write_text
 
 PLOTS = ("timelines", "budgets", "front", "changes")
@@ -123,7 +121,7 @@ def write_report(report: CostReport, folder: Path) -> list[Path]:
     write_json(written[0], plain_data(report))
     for name, rows in tables.items():
         if rows:
-            write_text(folder / name, _csv(rows))
+            write_text(folder / name, to_csv(list(rows[0]), (row.values() for row in rows)))
             written.append(folder / name)
     return written
 
@@ -206,22 +204,6 @@ def _timeline_rows(curves: Iterable[Curve]) -> Iterable[dict[str, Any]]:
 
 def _both(name: str, value: Summary) -> dict[str, float]:
     return {name: value.mean, f"{name}_std": value.spread}
-
-
-def _csv(rows: Sequence[dict[str, Any]]) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(rows[0])
-    writer.writerows([_cell(value) for value in row.values()] for row in rows)
-    return text.getvalue()
-
-
-def _cell(value: Any) -> str:
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, float):
-        return "" if math.isnan(value) else repr(value)
-    return csv_text(value) if isinstance(value, str) else str(value)
 
 
 def finite(value: Any) -> Any:

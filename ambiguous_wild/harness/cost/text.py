@@ -12,7 +12,9 @@ from ambiguous_wild.harness.cost.pairs import Change
 from ambiguous_wild.harness.cost.reach import Reach
 from ambiguous_wild.harness.cost.report import CostReport
 from ambiguous_wild.harness.running.timing import seconds_range
-from ambiguous_wild.harness.tables.render import plain
+from ambiguous_wild.harness.tables import plain_formats
+from ambiguous_wild.harness.tables.plain_formats import plain
+from ambiguous_wild.harness.tables.table import Table, text_table
 
 MISSING = "—"
 TIMES = {
@@ -22,20 +24,9 @@ TIMES = {
 SHORT_MIN = 3.0  # trainings below this are told in seconds
 
 
-@dataclass(frozen=True)
-class Listing:
-    """A small table: a title, a head, rows of text."""
-
-    title: str
-    head: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-
-
 def to_text(report: CostReport) -> str:
     """Every table of the report, aligned, and what is missing below."""
-    parts = []
-    for listing in listings(report):
-        parts += [plain(listing.title), *_aligned(listing), ""]
+    parts = [plain_formats.to_text(tables_of(report))]
     parts += [f"{plain(answer.text)}" for answer in report.answers]
     parts += ["±: sample standard deviation over seeds"] if _has_spread(report) else []
     parts += [TIMES[report.reference]]
@@ -67,7 +58,7 @@ def time_unit(report: CostReport) -> Unit:
     return Unit(f"{kind}min", 1.0, 2)
 
 
-def listings(report: CostReport) -> list[Listing]:
+def tables_of(report: CostReport) -> list[Table]:
     """The tables: what each curve reaches, how soon, and what each change brings."""
     tables = [_points(report)]
     scenes: dict[str | None, list[Reach]] = {}
@@ -87,7 +78,7 @@ def listings(report: CostReport) -> list[Listing]:
     return tables
 
 
-def _points(report: CostReport) -> Listing:
+def _points(report: CostReport) -> Table:
     over = f"mean over {len(report.scenes)} scenes" if len(report.scenes) > 1 else report.scenes[0]
     unit = time_unit(report)
     rows = []
@@ -103,10 +94,10 @@ def _points(report: CostReport) -> Listing:
     kind = "ref " if report.reference else ""
     head = ("method", "trained for", "runs", "PSNR dB", took, "on the front", f"{kind}set-up s",
             f"{kind}ms/iter", "Gaussians", "MB", f"{kind}FPS")  # fmt: skip
-    return Listing(f"what each method reaches, and what it costs ({over})", head, tuple(rows))
+    return text_table(f"what each method reaches, and what it costs ({over})", head, rows)
 
 
-def _reached(scene: str | None, rows: Sequence[Reach], report: CostReport) -> Listing:
+def _reached(scene: str | None, rows: Sequence[Reach], report: CostReport) -> Table:
     unit = time_unit(report)
     targets = list(dict.fromkeys(row.target for row in rows))
     by_key = {(row.curve, row.target): row for row in rows}
@@ -121,7 +112,7 @@ def _reached(scene: str | None, rows: Sequence[Reach], report: CostReport) -> Li
     kind = "reference " if report.reference else ""
     counted = kind + ("minutes" if unit.per_minute == 1.0 else "seconds") + " of training"
     counted += " and set-up" if report.setup else ""
-    return Listing(f"{counted} to reach a test PSNR ({where})", ("method", *head), tuple(lines))
+    return text_table(f"{counted} to reach a test PSNR ({where})", ("method", *head), lines)
 
 
 def _when(row: Reach, unit: Unit, several: bool) -> str:
@@ -144,7 +135,7 @@ def _time(minutes: Summary, row: Point | Reach, unit: Unit) -> str:
     return seconds_range([row.low * unit.per_minute, row.high * unit.per_minute], unit.digits)
 
 
-def _changed(title: str, rows: Sequence[Change], unit: Unit) -> Listing:
+def _changed(title: str, rows: Sequence[Change], unit: Unit) -> Table:
     head = ("change", "method", "trained for", "pairs", "dB gained", "95 % interval", f"extra {unit.name}",
             "extra ms/iter", f"dB per extra {'ref ' if unit.name.startswith('ref') else ''}min")  # fmt: skip
     lines = []
@@ -154,7 +145,7 @@ def _changed(title: str, rows: Sequence[Change], unit: Unit) -> Listing:
             c.what, c.method, c.length, str(c.pairs), number(c.db, 2, sign=True), interval,
             number(unit.of(c.minutes), unit.digits, sign=True), number(c.ms, 1, sign=True), per_minute(c),
         ))  # fmt: skip
-    return Listing(title, head, tuple(lines))
+    return text_table(title, head, lines)
 
 
 def per_minute(change: Change) -> str:
@@ -178,15 +169,3 @@ def number(value: Summary, digits: int, *, sign: bool = False, spread: bool = Tr
 
 def _has_spread(report: CostReport) -> bool:
     return any(not math.isnan(p.psnr.spread) for p in report.points)
-
-
-def _aligned(listing: Listing) -> list[str]:
-    lines = [tuple(map(plain, line)) for line in (listing.head, *listing.rows)]
-    widths = [max(len(line[i]) for line in lines) for i in range(len(listing.head))]
-    text = [
-        "  ".join(
-            [line[0].ljust(widths[0]), *(cell.rjust(w) for cell, w in zip(line[1:], widths[1:]))]
-        ).rstrip()
-        for line in lines
-    ]
-    return [text[0], "  ".join("─" * w for w in widths), *text[1:]]

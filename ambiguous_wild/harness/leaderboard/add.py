@@ -10,7 +10,7 @@ from typing import Literal
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.leaderboard import pictures
-from ambiguous_wild.harness.leaderboard.board import dataset_file, measured, read_board, write_board
+from ambiguous_wild.harness.leaderboard.board import measured, read_board, write_board
 from ambiguous_wild.harness.leaderboard.entry import CHECKED, Entry, Key
 from ambiguous_wild.harness.leaderboard.scenes import Scenes
 from ambiguous_wild.harness.leaderboard.verify import Unfinished, Verified, verify
@@ -80,7 +80,7 @@ def add(
             except AwError as error:
                 reports[run] = AddReport(run, "refused", str(error))
         tick(len(runs), len(runs))
-        merged = _merge(board, there, passed, replace_other, reports)
+        merged = _merge(there, passed, replace_other, reports)
         if not dry:
             taken = [v for v in passed if reports[v.run].outcome != "refused"]
             if taken:
@@ -102,7 +102,6 @@ def _find(paths: Sequence[Path]) -> set[Path]:
 
 
 def _merge(
-    board: Path,
     there: list[Entry],
     passed: list[Verified],
     replace_other: bool,
@@ -110,7 +109,7 @@ def _merge(
 ) -> list[Entry]:
     """The runs of the board afterwards; fills in the reports."""
     entries = {e.key: e for e in there}
-    for reason, bad in _conflicts(board, there, passed):
+    for reason, bad in _conflicts(there, passed):
         reports[bad.run] = AddReport(bad.run, "refused", reason)
     for v in passed:
         if v.run in reports:
@@ -148,37 +147,28 @@ def _other_numbers(new: Verified, old: Entry) -> str:
     )
 
 
-def _conflicts(board: Path, there: list[Entry], passed: list[Verified]) -> list[tuple[str, Verified]]:
+def _conflicts(there: list[Entry], passed: list[Verified]) -> list[tuple[str, Verified]]:
     """(why, run) of those that cannot stand together; the same whatever the order they came in."""
     cells: dict[Key, list[Verified]] = defaultdict(list)
     hashes: dict[tuple[str, str], set[str]] = defaultdict(set)
-    spelt: dict[Path, set[str]] = defaultdict(set)
-    for e in (*there, *(v.entry for v in passed)):
-        hashes[e.dataset, e.scene].add(e.scene_hash)
-        spelt[dataset_file(board, e.dataset)].add(e.dataset)
+    configs: dict[str, list[Entry]] = defaultdict(list)
     for v in passed:
         cells[v.entry.key].append(v)
-    on_board = {(e.dataset, e.scene): e.scene_hash for e in there}
-    names_on_board = {e.dataset for e in there}
-    configs: dict[str, list[Entry]] = defaultdict(list)
     for e in (*there, *(v.entry for v in passed)):
+        hashes[e.dataset, e.scene].add(e.scene_hash)
         configs[e.config_hash].append(e)
+    on_board = {(e.dataset, e.scene): e.scene_hash for e in there}
     found: list[tuple[str, Verified]] = []
     for v in passed:
-        e, same = v.entry, cells[v.entry.key]
-        known = on_board.get((e.dataset, e.scene))
+        e = v.entry
+        scenes = hashes[e.dataset, e.scene]
         twins = [o for o in configs[e.config_hash] if o.key != e.key]
-        others = [o for o in same if o.entry.result_hash != e.result_hash]
-        if len(names := spelt[dataset_file(board, e.dataset)]) > 1 and e.dataset not in names_on_board:
-            reason = (
-                f"{v.run}: dataset {e.dataset!a} is also spelt {min(names - {e.dataset})!a}; spell it alike"
-            )
-        elif len(hashes[e.dataset, e.scene]) > 1 and e.scene_hash != known:
-            other = min(hashes[e.dataset, e.scene] - {e.scene_hash})
+        others = [o for o in cells[e.key] if o.entry.result_hash != e.result_hash]
+        if len(scenes) > 1 and e.scene_hash != on_board.get((e.dataset, e.scene)):
             reason = (
                 f"{v.run}: scene {e.scene!a} has hash {e.scene_hash[:12]}, another run's of that name has "
-                f"{other[:12]}: other photos, split or size, so their numbers do not compare; put it under "
-                "another --dataset"
+                f"{min(scenes - {e.scene_hash})[:12]}: other photos, split or size, so their numbers do not "
+                "compare; put it under another --dataset"
             )
         elif others:
             reason = f"{v.run} and {others[0].run} are the same cell with other numbers; give one of them"

@@ -8,13 +8,12 @@ BOARD/measured/images/            small pictures, and index.csv that says what t
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from pathlib import Path
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.leaderboard.entry import FIRST, LAST, TIDY, Entry, from_wide, tidy, wide
-from ambiguous_wild.harness.leaderboard.sheet import read_csv, slug, to_csv, unguard
+from ambiguous_wild.harness.leaderboard.sheet import board_csv, read_csv, slug
 from ambiguous_wild.io.atomic import write_text
 
 ALL = "all"
@@ -84,26 +83,17 @@ def examine(board: Path) -> tuple[list[Entry], list[str]]:
         seen.add(e.key)
     entries.sort(key=lambda e: e.key)
     # Where a row was changed, all.csv must differ: that is not a second problem.
-    return entries, wrong or _check_all(board, entries)
+    return entries, wrong or _other_files(board, entries)
 
 
-def _check_all(board: Path, entries: Sequence[Entry]) -> list[str]:
-    """Whether all.csv is what the rows give; one that is not there can be made from them."""
-    path = measured(board) / f"{ALL}.csv"
-    if not path.is_file():
-        return []
-    found, expected = path.read_bytes(), to_csv(TIDY, tidy(entries)).encode()
-    if found == expected:
-        return []
-    differing = sorted(set(found.splitlines()) ^ set(expected.splitlines()))
-    cell = next(csv.reader([differing[0].decode("utf-8", "replace")]), [""])[0] if differing else ""
-    names = {e.dataset: dataset_file(board, e.dataset) for e in entries}
-    other = names.get(unguard(cell))
-    about = f"what {other} gives" if other is not None else f"what the other files of {path.parent} give"
+def _other_files(board: Path, entries: Sequence[Entry]) -> list[str]:
+    """A line for each file that the runs do not give; one that is not there can be made from them."""
     return [
-        f"{path} is not {about}: rows were changed, added or taken out by hand, or a write was cut off; "
-        f"restore both from your version control. Where {ALL}.csv alone is wrong, remove it: 'aw leaderboard "
-        "add' of any run writes it again"
+        f"{path} is not what the runs of {path.parent} give: rows were changed, added or taken out by hand, "
+        "or a write was cut off; restore the files from your version control. Where "
+        f"{ALL}.csv alone is wrong, remove it: 'aw leaderboard add' of any run writes it again"
+        for path, text in files_of(board, entries).items()
+        if path.is_file() and path.read_bytes() != text.encode()
     ]
 
 
@@ -120,8 +110,8 @@ def files_of(board: Path, entries: Sequence[Entry]) -> dict[Path, str]:
         names = sorted({e.dataset for e in rows})
         if len(names) > 1:
             raise AwError(f"datasets {names[0]!a} and {names[1]!a} would share {path.name}: spell them alike")
-    files = {path: to_csv(*wide(rows)) for path, rows in sorted(by_file.items())}
-    return files | {measured(board) / f"{ALL}.csv": to_csv(TIDY, tidy(entries))}
+    files = {path: board_csv(*wide(rows)) for path, rows in sorted(by_file.items())}
+    return files | {measured(board) / f"{ALL}.csv": board_csv(TIDY, tidy(entries))}
 
 
 def write_board(board: Path, entries: Sequence[Entry]) -> None:

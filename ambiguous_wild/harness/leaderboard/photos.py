@@ -8,16 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
-from ambiguous_wild.core import AwError, Scene, View
+from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.harness.measures import PARTIAL
 from ambiguous_wild.harness.running.records import ImageRow, metrics_of
 from ambiguous_wild.harness.running.regions import find_regions
-from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.metrics.full_image import FULL_IMAGE
 
 TOLERANCE = 1e-6  # the same arithmetic on the same 8-bit pixels; another CPU may round otherwise
+RESTORE = "restore the files, or run it again with 'aw bench --overwrite always'"
 # dB. Which pixels are covered is itself computed: where rounding moves a pixel over the threshold, the mean
 # over thousands of them moves a little.
 REGION_TOLERANCE = {"psnr_covered": 1e-2, "psnr_uncovered": 1e-2, "psnr_supported": 1e-2}
@@ -36,15 +36,15 @@ def check_photos(
 
     Args:
         run: the run folder, for messages.
-        scene: with the test photos.
+        scene: with the test photos, opened with `verify`: its files are those that its hash was made of.
         rows: metrics of each image.
         renders: PNG by image name.
         half: the right half was measured.
         quick: PSNR of the whole picture alone.
 
     Raises:
-        AwError: an image left out or added, a photo that was changed, a number that does not follow, or a
-            render that is the photo itself.
+        AwError: an image left out or added, a number that does not follow, or a render that is the photo
+            itself.
     """
     views = {view.name: view for view in scene.test}
     if set(views) != set(renders):
@@ -63,7 +63,7 @@ def check_photos(
     copies = []
     for row in rows:
         name = row["name"]
-        render, photo = read_png_rgb(renders[name]), _photo(scene, views[name])
+        render, photo = read_png_rgb(renders[name]), read_png_rgb(views[name].image_path)
         if render.shape != photo.shape:
             raise AwError(f"{renders[name]} is not of the size of {views[name].image_path}: it was changed")
         if half:
@@ -93,12 +93,11 @@ def _compare_regions(run: Path, row: ImageRow, computed: dict[str, float]) -> No
         if metric in values and metric not in computed:
             raise AwError(
                 f"{run} was changed: {metric} of {name} is in metrics.json, and its scene has no such pixel "
-                "in that picture; restore the files, or run it again with 'aw bench --overwrite always'"
+                f"in that picture; {RESTORE}"
             )
         if metric in computed and metric not in values:
             raise AwError(
-                f"{run} is partial: no {metric} of {name}, though its scene has such pixels there; restore "
-                "metrics.json, or run it again with 'aw bench --overwrite always'"
+                f"{run} is partial: no {metric} of {name}, though its scene has such pixels there; {RESTORE}"
             )
         if metric in values:
             tolerance = REGION_TOLERANCE.get(metric, TOLERANCE)
@@ -109,26 +108,9 @@ def _compare(
     run: Path, name: str, metric: str, said: float | None, computed: float, tolerance: float = TOLERANCE
 ) -> None:
     value = math.nan if said is None else float(said)
-    same = (
-        value == computed
-        or abs(value - computed) <= tolerance
-        or (math.isnan(value) and math.isnan(computed))
-    )
-    if not same:
+    both_missing = math.isnan(value) and math.isnan(computed)
+    if not (value == computed or abs(value - computed) <= tolerance or both_missing):
         raise AwError(
             f"{run} was changed: {metric} of {name} is {value:.6f} in metrics.json, render and photo give "
-            f"{computed:.6f}; restore the files, or run it again with 'aw bench --overwrite always'"
+            f"{computed:.6f}; {RESTORE}"
         )
-
-
-def _photo(scene: Scene, view: View) -> np.ndarray:  # [H, W, 3] uint8
-    """The test photo, whose bytes are what the scene's hash was made of."""
-    files = scene.info.get("files")
-    relative = view.image_path.relative_to(scene.root).as_posix()
-    if (
-        isinstance(files, dict)
-        and relative in files
-        and sha256_file(view.image_path) != files[relative]["sha256"]
-    ):
-        raise AwError(f"{view.image_path} is not the photo that scene.json lists: restore it")
-    return read_png_rgb(view.image_path)

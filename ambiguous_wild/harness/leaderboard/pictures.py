@@ -20,11 +20,11 @@ from ambiguous_wild.harness.leaderboard.board import measured
 from ambiguous_wild.harness.leaderboard.entry import Entry
 from ambiguous_wild.harness.leaderboard.sheet import (
     CsvValue,
+    board_csv,
     number,
     read_csv,
     slug,
     to_count,
-    to_csv,
     to_number,
     unguard,
     unique_slug,
@@ -155,7 +155,7 @@ def _write_index(board: Path, index: Iterable[Row]) -> None:
         psnr = to_number(row["psnr"], "psnr")
         texts = (*(row[k] for k in COLUMNS[:6]), seed, psnr, row["file"], row["sha256"], row["kind"])
         rows.append([*texts, _row_hash(row, "psnr")])
-    write_text(folder_of(board) / INDEX, to_csv(COLUMNS, rows))
+    write_text(folder_of(board) / INDEX, board_csv(COLUMNS, rows))
 
 
 def _row_hash(row: Row, where: str) -> str:

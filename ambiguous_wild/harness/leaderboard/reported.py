@@ -13,7 +13,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.audit.finding import Finding
 from ambiguous_wild.harness.audit.run import audit
 from ambiguous_wild.harness.audit.table import read_tables
-from ambiguous_wild.harness.leaderboard.sheet import CsvValue, to_csv
+from ambiguous_wild.harness.leaderboard.sheet import CsvValue, board_csv
 
 SOURCE = "reported"
 SOURCES = "sources.json"
@@ -126,4 +126,4 @@ def reported_csv(numbers: Sequence[Printed]) -> str:
         [SOURCE, n.method, n.setting, n.dataset, n.scene, n.metric, n.variant, n.value, n.printed, n.table]
         for n in numbers
     )
-    return to_csv(COLUMNS, rows)
+    return board_csv(COLUMNS, rows)

@@ -1,21 +1,180 @@
-"""The commands that make a scene again in an empty folder, from what the scene records of itself."""
+"""The settings of a run in words, and the commands that make it and its scene again in an empty folder."""
 
 from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Mapping
+import unicodedata
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError, Scene
+from ambiguous_wild.core.config import config_hash, to_plain
+from ambiguous_wild.harness.leaderboard.sheet import HIDDEN
+from ambiguous_wild.harness.running.records import RunResult
 from ambiguous_wild.simulate.presets import PRESETS, resized
 from ambiguous_wild.simulate.spec_file import plain_spec
 
 # options of `aw build-scene`
 FLAGS = ("camera", "matcher", "mapper", "max_features", "seed", "masks_missing", "sfm")
+
+
+def setting(config: Mapping[str, Any]) -> str:
+    """Length, effects, protocol, limits: "2000 iterations, effects exposure".
+
+    Only what the run itself says, for it is part of a cell: a method's defaults, which later versions change,
+    have no say in it. Options have a hash of their own.
+    """
+    train = config["train"]
+    words = [_length(train)]
+    if config.get("effects"):
+        words.append("effects " + "+".join(map(str, config["effects"])))
+    if config.get("protocol", "full") != "full":
+        words.append(f"{config['protocol']} images")
+    if train.get("resolution", "auto") != "auto":
+        words.append(f"resolution {train['resolution']}")
+    if train.get("max_gaussians") is not None:
+        words.append(f"at most {train['max_gaussians']} Gaussians")
+    return ", ".join(words)
+
+
+def _length(train: Mapping[str, Any]) -> str:
+    seconds = train.get("budget_s")
+    if seconds is None:
+        return f"{train.get('iterations')} iterations"
+    return f"{seconds / 60:g} min" if seconds >= 60 else f"{seconds:g} s"
+
+
+def options_hash(config: Mapping[str, Any]) -> str:
+    """First 8 hex digits over the method's options; empty where it has none."""
+    return config_hash(config["options"])[:8] if config["options"] else ""
+
+
+def command(config: Mapping[str, Any], before: Sequence[str] = ()) -> str:
+    """The command that makes the run again, the scene by its name.
+
+    From the hashed configuration alone: what a result file calls a command is a stranger's text, and whoever
+    reads a board pastes this one into a shell.
+
+    Args:
+        config: of the run.
+        before: commands that make its scene, see `preparation`.
+
+    Raises:
+        AwError: it would hold what is not seen: control characters, line breaks, text-direction marks.
+    """
+    train, method = config["train"], config["method"]
+    words = [
+        "aw",
+        "bench",
+        "--method",
+        method,
+        "--scene",
+        config["scene"].get("name"),
+        "--seed",
+        train["seed"],
+    ]
+    if config["source"]:
+        words += ["--plugin", "METHOD.py"]
+    if train.get("budget_s") is None:
+        words += ["--iterations", train.get("iterations")]
+    else:
+        words += ["--budget", f"{train['budget_s']:g}s"]
+    for flag, value, usual in (
+        ("--resolution", train.get("resolution"), "auto"),
+        ("--max-gaussians", train.get("max_gaussians"), None),
+        ("--protocol", config.get("protocol", "full"), "full"),
+        ("--factor", config["scene"].get("factor"), None),
+    ):
+        if value != usual:
+            words += [flag, value]
+    words += ["--effects", ",".join(map(str, config.get("effects") or ["none"]))]
+    for key, value in _changed(config).items():
+        words += ["--set", f"{key}={value}"]
+    words += ["--device", config.get("device", "cpu"), "-o", "runs"]
+    text = " && ".join([*before, shlex.join(str(w) for w in words)])
+    hidden = next((c for c in text if unicodedata.category(c) in HIDDEN), None)
+    if hidden is not None:
+        raise AwError(f"config.yaml holds {hidden!a}, which no command can show: run it again without")
+    return text
+
+
+def _changed(config: Mapping[str, Any]) -> dict[str, str]:
+    """METHOD.KEY and value of options that are not the method's defaults on every machine.
+
+    Of a method in a file, all of them. Of a variant only those that depend on the machine: its name says the
+    others.
+    """
+    options, name = _flat(config["options"]), config["method"]
+    if "@" in name:
+        kept = {f"{member}.{k}": options.get(f"{place}.{k}") for place, member, k in _chosen(name)}
+        return {key: _word(value) for key, value in kept.items() if value is not None}
+    usual = {} if config["source"] else _defaults(name)
+    if usual is None:
+        return {}
+    return {f"{name}.{k}": _word(v) for k, v in sorted(options.items()) if k not in usual or usual[k] != v}
+
+
+def _chosen(method: str) -> list[tuple[str, str, str]]:
+    """Of a graft: place, member and name of each option whose default depends on the machine."""
+    from ambiguous_wild.methods.registry import get_method
+
+    try:
+        places = get_method(method).places
+        return sorted((p, member, k) for p, member in places for k in get_method(member).by_machine())
+    except (AwError, ImportError):
+        return []
+
+
+@cache
+def _defaults(method: str) -> dict[str, Any] | None:
+    """Defaults that are the same on every machine; None of an unknown method."""
+    from ambiguous_wild.methods.registry import get_method
+
+    try:
+        entry = get_method(method)
+        options = _flat(to_plain(entry.options()))
+    except (AwError, ImportError):
+        return None
+    return {k: v for k, v in options.items() if k not in entry.by_machine()}
+
+
+def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return flat
+
+
+def _word(value: Any) -> str:
+    """As `--set` reads it."""
+    if isinstance(value, (list, tuple)):
+        return ",".join(map(_word, value))
+    return "none" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def hardware(path: Path, result: RunResult) -> str:
+    """What the times depend on: "Intel Xeon, 2 threads", or the GPU.
+
+    Raises:
+        AwError: env.json is damaged.
+    """
+    try:
+        facts = json.loads(path.read_text(encoding="utf-8"))
+        name = facts.get("gpu") or facts["cpu"]
+    except (OSError, ValueError, KeyError, AttributeError, RecursionError):
+        raise AwError(
+            f"{path} is damaged: restore it, or run again with 'aw bench --overwrite always'"
+        ) from None
+    threads = result["cost"].get("threads")
+    count = (
+        "" if facts.get("gpu") or threads is None else f", {threads:g} thread{'' if threads == 1 else 's'}"
+    )
+    return " ".join(str(name).split())[:100] + count
 
 
 def preparation(scene: Scene | None) -> list[str]:

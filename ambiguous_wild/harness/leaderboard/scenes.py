@@ -43,7 +43,7 @@ class Scenes:
         factor = asked.get("factor")
         key = (path, factor if isinstance(factor, int) else None)
         if key not in self._opened:
-            scene = load_scene(path, factor=key[1], verify="quick")
+            scene = load_scene(path, factor=key[1], verify=True)
             self._opened[key] = scene, scene_identity(scene)
         scene, identity = self._opened[key]
         if identity != asked.get("sha256"):

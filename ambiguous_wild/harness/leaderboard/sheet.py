@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import hashlib
-import io
 import math
 import re
 import unicodedata
@@ -12,6 +11,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.tables import plain_formats
+from ambiguous_wild.harness.tables.plain_formats import shortest
 
 FORMULA = ("=", "+", "-", "@")
 LARGEST = 200_000_000  # bytes
@@ -38,23 +39,16 @@ def number(value: float | None) -> str:
     """Shortest digits that read back as the same number; empty where it is missing."""
     if value is None or math.isnan(value):
         return ""
-    if isinstance(value, int) or (math.isfinite(value) and value == int(value) and abs(value) < 2**53):
-        return str(int(value))
-    return repr(float(value))
+    return str(value) if isinstance(value, int) else shortest(value)
 
 
-def to_csv(head: Sequence[str], rows: Iterable[Sequence[CsvValue]]) -> str:
+def board_csv(head: Sequence[str], rows: Iterable[Sequence[CsvValue]]) -> str:
     """Text is guarded, numbers stay numbers, None is an empty cell."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(head)
-    for row in rows:
-        writer.writerow([guard(c) if isinstance(c, str) else number(c) for c in row])
-    return out.getvalue()
+    return plain_formats.to_csv(head, rows, text=guard, number=shortest)
 
 
 def read_csv(path: Path, required: Sequence[str]) -> tuple[list[str], list[dict[str, str]]]:
-    """(columns, rows) of a file that `to_csv` wrote; cells as they stand, see `unguard` and `to_number`.
+    """(columns, rows) of a file that `board_csv` wrote; cells as they stand, see `unguard` and `to_number`.
 
     Raises:
         AwError: unreadable, malformed, or without a column that must be there.

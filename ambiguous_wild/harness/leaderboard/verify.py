@@ -7,17 +7,21 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any, cast
+from typing import Any, NoReturn, cast
 
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.harness.leaderboard.entry import ALONE, COST, FIRST, LAST, Entry
-from ambiguous_wild.harness.leaderboard.photos import check_photos
-from ambiguous_wild.harness.leaderboard.reproduce import preparation
+from ambiguous_wild.harness.leaderboard.photos import RESTORE, check_photos
+from ambiguous_wild.harness.leaderboard.reproduce import (
+    command,
+    hardware,
+    options_hash,
+    preparation,
+    setting,
+)
 from ambiguous_wild.harness.leaderboard.scenes import Scenes
-from ambiguous_wild.harness.leaderboard.settings import command, hardware, options_hash, setting
 from ambiguous_wild.harness.leaderboard.sheet import check_text
-from ambiguous_wild.harness.leaderboard.values import check_values
 from ambiguous_wild.harness.measures import PARTIAL
 from ambiguous_wild.harness.running.identity import config_identity
 from ambiguous_wild.harness.running.records import RunConfig, RunResult, metrics_of
@@ -27,11 +31,19 @@ from ambiguous_wild.harness.running.timing import timing_of
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.metrics import stats
+from ambiguous_wild.metrics.image import METRICS
 
 PLY = "point_cloud.ply"
 ENVIRONMENT = "env.json"
 RENDERS = Path("renders") / "test"
-ANEW = "run it again with 'aw bench --overwrite always'"
+# Lowest and highest value by the first word of a metric's name; PSNR of pictures in [0, 1] is not negative.
+RANGES = {
+    "psnr": (0.0, math.inf),
+    "ssim": (-1.0, 1.0),
+    "flip": (0.0, 1.0),
+    "lpips": (0.0, math.inf),
+}
+ROUNDING = 1e-9  # by which a share computed in floats may leave its range
 
 
 class Unfinished(AwError):
@@ -65,13 +77,16 @@ def verify(run: Path, scenes: Scenes, *, quick: bool = False) -> Verified:
     _check_identity(run, result, config)
     renders = _check_files(run, result, ours=not config["source"])
     scene = scenes.find(run, config)
-    check_values(run, result, photos=scene is not None)
+    _check_values(run, result, photos=scene is not None)
     if scene is not None:
-        check_photos(run, scene, result["per_image"], renders, half=_half(config), quick=quick)
+        half = config.get("protocol", "full") == "half"
+        check_photos(run, scene, result["per_image"], renders, half=half, quick=quick)
     dataset = scenes.dataset(run, scene, result["scene_hash"])
     quality, missing = _qualities(run, result)
     cost = {k: float(v) for k, v in result["cost"].items() if isinstance(v, (int, float)) and v == v}
-    cost |= _load(result)
+    verdict = timing_of(result["cost"]).verdict
+    if verdict != "unknown":
+        cost[ALONE] = float(verdict == "alone")
     words, again = _words(run, config, preparation(scene))
     entry = Entry(
         dataset=check_text("dataset", dataset),
@@ -99,24 +114,21 @@ def verify(run: Path, scenes: Scenes, *, quick: bool = False) -> Verified:
     return Verified(entry, run, tuple(sorted(renders)), psnr, scene)
 
 
-def _load(result: RunResult) -> dict[str, float]:
-    """Whether the run had the machine alone, as a number: 1 or 0; nothing where the load was not recorded."""
-    verdict = timing_of(result["cost"]).verdict
-    return {} if verdict == "unknown" else {ALONE: float(verdict == "alone")}
+def _changed(run: Path, what: str) -> NoReturn:
+    raise AwError(f"{run} was changed: {what}; {RESTORE}")
+
+
+def _partial(run: Path, what: str) -> NoReturn:
+    raise AwError(f"{run} is partial: {what}; {RESTORE}")
 
 
 def _result(run: Path) -> RunResult:
-    if not (run / RESULT).is_file():
-        if (run / FAILED).is_file():
-            failed = read_result(run / FAILED)
-            raise AwError(
-                f"{run} failed ({' '.join(str(failed['error']).split())[:120]}); a failed run has no "
-                f"numbers: {ANEW}"
-            )
+    if not (run / RESULT).is_file() and not (run / FAILED).is_file():
         raise Unfinished(f"{run} has no {RESULT}: still running, or stopped; the same 'aw bench' finishes it")
-    result = read_result(run / RESULT)
+    result = read_result(run / (RESULT if (run / RESULT).is_file() else FAILED))
     if result["status"] != "ok":
-        raise AwError(f"{run} failed, its {RESULT} says; a failed run has no numbers: {ANEW}")
+        error = " ".join(str(result["error"]).split())[:120]
+        raise AwError(f"{run} failed ({error}); a failed run has no numbers: run it again")
     if result["seed"] < 0:
         raise AwError(f"{run / RESULT} has seed {result['seed']}; seeds count from 0")
     return result
@@ -128,8 +140,7 @@ def _config(run: Path) -> RunConfig:
     wrong += [k for k in ("method", "source", "config_hash", "version") if not isinstance(config.get(k), str)]
     if wrong:
         raise AwError(
-            f"{run / 'config.yaml'} is absent, damaged or not of 'aw bench' ({shortlist(wrong)}); without it "
-            "its settings are unknown: restore it, or run again"
+            f"{run / 'config.yaml'} is absent, damaged or not of 'aw bench' ({shortlist(wrong)}): {RESTORE}"
         )
     return cast(RunConfig, config)
 
@@ -141,21 +152,20 @@ def _words(run: Path, config: RunConfig, before: list[str]) -> tuple[str, str]:
     except AwError as error:
         raise AwError(f"{run}: {error}") from None
     except (TypeError, ValueError, AttributeError, KeyError) as error:
-        raise AwError(f"{run / 'config.yaml'} is none that 'aw bench' writes ({error}); {ANEW}") from None
+        raise AwError(f"{run / 'config.yaml'} is none that 'aw bench' writes ({error}): {RESTORE}") from None
 
 
 def _check_identity(run: Path, result: RunResult, config: RunConfig) -> None:
     """Configuration and result are of each other, and of code that can be named."""
+    from ambiguous_wild.methods.registry import BUILTIN
+
     try:
         computed = config_identity(config)
     except (TypeError, ValueError) as error:
-        raise AwError(f"{run / 'config.yaml'} has no hash ({error}); {ANEW}") from None
+        raise AwError(f"{run / 'config.yaml'} has no hash ({error}): {RESTORE}") from None
     for where, known in (("config.yaml", config["config_hash"]), (RESULT, result["config_hash"])):
         if known != computed:
-            raise AwError(
-                f"{run} was changed: config.yaml hashes to {computed[:12]}, {where} says {str(known)[:12]}; "
-                f"restore both files, or {ANEW}"
-            )
+            _changed(run, f"config.yaml hashes to {computed[:12]}, {where} says {str(known)[:12]}")
     pairs = {
         "method": (config["method"], result["method"]),
         "scene": (config["scene"].get("name"), result["scene"]),
@@ -167,21 +177,11 @@ def _check_identity(run: Path, result: RunResult, config: RunConfig) -> None:
     }
     for what, (asked, got) in pairs.items():
         if asked != got:
-            raise AwError(
-                f"{run} was changed: {what} is {str(asked)[:40]!a} in config.yaml and {str(got)[:40]!a} in "
-                f"{RESULT}; restore both files, or {ANEW}"
-            )
-    _check_source(run, config)
-
-
-def _check_source(run: Path, config: RunConfig) -> None:
-    from ambiguous_wild.methods.registry import BUILTIN
-
+            _changed(run, f"{what} is {str(asked)[:40]!a} in config.yaml and {str(got)[:40]!a} in {RESULT}")
     source, method = config["source"], config["method"]
-    if source and not re.fullmatch(r"[0-9a-f]{64}", source):
-        raise AwError(f"{run}: source {source[:40]!a} in config.yaml is no sha256 of a method's file; {ANEW}")
     # A variant "method@..." is the method's code under another setting.
-    if not source and method.split("@")[0] not in {entry.name for entry in BUILTIN}:
+    named = method.split("@")[0] in {entry.name for entry in BUILTIN}
+    if not (re.fullmatch(r"[0-9a-f]{64}", source) or (named and not source)):
         raise AwError(
             f"{run}: method {method[:60]!a} is none of this package and config.yaml has no hash of its code, "
             "so its code is unknown; run it as a file, see docs/add-a-method.md"
@@ -197,18 +197,15 @@ def _check_files(run: Path, result: RunResult, *, ours: bool) -> dict[str, Path]
     renders = {row["name"]: run / RENDERS / _inside(run, row["name"]) for row in result["per_image"]}
     lacking += [str(path.relative_to(run)) for path in renders.values() if not path.is_file()]
     if lacking:
-        raise AwError(f"{run} is partial, it lacks {shortlist(lacking)}: restore what is gone, or {ANEW}")
+        raise AwError(f"{run} is partial, it lacks {shortlist(lacking)}; {RESTORE}")
     if not renders:
         raise AwError(f"{run} measured no test image: a scene without test views has no place on a board")
-    there = set((run / RENDERS).rglob("*.png"))
-    unlisted = sorted(str(p.relative_to(run / RENDERS)) for p in there - set(renders.values()))
-    if unlisted or len(set(renders.values())) < len(renders):
-        what = f"{shortlist(unlisted)} was rendered" if unlisted else "two images share a render"
-        raise AwError(f"{run} is partial: {what} and {RESULT} does not list it; {ANEW}")
-    if PLY in needed and (
-        size is None or not math.isclose(size, (run / PLY).stat().st_size / 1e6, abs_tol=1e-6)
-    ):
-        raise AwError(f"{run} was changed: {PLY} is not of the size that {RESULT} says; {ANEW}")
+    unlisted = sorted({p.name for p in set((run / RENDERS).rglob("*.png")) - set(renders.values())})
+    if unlisted:
+        _partial(run, f"{shortlist(unlisted)} was rendered and {RESULT} does not list it")
+    model_mb = (run / PLY).stat().st_size / 1e6 if PLY in needed else None
+    if model_mb is not None and (size is None or not math.isclose(size, model_mb, abs_tol=1e-6)):
+        _changed(run, f"{PLY} is not of the size that {RESULT} says")
     for path in renders.values():
         read_png_rgb(path)
     return renders
@@ -219,6 +216,42 @@ def _inside(run: Path, name: str) -> str:
     if pure.is_absolute() or ".." in pure.parts or not pure.name or "\\" in name:
         raise AwError(f"{run} names a test image outside itself: {name[:60]!a}; it is no run of ours")
     return str(pure.with_suffix(".png"))
+
+
+def _check_values(run: Path, result: RunResult, *, photos: bool) -> None:
+    """Refuse numbers that no measurement can give, and results that lack a required number.
+
+    `photos`: the test photos are at hand, and tell whether an infinite PSNR is right.
+    """
+    rows = result["per_image"]
+    for metric in METRICS:
+        # No reason excuses it: these need nothing but the two pictures.
+        lacking = [row["name"] for row in rows if metrics_of(row).get(metric) is None]
+        if lacking:
+            _partial(run, f"no {metric} of {shortlist(lacking)}, which every run measures")
+    for row in rows:
+        for metric, value in metrics_of(row).items():
+            family = metric.partition("_")[0]
+            low, high = RANGES.get(family, (-math.inf, math.inf))
+            if value is None:
+                continue
+            if not low - ROUNDING <= value <= high + ROUNDING:
+                _impossible(run, f"{metric} of {row['name']}", value, f"lies between {low:g} and {high:g}")
+            if math.isinf(value) and not (family == "psnr" and photos):
+                why = "is infinite only where picture and photo are equal, and the photos are not at hand: "
+                why = f"{why}name them with --scenes" if family == "psnr" else "is finite"
+                _impossible(run, f"{metric} of {row['name']}", value, why)
+    masks: Mapping[str, Any] = result["masks"] or {}
+    for name in MASK_SCORES:
+        if masks.get(name) is not None and not 0.0 <= masks[name] <= 1.0 + ROUNDING:
+            _impossible(run, f"masks.{name}", masks[name], "is a share, from 0 to 1")
+    for name, amount in result["cost"].items():
+        if isinstance(amount, (int, float)) and not (math.isfinite(amount) and amount >= 0):
+            _impossible(run, f"cost.{name}", amount, "is finite and not below 0")
+
+
+def _impossible(run: Path, what: str, value: float, why: str) -> NoReturn:
+    _changed(run, f"{what} is {value:g} in {RESULT}, such a number {why}")
 
 
 def _qualities(run: Path, result: RunResult) -> tuple[dict[str, float], tuple[str, ...]]:
@@ -244,7 +277,3 @@ def _qualities(run: Path, result: RunResult) -> tuple[dict[str, float], tuple[st
 
 def _known(value: float | None) -> float:
     return math.nan if value is None else value
-
-
-def _half(config: RunConfig) -> bool:
-    return config.get("protocol", "full") == "half"

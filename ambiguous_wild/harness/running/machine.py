@@ -1,11 +1,10 @@
-"""What else the machine does while a run trains: busy processors, load, other runs, the GPU's clock."""
+"""What else the machine does while a run trains: busy processors, and other runs."""
 
 from __future__ import annotations
 
 import contextlib
 import getpass
 import os
-import subprocess
 import tempfile
 import time
 import uuid
@@ -18,7 +17,6 @@ from filelock import FileLock, Timeout
 _STAT = Path("/proc/stat")
 _IDLE = (3, 4)  # fields of a line of /proc/stat: idle, waiting for a disk
 _GUEST = (8, 9)  # counted in user and nice already
-_QUERY_S = 5.0
 
 
 def cores() -> int:
@@ -47,31 +45,6 @@ def own_s() -> float:
     """Processor seconds of this process and of its children that have ended."""
     times = os.times()
     return time.process_time() + times.children_user + times.children_system
-
-
-def load() -> float | None:
-    """Load average of the last minute; None where the system has none."""
-    try:
-        return os.getloadavg()[0]
-    except (AttributeError, OSError):
-        return None
-
-
-def gpu_clock_mhz(device: str) -> float | None:
-    """The clock of a GPU's processors now; None where the driver does not tell."""
-    if not device.startswith("cuda"):
-        return None
-    words = [
-        "nvidia-smi",
-        f"--id={_gpu_name(device)}",
-        "--query-gpu=clocks.sm",
-        "--format=csv,noheader,nounits",
-    ]
-    try:
-        done = subprocess.run(words, capture_output=True, text=True, timeout=_QUERY_S, check=True)
-        return float(done.stdout.split()[0])
-    except (OSError, subprocess.SubprocessError, ValueError, IndexError):
-        return None
 
 
 def unit(device: str) -> str:

@@ -56,8 +56,6 @@ class Meter:
         self.presence = presence or machine.Presence(machine.unit(device))
         self._stack = ExitStack()
         self.samples: list[list[float]] = []  # trained seconds and the numbers of a Reading; NaN = none
-        self.clocks: list[float] = []
-        self.loads: list[float] = []
         self.runs = 1
         # of the intervals so far: seconds, processor seconds of this run, and of others
         self.wall_s = self.own_s = self.others_s = 0.0
@@ -104,8 +102,6 @@ class Meter:
         wall, own, others, blind = self._interval()
         return {
             "samples": [list(sample) for sample in self.samples],
-            "clocks": list(self.clocks),
-            "loads": list(self.loads),
             "runs": self.runs,
             "wall_s": self.wall_s + wall,
             "own_s": self.own_s + own,
@@ -118,7 +114,6 @@ class Meter:
         if self._since is not None:
             return
         self.samples = [list(map(float, sample)) for sample in state["samples"]]
-        self.clocks, self.loads = list(state["clocks"]), list(state["loads"])
         self.runs, self.blind = int(state["runs"]), bool(state["blind"])
         self.wall_s, self.own_s, self.others_s = (float(state[k]) for k in ("wall_s", "own_s", "others_s"))
 
@@ -140,10 +135,6 @@ class Meter:
             record["parallel_share"] = share
         if self.wall_s > 0.0 and not self.blind:
             record["others"] = self.others_s / self.wall_s
-        if self.loads:
-            record["load"] = sum(self.loads) / len(self.loads)
-        if self.clocks:
-            record["clock_mhz"] = [min(self.clocks), max(self.clocks)]
         cost: Cost = {"timing": record}
         if self.samples:
             found = in_reference_seconds(record["samples"], self.kernel.reference_s, [trained_s])
@@ -205,9 +196,6 @@ class Meter:
             [trained_s, reading.seconds, reading.processors, serial_s, reading.serial_processors]
         )
         self.runs = max(self.runs, self.presence.count())
-        for found, into in ((machine.load(), self.loads), (machine.gpu_clock_mhz(self.device), self.clocks)):
-            if found is not None:
-                into.append(found)
 
     def _now(self) -> tuple[float, float | None, float]:
         return time.monotonic(), machine.busy_s(), machine.own_s()

@@ -58,8 +58,6 @@ class TimeRecord(TypedDict, total=False):
     parallel_share: float  # of the time in which several threads worked; the samples allow for it
     runs: int  # most runs of ours at once on this machine or GPU, this one included
     others: float  # processors that other programs used, mean over the run
-    load: float  # load average of one minute, mean over the samples
-    clock_mhz: list[float]  # of the GPU, lowest and highest at the samples
 
 
 class Cost(TypedDict, total=False):

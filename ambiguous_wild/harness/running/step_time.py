@@ -16,11 +16,11 @@ def expected_s(iterations: int, pixels: int, gaussians: int) -> float:
     return 1e-3 * iterations * (STEP_MS + 1e-3 * (PIXELS_MS * pixels + GAUSSIANS_MS * gaussians))
 
 
-def slowness() -> float:
-    """How many times longer than on the reference machine this CPU takes now; kernels must be compiled."""
+def slowness(device: str = "cpu") -> float:
+    """How many times longer than on the reference machine this one takes now; kernels must be compiled."""
     import torch
 
     from ambiguous_wild.splat.calibration import KERNELS, calibration
 
-    kernel = calibration(torch.device("cpu"))
-    return statistics.median(kernel.seconds() for _ in range(3)) / KERNELS["cpu"].reference_s
+    kernel = calibration(torch.device(device))
+    return statistics.median(kernel.seconds() for _ in range(3)) / KERNELS[device].reference_s

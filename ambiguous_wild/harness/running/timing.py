@@ -1,7 +1,6 @@
 """Whether the times of runs can be compared, and in which seconds. Reads records; measures nothing.
 
     timing = timing_of(result["cost"])       # verdict and reason of one run
-    why = why_not_ranked(costs)              # "" = rank these runs by cost["reference_s"]
     text = seconds_range([c["train_s"] for c in costs])     # shown instead, unranked
 
 A run is *alone* where nothing else used its processors, and *contended* otherwise. `reference_s` is the
@@ -13,7 +12,7 @@ speed; a contended run keeps it, but is not ranked.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -22,8 +21,6 @@ import numpy as np
 Verdict = Literal["alone", "contended", "unknown"]
 VERDICTS: tuple[Verdict, ...] = ("alone", "contended", "unknown")
 UNTIMED = "its time was not calibrated (an earlier version, several GPUs, or an external program)"
-# Keys of "cost" that a busy machine changes; whatever ranks one of them asks `why_not_ranked` first.
-TIMED = ("train_s", "reference_s", "setup_s", "ms_per_iteration", "fps", "fps_low", "fps_high")
 
 
 @dataclass(frozen=True)
@@ -34,11 +31,6 @@ class Timing:
     reason: str  # why it is contended or unknown; empty for a run that was alone
     kernel: str  # calibration that `reference_s` rests on, e.g. "cpu-1"; empty without one
     reference_s: float  # training in seconds of the reference machine; NaN without calibration
-
-    @property
-    def ranked(self) -> bool:
-        """Whether this time may take part in a ranking."""
-        return self.verdict == "alone" and math.isfinite(self.reference_s)
 
 
 def timing_of(cost: Mapping[str, Any]) -> Timing:
@@ -53,23 +45,6 @@ def timing_of(cost: Mapping[str, Any]) -> Timing:
         str(record.get("kernel", "")),
         math.nan if seconds is None else float(seconds),
     )
-
-
-def why_not_ranked(costs: Iterable[Mapping[str, Any]]) -> str:
-    """Why the times of these runs cannot be ranked against each other; empty where they can.
-
-    Args:
-        costs: "cost" of each result.
-    """
-    timings = [timing_of(cost) for cost in costs]
-    for verdict in ("contended", "unknown"):
-        reasons = [t.reason for t in timings if t.verdict == verdict]
-        if reasons:
-            return f"{len(reasons)} of {len(timings)} runs {verdict}: {reasons[0]}"
-    if any(not t.ranked for t in timings):
-        return UNTIMED
-    kernels = sorted({t.kernel for t in timings})
-    return f"calibrated by different kernels: {', '.join(kernels)}" if len(kernels) > 1 else ""
 
 
 def seconds_range(values: Sequence[float], digits: int = 0) -> str:

@@ -1,18 +1,16 @@
-"""From runs to a comparison: rows are methods, columns are measures, one block a scene.
+"""From runs to a comparison: rows are methods, columns are measures, one table a scene.
 
 The mean is taken over images, then over seeds, then over scenes, in that order. No mean is shown where a
 value is missing. A scene that cannot have a value, such as a mask score without distractors, is left out of
 the mean, for every method. A failed run makes its cell "failed", so that no method gains by failing where
 it is hard, and a method with an unfinished run shows what it has but is not ranked.
-`render.py` writes a `Table` as text, Markdown, CSV or LaTeX.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -21,63 +19,21 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist, unknown
 from ambiguous_wild.harness.measures import ALWAYS, COST, MEASURES, PARTIAL, Measure, measure
 from ambiguous_wild.harness.running.store import TEXT_OF_RUNS, Runs
-from ambiguous_wild.harness.tables.notes import notes
-from ambiguous_wild.harness.tables.times import incomparable, untimed
+from ambiguous_wild.harness.tables.notes import incomparable, notes, untimed
+from ambiguous_wild.harness.tables.table import Cell, Column, Row, State, Table, ranks
 from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.metrics import stats
 
 MASK_COLUMNS = ("mask_iou", "mask_precision")
 UNDEFINED_ON_SOME = (*PARTIAL, *MASK_COLUMNS, "mask_recall")
-State = Literal["ok", "missing", "failed", "absent"]
-
-
-@dataclass(frozen=True)
-class TableCell:
-    """One number of the table."""
-
-    value: float = math.nan
-    spread: float = math.nan  # sample deviation over seeds; NaN for one seed
-    low: float = math.nan  # 95 % bootstrap interval over the images of one scene
-    high: float = math.nan
-    rank: int | None = None  # 1, 2, 3 or None
-    ranged: bool = False  # a time that cannot be compared: shown from `low` to `high`, its least and its most
-    state: State = "ok"
-
-
-@dataclass(frozen=True)
-class Row:
-    method: str
-    cells: tuple[TableCell, ...]  # one a column
-    runs: int  # finished runs behind it
-    ranked: bool = True  # False: a run behind it is unfinished, or the method knows the truth
-
-
-@dataclass(frozen=True)
-class Block:
-    scene: str | None  # None: the mean over all scenes
-    rows: tuple[Row, ...]
-
-
-@dataclass(frozen=True)
-class Table:
-    columns: tuple[Measure, ...]
-    blocks: tuple[Block, ...]  # the mean over scenes first, where there are several
-    scenes: tuple[str, ...]
-    notes: tuple[str, ...]  # what is missing, failed or not comparable
-
-    @property
-    def title(self) -> str:
-        return self.scenes[0] if len(self.scenes) == 1 else f"mean over {len(self.scenes)} scenes"
-
-    def with_note(self, note: str) -> Table:
-        """The same table with one more line below."""
-        return replace(self, notes=(*self.notes, note))
 
 
 def comparison(
     runs: Runs, *, metrics: Sequence[str] = (), scenes: Sequence[str] = (), drop_empty: bool | None = None
-) -> Table:
-    """The comparison of every method over the scenes.
+) -> list[Table]:
+    """The comparison of every method: a table a scene, before them the mean where there are several.
+
+    Notes on what is missing, failed or not comparable stand below the last table.
 
     Args:
         runs: from `store.read_runs`.
@@ -110,37 +66,34 @@ def comparison(
     columns = _columns(runs, metrics)
     defined = {c.key: [s for s in chosen if index.can_have(s, c, methods)] for c in columns}
     unranked = incomparable(runs.runs, columns)
-    blocks = [Block(scene, tuple(_scene_row(index, m, scene, columns) for m in methods)) for scene in chosen]
+    rows = {scene: [_scene_row(index, m, scene, columns) for m in methods] for scene in chosen}
     if len(chosen) > 1:
-        mean = tuple(_mean_row(index, m, chosen, columns, blocks, defined) for m in methods)
-        blocks.insert(0, Block(None, mean))
-    told = (*notes(runs, columns, methods, chosen), *_undefined(columns, chosen, defined))
-    if drop_empty if drop_empty is not None else not metrics:
-        columns, blocks = _without_empty(columns, blocks)
-    return Table(columns, tuple(_ranked(b, columns, unranked) for b in blocks), chosen, told)
+        mean = [_mean_row(index, k, m, chosen, columns, rows, defined) for k, m in enumerate(methods)]
+        rows = {"": mean} | rows
+    title = f"mean over {len(chosen)} scenes"
+    tables = [
+        Table(
+            scene or title,
+            tuple(Column("", measure, scene) for measure in columns),
+            tuple(_ranked(of, columns, unranked)),
+            continued=True,
+        )
+        for scene, of in rows.items()
+    ]
+    tables[-1] = replace(tables[-1], continued=False).with_notes(
+        *notes(runs, columns, methods, chosen), *_undefined(columns, chosen, defined)
+    )
+    return _without_empty(tables) if drop_empty or (drop_empty is None and not metrics) else tables
 
 
-def _without_empty(
-    columns: tuple[Measure, ...], blocks: list[Block]
-) -> tuple[tuple[Measure, ...], list[Block]]:
+def _without_empty(tables: list[Table]) -> list[Table]:
     """Without the columns that have no value anywhere; where none has any, everything stays."""
     kept = [
         i
-        for i in range(len(columns))
-        if any(row.cells[i].state == "ok" for block in blocks for row in block.rows)
+        for i in range(len(tables[0].columns))
+        if any(row.cells[i].state == "ok" for table in tables for row in table.rows)
     ]
-    return (columns, blocks) if not kept else selected(columns, blocks, kept)
-
-
-def selected(
-    columns: tuple[Measure, ...], blocks: Sequence[Block], kept: Sequence[int]
-) -> tuple[tuple[Measure, ...], list[Block]]:
-    """Columns and blocks with the columns of these numbers alone."""
-    chosen = [
-        replace(b, rows=tuple(replace(r, cells=tuple(r.cells[i] for i in kept)) for r in b.rows))
-        for b in blocks
-    ]
-    return tuple(columns[i] for i in kept), chosen
+    return [table.picked(kept) for table in tables] if kept else tables
 
 
 def _undefined(
@@ -215,17 +168,17 @@ def _scene_row(index: _Index, method: str, scene: str, columns: tuple[Measure, .
     state = index.state(method, scene)
     if state != "ok":
         count = 0 if state == "absent" else int((index.runs[method, scene]["status"] == "ok").sum())
-        return Row(method, tuple(TableCell(state=state) for _ in columns), count)
+        return Row(method, tuple(Cell(state=state) for _ in columns), runs=count)
     cells = []
     for column in columns:
         values = index.seeds(method, scene, column).to_numpy()
         value = stats.mean(values)
         if math.isnan(value):
-            cells.append(TableCell(state="missing"))
+            cells.append(Cell(state="missing"))
             continue
         low = high = math.nan
         if column.timed and (method, scene) in index.untimed:
-            cells.append(TableCell(value, math.nan, float(values.min()), float(values.max()), ranged=True))
+            cells.append(Cell(value, math.nan, float(values.min()), float(values.max()), ranged=True))
             continue
         if column.per_image:
             images = index.images[method, scene, column.key].pivot_table(
@@ -233,57 +186,63 @@ def _scene_row(index: _Index, method: str, scene: str, columns: tuple[Measure, .
             )
             interval = stats.bootstrap_interval(images.to_numpy().mean(axis=1))
             low, high = interval.low, interval.high
-        cells.append(TableCell(value, stats.spread(values), low, high))
+        cells.append(Cell(value, stats.spread(values), low, high))
     ranked = (method, scene) not in index.unfinished and not knows_truth(method)
-    return Row(method, tuple(cells), len(index.runs[method, scene]), ranked=ranked)
+    return Row(method, tuple(cells), runs=len(index.runs[method, scene]), ranked=ranked)
 
 
 def _mean_row(
     index: _Index,
+    k: int,  # number of the method among the rows
     method: str,
     scenes: tuple[str, ...],
     columns: tuple[Measure, ...],
-    blocks: list[Block],
+    by_scene: Mapping[str, Sequence[Row]],
     defined: Mapping[str, Sequence[str]],  # column -> scenes that can have a value
 ) -> Row:
-    rows = [next(r for r in block.rows if r.method == method) for block in blocks]
+    rows = [by_scene[scene][k] for scene in scenes]
     states = [index.state(method, scene) for scene in scenes]
     cells = []
     for i, column in enumerate(columns):
         over = defined[column.key]
         value = stats.mean([row.cells[i].value for row, s in zip(rows, scenes) if s in over])
         if "failed" in states:
-            cells.append(TableCell(state="failed"))
+            cells.append(Cell(state="failed"))
         elif math.isnan(value):
-            cells.append(TableCell(state="missing"))
+            cells.append(Cell(state="missing"))
         elif any(row.cells[i].ranged for row in rows):
             own = [(c.low, c.high) if c.ranged else (c.value, c.value) for c in (r.cells[i] for r in rows)]
             low, high = (float(np.mean(ends)) for ends in zip(*own))
-            cells.append(TableCell(value, math.nan, low, high, ranged=True))
+            cells.append(Cell(value, math.nan, low, high, ranged=True))
         else:
             # Seed by seed, so that the spread is that of the number shown; needs the same seeds everywhere.
             by_seed = pd.concat([index.seeds(method, s, column) for s in over], axis=1).to_numpy()
-            cells.append(TableCell(value, stats.spread(by_seed.mean(axis=1))))
-    return Row(method, tuple(cells), sum(row.runs for row in rows), ranked=all(row.ranked for row in rows))
+            cells.append(Cell(value, stats.spread(by_seed.mean(axis=1))))
+    return Row(
+        method, tuple(cells), runs=sum(row.runs for row in rows), ranked=all(row.ranked for row in rows)
+    )
 
 
-def _ranked(block: Block, columns: tuple[Measure, ...], unranked: frozenset[str]) -> Block:
-    """The block with the first, second and third of every column marked; equal in print = equal rank.
+def _ranked(rows: Sequence[Row], columns: tuple[Measure, ...], unranked: frozenset[str]) -> list[Row]:
+    """The rows with the first, second and third of every column marked.
 
     `unranked`: columns of times that were measured on machines that differ.
     """
-    rows = [list(row.cells) for row in block.rows]
+    marked = [list(row.cells) for row in rows]
     for i, column in enumerate(columns):
-        values = {
-            k: round(row.cells[i].value, column.digits)
-            for k, row in enumerate(block.rows)
-            if row.ranked and row.cells[i].state == "ok" and not row.cells[i].ranged
-        }
-        if column.better is None or column.key in unranked or len(set(values.values())) < 2:
+        if column.key in unranked:
             continue
-        for k, value in values.items():
-            ahead = sum(v > value if column.better == "higher" else v < value for v in values.values())
-            if ahead < 3:
-                rows[k][i] = replace(rows[k][i], rank=ahead + 1)
-    marked = (replace(row, cells=tuple(cells)) for row, cells in zip(block.rows, rows))
-    return replace(block, rows=tuple(marked))
+        cells = [row.cells[i] for row in rows]
+        values = [
+            c.value if row.ranked and c.state == "ok" and not c.ranged else math.nan
+            for row, c in zip(rows, cells)
+        ]
+        for k, rank in enumerate(ranks(values, column)):
+            marked[k][i] = replace(cells[k], rank=rank)
+    return [replace(row, cells=tuple(cells), note=_why_unranked(row)) for row, cells in zip(rows, marked)]
+
+
+def _why_unranked(row: Row) -> str:
+    if row.ranked:
+        return ""
+    return "knows the truth, not ranked" if knows_truth(row.name) else "unfinished, not ranked"

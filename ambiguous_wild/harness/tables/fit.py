@@ -1,14 +1,13 @@
-"""Tables for a terminal: the columns that fit its width; wide layouts become several tables."""
+"""Tables for a terminal: the columns that fit its width, or several tables for all of them."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 from ambiguous_wild.harness.measures import Measure
-from ambiguous_wild.harness.tables.comparison import Table, selected
-from ambiguous_wild.harness.tables.layouts.grid import Layout
-from ambiguous_wild.harness.tables.layouts.plain_formats import marked, row_name
-from ambiguous_wild.harness.tables.render import ARROWS, display_width, number, plain
+from ambiguous_wild.harness.tables.plain_formats import display_width, marked, plain, row_name
+from ambiguous_wild.harness.tables.table import Table
 
 WIDTH = 100
 # What is shown first; what is not listed comes after, in the order of the table.
@@ -18,47 +17,42 @@ FIRST = (
 )  # fmt: skip
 
 
-def fitted(table: Table, width: int = WIDTH) -> Table:
-    """The table with the most important columns that fit, in their order; a note names the others.
+def fitted(tables: Sequence[Table], width: int = WIDTH) -> list[Table]:
+    """Tables of the same columns with the most important ones that fit, in their order.
 
-    At least one column is kept, however long the names are.
+    A note below the last table names the others. At least one column is kept, however long the names are.
     """
-    left = width - max(display_width(plain(r.method)) for b in table.blocks for r in b.rows)
-    order = sorted(range(len(table.columns)), key=lambda i: (_importance(table.columns[i]), i))
+    columns = tables[0].columns
+    left = width - max(display_width(row_name(row)) for table in tables for row in table.rows)
+    order = sorted(range(len(columns)), key=lambda i: (_importance(columns[i].measure), i))
     kept: list[int] = []
     for i in order:
-        need = 2 + _width(table, i)
+        need = max(_column_width(table, i) for table in tables)
         if kept and need > left:
             continue
         kept.append(i)
         left -= need
-    out = [c.label for i, c in enumerate(table.columns) if i not in kept]
+    out = [column.measure.label for i, column in enumerate(columns) if i not in kept]
     if not out:
-        return table
-    columns, blocks = selected(table.columns, table.blocks, sorted(kept))
+        return list(tables)
+    shown = [table.picked(sorted(kept)) for table in tables]
     note = f"not shown, to fit {width} columns: {', '.join(out)}; --all shows them"
-    return replace(table, columns=columns, blocks=tuple(blocks), notes=(*table.notes, note))
+    return [*shown[:-1], shown[-1].with_notes(note)]
 
 
 def _importance(column: Measure) -> int:
     return FIRST.index(column.key) if column.key in FIRST else len(FIRST)
 
 
-def _width(table: Table, i: int) -> int:
-    column = table.columns[i]
-    cells = [number(column, row.cells[i]) for block in table.blocks for row in block.rows]
-    return max(display_width(t) for t in (f"{column.label}{ARROWS[column.better]}", *cells))
-
-
-def divided(layout: Layout, width: int = WIDTH) -> list[Layout]:
-    """The layout as tables that fit: columns of one heading stay together where they can."""
-    room = width - max((display_width(row_name(line)) for line in layout.lines), default=0)
+def divided(table: Table, width: int = WIDTH) -> list[Table]:
+    """The table as tables that fit: columns of one heading stay together where they can."""
+    room = width - max((display_width(row_name(row)) for row in table.rows), default=0)
     parts: list[list[int]] = [[]]
     left, at = room, 0
-    for title, count in layout.groups:
+    for title, count in table.groups:
         group = list(range(at, at + count))
         at += count
-        needs = [_layout_width(layout, i) for i in group]
+        needs = [_column_width(table, i) for i in group]
         needs[0] += max(0, display_width(plain(title)) + 2 - sum(needs))
         if parts[-1] and sum(needs) > left:
             parts.append([])
@@ -69,20 +63,16 @@ def divided(layout: Layout, width: int = WIDTH) -> list[Layout]:
                 left = room
             parts[-1].append(i)
             left -= need
-    return [_part(layout, columns, k, len(parts)) for k, columns in enumerate(parts)]
+    return [_part(table, columns, k, len(parts)) for k, columns in enumerate(parts)]
 
 
-def _part(layout: Layout, columns: list[int], k: int, count: int) -> Layout:
+def _part(table: Table, columns: list[int], k: int, count: int) -> Table:
     """Notes stand below the last part."""
-    title = f"{layout.title}, part {k + 1} of {count}" if count > 1 else layout.title
-    lines = tuple(replace(line, entries=tuple(line.entries[i] for i in columns)) for line in layout.lines)
-    notes = layout.notes if k == count - 1 else ()
-    return replace(
-        layout, title=title, columns=tuple(layout.columns[i] for i in columns), lines=lines, notes=notes
-    )
+    title = f"{table.title}, part {k + 1} of {count}" if count > 1 else table.title
+    return replace(table.picked(columns), title=title, notes=table.notes if k == count - 1 else ())
 
 
-def _layout_width(layout: Layout, i: int) -> int:
-    column = layout.columns[i]
-    cells = [marked(line.entries[i], column.measure) for line in layout.lines]
+def _column_width(table: Table, i: int) -> int:
+    column = table.columns[i]
+    cells = [marked(row.cells[i], column.measure) for row in table.rows]
     return 2 + max(display_width(text) for text in (column.label, *cells))

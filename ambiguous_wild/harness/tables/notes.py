@@ -1,4 +1,4 @@
-"""Notes below a comparison: missing, failed and unfinished runs, and results that do not compare."""
+"""Notes below a comparison: missing, failed and unfinished runs, results and times that do not compare."""
 
 from __future__ import annotations
 
@@ -8,16 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from ambiguous_wild.core.config import flatten
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.harness.measures import Measure
 from ambiguous_wild.harness.running.store import Runs, read_config
-from ambiguous_wild.harness.tables.times import time_notes
 from ambiguous_wild.methods.graft import members
 from ambiguous_wild.methods.registry import all_methods, knows_truth
 
 LENGTHS_DIFFER = 1.1  # a note is due where the longest training has this many times the shortest's steps
+REFERENCE = "reference_s"  # compares machines; other times compare runs of one machine
 
 
 def notes(
@@ -168,4 +169,50 @@ def _not_comparable(runs: Runs, columns: Sequence[Measure]) -> list[str]:
         lines.append(
             "results of different versions of ambiguous_wild: " + ", ".join(sorted(set(ok["version"])))
         )
+    return lines
+
+
+def untimed(frame: pd.DataFrame) -> dict[tuple[str, str], str]:
+    """(method, scene) -> why its times are not ranked: one of its runs was not alone, or not calibrated.
+
+    Args:
+        frame: `Runs.runs`.
+    """
+    done = frame[frame["status"] == "ok"]
+    found: dict[tuple[str, str], str] = {}
+    for row in done[done["timing"] != "alone"].itertuples():
+        found.setdefault((str(row.method), str(row.scene)), f"{row.timing}: {row.timing_reason}")
+    return found
+
+
+def incomparable(frame: pd.DataFrame, columns: Sequence[Measure]) -> frozenset[str]:
+    """Keys of timed columns whose values come from machines, or calibrations, that differ."""
+    alone = frame[(frame["status"] == "ok") & (frame["timing"] == "alone")]
+    differ = {
+        REFERENCE: alone["timing_kernel"].nunique() > 1,
+        "": alone["hardware"].nunique() > 1,
+    }
+    return frozenset(c.key for c in columns if c.timed and differ[REFERENCE if c.key == REFERENCE else ""])
+
+
+def time_notes(frame: pd.DataFrame, columns: Sequence[Measure]) -> list[str]:
+    """One line a reason for times that are not ranked."""
+    if not any(c.timed for c in columns):
+        return []
+    reasons: dict[str, list[str]] = {}
+    for (method, scene), reason in untimed(frame).items():
+        reasons.setdefault(reason, []).append(f"{method} on {scene}")
+    total = len(frame[frame["status"] == "ok"].groupby(["method", "scene"]))
+    lines = [
+        f"times not ranked, lowest to highest run: {'all' if len(who) == total else shortlist(who)}: {reason}"
+        for reason, who in reasons.items()
+    ]
+    unranked = incomparable(frame, columns)
+    if unranked - {REFERENCE}:
+        machines = sorted(set(frame[frame["timing"] == "alone"]["hardware"]))
+        lines.append(
+            f"times of different machines, ranked by reference seconds alone: {shortlist(machines, 4)}"
+        )
+    if REFERENCE in unranked:
+        lines.append("reference seconds of CPU and GPU are not ranked against each other")
     return lines

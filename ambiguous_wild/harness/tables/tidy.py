@@ -10,7 +10,6 @@ import pandas as pd
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.harness.measures import measure
 from ambiguous_wild.harness.running.store import TEXT_OF_RUNS, Runs
-from ambiguous_wild.harness.tables.render import csv_text
 
 COLUMNS = ("scene", "method", "seed", "image", "metric", "value", "better", "reason", "config_hash")
 _KEYS = ["scene", "method", "seed"]
@@ -49,14 +48,6 @@ def _only(frame: pd.DataFrame, column: str, names: Sequence[str]) -> pd.DataFram
         if name not in known:
             raise unknown(column, name, known)
     return frame[frame[column].isin(list(names))].copy() if names else frame
-
-
-def to_csv(frame: pd.DataFrame) -> str:
-    """CSV of a tidy table: an empty value is missing, ``inf`` is infinite, no cell is a formula."""
-    guarded = frame.copy()
-    for name in _TEXT:
-        guarded[name] = guarded[name].map(lambda text: csv_text(str(text)))
-    return str(guarded.to_csv(index=False, lineterminator="\n"))
 
 
 def _images(runs: Runs) -> pd.DataFrame:

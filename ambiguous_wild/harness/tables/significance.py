@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 
 from ambiguous_wild.harness.running.store import Runs
+from ambiguous_wild.harness.tables.table import Row, Table
 
 LEVEL = 0.95
 RESAMPLES = 2000
@@ -59,6 +61,29 @@ class Ties:
             means = cells["mean"].where(cells["count"] == cells["size"])
             self._values[key] = means.unstack("method")
         return self._values[key]
+
+    def marked(self, tables: Sequence[Table], scenes: Sequence[str]) -> list[Table]:
+        """Tables of `comparison` with the cells marked that do not differ from the best of their column.
+
+        `scenes`: that a mean is over.
+        """
+        return [
+            replace(table, rows=tuple(self._marked(row, table, scenes) for row in table.rows))
+            for table in tables
+        ]
+
+    def _marked(self, row: Row, table: Table, scenes: Sequence[str]) -> Row:
+        cells = []
+        for i, (column, cell) in enumerate(zip(table.columns, row.cells)):
+            best = [other.name for other in table.rows if other.cells[i].rank == 1]
+            of = (column.scene,) if column.scene else scenes
+            tie = (
+                row.ranked and cell.state == "ok" and column.measure.per_image
+                and bool(best) and row.name not in best
+                and self.tied(best[0], row.name, of, column.measure.key)
+            )  # fmt: skip
+            cells.append(replace(cell, tie=tie))
+        return replace(row, cells=tuple(cells))
 
     def tied(self, best: str, other: str, scenes: Sequence[str], metric: str) -> bool:
         """Whether the interval of their difference holds zero; False where it is not known."""

@@ -1,4 +1,4 @@
-"""The study of `aw ablate` as laid-out tables: a table a group, a row a variant."""
+"""The study of `aw ablate` as tables: a table a group, a row a variant."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from pathlib import Path
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.ablation.records import GroupFacts, StudyReport, VariantRow
 from ambiguous_wild.harness.measures import Measure, measure
-from ambiguous_wild.harness.tables.layouts.grid import Column, Layout, LayoutCell, Line, ranked
+from ambiguous_wild.harness.tables.table import Cell, Column, Row, Table, ranks
 
 FILE = "ablation.json"
 SHOWN = ("psnr", "ssim", "lpips_alex", "lpips_vgg", "mask_iou", "ms_per_iteration", "gaussians", "model_mb")
 
 
-def ablation(folder: Path, metrics: tuple[str, ...] = ()) -> list[Layout]:
+def ablation(folder: Path, metrics: tuple[str, ...] = ()) -> list[Table]:
     """The tables of a study.
 
     Args:
@@ -42,13 +42,13 @@ def ablation(folder: Path, metrics: tuple[str, ...] = ()) -> list[Layout]:
         raise AwError(f"{path} is damaged ({error!r}): run 'aw ablate' again") from None
 
 
-def _group(group: GroupFacts, rows: list[VariantRow], columns: list[Measure], data: StudyReport) -> Layout:
+def _group(group: GroupFacts, rows: list[VariantRow], columns: list[Measure], data: StudyReport) -> Table:
     members = [row for row in rows if row["group"] == group["name"]]
-    ranks = [ranked([_number(_mean(row, c.key)) for row in members], c) for c in columns]
+    by_column = [ranks([_number(_mean(row, c.key)) for row in members], c) for c in columns]
     lines = []
     for k, row in enumerate(members):
-        entries = [_entry(row, c, rank[k]) for c, rank in zip(columns, ranks)]
-        lines.append(Line(str(row["variant"]), tuple(entries), note=str(row["text"])))
+        cells = [_cell(row, c, rank[k]) for c, rank in zip(columns, by_column)]
+        lines.append(Row(str(row["variant"]), tuple(cells), note=str(row["text"])))
     notes = [f"{row['variant']} {row['status']}: {row['reason']}" for row in members if row["status"] != "ok"]
     source = f" (paper: {group['source']})" if group["source"] else ""
     notes.append(f"{', '.join(data['scenes'])}; seeds {', '.join(map(str, data['seeds']))}")
@@ -56,16 +56,16 @@ def _group(group: GroupFacts, rows: list[VariantRow], columns: list[Measure], da
     notes += [f"command of the runs: {data['made_by']}"] if data["made_by"] else []
     title = f"{data['method']}, {group['name']}: {group['title']}{source}"
     over = "seeds" if len(data["scenes"]) == 1 else "scenes and seeds"
-    return Layout(title, tuple(Column("", c) for c in columns), tuple(lines), tuple(notes), over)
+    return Table(title, tuple(Column("", c) for c in columns), tuple(lines), tuple(notes), over)
 
 
-def _entry(row: VariantRow, column: Measure, rank: int | None) -> LayoutCell:
+def _cell(row: VariantRow, column: Measure, rank: int | None) -> Cell:
     if row["status"] == "failed":
-        return LayoutCell(state="failed")
+        return Cell(state="failed")
     value = _number(_mean(row, column.key))
     if math.isnan(value):
-        return LayoutCell(state="missing")
-    return LayoutCell(value, _number(row["values"][column.key]["spread"]), rank)
+        return Cell(state="missing")
+    return Cell(value, _number(row["values"][column.key]["spread"]), rank=rank)
 
 
 def _mean(row: VariantRow, key: str) -> float | None:

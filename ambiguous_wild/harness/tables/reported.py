@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.audit.table import MEAN, REPORTED, Number, read_tables
-from ambiguous_wild.harness.tables.layouts.grid import Column, Layout, LayoutCell, Line
+from ambiguous_wild.harness.tables.table import BLANK, Cell, Column, Row, Table
 
 FAMILIES = ("psnr", "ssim", "lpips")
 NAMES = {"model_mb": "memory"}  # a measure -> how papers call it
@@ -36,14 +36,14 @@ def datasets_of(numbers: Sequence[Number], scenes: Sequence[str]) -> dict[str, l
     return found
 
 
-def with_reported(layout: Layout, numbers: Sequence[Number]) -> Layout:
+def with_reported(table: Table, numbers: Sequence[Number]) -> Table:
     """The table with a row for every method that some paper reports on what it shows.
 
     Only methods as published: a row of an ablation has no place here. Where tables contradict each other,
     all their values are shown. A paper's mean over a dataset stands under ours, over the same scenes or not.
 
     Args:
-        layout: a table of `build`.
+        table: a table of `papers`.
         numbers: from `read_reported`.
     """
     texts: dict[tuple[str, str, str], dict[str, list[str]]] = {}  # (method, scene, metric) -> by dataset
@@ -52,19 +52,17 @@ def with_reported(layout: Layout, numbers: Sequence[Number]) -> Layout:
             texts.setdefault((n.method, _plain(n.scene), n.metric), {}).setdefault(n.dataset, []).append(
                 n.text
             )
-    lines = []
+    rows = []
     for method in dict.fromkeys(key[0] for key in texts):
-        entries = tuple(_entry(texts, method, column) for column in layout.columns)
-        if any(entry.printed for entry in entries):
-            lines.append(Line(method, entries, kind="reported"))
-    if not lines:
-        return layout.with_notes("reported: no table has these scenes")
-    return replace(layout, lines=(*layout.lines, *lines))
+        cells = tuple(_cell(texts, method, column) for column in table.columns)
+        if any(cell.printed for cell in cells):
+            rows.append(Row(method, cells, kind="reported"))
+    if not rows:
+        return table.with_notes("reported: no table has these scenes")
+    return replace(table, rows=(*table.rows, *rows))
 
 
-def _entry(
-    texts: Mapping[tuple[str, str, str], Mapping[str, list[str]]], method: str, column: Column
-) -> LayoutCell:
+def _cell(texts: Mapping[tuple[str, str, str], Mapping[str, list[str]]], method: str, column: Column) -> Cell:
     family = column.measure.key.partition("_")[0]
     metric = NAMES.get(column.measure.key, family if family in FAMILIES else "")
     by_dataset = texts.get((method, _plain(column.scene or MEAN), metric), {})
@@ -72,7 +70,7 @@ def _entry(
         found = by_dataset.get(column.dataset, [])
     else:  # a scene is told by its name alone, a mean is not
         found = [text for of in by_dataset.values() for text in of] if column.scene else []
-    return LayoutCell(printed=" / ".join(dict.fromkeys(found))) if found else LayoutCell(state="blank")
+    return Cell(printed=" / ".join(dict.fromkeys(found))) if found else BLANK
 
 
 def _plain(name: str) -> str:

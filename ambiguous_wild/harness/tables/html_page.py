@@ -1,4 +1,4 @@
-"""Laid-out tables as one HTML page that needs nothing else: no script, no font, no request."""
+"""Tables as one HTML page that needs nothing else: no script, no font, no request."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from html import escape
 
 from ambiguous_wild.harness.measures import Measure
-from ambiguous_wild.harness.tables.layouts.grid import TIE, Layout, LayoutCell, Line
-from ambiguous_wild.harness.tables.render import plain
+from ambiguous_wild.harness.tables.plain_formats import plain
+from ambiguous_wild.harness.tables.table import TIE, Cell, Row, Table
 
 STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #1a1a1a; background: #fff; margin: 1.5rem auto;
@@ -33,66 +33,71 @@ ul { padding-left: 1.1rem; color: #555; font-size: .85rem; overflow-wrap: anywhe
 RANKS = ("first", "second", "third")
 
 
-def to_html(layouts: Sequence[Layout]) -> str:
+def to_html(tables: Sequence[Table]) -> str:
     """The tables on one page; names are text, whatever they hold."""
-    title = escape(plain(layouts[0].title)) if len(layouts) == 1 else "Results"
+    title = escape(plain(tables[0].title)) if len(tables) == 1 else "Results"
     head = (
         '<meta charset="utf-8">\n<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{title}</title>\n<style>{STYLE}</style>"
     )
-    body = "\n".join(_table(layout) for layout in layouts)
+    body = "\n".join(_section(table) for table in tables)
     return f'<!doctype html>\n<html lang="en">\n<head>\n{head}\n</head>\n<body>\n{body}\n</body>\n</html>\n'
 
 
-def _table(layout: Layout) -> str:
-    parts = [f"<h2>{_text(layout.title)}</h2>", '<div class="scroll">', "<table>", "<thead>"]
-    begins = _begins(layout)
-    if any(title for title, _ in layout.groups):
+def _section(table: Table) -> str:
+    parts = [f"<h2>{_text(table.title)}</h2>", '<div class="scroll">', html_table(table), "</div>"]
+    return "\n".join([*parts, _below(table)])
+
+
+def html_table(table: Table) -> str:
+    """The element alone, for a page with a style of its own; names are text."""
+    parts = ["<table>", "<thead>"]
+    begins = _begins(table)
+    if any(title for title, _ in table.groups):
         groups = "".join(
             f'<th class="group" colspan="{count}" scope="colgroup">{_text(title)}</th>'
-            for title, count in layout.groups
+            for title, count in table.groups
         )
         parts.append(f"<tr><th></th>{groups}</tr>")
-    labels = "".join(f"<th{_class([b])}>{_text(c.label)}</th>" for c, b in zip(layout.columns, begins))
-    parts += [f'<tr><th class="name">method</th>{labels}</tr>', "</thead>", "<tbody>"]
+    labels = "".join(f"<th{_class([b])}>{_text(c.label)}</th>" for c, b in zip(table.columns, begins))
+    parts += [f'<tr><th class="name">{_text(table.head)}</th>{labels}</tr>', "</thead>", "<tbody>"]
     before = "measured"
-    for line in layout.lines:
-        if line.kind != before:
-            span = len(layout.columns) + 1
+    for row in table.rows:
+        if row.kind != before:
+            span = len(table.columns) + 1
             parts.append(
                 f'<tr class="divider"><th colspan="{span}">reported by papers, not measured here</th></tr>'
             )
-            before = line.kind
-        parts.append(_row(layout, line, begins))
-    parts += ["</tbody>", "</table>", "</div>", _below(layout)]
-    return "\n".join(parts)
+            before = row.kind
+        parts.append(_row(table, row, begins))
+    return "\n".join([*parts, "</tbody>", "</table>"])
 
 
-def _begins(layout: Layout) -> list[str]:
+def _begins(table: Table) -> list[str]:
     """A class for the first column of every group but the first."""
     return [
-        "begins" if i and c.group != layout.columns[i - 1].group else "" for i, c in enumerate(layout.columns)
+        "begins" if i and c.group != table.columns[i - 1].group else "" for i, c in enumerate(table.columns)
     ]
 
 
-def _row(layout: Layout, line: Line, begins: Sequence[str]) -> str:
-    cells = "".join(_cell(e, c.measure, b) for c, e, b in zip(layout.columns, line.entries, begins))
-    title = f' title="{_text(line.note)}"' if line.note else ""
-    return f'<tr{_class([line.kind])}><th class="name" scope="row"{title}>{_text(line.name)}</th>{cells}</tr>'
+def _row(table: Table, row: Row, begins: Sequence[str]) -> str:
+    cells = "".join(_cell(e, c.measure, b) for c, e, b in zip(table.columns, row.cells, begins))
+    title = f' title="{_text(row.note)}"' if row.note else ""
+    return f'<tr{_class([row.kind])}><th class="name" scope="row"{title}>{_text(row.name)}</th>{cells}</tr>'
 
 
-def _cell(entry: LayoutCell, measure: Measure, begins: str) -> str:
-    value, sign, spread = entry.text(measure).partition(" ± ")
+def _cell(cell: Cell, measure: Measure, begins: str) -> str:
+    value, sign, spread = cell.text(measure).partition(" ± ")
     text = _text(value) + (f' <span class="spread">{_text(sign + spread).strip()}</span>' if sign else "")
-    if entry.tie:
+    if cell.tie:
         text += f' <span title="not significantly different from the best">{TIE}</span>'
-    rank = RANKS[entry.rank - 1] if entry.rank else ""
+    rank = RANKS[cell.rank - 1] if cell.rank else ""
     return f"<td{_class([rank, begins])}>{text}</td>"
 
 
-def _below(layout: Layout) -> str:
-    items = [f"<li>{_text(line)}</li>" for line in (*layout.legend, *layout.notes)]
-    if any(entry.rank for line in layout.lines for entry in line.entries):
+def _below(table: Table) -> str:
+    items = [f"<li>{_text(line)}</li>" for line in (*table.legend, *table.notes)]
+    if any(cell.rank for cell in table.cells):
         key = " ".join(f'<span class="{rank}">{rank}</span>' for rank in RANKS)
         items.insert(0, f'<li class="key">{key} of each column</li>')
     return f"<ul>{''.join(items)}</ul>" if items else ""

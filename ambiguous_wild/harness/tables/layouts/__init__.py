@@ -1,1 +1,0 @@
-"""Tables laid out as papers have them, for text, Markdown, CSV, LaTeX and HTML."""

@@ -1,0 +1,253 @@
+"""Tables for a terminal, as Markdown and as CSV.
+
+Names of methods and scenes come from others' files: in every format they stay text. Control characters
+and invisible direction marks are written out, so that a name cannot steer a terminal either.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import re
+import unicodedata
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any
+
+from ambiguous_wild.harness.measures import Measure
+from ambiguous_wild.harness.tables.table import ARROWS, TIE, Cell, Column, Row, Table
+
+RANKS = "(1) (2) (3): first, second and third in the column"
+COLORS = {1: "green", 2: "cyan", 3: "yellow"}  # of the terminal
+
+
+def plain(text: str) -> str:
+    """The text on one line, with control and format characters written as escapes."""
+    hidden = ("Cc", "Cf", "Zl", "Zp", "Cs")
+    return "".join(
+        c.encode("unicode_escape").decode() if unicodedata.category(c) in hidden else c for c in str(text)
+    )
+
+
+def display_width(text: str) -> int:
+    """Columns of a terminal: wide characters take two, combining ones none."""
+    wide = sum(unicodedata.east_asian_width(c) in "WF" for c in text)
+    return len(text) + wide - sum(unicodedata.combining(c) > 0 for c in text)
+
+
+def marked(cell: Cell, measure: Measure) -> str:
+    """The cell with its rank and whether it is told apart from the best."""
+    text = plain(cell.text(measure))
+    return text + (f" ({cell.rank})" if cell.rank else "") + (f" {TIE}" if cell.tie else "")
+
+
+def row_name(row: Row) -> str:
+    """What stands in front of a row of text."""
+    return plain(f"  {row.name}" if row.kind == "reported" else row.name)
+
+
+def to_text(tables: Sequence[Table], *, color: bool = False) -> str:
+    """Aligned for a terminal; with `color`, the three best are coloured."""
+    parts = []
+    for table, below in _with_below(tables):
+        parts += [plain(table.title), *_aligned(table, color), ""]
+        parts += [*map(plain, below), ""] if below else []
+    return "\n".join(parts).rstrip("\n") + "\n"
+
+
+def _with_below(tables: Sequence[Table]) -> Iterator[tuple[Table, list[str]]]:
+    """Every table with the lines below it: what its marks mean, and notes."""
+    before: list[Table] = []
+    for table in tables:
+        before.append(table)
+        if table.continued:
+            yield table, []
+            continue
+        ranks = [RANKS] if any(cell.rank for one in before for cell in one.cells) else []
+        legend = dict.fromkeys(line for one in before for line in one.legend)
+        yield table, [*ranks, *legend, *(note for one in before for note in one.notes)]
+        before = []
+
+
+def _aligned(table: Table, color: bool) -> list[str]:
+    head = [table.head, *(plain(column.label) for column in table.columns)]
+    body = [
+        [row_name(row), *(marked(e, c.measure) for c, e in zip(table.columns, row.cells))]
+        for row in table.rows
+    ]
+    widths = [max(display_width(line[i]) for line in [head, *body]) for i in range(len(head))]
+    top, at = [" " * widths[0]], 1
+    for title, count in table.groups:
+        room = sum(widths[at : at + count]) + 2 * (count - 1)
+        name = plain(title)
+        if display_width(name) > room:  # a long name makes room for itself
+            widths[at] += display_width(name) - room
+            room = display_width(name)
+        top.append(name + " " * (room - display_width(name)))
+        at += count
+    lines = ["  ".join(top).rstrip()] if any(title for title, _ in table.groups) else []
+    lines += [_text_row(head, widths), "  ".join("─" * w for w in widths)]
+    before = "measured"
+    for row, cells in zip(table.rows, body):
+        lines += ["reported:"] if row.kind != before else []
+        before = row.kind
+        lines.append(_text_row(cells, widths, [cell.rank for cell in row.cells] if color else None))
+    return lines
+
+
+def _text_row(cells: Sequence[str], widths: Sequence[int], ranks: Sequence[int | None] | None = None) -> str:
+    out = [cells[0] + " " * (widths[0] - display_width(cells[0]))]
+    for i, (cell, width) in enumerate(zip(cells[1:], widths[1:])):
+        gap = " " * (width - display_width(cell))
+        if ranks is not None and ranks[i]:
+            import click
+
+            cell = click.style(cell, fg=COLORS[ranks[i] or 1], bold=ranks[i] == 1)
+        out.append(gap + cell)
+    return "  ".join(out).rstrip()
+
+
+def to_markdown(tables: Sequence[Table]) -> str:
+    """GitHub tables; the best of a column is bold, the three best are numbered."""
+    parts = []
+    for table, below in _with_below(tables):
+        parts += [f"**{markdown_text(table.title)}**", ""] if table.title else []
+        head = [
+            f"{markdown_text(c.group)} {c.measure.label} {ARROWS[c.measure.better]}".strip()
+            for c in table.columns
+        ]
+        parts.append(_markdown_row([table.head, *head]))
+        parts.append("|---|" + "".join("---|" if c.words else "---:|" for c in table.columns))
+        for row in table.rows:
+            name = markdown_text(row.name) + (" (reported)" if row.kind == "reported" else "")
+            cells = [_markdown(cell, column) for column, cell in zip(table.columns, row.cells)]
+            parts.append(_markdown_row([name, *cells]))
+        parts += ["", *(f"- {markdown_text(text)}" for text in below), *([""] if below else [])]
+    return "\n".join(parts).rstrip("\n") + "\n"
+
+
+def markdown_text(text: str) -> str:
+    """Escaped for a GitHub table: neither HTML, nor a link, nor a new column."""
+    text = plain(text).replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+    text = re.sub(r"([\\`*_\[\]|~#$])", r"\\\1", text)
+    # A scheme makes a link without any bracket.
+    return re.sub(r"(?i)\b(https?|ftp|www)(:|\.)", r"\1&#8203;\2", text)
+
+
+def _markdown_row(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+def _markdown(cell: Cell, column: Column) -> str:
+    if cell.markdown:
+        return cell.markdown.replace("|", "\\|")
+    text = _markdown_cell(marked(cell, column.measure))
+    if cell.rank != 1:
+        return text
+    value, _, mark = text.rpartition(" (")
+    return f"**{value}** ({mark}"
+
+
+def _markdown_cell(text: str) -> str:
+    """Numbers and intervals unchanged; everything else escaped."""
+    return text if re.fullmatch(r"[-\d.,%\[\]{}— ]*", text) else markdown_text(text)
+
+
+def csv_text(text: str) -> str:
+    """A cell that a spreadsheet takes for text: a leading formula character gets an apostrophe."""
+    text = plain(text) if not str(text).startswith("\t") else "'" + plain(text)
+    return "'" + text if text.lstrip()[:1] in ("=", "+", "-", "@") else text
+
+
+def exact(value: float) -> str:
+    """Digits that read back as the same number: 3.0 for 3.0."""
+    return repr(float(value))
+
+
+def shortest(value: float) -> str:
+    """The fewest digits that read back as the same number: 3 for 3.0."""
+    whole = math.isfinite(value) and value == int(value) and abs(value) < 2**53
+    return str(int(value)) if whole else exact(value)
+
+
+def to_csv(
+    head: Sequence[str],
+    rows: Iterable[Iterable[Any]],
+    *,
+    text: Callable[[str], str] = csv_text,
+    number: Callable[[float], str] = exact,
+) -> str:
+    """CSV of texts, numbers, yes and no; None and NaN are empty cells, so that what is missing is no number.
+
+    Args:
+        head: names of the columns.
+        rows: one value a column.
+        text: guards a text against spreadsheets that calculate it.
+        number: writes a float.
+    """
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow([text(name) for name in head])
+    for row in rows:
+        writer.writerow([_csv_cell(value, text, number) for value in row])
+    return out.getvalue()
+
+
+def _csv_cell(value: Any, text: Callable[[str], str], number: Callable[[float], str]) -> str:
+    if value is None or value == "":
+        return ""
+    if isinstance(value, str):
+        return text(value)
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return "" if math.isnan(value) else number(value)
+    return str(value)
+
+
+LONG_HEAD = ("table", "kind", "method", "dataset", "column", "scene", "metric", "value", "std", "rank",
+             "not_significant", "status", "printed")  # fmt: skip
+
+
+def to_long_csv(tables: Sequence[Table]) -> str:
+    """One number a row. What was measured has a value, what a paper prints is under `printed` alone."""
+    rows = (
+        (
+            table.title, row.kind, row.name, column.dataset, column.group, column.scene, column.measure.key,
+            cell.value, cell.spread, cell.rank, "yes" if cell.tie else "",
+            "" if cell.printed else cell.state, cell.printed,
+        )
+        for table in tables
+        for row in table.rows
+        for column, cell in zip(table.columns, row.cells)
+        if cell.state != "blank"
+    )  # fmt: skip
+    return to_csv(LONG_HEAD, rows)
+
+
+def to_wide_csv(tables: Sequence[Table]) -> str:
+    """One row a scene and method; the mean has an empty scene. The tables have the same columns.
+
+    For every column: the mean, `_std` over seeds, and for image metrics of one scene `_low` and `_high`,
+    the 95 % bootstrap interval over its test images.
+    """
+    head = ["scene", "method", "status", "runs"]
+    for column in tables[0].columns:
+        key = column.measure.key
+        head += [key, f"{key}_std", *([f"{key}_low", f"{key}_high"] if column.measure.per_image else [])]
+    rows = (
+        [table.columns[0].scene, row.name, _status(row), row.runs, *_wide_values(table, row)]
+        for table in tables
+        for row in table.rows
+    )
+    return to_csv(head, rows, number=shortest)
+
+
+def _wide_values(table: Table, row: Row) -> Iterator[float]:
+    for column, cell in zip(table.columns, row.cells):
+        yield from (cell.value, cell.spread, *((cell.low, cell.high) if column.measure.per_image else ()))
+
+
+def _status(row: Row) -> str:
+    states = {cell.state for cell in row.cells}
+    return next((s for s in ("failed", "absent", "ok") if s in states), "missing")

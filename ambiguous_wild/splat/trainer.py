@@ -152,12 +152,13 @@ class Trainer(Run):
         with self.clock.part("render"):
             self.optimiser.prepare(shot.camera)
             rendered = self.drawing(self.gaussians, shot)
-        return self._step_of(shot, rendered, self.pace.ceiling(divisor, progress))
-
-    def _step_of(self, shot: Shot, rendered: Rendered, ceiling: int) -> Step:
         known = {f.name: getattr(shot, f.name) for f in fields(Shot)}
         return Step(
-            **known, ceiling=ceiling, rendered=rendered, gaussians=self.gaussians, drawer=self.drawing.again
+            **known,
+            ceiling=self.pace.ceiling(divisor, progress),
+            rendered=rendered,
+            gaussians=self.gaussians,
+            drawer=self.drawing.again,
         )
 
     def _photometric(self, step: Step, keep: Tensor | None) -> PhotometricLoss:
@@ -257,9 +258,6 @@ class Trainer(Run):
         value = torch.as_tensor(loss.value)
         self._divisors[step.iteration] = step.divisor
         called_off = self.sentinel.watch(step.iteration, step.view, value, looked_at, keep, extra)
-        over = getattr(step.rendered, "over", None)
-        if over is not None:  # the picture is not whole
-            called_off = torch.maximum(called_off, over)
         # statistics of growth leave out such a step: neither its zeros nor its NaN are added
         going = called_off == 0
         step.rendered.visible = step.rendered.visible & going

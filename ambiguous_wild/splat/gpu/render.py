@@ -24,6 +24,7 @@ from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
 from ambiguous_wild.splat.gpu import gsplat_seam as seam
 from ambiguous_wild.splat.gpu.footprint import visible
 from ambiguous_wild.splat.rendered import (
+    GSPLAT_SUMS,
     NOTHING,
     Cotangents,
     Gradients,
@@ -124,7 +125,7 @@ class RenderedCuda:
             AwError: a statistic that is unknown, or that gsplat does not offer.
             RuntimeError: the picture was drawn under `torch.no_grad`, or had its backward pass.
         """
-        check_needs(needs, accelerated=True)
+        check_needs(needs, GSPLAT_SUMS)
         if not self._graph:
             raise RuntimeError("drawn under torch.no_grad: there is no backward pass")
         if self._done:

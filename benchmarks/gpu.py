@@ -1,122 +1,221 @@
-"""GPU benchmarks: parity with float64, iteration time against plain gsplat, trainings, frames per second.
+"""A GPU against float64 and gsplat's own loop: parity, training, milliseconds a step, frames a second.
 
-    bash benchmarks/gpu.sh                                  everything but `same`
-    bash benchmarks/gpu.sh --call 1                         what fits ten minutes; then 2, 3 and 4
-    python benchmarks/gpu.py --stages parity cost           only some stages
-    python benchmarks/gpu.py --stages same --captures A B   CPU and GPU on the same captures, three seeds
-    bash benchmarks/gpu.sh --pack DIR                       a kit for a machine without network
+    python benchmarks/gpu.py --scene SCENE [--methods 3dgs refinesplat] [--iterations 7000]
 
-Each stage prints its results and writes benchmarks/results/gpu-STAGE.json; gpu.md is made from these files.
-A stage that was stopped goes on where it was if --work is the same. `cost` and `profile` begin with the final
-Gaussians of `3dgs`; a line says whether --work has that training, which is made first where it is absent.
-`cost` compares at equal counts, without density control, alternating in blocks, so that machine load affects
-all loops alike. Exits with 1 if parity or a training fails.
+Four measurements, printed and written to benchmarks/results/gpu.json:
+
+- parity: the hard cases of `aw stress` that apply to a GPU, against the float64 reference;
+- a training of every method: seconds, Gaussians, PSNR of the test photos, frames a second, memory;
+- milliseconds a step of every method and of gsplat's own loop, in turns, all with the final Gaussians of the
+  first method and without density control, so that the load of the machine affects all alike;
+- versions of torch and gsplat, the GPU, the alpha clamp.
+
+Exits with 1 if a hard case fails.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-import os
+import dataclasses
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
-from gpu_measure import DINO, random_dino, write
-from gpu_report import to_markdown
-from gpu_stages import STAGES, lacking, needs
+import numpy as np
+import torch
+from torch import Tensor
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.io.atomic import write_text
-from ambiguous_wild.splat.gpu.readiness import look, why_not
+from ambiguous_wild.harness.running.environment import environment
+from ambiguous_wild.harness.running.evaluate import frames_per_second, load_test_photos, mean_psnr
+from ambiguous_wild.harness.running.memory import peak_memory, reset_peak
+from ambiguous_wild.io.atomic import write_json
+from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.methods.registry import get_method
+from ambiguous_wild.splat import readiness
+from ambiguous_wild.splat.data import load_train_data
+from ambiguous_wild.splat.device import wait
+from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.gpu.fused_loss import photometric_fused
+from ambiguous_wild.splat.gpu.gsplat_seam import gsplat
+from ambiguous_wild.splat.optim import SplatAdam
+from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.step import TrainData
+from ambiguous_wild.splat.trainer import Trainer
+from ambiguous_wild.stress import table
+from ambiguous_wild.stress.case import run
 
-RESULTS = Path(__file__).parent / "results"
-METHODS = ("3dgs", "robustsplat", "refinesplat")
-USUAL = ("build", "parity", "train", "budget", "cost", "profile")
-TURNS = 12
-CALLS: dict[int, tuple[tuple[str, ...], tuple[str, ...]]] = {  # stages and methods of ten minutes each
-    1: (("build", "parity", "train", "budget", "cost"), ("3dgs",)),
-    2: (("build", "train", "budget", "cost"), ("refinesplat", "robustsplat")),
-    3: (("build", "train", "budget", "cost", "profile"), (DINO,)),
-    4: (("build", "same"), ("3dgs",)),
-}
-SAME_ITERATIONS = 3000  # of call 4: three seeds on the CPU fit into ten minutes
+RESULTS = Path(__file__).parent / "results" / "gpu.json"
+BLOCK = 50  # steps of a loop before the next loop has its turn
 
 
-def parser() -> argparse.ArgumentParser:
-    p = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    p.add_argument("--scene", type=Path, help="a scene folder; simulated without")
-    p.add_argument("--work", type=Path, default=Path("gpu-benchmark"), help="scene, runs and caches")
-    p.add_argument("--results", type=Path, default=RESULTS)
-    p.add_argument("--call", type=int, choices=CALLS, help="the stages and methods of one call")
-    p.add_argument("--stages", nargs="+", choices=list(STAGES))
-    p.add_argument("--methods", nargs="+", help=f"also {DINO}: with DINOv2, random weights unless AW_WEIGHTS")
-    p.add_argument(
-        "--captures", nargs="+", type=Path, default=[], help="of the stage 'same'; default: --scene"
+class _Loss(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, photo: Tensor) -> Tensor:
+        l1, dssim, gradient = photometric_fused(image, photo, None, 0.2, "map")
+        ctx.save_for_backward(gradient)
+        return 0.8 * l1 + 0.2 * dssim
+
+    @staticmethod
+    def backward(ctx: Any, d_loss: Tensor) -> tuple[Tensor, None]:
+        (gradient,) = ctx.saved_tensors
+        return d_loss * gradient, None
+
+
+class PlainLoop:
+    """gsplat's own loop: `rasterization`, autograd and torch's fused Adam, as in its example trainer.
+
+    Trains copies of these Gaussians, one photo a step, spherical harmonics of degree 3, no density control.
+    The loss is ours, so that SSIM takes the same time in both loops.
+    """
+
+    def __init__(self, gaussians: Gaussians, data: TrainData, rates: dict[str, float]) -> None:
+        self.data, self.iteration = data, 0
+        self.parameters = {name: torch.nn.Parameter(t.clone()) for name, t in gaussians.items()}
+        self.optimisers = [
+            torch.optim.Adam([p], lr=rates[name], eps=1e-15, fused=True)
+            for name, p in self.parameters.items()
+        ]
+
+        def there(matrix: np.ndarray) -> Tensor:
+            return torch.from_numpy(matrix.astype("float32"))[None].to(data.device)
+
+        self.poses = [there(camera.cam_from_world) for camera in data.cameras]
+        self.intrinsics = [there(camera.intrinsics) for camera in data.cameras]
+
+    def step(self) -> Tensor:
+        """One iteration; returns the loss, on the device."""
+        view = self.iteration % len(self.data.photos)
+        self.iteration += 1
+        p, camera = self.parameters, self.data.cameras[view]
+        picture, _, meta = gsplat().rasterization(
+            means=p["means"],
+            quats=p["quats"],
+            scales=torch.exp(p["log_scales"]),
+            opacities=torch.sigmoid(p["opacity_logits"]),
+            colors=torch.cat([p["sh0"][:, None], p["sh_rest"]], dim=1),
+            viewmats=self.poses[view],
+            Ks=self.intrinsics[view],
+            width=camera.width,
+            height=camera.height,
+            sh_degree=3,
+            packed=False,
+        )
+        meta["means2d"].retain_grad()  # its density control reads it
+        loss: Tensor = _Loss.apply(picture[0], self.data.photos[view])
+        loss.backward()
+        for optimiser in self.optimisers:
+            optimiser.step()
+            optimiser.zero_grad(set_to_none=True)
+        return loss.detach()
+
+
+def trainer_of(args: argparse.Namespace, method: str, iterations: int) -> Trainer:
+    """A trainer of the method on the scene, before training."""
+    entry, device = get_method(method), torch.device(args.device)
+    data = load_train_data(load_scene(args.scene), device=device, seed=0, cache_dir=args.work / "cache")
+    config = TrainConfig(iterations=iterations, probes=0)
+    return Trainer(data, entry.build(entry.options()), config, folder=args.work / f"{method}-{iterations}")
+
+
+def late(trainer: Trainer, gaussians: Gaussians) -> Trainer:
+    """The trainer in the middle of its run, with these Gaussians and no density control."""
+    trainer.gaussians = gaussians.clone()
+    trainer.optimiser = SplatAdam(trainer.gaussians, trainer.pace.learning_rates(0.5))
+    trainer.iteration = trainer.config.iterations // 2  # masks have begun, all harmonics are on
+    # nothing grows, is reset or is dropped; statistics are gathered all the same
+    trainer.density.config = dataclasses.replace(
+        trainer.density.config, start=1e9, stop=1e9, resets=(), min_every=10**9
     )
-    p.add_argument("--iterations", type=int)
-    p.add_argument("--seed", type=int, default=0)
-    p.add_argument("--set", dest="settings", action="append", default=[], metavar="METHOD.KEY=VALUE")
-    p.add_argument("--device", default="cuda")
-    p.add_argument("--warm-up", type=int, default=300, help="iterations before a loop is timed")
-    p.add_argument("--budget", type=float, default=60.0, help="seconds of the stage 'budget'")
-    p.add_argument("--turns", type=int, default=TURNS)
-    return p
+    return trainer
+
+
+def parity(args: argparse.Namespace) -> list[dict[str, Any]]:
+    """The hard cases that apply to a GPU: error against float64, and the allowed error."""
+    rows = [run(case, args.device).plain() for case in table.CASES if "cuda" in case.devices]
+    for row in rows:
+        print({name: row[name] for name in ("key", "error", "tolerance", "passed")}, flush=True)
+    return rows
+
+
+def train(args: argparse.Namespace, method: str) -> tuple[Trainer, dict[str, Any]]:
+    """A whole training, or the rest of one that was stopped, and its figures."""
+    reset_peak(args.device)
+    trainer = trainer_of(args, method, args.iterations)
+    trainer.resume()
+    trainer.train()
+    trainer.clock.settle()
+    truth = load_test_photos(trainer.data.scene)
+    row = {
+        "method": method,
+        "iterations": trainer.iteration,
+        "train_s": trainer.clock.now(),
+        "ms_per_iteration": trainer.ms_per_iteration,
+        "ms_parts": {k: 1e3 * v / trainer.iteration for k, v in trainer.clock.parts_s.items()},
+        "gaussians": len(trainer.gaussians),
+        "psnr": mean_psnr(truth, lambda camera: trainer.render(camera).image.cpu().numpy()),
+        **frames_per_second(trainer),
+        **peak_memory(args.device),
+    }
+    print(row, flush=True)
+    return trainer, row
+
+
+def cost(args: argparse.Namespace, base: Trainer) -> dict[str, float]:
+    """Milliseconds a step of every loop, the mean of all turns, with the Gaussians of `base`."""
+    endless = 10**6
+    trainers = {name: late(trainer_of(args, name, endless), base.gaussians) for name in args.methods}
+    loops: dict[str, Callable[[], Any]] = {name: trainer.step for name, trainer in trainers.items()}
+    loops["gsplat"] = PlainLoop(base.gaussians, base.data, base.pace.learning_rates(1.0)).step
+    for step in loops.values():  # every mask once, every kernel compiled
+        for _ in range(args.warm_up):
+            step()
+    spent = dict.fromkeys(loops, 0.0)
+    for _ in range(args.turns):
+        for name, step in loops.items():
+            wait(args.device)
+            begin = time.perf_counter()
+            for _ in range(BLOCK):
+                step()
+            wait(args.device)
+            spent[name] += time.perf_counter() - begin
+    return {name: 1e3 * seconds / (args.turns * BLOCK) for name, seconds in spent.items()}
 
 
 def main(words: list[str] | None = None) -> int:
-    p = parser()
+    p = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    p.add_argument("--scene", type=Path, required=True, help="a scene folder, e.g. of aw build-scene")
+    p.add_argument("--methods", nargs="+", default=["3dgs", "refinesplat"])
+    p.add_argument("--iterations", type=int, default=7000)
+    p.add_argument("--warm-up", type=int, default=300, help="steps of each loop before they are timed")
+    p.add_argument("--turns", type=int, default=12, help=f"turns of {BLOCK} steps")
+    p.add_argument("--work", type=Path, default=Path("gpu-benchmark"), help="checkpoints and caches")
+    p.add_argument("--results", type=Path, default=RESULTS)
+    p.add_argument("--device", default="cuda", help=argparse.SUPPRESS)
     args = p.parse_args(words)
-    stages, methods = CALLS[args.call] if args.call else (USUAL, METHODS)
-    args.stages, args.methods = args.stages or list(stages), args.methods or list(methods)
-    if args.iterations is None:
-        args.iterations = SAME_ITERATIONS if args.call == 4 else 30_000
-    lack = why_not(look()) if args.device == "cuda" else None
-    if lack is not None:
-        p.error(f"no GPU to measure: {lack}")
-    if lacks := lacking(args.stages, args.methods):
-        able = [method for method in args.methods if not lacking([], [method])]
-        rest = f"; the others: --methods {' '.join(able)}" if 0 < len(able) < len(args.methods) else ""
-        p.error("; ".join(lacks) + rest)
-    if args.device == "cuda" and "build" not in args.stages:
-        args.stages.insert(0, "build")  # loads the kernels; without them gsplat would compile all of its own
-    args.work.mkdir(parents=True, exist_ok=True)
     try:
-        if DINO in args.methods and not os.environ.get("AW_WEIGHTS"):
-            os.environ["AW_WEIGHTS"] = str(random_dino(args.work / "random-weights").resolve())
-        if args.scene is None and set(args.stages) & {"train", "budget", "cost", "profile", "same"}:
-            from gpu_scene import make_scene  # needs OpenCV and the simulator
-
-            args.scene = make_scene(
-                args.work / "scene", name="courtyard-colour", train=150, test=20, width=582
-            )
-        return _run(args)
+        if args.device == "cuda":
+            readiness.require(readiness.look())
+        cases = parity(args)
+        trained = [train(args, method) for method in args.methods]
+        ms = cost(args, trained[0][0])
     except AwError as error:
         p.error(str(error))
-
-
-def _run(args: argparse.Namespace) -> int:
-    failed = False
-    for name in args.stages:
-        print(f"stage {name}", flush=True)
-        if line := needs(args, name):
-            print(line, flush=True)
-        begin = time.perf_counter()
-        found = STAGES[name](args)
-        found["seconds_of_stage"] = time.perf_counter() - begin
-        # of a call its own file, so that the next call leaves it
-        part = f"{name}-{args.call}" if args.call and name in ("budget", "cost", "profile") else name
-        write(args, part, found)
-        print(f"{name}: {found['seconds_of_stage']:.0f} s", flush=True)
-        failed |= name == "parity" and found["passed"] < found["cases"]
-        failed |= bool(found.get("failed"))
-    there = {
-        path.stem.removeprefix("gpu-"): json.loads(path.read_text(encoding="utf-8"))
-        for path in sorted(args.results.glob("gpu-*.json"))
+    camera = trained[0][0].data.cameras[0]
+    results = {
+        "environment": environment(args.device),
+        "scene": {"photos": len(trained[0][0].data.photos), "width": camera.width, "height": camera.height},
+        "parity": cases,
+        "trainings": [row for _, row in trained],
+        "ms_a_step": ms,
+        "gaussians_of_steps": len(trained[0][0].gaussians),
+        "against_gsplat": {name: ms[name] / ms["gsplat"] for name in args.methods},
     }
-    write_text(args.results / "gpu.md", to_markdown(there))
-    print(to_markdown(there))
-    return int(failed)
+    write_json(args.results, results)
+    print(f"ms a step: {ms}; written to {args.results}")
+    return int(not all(case["passed"] for case in cases))
 
 
 if __name__ == "__main__":

@@ -36,7 +36,7 @@ def pytest_collection_modifyitems(config, items):
     wanted = [item for item in items if item.get_closest_marker("gpu")]
     if not wanted:
         return
-    from ambiguous_wild.splat.gpu.readiness import look, why_not
+    from ambiguous_wild.splat.readiness import look, why_not
 
     lack = why_not(look())
     if lack is not None:

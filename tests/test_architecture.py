@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
@@ -97,6 +98,17 @@ def test_the_reader_of_imports_sees_every_form(tmp_path: Path) -> None:
     assert ("torch.Tensor", False) in {(name, at_run_time) for name, _, at_run_time in found}
     assert of_ours("ambiguous_wild.core.AwError") == "core" and of_ours("ambiguous_wild.__version__") == ""
     assert of_ours("numpy.core") is None
+
+
+def test_only_the_back_end_asks_where_tensors_lie() -> None:
+    """Whatever differs between the CPU and a GPU is a call of `splat/backend.py`."""
+    asking = {
+        path.relative_to(PACKAGE).as_posix()
+        for path in FILES
+        if re.search(r"\baccelerated\(", path.read_text(encoding="utf-8"))
+    }
+    ours = {f"methods/refinesplat/{name}.py" for name in ("density", "losses", "policy", "support")}
+    assert asking - ours == {"splat/device.py", "splat/backend.py"}
 
 
 def test_no_two_packages_import_each_other() -> None:

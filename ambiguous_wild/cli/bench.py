@@ -133,13 +133,6 @@ def parse_budget(text: str) -> float:
     help="On a NaN or infinite value: stop and say where, or go back and skip that photo.",
 )
 @click.option(
-    "--gpus",
-    type=click.IntRange(1, 9),
-    default=1,
-    show_default=True,
-    help="Number of GPUs that share one model too large for one; each photo is one iteration.",
-)
-@click.option(
     "--pictures/--no-pictures",
     default=True,
     show_default=True,
@@ -176,7 +169,6 @@ def command(
     cache: Path | None,
     checkpoint_every: float,
     on_nonfinite: str,
-    gpus: int,
     pictures: bool,
     as_json: bool,
 ) -> None:
@@ -238,7 +230,6 @@ def command(
         device=device,  # type: ignore[arg-type]
         threads=threads,
         engine=engine,
-        gpus=gpus,
         factor=factor,
         protocol=protocol,  # type: ignore[arg-type]
         overwrite=overwrite,  # type: ignore[arg-type]

@@ -22,7 +22,7 @@ from ambiguous_wild.cli.probes import PROBES, Probe, probe
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.extras import install_command
 from ambiguous_wild.harness.running.environment import installed
-from ambiguous_wild.splat.gpu import readiness
+from ambiguous_wild.splat import readiness
 
 PACKAGE = Path(__file__).resolve().parent.parent
 DISTRIBUTION = "ambiguous-wild"
@@ -204,21 +204,17 @@ def _gpu(torch: Probe) -> list[Check]:
     if torch.facts is None:
         fix = _library("torch", torch, "").fix
         return [Check("optional", "torch cuda", False, torch.error, fix)]
-    found = readiness.look(torch.facts)
-    driver, version = found.driver, installed("gsplat") or "present"
+    facts = readiness.look(torch.facts)
+    driver = facts.driver
     checks = [
         Check("optional", "nvidia driver", driver is not None, driver or "no nvidia-smi; the CPU is used",
               "" if driver else _driver_install()),
-        _part("torch cuda", ", ".join(torch.facts["names"]), readiness.no_cuda(found)),
-        _part("gsplat", version, readiness.no_gsplat(found)),
+        _part("torch cuda", ", ".join(torch.facts["names"]), readiness.no_cuda(facts)),
+        _part("gsplat", facts.gsplat or "", readiness.no_gsplat(facts)),
     ]  # fmt: skip
-    if found.gsplat and found.has_gpu:
-        state = f"compiled, in {found.folder}"
-        if found.prebuilt:
-            state = "prebuilt in the wheel"
-        elif not found.compiled:
-            state = f"not compiled yet: the first run takes several minutes longer, kept in {found.folder}"
-        checks.append(_part("gsplat kernels", state, readiness.no_kernels(found)))
+    if facts.gsplat and facts.torch["cuda"]:
+        state = "in the wheel" if facts.prebuilt else "compiled by the first run, which takes minutes longer"
+        checks.append(_part("gsplat kernels", state, readiness.no_compiler(facts)))
     return checks
 
 

@@ -15,7 +15,7 @@ def choose_device(device: str) -> str:
     """
     if device == "cpu":
         return "cpu"
-    from ambiguous_wild.splat.gpu.readiness import choose
+    from ambiguous_wild.splat.readiness import choose
 
     return choose(device, lambda text: click.echo(text, err=True))
 

@@ -13,7 +13,7 @@ TIMEOUT_S = 60
 # Each prints one line of JSON.
 PROBES = {
     "torch": """
-from ambiguous_wild.splat.gpu.readiness import torch_facts
+from ambiguous_wild.splat.readiness import torch_facts
 print(json.dumps(torch_facts()))
 """,
     "torchvision": "import torchvision; print(json.dumps({'version': torchvision.__version__}))",

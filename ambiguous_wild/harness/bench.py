@@ -140,7 +140,6 @@ def bench(
     threads: int | None = None,
     jobs: int | None = None,
     engine: Engine | None = None,
-    gpus: int = 1,
     factor: int | None = None,
     protocol: Protocol | None = None,
     overwrite: Overwrite = "missing",
@@ -169,7 +168,6 @@ def bench(
         threads: of the CPU kernels; None = all cores. The result does not depend on it.
         jobs: cells at a time on this machine; None = what `engine` says.
         engine: where cells run; None = this machine.
-        gpus: that share one model, for a scene too large for one.
         factor: which images_N; None = what the scene was built for.
         protocol: "full" measures whole test photos, "half" the right half (NeRF-W); None = what the scene's
             scene.json says, else "full".
@@ -235,8 +233,6 @@ def bench(
             for wanted in dict.fromkeys(choices)
         }
         cells = grouped(planned, budgets_s)
-        if gpus > 1:
-            cells = _on_several_gpus(cells, gpus, where)
         warnings = check_grafts(cells)
         for cell in {cell.method.name: cell for cell in cells}.values():
             check_passes(cell)
@@ -252,7 +248,7 @@ def bench(
             prepare_cpu(threads, told.say)
             if to_train and iterations is None and not budgets_s:
                 told.say(expected_line(to_train))
-        one_by_one = gpus > 1 or session.in_process(cells)
+        one_by_one = session.in_process(cells)
         told.planned(cells, one_by_one)
         if one_by_one:
             reports = run_cells(
@@ -320,26 +316,6 @@ def _read_plan(plan: Plan | Words | None) -> Plan | None:
     from ambiguous_wild.harness.planning.file import read_plan
 
     return read_plan(Path(plan))
-
-
-def _on_several_gpus(cells: list[Cell], gpus: int, engine: Engine) -> list[Cell]:
-    """The cells with one model on so many GPUs.
-
-    Raises:
-        AwError: a cell cannot be trained so, or there are fewer GPUs.
-    """
-    import torch
-
-    from ambiguous_wild.harness.running.multi_gpu import check_multi_gpu
-    from ambiguous_wild.splat.multi_gpu.refuse import refuse_more_than
-
-    if engine.remote or (engine.jobs or 1) > 1:
-        raise AwError("--gpus gives all GPUs to one run at a time: leave --jobs and --engine out")
-    sharing = [dataclasses.replace(cell, gpus=gpus) for cell in cells]
-    for cell in sharing:
-        check_multi_gpu(cell)
-    refuse_more_than(torch.cuda.device_count(), gpus)
-    return sharing
 
 
 def _remarks(cells: Sequence[Cell]) -> list[str]:

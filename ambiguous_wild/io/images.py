@@ -1,19 +1,16 @@
-"""Read and write the images of a scene, through OpenCV or, without it, Pillow.
+"""Read and write the images of a scene, through OpenCV, which the first image imports.
 
-The first image imports one of them, and a packaged scene needs no more. For photos of any kind (EXIF, CMYK,
-damaged files) see `io/photos.py`.
+For photos of any kind (EXIF, CMYK, damaged files) see `io/photos.py`.
 """
 
 from __future__ import annotations
 
-import functools
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 import numpy as np
 
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.io import pillow_fallback
 from ambiguous_wild.io.atomic import atomic_path
 from ambiguous_wild.io.image_header import MAX_PIXELS, READ, header_size
 
@@ -126,9 +123,8 @@ def write_png(
 
 
 def _encode_png(path: Path | str, image: np.ndarray) -> bytes:
-    cv2 = _opencv()
-    if cv2 is None:
-        return pillow_fallback.encode_png(image)
+    import cv2
+
     pixels = image[:, :, ::-1] if image.ndim == 3 else image
     # one filter for all rows: about as small as choosing by row, and faster
     options = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_PAETH]
@@ -171,32 +167,23 @@ def _sound(data: np.ndarray, where: str) -> bool:
     return True
 
 
-@functools.cache
-def _opencv() -> Any:
-    """OpenCV, None where it is not installed."""
-    try:
-        import cv2
-    except ImportError:
-        return None
-    return cv2
+def _decode(
+    path: Path | str,
+    kind: Literal["rgb", "grey", "deep"],  # 8-bit colour, 8-bit grey, colour at the file's own depth
+) -> np.ndarray:
+    import cv2
 
-
-def _decode(path: Path | str, kind: pillow_fallback.Kind) -> np.ndarray:
     # Not cv2.imread: non-ASCII names on every platform, and our own error messages.
     try:
         data = np.fromfile(path, dtype=np.uint8)
     except OSError as error:
         raise AwError(f"cannot read image {path}: {error.strerror}") from error
-    cv2 = _opencv()
-    if cv2 is not None:
-        flags = {
-            "rgb": cv2.IMREAD_COLOR_RGB,
-            "grey": cv2.IMREAD_GRAYSCALE,
-            "deep": cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH,
-        }
-        image = decode(data, flags[kind] | cv2.IMREAD_IGNORE_ORIENTATION, str(path))
-    else:
-        image = pillow_fallback.decode(data.tobytes(), kind, str(path)) if _sound(data, str(path)) else None
+    flags = {
+        "rgb": cv2.IMREAD_COLOR_RGB,
+        "grey": cv2.IMREAD_GRAYSCALE,
+        "deep": cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH,
+    }
+    image = decode(data, flags[kind] | cv2.IMREAD_IGNORE_ORIENTATION, str(path))
     if image is None:
         raise AwError(
             f"cannot read image {path}: it is empty, cut short or no {READ}; restore it and try again"

@@ -19,15 +19,13 @@ from torch import Tensor
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.palette import MASKED, faded, ramp, tint
 from ambiguous_wild.methods.masking_common import MaskedShares, WarmUpMask
-from ambiguous_wild.splat import device
+from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.losses import ssim_map
 from ambiguous_wild.splat.parts import Parts, State
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData
 from ambiguous_wild.vision.backends import check_instances, make_instances
 from ambiguous_wild.vision.precompute import instance_labels
-
-_LANES = 64  # sums a label while an accelerator adds up
 
 
 @dataclass(frozen=True)
@@ -88,22 +86,8 @@ def heat_map(
 def label_means(values: Tensor, labels: Tensor, count: int) -> Tensor:
     """[count] float64: mean of `values` [H, W] over the pixels of each label [H, W]; 0 where it has none."""
     flat, given = labels.reshape(-1), values.reshape(-1).double()
-    if device.accelerated(flat.device):
-        sums, sizes = _label_sums(given, flat, count), _label_sums(torch.ones_like(given), flat, count)
-    else:
-        sums = torch.bincount(flat, weights=given, minlength=count)
-        sizes = torch.bincount(flat, minlength=count)
-    return sums / sizes.clamp(min=1)
-
-
-def _label_sums(values: Tensor, flat: Tensor, count: int) -> Tensor:
-    """Sums [count] of values [P] by label [P]: `bincount` without reading the labels on the host.
-
-    Neighbouring pixels mostly share a label and would wait for one address: each label has `_LANES` of them.
-    """
-    lane = torch.arange(len(flat), device=flat.device) % _LANES
-    sums = values.new_zeros(count * _LANES).scatter_add_(0, flat * _LANES + lane, values)
-    return sums.reshape(count, _LANES).sum(dim=1)
+    backend = backend_of(flat.device)
+    return backend.label_sums(flat, count, given) / backend.label_sums(flat, count).clamp(min=1)
 
 
 def threshold(heat: Tensor, nominal: float, t_local: float = 0.4) -> Tensor:

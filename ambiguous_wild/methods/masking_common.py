@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ambiguous_wild.methods.deferred import deferred
+from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.parts import MaskPolicy
 from ambiguous_wild.splat.step import Step
@@ -71,7 +71,7 @@ class MaskedShares(dict[int, float | Tensor]):
 
     def take(self, view: int, keep: Tensor) -> None:
         """Note the share of a keep map [H, W]; on an accelerator it is read later."""
-        self[view] = deferred(1.0 - keep.mean())
+        self[view] = backend_of(keep.device).number(1.0 - keep.mean())
 
     def mean(self) -> float:
         """Over the views seen so far, 0 before the first."""

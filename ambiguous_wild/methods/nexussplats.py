@@ -25,7 +25,7 @@ from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.methods.feature_distance import FeatureDistance
 from ambiguous_wild.methods.masking_common import MaskedShares, WarmUpMask, hashed_uniform
 from ambiguous_wild.methods.wildgaussians import fourier
-from ambiguous_wild.splat import device
+from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
 from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_leaves
 from ambiguous_wild.splat.effects.placing import directions, in_picture
@@ -209,10 +209,9 @@ class Doubt(WarmUpMask):
         return judged, gradients
 
     def _seen(self, step: Step) -> Any:
-        """Rows that may be in the picture; on an accelerator all of them."""
-        if device.accelerated(step.gaussians.device):
-            return slice(None)
-        return torch.nonzero(in_picture(step.gaussians.means, step.camera, margin=0.5)).squeeze(1)
+        """Rows that may be in the picture, see `Backend.rows`."""
+        g = step.gaussians
+        return backend_of(g.device).rows(lambda: in_picture(g.means, step.camera, margin=0.5))
 
     def facts(self) -> dict[str, Any]:
         return {"masked_share": self.shares.mean(), "features": self.distance.name}

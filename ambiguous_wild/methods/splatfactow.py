@@ -20,8 +20,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ambiguous_wild.core.config import check_limits
-from ambiguous_wild.methods.deferred import deferred
 from ambiguous_wild.methods.robustsplat.net import enlarged
+from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.density import DensityConfig, DensityControl, Growth
 from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_leaves
 from ambiguous_wild.splat.effects.placing import directions, harmonics, ray_directions
@@ -155,7 +155,8 @@ class TrimmedLoss(MaskPolicy):
         start = rounds != self.rounds
         self.high = loss if start else torch.maximum(loss, torch.as_tensor(self.high).to(loss))
         self.low = torch.minimum(loss, torch.as_tensor(self.low).to(loss)) if self.rounds else loss
-        self.rounds, self.high, self.low = rounds, deferred(self.high), deferred(self.low)
+        number = backend_of(loss.device).number
+        self.rounds, self.high, self.low = rounds, number(self.high), number(self.low)
         return trimmed(error, self._share(loss))
 
     def predict(self, step: Step) -> Tensor | None:

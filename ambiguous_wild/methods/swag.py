@@ -19,7 +19,7 @@ from torch import Tensor
 
 from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.methods.masking_common import hashed_uniform
-from ambiguous_wild.splat import device
+from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.effects.hash_grid import hash_encoding, prepare
 from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_leaves
@@ -109,9 +109,8 @@ class GatedColours(Learnt):
             return {}
         if shot.view is None:
             return {"opacity_logits": torch.where(self._transient(gaussians, leaf, shot), CLOSED, logits)}
-        seen: Any = slice(None)
-        if not device.accelerated(logits.device):  # only those that may be drawn
-            seen = torch.nonzero(in_picture(gaussians.means.detach(), shot.camera)).squeeze(1)
+        means = gaussians.means.detach()
+        seen: Any = backend_of(logits.device).rows(lambda: in_picture(means, shot.camera))
         colours = gaussians.sh0[seen] * SH_C0 + 0.5
         a = self._net(self.encoded(gaussians.means[seen], leaf), colours, leaf)[:, 3]
         u = hashed_uniform(len(logits), (self.seed, shot.iteration, 0x5A), logits.device)[seen]
@@ -119,7 +118,7 @@ class GatedColours(Learnt):
         opacity = (torch.sigmoid(logits[seen]) * (1.0 - z)).clamp(LEAST, 1.0 - 1e-6)
         opened = logits.clone()
         opened[seen] = torch.logit(opacity)
-        gate = mean_of_seen(z, gaussians.means.detach()[seen], shot.camera)
+        gate = mean_of_seen(z, means[seen], shot.camera)
         return {"opacity_logits": with_penalty(opened, self.config.off * gate)}
 
     @torch.no_grad()

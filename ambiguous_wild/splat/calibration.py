@@ -41,7 +41,7 @@ class Size:
 # is nominal: the kernel takes a twentieth of a second there.
 KERNELS = {
     "cpu": Size("cpu-3", 0.040, 12_000, 240, 136, 3, 2, 0.050),
-    "cuda": Size("gpu-2", 0.05, 100_000, 960, 544, 12),
+    "cuda": Size("gpu-3", 0.05, 100_000, 960, 544, 12),
 }
 
 
@@ -106,10 +106,7 @@ class Calibration:
     def _steps(self, count: int) -> None:
         for k in range(count):
             rendered = render(self.gaussians, self.cameras[k % len(self.cameras)])
-            if devices.accelerated(self.device):  # the loss there is compiled for one size of photo
-                cotangent = rendered.image - self.photo
-            else:
-                cotangent = photometric(rendered.image, self.photo).d_image
+            cotangent = photometric(rendered.image, self.photo).d_image
             self.optimiser.step(rendered.backward(cotangent), rendered.visible)
 
 

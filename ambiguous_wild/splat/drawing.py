@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.splat import device
 from ambiguous_wild.splat.effects.chain import Chain
 from ambiguous_wild.splat.field import Field
 from ambiguous_wild.splat.fields import STATIC, Composite, FieldStart, renders_of
@@ -52,7 +51,7 @@ class Drawing:
         self.others[name] = Field(start.gaussians, start.rates, start.density)
         self._most[name] = start.most
         if start.density is not None:
-            check_needs(start.density.needs, accelerated=device.accelerated(data.device))
+            check_needs(start.density.needs, data.backend.statistics)
             start.density.setup(data)
             start.density.spares = None if self.effects is None else self.effects.spares()
 

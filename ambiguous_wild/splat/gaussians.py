@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.splat.neighbours import nearest_three
 
 # what the renderer reads, in the order of its arguments
 LEAST_POINTS = 4  # to start from: a size is the distance of three neighbours
@@ -145,7 +144,7 @@ class Gaussians:
             sh_degree: largest SH degree to hold, 0 to 3.
             opacity: of every Gaussian.
             min_scale: floor of the scale, so that coincident points stay finite.
-            device: where neighbours are looked for and the Gaussians lie.
+            device: where the Gaussians lie.
 
         Raises:
             AwError: fewer than 4 points.
@@ -155,7 +154,9 @@ class Gaussians:
                 f"cannot start from {len(xyz)} points: at least {LEAST_POINTS} are needed; "
                 "check the sparse model"
             )
-        distances = nearest_three(xyz, device)
+        from scipy.spatial import cKDTree
+
+        distances = cKDTree(xyz).query(xyz, k=4)[0][:, 1:]  # of the three nearest other points
         scale = np.sqrt((distances**2).mean(axis=1)).clip(min=min_scale)
         n = len(xyz)
         quats = torch.zeros(n, 4)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import unknown
-from ambiguous_wild.splat import device
+from ambiguous_wild.splat.backend import backend_of
 
 Weighting = Literal["map", "images", "none"]
 _WEIGHTINGS = ("map", "images", "none")
@@ -60,16 +60,8 @@ def photometric(
         raise AwError(f"keep must be {list(render.shape[:2])} as the photo, got {list(keep.shape)}")
     if weighting == "none":
         keep = None
-    l1: float | Tensor
-    dssim: float | Tensor
-    if device.accelerated(render.device):
-        from ambiguous_wild.splat.gpu.fused_loss import photometric_fused
-
-        l1, dssim, d_image = photometric_fused(render, photo, keep, lambda_dssim, weighting)
-    else:
-        from ambiguous_wild.splat.cpu.photometric import photometric_cpu
-
-        l1, dssim, d_image = photometric_cpu(render, photo, keep, lambda_dssim, weighting)
+    backend = backend_of(render.device)
+    l1, dssim, d_image = backend.photometric(render, photo, keep, lambda_dssim, weighting)
     return PhotometricLoss((1 - lambda_dssim) * l1 + lambda_dssim * dssim, l1, dssim, d_image)
 
 
@@ -80,10 +72,4 @@ def ssim_map(
     """SSIM of every pixel and channel, [H, W, 3]; window as in `photometric`. Values in [-1, 1]."""
     if a.dim() != 3 or a.shape[2] != 3 or a.shape != b.shape:
         raise AwError(f"pictures must both be [H, W, 3], got {list(a.shape)} and {list(b.shape)}")
-    if device.accelerated(a.device):
-        from ambiguous_wild.splat.gpu.fused_loss import ssim_map_fused
-
-        return ssim_map_fused(a, b)
-    from ambiguous_wild.splat.cpu.photometric import ssim_map_cpu
-
-    return ssim_map_cpu(a, b)
+    return backend_of(a.device).ssim_map(a, b)

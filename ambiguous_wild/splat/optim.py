@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import unknown
-from ambiguous_wild.splat import device
+from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.gaussians import PARAMETERS, Gaussians
 from ambiguous_wild.splat.rendered import Gradients
 
@@ -44,8 +44,8 @@ class SplatAdam:
         lazy: bool = True,  # False steps every row of sh_rest at once: the same bits, more memory traffic
     ) -> None:
         self.betas, self.eps = betas, eps
-        self._accelerated = device.accelerated(gaussians.device)
-        self.steps = 0  # an accelerator counts for itself, see `_count`
+        self._kernels = backend_of(gaussians.device).kernels
+        self.steps = 0  # a GPU counts for itself, see `_count`
         self._count = torch.zeros((), device=gaussians.device)
         self._rates: dict[str, float] = {}
         self._moments = {
@@ -53,7 +53,7 @@ class SplatAdam:
             for name, tensor in gaussians.rows()
             if name in PARAMETERS or name in learning_rates
         }
-        self._lazy = lazy and not self._accelerated
+        self._lazy = lazy and self._kernels
         self._taken = np.zeros(len(gaussians), np.int64)  # steps each row of sh_rest has taken
         self._history = np.zeros((2, 256), np.float32)  # a step's lr / bias1 of sh_rest, and 1 / sqrt(bias2)
         self._rows = len(gaussians)
@@ -157,7 +157,7 @@ class SplatAdam:
         if learning_rates is not None:
             self._set_rates(learning_rates)
         gaussians = self.gaussians
-        if self._accelerated:
+        if not self._kernels:
             self._step_fused(gaussians, grads, called_off)
             return
         now, self.steps = self.steps, self.steps + 1
@@ -267,7 +267,7 @@ class SplatAdam:
         """Steps and moments as plain tensors, every row up to date; the parameters are the caller's."""
         self.flush()
         return {
-            "steps": int(self._count) if self._accelerated else self.steps,
+            "steps": self.steps if self._kernels else int(self._count),
             "rates": dict(self._rates),
             "first": {name: m for name, (m, _) in self._moments.items()},
             "second": {name: v for name, (_, v) in self._moments.items()},

@@ -8,10 +8,8 @@ screen-space statistic is kept apart, which is what entropy-aware density contro
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from ambiguous_wild.core import Camera
-from ambiguous_wild.splat import device
+from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.rendered import Rendered, Shade
 
@@ -30,22 +28,14 @@ def render(
 ) -> Rendered:
     """Render the Gaussians for one camera on the device they live on.
 
-    Conventions of both back ends: near plane 0.01, alpha clamped at 0.99 (at 0.999 by
-    gsplat up to 1.5.3, see gsplat_seam.py), alpha below 1/255 skipped, a pixel stops before transmittance
+    Conventions of both back ends: near plane 0.01, alpha clamped at 0.99 (at 0.999 by gsplat
+    1.5.3, see gsplat_seam.py), alpha below 1/255 skipped, a pixel stops before transmittance
     reaches 1e-4, colours max(SH + 0.5, 0).
 
     Raises:
         AwError: the Gaussians are on a GPU and gsplat is not installed.
     """
-    if not device.accelerated(gaussians.device):
-        from ambiguous_wild.splat.cpu.render import render_cpu
-
-        draw: Callable[..., Rendered] = render_cpu
-    else:
-        from ambiguous_wild.splat.gpu.render import render_cuda
-
-        draw = render_cuda
-    return draw(
+    return backend_of(gaussians.device).render(
         gaussians,
         camera,
         sh_degree=sh_degree,

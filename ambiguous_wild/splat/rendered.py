@@ -7,7 +7,7 @@ in an object between the forward and the backward pass, so that two pictures of 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Protocol
 
@@ -22,7 +22,7 @@ from ambiguous_wild.splat.gaussians import Gaussians
 Own = Mapping[str, Mapping[str, Tensor]]
 # What density control can ask of the backward pass beyond the signed sums, see `Gradients`.
 NEEDS = ("absolute", "squared", "count")
-_CPU_ONLY = ("squared", "count")  # gsplat does not sum them
+GSPLAT_SUMS = ("absolute",)  # of these, what gsplat can sum
 NOTHING: frozenset[str] = frozenset()
 
 
@@ -184,12 +184,17 @@ def spread(gradients: Gradients, found: ShadeGradients, rows: Tensor | slice, g:
     return gradients
 
 
-def check_needs(needs: frozenset[str], *, accelerated: bool = False) -> None:
-    """Raise AwError where no back end knows a statistic, or that of an accelerator does not offer it."""
+def check_needs(needs: frozenset[str], offered: Sequence[str] = NEEDS) -> None:
+    """Raise AwError where no back end knows a statistic, or this one does not offer it.
+
+    Args:
+        needs: asked for.
+        offered: `Backend.statistics`.
+    """
     for name in needs:
         if name not in NEEDS:
             raise unknown("statistic", name, NEEDS)
-        if accelerated and name in _CPU_ONLY:
+        if name not in offered:
             raise AwError(
                 f"the statistic {name!r} of the backward pass is not offered by gsplat: run with --device cpu"
             )

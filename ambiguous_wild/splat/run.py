@@ -6,7 +6,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 from torch import Tensor
@@ -15,7 +15,6 @@ from ambiguous_wild.core import Camera
 from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.clock import Clock, clock_for
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.gpu.sentinel import Sentinel
 from ambiguous_wild.splat.interrupt import Stopped, deferred
 from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.pace import Pace, TrainConfig
@@ -23,6 +22,9 @@ from ambiguous_wild.splat.rendered import Rendered
 from ambiguous_wild.splat.step import TrainData
 from ambiguous_wild.splat.timeline import ROWS, Timeline
 from ambiguous_wild.splat.watchdog import NonFinite, Watchdog
+
+if TYPE_CHECKING:
+    from ambiguous_wild.splat.gpu.sentinel import Sentinel
 
 Probe = Callable[[Callable[[Camera], Tensor]], float]
 

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import Camera, Scene
+from ambiguous_wild.splat.backend import Backend, backend_of
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.rendered import Rendered
 
@@ -29,6 +30,11 @@ class TrainData:
     device: torch.device
     seed: int
     cache_dir: Path  # features and instance masks that survive the run; shared between runs
+
+    @property
+    def backend(self) -> Backend:
+        """What computes there."""
+        return backend_of(self.device)
 
     @property
     def sfm_points(self) -> Tensor:

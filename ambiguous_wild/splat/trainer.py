@@ -11,14 +11,13 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError, Camera
-from ambiguous_wild.splat import device, snapshot
+from ambiguous_wild.splat import snapshot
 from ambiguous_wild.splat.data import shrink_keep
 from ambiguous_wild.splat.density import DensityControl
 from ambiguous_wild.splat.drawing import Drawing
 from ambiguous_wild.splat.effects.chain import Chain
 from ambiguous_wild.splat.field import Field, rates_with
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.gpu.sentinel import Sentinel
 from ambiguous_wild.splat.losses import PhotometricLoss, photometric
 from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.pace import Pace, TrainConfig
@@ -49,7 +48,7 @@ class Trainer(Run):
             folder: where checkpoint and timeline go.
             probe: gets a function that renders a camera, returns PSNR in dB of the test views.
         """
-        device.set_torch_threads(config.torch_threads, data.device)
+        data.backend.use_threads(config.torch_threads)
         if parts.train_data is not None:
             data = parts.train_data(data)
         super().__init__(data, config, folder, probe)
@@ -57,18 +56,14 @@ class Trainer(Run):
         self.pyramid = Pyramid(data)
         self._divisors: dict[int, int] = {}  # of the steps since the sentinel's last look
         # where the host must not wait, what would make it wait is written down there and looked at later
-        on = device.accelerated(data.device)
-        self.sentinel = Sentinel(data.device, len(data.photos)) if on else None
-        check_needs(parts.density.needs, accelerated=on)
+        self.sentinel = data.backend.sentinel(data.device, len(data.photos))
+        check_needs(parts.density.needs, data.backend.statistics)
         most = parts.density_config.max_gaussians
         room = Pace(config, parts.schedule, data, start=0, most=most).most
         gaussians = parts.first_gaussians(data, room)
         self.pace = Pace(config, parts.schedule, data, start=len(gaussians), most=most)
-        if on:
-            from ambiguous_wild.splat.gpu import fused_loss
-
-            sizes = self.pyramid.sizes(self.pace.divisors)
-            fused_loss.prepare(data.device, sizes, parts.lambda_dssim, parts.weighting)
+        sizes = self.pyramid.sizes(self.pace.divisors)
+        data.backend.prepare_loss(data.device, sizes, parts.lambda_dssim, parts.weighting)
         self.effects = Chain(parts.effects, data) if parts.effects else None
         rows = {} if self.effects is None else self.effects.rows(gaussians)
         if rows:
@@ -152,12 +147,13 @@ class Trainer(Run):
         with self.clock.part("render"):
             self.optimiser.prepare(shot.camera)
             rendered = self.drawing(self.gaussians, shot)
-        return self._step_of(shot, rendered, self.pace.ceiling(divisor, progress))
-
-    def _step_of(self, shot: Shot, rendered: Rendered, ceiling: int) -> Step:
         known = {f.name: getattr(shot, f.name) for f in fields(Shot)}
         return Step(
-            **known, ceiling=ceiling, rendered=rendered, gaussians=self.gaussians, drawer=self.drawing.again
+            **known,
+            ceiling=self.pace.ceiling(divisor, progress),
+            rendered=rendered,
+            gaussians=self.gaussians,
+            drawer=self.drawing.again,
         )
 
     def _photometric(self, step: Step, keep: Tensor | None) -> PhotometricLoss:
@@ -257,9 +253,6 @@ class Trainer(Run):
         value = torch.as_tensor(loss.value)
         self._divisors[step.iteration] = step.divisor
         called_off = self.sentinel.watch(step.iteration, step.view, value, looked_at, keep, extra)
-        over = getattr(step.rendered, "over", None)
-        if over is not None:  # the picture is not whole
-            called_off = torch.maximum(called_off, over)
         # statistics of growth leave out such a step: neither its zeros nor its NaN are added
         going = called_off == 0
         step.rendered.visible = step.rendered.visible & going

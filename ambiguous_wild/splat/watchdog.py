@@ -22,7 +22,8 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.atomic import atomic_path, write_json
-from ambiguous_wild.splat import checkpoint, device
+from ambiguous_wild.splat import checkpoint
+from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.losses import PhotometricLoss
 from ambiguous_wild.splat.rendered import Gradients
@@ -203,13 +204,7 @@ class Watchdog:
 
 def _finite(named: Mapping[str, Tensor]) -> bool:
     tensors = list(named.values())
-    if not device.accelerated(tensors[0].device):
-        from ambiguous_wild.splat.cpu.finite import all_finite
-
-        return all_finite(tensors)
-    # On a GPU a sum each: several times as fast as isfinite().all(), which writes a tensor of its own. A
-    # large but sound one may overflow; the rows tell.
-    return bool(torch.isfinite(torch.stack([tensor.sum() for tensor in tensors])).all())
+    return backend_of(tensors[0].device).all_finite(tensors)  # where that says no, the rows tell
 
 
 def _bad_rows(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -8,7 +8,7 @@ exponent, three for each Gaussian over it, as many again for gradients, plus the
 On a GPU gsplat is compiled with `-use_fast_math`: an exponential is accurate to 2 + |1.2 x| units, 8 down to
 the cut at 1/255, a quotient to 2. It also inverts the blurred covariance by its determinant, a difference
 that keeps only (a c - b^2) / (a c) of the digits. Its bound is wider by both factors. The reference then
-uses gsplat's alpha clamp (`gsplat_seam.max_alpha`).
+uses gsplat's alpha clamp (`Backend.max_alpha`).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import Camera
-from ambiguous_wild.splat import device as splat_device
+from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.reference import render_reference
 from ambiguous_wild.splat.render import render
@@ -33,11 +33,7 @@ FAST_MATH = 8  # largest error of a GPU's exponential, in units
 
 def alpha_clamp(device: str) -> dict[str, Any]:
     """The alpha clamp of the device's renderer, as an argument of `float64_result`."""
-    if not splat_device.accelerated(device):
-        return {}
-    from ambiguous_wild.splat.gpu.gsplat_seam import max_alpha
-
-    return {"max_alpha": max_alpha(device)}
+    return {"max_alpha": backend_of(device).max_alpha(device)}
 
 
 def device_result(
@@ -115,7 +111,7 @@ def agree(
     error = _distance(device_result(g, camera, device, d_image, d_alpha, d_depth, **options), truth)
     steps = 96 + 6 * (len(g) if layers is None else layers)
     bound, why = steps * condition * UNIT, f"{steps} roundings x condition"
-    if splat_device.accelerated(device):
+    if not backend_of(device).kernels:
         lost = _lost_by_determinants(parameters, camera, **options)
         bound, why = bound * FAST_MATH * lost, f"{why} x {FAST_MATH} x determinant {lost:.1e}"
     return Measured(error, bound, why, comes_out, condition)

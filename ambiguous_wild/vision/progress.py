@@ -22,10 +22,8 @@ def terminal_bar(what: str, unit: str = "photo") -> Bar:
     """
 
     def wrap(items: Sequence[Any]) -> Iterable[Any]:
-        try:
-            from tqdm import tqdm
-        except ImportError:  # tqdm is optional on a machine that only trains
-            return items
+        from tqdm import tqdm
+
         return tqdm(items, desc=what, unit=unit, disable=None, leave=False)  # None: only on a terminal
 
     return wrap

@@ -120,7 +120,6 @@ def test_several_processes_tell_the_same(scene, tmp_path):
         ({"settings": ["3dgs=1"]}, "METHOD.KEY=VALUE"),
         ({"engine": Engine(address="auto")}, "add --engine ray"),
         ({"parts": {"mask": "refinsplat"}}, "refinesplat"),
-        ({"gpus": 2, "jobs": 2}, "leave --jobs"),
     ],
 )
 def test_what_cannot_be_is_said_before_anything_is_made(scene, tmp_path, options, message):

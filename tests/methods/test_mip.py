@@ -18,7 +18,7 @@ from ambiguous_wild.methods.mip import (
 from ambiguous_wild.methods.uad import UadConfig, UncertaintyAware, footprint_mean
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.effects.smoothing import SmoothingFilter, filter_sizes
-from ambiguous_wild.splat.rendered import check_needs
+from ambiguous_wild.splat.rendered import GSPLAT_SUMS, check_needs
 from tests.methods.baselines import bits, data_of, parts_of, resumed_equals_whole, trained, trainer_of
 from tests.splat.scenes import camera, gaussians
 from tests.tiny_scene import write_tiny_scene
@@ -139,4 +139,4 @@ def test_uad_is_a_density_control_for_any_host_and_for_the_cpu_alone(scene, tmp_
     assert host.density is UncertaintyAware
     assert bits(trained(scene, tmp_path / "uad", host, iterations=120)) != bits(plain)
     with pytest.raises(AwError, match=r"'count'.*gsplat.*--device cpu"):
-        check_needs(host.density.needs, accelerated=True)
+        check_needs(host.density.needs, GSPLAT_SUMS)

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from ambiguous_wild.methods import dronesplat
-from ambiguous_wild.methods.deferred import deferred
 from ambiguous_wild.methods.robustsplat import policy as robustsplat
 from ambiguous_wild.methods.robustsplat import supervision
 from ambiguous_wild.methods.robustsplat.config import RobustSplatConfig
@@ -166,14 +165,6 @@ def test_dronesplat_masks_what_it_masks_on_the_cpu(scene, cache, monkeypatch):
     # an instance whose heat is within rounding of the threshold would go as a whole; none is here
     assert torch.equal(keeps, keeps_there)
     assert there.facts() == cpu.facts()
-
-
-def test_a_number_for_later_is_the_number(monkeypatch):
-    value = torch.tensor(0.1)
-    assert deferred(value) == float(value)
-    on_accelerator(monkeypatch)
-    kept = deferred(value.requires_grad_(True) * 1)
-    assert isinstance(kept, torch.Tensor) and not kept.requires_grad and float(kept) == float(value.detach())
 
 
 def test_enlarging_copies_its_weights_once():

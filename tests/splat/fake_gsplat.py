@@ -1,7 +1,7 @@
 """gsplat's calls in plain torch: every pixel against every Gaussian, gradients by autograd.
 
 Stands in for the package where there is no GPU: the code around it runs with real numbers on the CPU, and
-without any on torch's `meta` device. Signatures, shapes and conventions are those of the release named.
+without any on torch's `meta` device. Signatures, shapes and conventions are those of release 1.5.3.
 """
 
 import contextlib
@@ -15,6 +15,7 @@ from ambiguous_wild.splat.gpu import gsplat_seam
 from ambiguous_wild.splat.reference import harmonics, rotations
 
 _BOX = 3.33  # deviations a radius has at most
+MAX_ALPHA = 0.999
 
 
 def fully_fused_projection(
@@ -67,14 +68,6 @@ def spherical_harmonics(degrees_to_use, dirs, coeffs, masks=None):
     return 0.28209479177387814 * coeffs[:, 0] + torch.einsum("nk,nkc->nc", bands, used)
 
 
-def spherical_harmonics_later(degrees_to_use, means, viewmats, coeffs, masks=None):
-    """After 1.5.3: directions are made of means and cameras, and the colours have a dimension of cameras."""
-    assert means.shape == (len(coeffs), 3) and viewmats.shape == (1, 4, 4), (means.shape, viewmats.shape)
-    assert (degrees_to_use + 1) ** 2 <= coeffs.shape[1] and masks is None
-    centre = -viewmats[0, :3, :3].T @ viewmats[0, :3, 3]
-    return spherical_harmonics(degrees_to_use, means - centre, coeffs)[None]
-
-
 def isect_tiles(means2d, radii, depths, tile_size, tile_width, tile_height, sort=True, segmented=False,
                 packed=False, n_images=None, image_ids=None, gaussian_ids=None):  # fmt: skip
     assert not depths.requires_grad and depths.shape == radii.shape[:-1] == means2d.shape[:-1]
@@ -92,10 +85,8 @@ def rasterize_to_pixels(means2d, conics, colors, opacities, image_width, image_h
                         isect_offsets, flatten_ids, backgrounds=None, masks=None, packed=False,
                         absgrad=False):  # fmt: skip
     tall, wide = -(-image_height // tile_size), -(-image_width // tile_size)
-    assert isect_offsets.shape[0] == 1 and isect_offsets.shape[2] == wide and isect_offsets.shape[1] >= tall
+    assert isect_offsets.shape == (1, tall, wide)
     ids = flatten_ids.long()
-    if isect_offsets.shape[1] > tall and means2d.device.type != "meta":
-        ids = ids[: int(isect_offsets[0, tall, 0])]  # what no pixel reads would be most of it
     rows = torch.arange(image_height, device=means2d.device).to(means2d) + 0.5
     columns = torch.arange(image_width, device=means2d.device).to(means2d) + 0.5
     x = columns.repeat(image_height)[:, None]
@@ -106,26 +97,15 @@ def rasterize_to_pixels(means2d, conics, colors, opacities, image_width, image_h
         everywhere = means2d.new_zeros(means2d.shape)
 
         def keep(gradient):
-            found = everywhere.index_add(1, ids, gradient.abs().sum(0)[None])
-            if rasterize_to_pixels.in_place and getattr(means2d, "absgrad", None) is not None:
-                means2d.absgrad.copy_(found)
-            else:
-                means2d.absgrad = found
+            means2d.absgrad = everywhere.index_add(1, ids, gradient.abs().sum(0)[None])
 
         centres.register_hook(keep)
     dx, dy = centres[..., 0] - x, centres[..., 1] - y
     a, b, c = conics[0, ids].unbind(1)
     sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
     alpha = opacities[0, ids] * torch.exp(-sigma)
-    alpha = torch.where(alpha > rasterize_to_pixels.max_alpha, rasterize_to_pixels.max_alpha, alpha)
+    alpha = torch.where(alpha > MAX_ALPHA, MAX_ALPHA, alpha)
     alpha = torch.where((alpha < 1 / 255) | (sigma < 0), torch.zeros_like(alpha), alpha)
-    if isect_offsets.shape[1] > tall:  # not of `isect_tiles` above: a list for every tile
-        here = (y[:, 0] // tile_size).long() * wide + (x[:, 0] // tile_size).long()
-        starts = isect_offsets.flatten().long()
-        ends = torch.cat([starts[1:], starts.new_full((1,), len(ids))])
-        index = torch.arange(len(ids), device=ids.device)[None]
-        listed = (index >= starts[here][:, None]) & (index < ends[here][:, None])
-        alpha = torch.where(listed, alpha, torch.zeros_like(alpha))
     after = torch.cumprod((1 - alpha).double(), 1).to(alpha)
     drawn = after > 1e-4
     alpha = torch.where(drawn, alpha, torch.zeros_like(alpha))
@@ -155,19 +135,10 @@ def rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, 
     return picture, alpha, {"means2d": means2d, "radii": radii}
 
 
-def isect_tiles_later(*arguments, conics=None, opacities=None, **options):
-    """After 1.5.3: with the ellipses, tiles are tested against them."""
-    assert conics is not None and opacities.shape == conics.shape[:-1] and not conics.requires_grad
-    return isect_tiles(*arguments, **options)
-
-
-def module(version="1.6.0"):
-    """The package of that version."""
+def module():
+    """The package."""
     fake = types.ModuleType("gsplat")
-    fake.__version__ = version
-    old = version.startswith("1.5")
-    rasterize_to_pixels.max_alpha = 0.999 if old else 0.99
-    rasterize_to_pixels.in_place = not old
+    fake.__version__ = "1.5.3"
     calls = (
         fully_fused_projection,
         spherical_harmonics,
@@ -178,30 +149,20 @@ def module(version="1.6.0"):
     )
     for call in calls:
         setattr(fake, call.__name__, call)
-    if not old:
-        fake.isect_tiles = isect_tiles_later
-        fake.spherical_harmonics = spherical_harmonics_later
     return fake
 
 
 @contextlib.contextmanager
-def installed(monkeypatch, version="1.6.0", *, everywhere=True):
-    """As if gsplat were installed; `everywhere` also sends tensors on the CPU the accelerator's way."""
+def installed(monkeypatch):
+    """As if gsplat were installed; tensors on the CPU take the GPU's way."""
     with monkeypatch.context() as patch:
-        patch.setitem(sys.modules, "gsplat", module(version))
+        patch.setitem(sys.modules, "gsplat", module())
         _forget()
-        if everywhere:
-            patch.setattr(device, "accelerated", lambda _: True)
+        patch.setattr(device, "accelerated", lambda _: True)
         yield
     _forget()
 
 
 def _forget():
-    for what in (
-        gsplat_seam.gsplat,
-        gsplat_seam.ready,
-        gsplat_seam.max_alpha,
-        gsplat_seam._tests_tiles_by_ellipse,
-        gsplat_seam._takes_cameras,
-    ):
+    for what in (gsplat_seam.gsplat, gsplat_seam.max_alpha):
         what.cache_clear()

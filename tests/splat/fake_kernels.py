@@ -1,7 +1,4 @@
-"""Stand-ins for gsplat's compiled kernels, in torch: its own Python runs around them, on the CPU.
-
-The benchmark's kit carries this file too, so it needs no test library.
-"""
+"""Stand-ins for gsplat's compiled kernels, in torch: its own Python runs around them, on the CPU."""
 
 import contextlib
 import sys
@@ -12,10 +9,7 @@ import torch
 
 from ambiguous_wild.splat import device
 
-try:
-    from . import fake_gsplat
-except ImportError:  # in the kit the two lie side by side
-    import fake_gsplat
+from . import fake_gsplat
 
 
 def pulled(function, inputs, cotangents):
@@ -105,8 +99,6 @@ def rasterize_bwd(means2d, conics, colors, opacities, backgrounds, masks, width,
 @contextlib.contextmanager
 def in_place():
     """gsplat as it is installed, its compiled module replaced; tensors of the CPU take the GPU's path."""
-    import gsplat
-
     backend = ModuleType("gsplat.cuda._backend")
     backend._C = SimpleNamespace(
         CameraModelType="all of them",
@@ -120,7 +112,6 @@ def in_place():
         rasterize_to_pixels_3dgs_fwd=rasterize_fwd,
         rasterize_to_pixels_3dgs_bwd=rasterize_bwd,
     )
-    fake_gsplat.module(gsplat.__version__)  # its clamp
     fake_gsplat._forget()
     with (
         mock.patch.dict(sys.modules, {"gsplat.cuda._backend": backend}),

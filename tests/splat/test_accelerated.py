@@ -1,6 +1,7 @@
 """The training loop of an accelerator: with numbers on the CPU, and without any where host reads raise."""
 
 import math
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -9,9 +10,8 @@ import torch
 
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat import clock
-from ambiguous_wild.splat.gpu import compiled as compiled_module
 from ambiguous_wild.splat.gpu import fused_loss
-from ambiguous_wild.splat.gpu.compiled import Compiled
+from ambiguous_wild.splat.gpu.compiled import compiled
 from ambiguous_wild.splat.gpu.sentinel import Sentinel
 from ambiguous_wild.splat.losses import photometric, ssim_map
 from ambiguous_wild.splat.parts import MaskPolicy, Parts
@@ -269,47 +269,20 @@ def test_the_fused_loss_reads_nothing_and_is_one_graph_for_a_compiler():
             assert torch.equal(x, y)
 
 
-def test_the_loss_is_compiled_once_for_all_sizes(monkeypatch):
-    """Photos of several sizes, smaller ones, and strides of any kind: a run meets them in the middle."""
-    compiled = []
-    monkeypatch.setattr(compiled_module, "compiles", lambda device: True)
-
-    def counting(graph, inputs):
-        compiled.append(graph)
-        return graph.forward
-
-    loss = Compiled(fused_loss._loss, backend=counting)
-    for height, width, masked in (
-        (16, 16, True),  # a square one first: its sides must not be taken for one number
-        (17, 23, True),
-        (40, 21, True),
-        (17, 23, False),
-        (9, 30, False),
-    ):
-        a, b, keep = pictures(height, width)
-        keep = keep if masked else None
-        planes = b.permute(2, 0, 1).contiguous().permute(1, 2, 0)  # the same values, other strides
-        for photo in (b, planes):
-            found = loss(a, photo, keep, 0.2, False)
-            for x, y in zip(found, fused_loss._loss(a, b, keep, 0.2, False), strict=True):
-                torch.testing.assert_close(x, y, rtol=1e-6, atol=1e-9)
-        assert len(compiled) == (1 if masked else 2), (height, width)
-    assert not loss.broken
-
-
-def test_without_a_compiler_the_loss_runs_as_it_stands_and_says_so():
+def test_without_a_compiler_the_loss_runs_as_it_stands_and_says_so(monkeypatch):
     class Cuda(torch.Tensor):
         device = torch.device("cuda")
 
     def broken(*arguments):
         raise RuntimeError("no triton\nand more")
 
-    call = Compiled(lambda x: x + 1)
-    call.compiled[torch.Tensor,] = broken
+    monkeypatch.setattr(torch, "compile", lambda function, **options: broken)
+    call = compiled(lambda x: x + 1, "the loss")
     argument = torch.zeros(2).as_subclass(Cuda)
-    with pytest.warns(UserWarning, match="not compiled and slower for it: no triton$"):
+    with pytest.warns(UserWarning, match="the loss is not compiled and slower for it: no triton$"):
         assert torch.equal(torch.Tensor(call(argument)), torch.ones(2))
-    call(argument)  # and says it once
+    with warnings.catch_warnings(action="error"):  # it says so once
+        assert torch.equal(torch.Tensor(call(argument)), torch.ones(2))
 
 
 def test_the_sentinel_stays_up_and_counts_what_was_sound():

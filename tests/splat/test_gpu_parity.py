@@ -1,20 +1,17 @@
-"""Where the accelerator differed from the CPU: versions of gsplat, tiny splats, needles, masked photos."""
+"""Where the accelerator differed from the CPU: tiny splats, needles, masked photos."""
 
-import sys
 from dataclasses import replace
 
 import pytest
 import torch
 
-from ambiguous_wild.core import AwError
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.cpu.render import render_cpu
 from ambiguous_wild.splat.density import DensityConfig
-from ambiguous_wild.splat.gpu import compiled, fused_loss
+from ambiguous_wild.splat.gpu import fused_loss
 from ambiguous_wild.splat.parts import MaskPolicy, Parts
 from ambiguous_wild.splat.reference import render_reference
 from ambiguous_wild.splat.render import render
-from ambiguous_wild.splat.rendered import Cotangents
 from tests.tiny_scene import with_points, write_tiny_scene
 
 from . import fake_gsplat
@@ -31,48 +28,6 @@ def fake(monkeypatch):
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     return with_points(load_scene(write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")), 60)
-
-
-# -- versions of gsplat ---------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("degree", [1, 2, 3])
-def test_harmonics_of_either_version_are_the_reference(monkeypatch, degree):
-    g, cam = gaussians(3), camera()
-    d = cotangents(cam.height, cam.width)["d_image"]
-    leaves = {name: value.requires_grad_(True) for name, value in doubles(g).items()}
-    for version, clamp in (("1.5.3", 0.999), ("1.6.0", 0.99)):
-        truth = render_reference(leaves, cam, sh_degree=degree, max_alpha=clamp).image
-        wanted = torch.autograd.grad((truth * d).sum(), [leaves["means"], leaves["sh_rest"]])
-        with fake_gsplat.installed(monkeypatch, version):
-            rendered = render(g, cam, sh_degree=degree)
-            assert (rendered.image - truth).abs().max() < 3e-5, version
-            grads = rendered.backward(d)
-        for name, value in zip(("means", "sh_rest"), wanted):
-            assert (getattr(grads, name) - value).abs().max() < 3e-5 * value.abs().max(), (version, name)
-
-
-def test_a_version_with_other_arguments_is_refused_in_one_line(monkeypatch):
-    def spherical_harmonics(degree, rays, camera_ids, coeffs):
-        raise AssertionError("called")
-
-    with fake_gsplat.installed(monkeypatch, "1.9.0"):
-        monkeypatch.setattr(sys.modules["gsplat"], "spherical_harmonics", spherical_harmonics)
-        with pytest.raises(
-            AwError, match=r"gsplat 1\.9\.0 .*\(degree, rays, camera_ids, coeffs\).*==1\.5\.3"
-        ):
-            render(gaussians(3), camera(), sh_degree=1)
-
-
-@pytest.mark.parametrize("version", ["1.5.3", "1.6.0"])
-def test_absolute_sums_survive_the_second_backward_pass(monkeypatch, version):
-    """After 1.5.3 gsplat overwrites them in place."""
-    g, cam = gaussians(4), camera()
-    d, needs = cotangents(cam.height, cam.width), frozenset({"absolute"})
-    with fake_gsplat.installed(monkeypatch, version):
-        alone = render(g, cam).backward(Cotangents(d["d_image"]), needs).screen_abs
-        both = render(g, cam).backward(Cotangents(d["d_image"], 5 * d["d_image_extra"]), needs).screen_abs
-    assert torch.equal(alone, both) and alone.max() > 0
 
 
 # -- splats ---------------------------------------------------------------------------------------
@@ -152,22 +107,6 @@ def test_growth_waits_for_the_next_photo_where_one_is_all_masked(scene, tmp_path
     assert trainer.skipped == other.skipped != set()
 
 
-@pytest.mark.parametrize(("off", "due", "grows"), [(1.0, True, False), (0.0, True, True), (1.0, False, True)])
-def test_several_gpus_put_off_a_round_of_growth_as_one_does(off, due, grows):
-    """`called_off` is the same on all ranks; only a step at which something would change asks for it."""
-    from types import SimpleNamespace
-    from unittest.mock import MagicMock
-
-    from ambiguous_wild.splat.multi_gpu.trainer import SharedTrainer
-
-    trainer = MagicMock()
-    trainer.density.due.return_value, trainer._step_cameras.return_value = due, []
-    trainer.density.refine.return_value = ("model", ["prune"])
-    step = SimpleNamespace(iteration=8, divisor=1)
-    events = SharedTrainer._change_density(trainer, step, MagicMock(), None, torch.tensor([off]))
-    assert (events == ["prune"]) == trainer.density.refine.called == grows
-
-
 # -- the loss, compiled before the clock starts ---------------------------------------------------
 
 
@@ -198,18 +137,3 @@ def test_photos_of_several_sizes_are_all_counted(scene, tmp_path):
     cameras = [c.resized(40, 30) if i % 2 else c for i, c in enumerate(trainer.data.cameras)]
     pyramid = Pyramid(replace(trainer.data, cameras=cameras))
     assert pyramid.sizes((1, 2)) == {(48, 64), (24, 32), (30, 40), (15, 20)}
-
-
-def test_a_function_of_rows_is_compiled_for_any_number_of_them(monkeypatch):
-    monkeypatch.setattr(compiled, "compiles", lambda device: True)
-    graphs = []
-
-    def counting(graph, inputs):
-        graphs.append(graph)
-        return graph.forward
-
-    call = compiled.Compiled(lambda rows, one: rows * one[:, None], backend=counting)
-    for n in (5, 9, 100):
-        rows, one = torch.rand(n, 3), torch.rand(n)
-        assert torch.equal(call(rows, one), rows * one[:, None])
-    assert len(graphs) == 1 and not call.broken

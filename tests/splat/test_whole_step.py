@@ -14,6 +14,7 @@ from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.gpu import fused_loss
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
+from tests.benchmark_scripts import benchmark
 from tests.host_reads import READ, moved, no_transfers
 from tests.tiny_scene import with_points, write_tiny_scene
 
@@ -146,13 +147,9 @@ class Launches(TorchDispatchMode):
 
 def test_a_step_launches_no_more_than_gsplats_own_loop(scene, tmp_path, fake, monkeypatch):
     """The two meet the same gsplat; what a step adds to it is the host's time and the GPU's gaps."""
-    from pathlib import Path
-
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
-    from gpu_plain import PlainLoop
-
     trainer = late(scene, tmp_path, "3dgs")
-    plain = PlainLoop(trainer.gaussians, trainer.data, trainer.pace.learning_rates(0.5))
+    with benchmark("gpu") as gpu:
+        plain = gpu.PlainLoop(trainer.gaussians, trainer.data, trainer.pace.learning_rates(0.5))
     trainer.step()
     launches = {}
     for name, step in (("ours", trainer.step), ("gsplat", plain.step)):

@@ -280,7 +280,7 @@ def speed_here(found: Found, say: Callable[[str], None] = lambda text: None) -> 
     from ambiguous_wild.harness.running.prepare import prepare_cpu
     from ambiguous_wild.harness.running.step_time import slowness
     from ambiguous_wild.splat.calibration import KERNELS
-    from ambiguous_wild.splat.gpu.readiness import choose
+    from ambiguous_wild.splat.readiness import choose
 
     kernels = {run.timing.kernel for run in found.runs if not run.error}
     device = next((device for device, size in KERNELS.items() if size.name in kernels), "cpu")

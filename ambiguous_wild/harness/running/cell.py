@@ -32,7 +32,6 @@ class Cell:
     device: str = "cpu"
     chosen: Chosen = field(default_factory=Chosen)  # optional effects, and why
     protocol: Protocol = "full"  # "half": measured on the right half, colour effects fitted on the left
-    gpus: int = 1  # that share the model; iterations count photos, on any number
     group: str = ""  # folder below the output, where one output takes several lengths or effects
 
     @property
@@ -44,8 +43,6 @@ class Cell:
             unusual["effects"] = list(self.chosen.effects)
         if self.protocol != "full":
             unusual["protocol"] = self.protocol
-        if self.gpus != 1:
-            unusual["gpus"] = self.gpus
         return {
             **unusual,
             "method": self.method.name,

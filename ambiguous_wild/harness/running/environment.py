@@ -27,13 +27,10 @@ def environment(device: str) -> Environment:
         "packages": {name: installed(name) for name in PACKAGES},
     }
     if device.startswith("cuda"):
-        from ambiguous_wild.splat.gpu import options
         from ambiguous_wild.splat.gpu.gsplat_seam import max_alpha
 
         facts["gpu"] = torch.cuda.get_device_name(device)
-        facts["gsplat_max_alpha"] = max_alpha(device)  # differs between its versions
-        if options.current() != options.Options():
-            facts["gpu_options"] = str(options.current())
+        facts["gsplat_max_alpha"] = max_alpha(device)  # differs between its sources
     return facts
 
 

@@ -49,12 +49,9 @@ def of_one_pass(cell: Cell) -> TrainConfig:
 
 
 def check_passes(cell: Cell) -> None:
-    """Raise AwError if the cell trains twice and its method has no masks, or several GPUs share its model."""
-    if cell.method.passes == 1:
-        return
-    if cell.gpus > 1:
-        raise AwError(f"{cell.method.name}: --passes 2 and --gpus exclude each other; leave one of them out")
-    refuse_without_masks(cell.method.base, cell.method.build(cell.options))
+    """Raise AwError if the cell trains twice and its method has no masks."""
+    if cell.method.passes > 1:
+        refuse_without_masks(cell.method.base, cell.method.build(cell.options))
 
 
 def refuse_without_masks(name: str, parts: Parts) -> None:

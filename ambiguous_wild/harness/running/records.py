@@ -78,7 +78,6 @@ class Cost(TypedDict, total=False):
     peak_cuda_mb: float
     device: str
     threads: int
-    gpus: int  # that shared one model, where more than one did
     fps: float  # median of several rounds
     fps_low: float
     fps_high: float
@@ -96,8 +95,7 @@ class Environment(TypedDict):
     device: str
     packages: dict[str, str | None]  # None = not installed
     gpu: NotRequired[str]
-    gsplat_max_alpha: NotRequired[float]  # differs between versions of gsplat
-    gpu_options: NotRequired[str]  # $AW_GPU, where it is not the default
+    gsplat_max_alpha: NotRequired[float]  # differs between sources of gsplat
 
 
 class Provenance(TypedDict):
@@ -155,7 +153,6 @@ class UnusualConfig(TypedDict, total=False):
 
     effects: list[str]
     protocol: str
-    gpus: int
 
 
 class RunConfig(UnusualConfig):

@@ -19,7 +19,6 @@ from ambiguous_wild.harness.running.cell import Cell
 from ambiguous_wild.harness.running.costs import both_passes, cost_of
 from ambiguous_wild.harness.running.memory import is_out_of_gpu_memory, out_of_gpu_memory, reset_peak
 from ambiguous_wild.harness.running.meter import Meter
-from ambiguous_wild.harness.running.multi_gpu import multi_gpu_cost, train_multi_gpu
 from ambiguous_wild.harness.running.passes import FirstPass, first_pass, of_one_pass
 from ambiguous_wild.harness.running.records import RunResult
 from ambiguous_wild.harness.running.result import finished_result
@@ -29,7 +28,6 @@ from ambiguous_wild.methods.fixed_masks import FixedMasks
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.interrupt import Stopped
-from ambiguous_wild.splat.multi_gpu import shards
 from ambiguous_wild.splat.trainer import Trainer
 
 STOPPED = "stopped"  # folder of a run that Ctrl-C stopped: the model as it was then; gone when the run ends
@@ -48,8 +46,6 @@ def train_and_measure(
     problem: AwError
     try:
         reset_peak(cell.device)
-        if cell.gpus > 1:  # before photos lie on the first of them
-            train_multi_gpu(cell, folder, cache_dir, tick)
         truth = evaluate.load_test_photos(cell.scene)
         first = None
         if cell.method.passes > 1:
@@ -85,8 +81,7 @@ def _make_trainer(
     trainer = Trainer(data, parts, train, folder=folder, probe=probe if truth else None)
     # Frozen inputs, instance masks and identities are part of what a method costs.
     trainer.setup_s = time.perf_counter() - before
-    if cell.gpus == 1:
-        trainer.meter = Meter.of(cell.device)
+    trainer.meter = Meter.of(cell.device)
     if first is not None:
         trainer.timeline.before_s = first.cost["train_s"]
     return trainer
@@ -101,9 +96,7 @@ def _train_and_measure(
     first: FirstPass | None,
 ) -> RunResult:
     folder = trainer.folder
-    ranks = shards.take_over(trainer, folder) if cell.gpus > 1 else []
-    if not ranks:
-        trainer.resume()
+    trainer.resume()
     recorder = pictures_of_training.Recorder(trainer, folder) if pictures else None
 
     def after_iteration(trainer: Trainer) -> None:
@@ -112,17 +105,14 @@ def _train_and_measure(
         if tick is not None:
             tick(trainer)
 
-    if not ranks:
-        try:
-            trainer.train(tick=after_iteration)
-        except Stopped:
-            raise Stopped(_keep_stopped(cell, trainer, truth)) from None
-        shutil.rmtree(folder / STOPPED, ignore_errors=True)
+    try:
+        trainer.train(tick=after_iteration)
+    except Stopped:
+        raise Stopped(_keep_stopped(cell, trainer, truth)) from None
+    shutil.rmtree(folder / STOPPED, ignore_errors=True)
     cost = cost_of(cell, trainer)  # now: what follows measures, and is no training
     if first is not None:
         cost = both_passes(first.cost, cost)
-    if ranks:
-        cost |= multi_gpu_cost(cell, ranks)
     write_splat_ply(
         folder / "point_cloud.ply", {k: v.cpu().numpy() for k, v in trainer.neutral_model().items()}
     )

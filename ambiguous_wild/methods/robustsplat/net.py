@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ambiguous_wild.splat import device
+from ambiguous_wild.splat.backend import backend_of
 
 
 class MaskNet(nn.Module):
@@ -75,8 +75,8 @@ def _weights(size: int, to: int, dtype: torch.dtype, place: torch.device) -> Ten
 
 
 def adam_of(net: nn.Module, lr: float, place: torch.device) -> torch.optim.Adam:
-    """Adam on the net's parameters; on an accelerator one kernel, which keeps the step count there."""
-    return torch.optim.Adam(net.parameters(), lr=lr, fused=device.accelerated(place) or None)
+    """Adam on the net's parameters, see `Backend.adam`."""
+    return backend_of(place).adam(net.parameters(), lr)
 
 
 def adam_state(optimiser: torch.optim.Adam) -> list[dict[str, Any]]:

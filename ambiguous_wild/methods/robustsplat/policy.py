@@ -11,11 +11,11 @@ from torch import Tensor
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.io.palette import MASKED, faded, ramp, tint
-from ambiguous_wild.methods.deferred import deferred
 from ambiguous_wild.methods.masking_common import MaskedShares, PausingMask, upsampled
 from ambiguous_wild.methods.robustsplat import supervision
 from ambiguous_wild.methods.robustsplat.config import RobustSplatConfig
 from ambiguous_wild.methods.robustsplat.net import MaskNet, adam_of, adam_state, load_adam_state
+from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.data import shrink, shrink_camera
 from ambiguous_wild.splat.parts import State
 from ambiguous_wild.splat.step import Step, TrainData
@@ -67,7 +67,8 @@ class RobustSplatMask(PausingMask):
                 loss.backward()
             keep = self._cut(mask.detach())  # of the net before this step, as the authors have it
             self.optimiser.step()
-            self.loss_sum, self.loss_count = self.loss_sum + deferred(loss), self.loss_count + 1
+            self.loss_sum = self.loss_sum + backend_of(loss.device).number(loss)
+            self.loss_count += 1
         self.shares.take(step.view, keep)
         return keep
 

@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ambiguous_wild.splat import device
+from ambiguous_wild.splat.backend import backend_of
 
 
 def cosine_target(cosine: Tensor) -> Tensor:
@@ -46,32 +46,20 @@ def update_histogram(histogram: Tensor, values: Tensor, decay: float) -> Tensor:
     """h <- decay h + hist(values); `histogram` [bins] float64 over [0, 1], values in [0, 1]."""
     bins = len(histogram)
     index = (values.reshape(-1).double() * bins).long().clamp(0, bins - 1)
-    if device.accelerated(histogram.device):  # bincount reads the largest index on the host
-        ones = torch.ones_like(index, dtype=histogram.dtype)
-        return decay * histogram + torch.zeros_like(histogram).scatter_add_(0, index, ones)
-    return decay * histogram + torch.bincount(index, minlength=bins).double()
+    return decay * histogram + backend_of(histogram.device).label_sums(index, bins)
 
 
 def percentile(histogram: Tensor, share: float) -> float | Tensor:
     """The smallest bin edge with at least `share` of all counts below it; 1 for an empty histogram.
 
-    A 0-d tensor on an accelerator, so that the host does not wait for it.
+    As `Backend.number`: a 0-d tensor on a GPU, so that the host does not wait for it.
     """
-    if device.accelerated(histogram.device):
-        return _percentile_there(histogram, share)
-    total = float(histogram.sum())
-    if total <= 0:
-        return 1.0
+    total = histogram.sum()
     # a little below the target for rounding, so that 0.6 of 10 equal counts is six of them
     reached = torch.cumsum(histogram, 0) >= share * total * (1.0 - 1e-12)
-    return (int(torch.nonzero(reached)[0]) + 1) / len(histogram)
-
-
-def _percentile_there(histogram: Tensor, share: float) -> Tensor:
-    total = histogram.sum()
-    reached = torch.cumsum(histogram, 0) >= share * total * (1.0 - 1e-12)
     first = reached.int().argmax()  # of equal values the first
-    return ((first + 1).to(histogram) / len(histogram)).masked_fill(total <= 0, 1.0)
+    edge = ((first + 1).to(histogram) / len(histogram)).masked_fill(total <= 0, 1.0)
+    return backend_of(histogram.device).number(edge)
 
 
 def bound(e: Tensor, threshold: float | Tensor) -> Tensor:

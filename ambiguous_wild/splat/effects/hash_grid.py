@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ambiguous_wild.splat import device
+from ambiguous_wild.splat.backend import backend_of
 
 PRIMES = (1, 2_654_435_761, 805_459_861)  # Instant-NGP's
 
@@ -21,7 +21,7 @@ def hash_encoding(unit: Tensor, grid: Tensor, coarsest: int, finer: float) -> Te
     """
     unit = unit.detach().to(grid).clamp(0.0, 1.0)
     cells = [float(int(coarsest * finer**level)) for level in range(len(grid))]
-    if device.accelerated(grid.device) or grid.dtype != torch.float32:
+    if not backend_of(grid.device).kernels or grid.dtype != torch.float32:
         return in_torch(unit, grid, cells)
     found: Tensor = _Encoding.apply(unit, grid, torch.tensor(cells))
     return found

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import Camera
-from ambiguous_wild.splat import device
+from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.effects.learnt import Leaf
 from ambiguous_wild.splat.effects.posed import PosedCamera
 from ambiguous_wild.splat.gaussians import SH_C0
@@ -65,15 +65,8 @@ def inside(pixels: Tensor, z: Tensor, camera: Camera, margin: float) -> Tensor:
 
 
 def mean_of_seen(values: Tensor, means: Tensor, camera: Camera) -> Tensor:
-    """Mean of values [N, ...] over the rows that the camera may see.
-
-    On the CPU a recipe is given no others; on an accelerator it is given all rows.
-    """
-    if not device.accelerated(means.device):
-        return values.mean()
-    inside = in_picture(means, camera).to(values)
-    seen = inside.sum() * (values.numel() // max(len(values), 1))
-    return (values * inside.reshape(-1, *[1] * (values.dim() - 1))).sum() / seen.clamp(min=1.0)
+    """Mean of values [N, ...] over the rows that the camera may see, given those of `Backend.rows`."""
+    return backend_of(means.device).mean_of_rows(values, lambda: in_picture(means, camera))
 
 
 class Unit:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import Camera
-from ambiguous_wild.splat import device
+from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.effects.base import Effect, RowAdam, State, decayed, share_of
 from ambiguous_wild.splat.effects.posed import PosedCamera, left_jacobian, scaled, turned
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
@@ -52,7 +52,7 @@ class PoseRefinement(Effect):
     def camera(self, shot: Shot) -> Camera:
         assert shot.view is not None
         view, camera = shot.view, shot.camera
-        if device.accelerated(self.adam.values.device):
+        if not backend_of(self.adam.values.device).reads_at_once:
             return self._camera_there(view, camera)
         delta = self.adam.values[view].numpy()
         if not delta.any():
@@ -74,7 +74,7 @@ class PoseRefinement(Effect):
     def pose(self, gaussians: Gaussians, gradients: Gradients, shot: Shot) -> Mapping[str, Tensor]:
         assert shot.view is not None
         row = self.adam.values[shot.view]
-        if device.accelerated(row.device):
+        if not backend_of(row.device).reads_at_once:
             return {"motion": self._gradient_there(gaussians, gradients, shot.camera, shot.view)}
         left = left_gradient(gaussians, shot.camera, gradients, self.degree)
         # the motion is exp(w) then the shift: about the present pose, the shift part of w is subtracted

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ambiguous_wild.splat.gpu.compiled import Compiled
+from ambiguous_wild.splat.gpu.compiled import compiled
 
 _SMALLEST = 1e-30  # keeps the square root differentiable
 
@@ -26,7 +26,7 @@ def _covers(radii: Tensor, means2d: Tensor, conics: Tensor, opacities: Tensor, s
     return (radii > 0).all(1) & ~(first > last).any(1)
 
 
-_compiled_covers = Compiled(_covers, "the test of visibility")
+_compiled_covers = compiled(_covers, "the test of visibility")
 
 
 @torch.no_grad()
@@ -97,8 +97,8 @@ def _pull(
     return found
 
 
-_compiled_ratio = Compiled(_ratio, "antialiasing")
-_compiled_pull = Compiled(_pull, "antialiasing's backward pass")
+_compiled_ratio = compiled(_ratio, "antialiasing")
+_compiled_pull = compiled(_pull, "antialiasing's backward pass")
 
 
 class _Compensation(torch.autograd.Function):

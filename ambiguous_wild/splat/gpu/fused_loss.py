@@ -2,8 +2,7 @@
 
 The gradient is written out, so that no graph is kept and every step runs the same few kernels: SSIM's window
 is symmetric and padded with zeros, hence its own adjoint, and gradients of the three blurred pictures that
-depend on the render are blurred once more. Compiled by torch where it can be (its compiler needs
-Triton, which comes with torch's CUDA builds on Linux), else the same function runs without compilation.
+depend on the render are blurred once more.
 Nothing here reads a tensor's values.
 """
 
@@ -15,7 +14,7 @@ import math
 import torch
 from torch import Tensor
 
-from ambiguous_wild.splat.gpu.compiled import Compiled, compiles
+from ambiguous_wild.splat.gpu.compiled import compiled, compiles
 
 _REACH = 5  # px, of the 11 taps to either side
 _C1, _C2 = 0.01**2, 0.03**2
@@ -83,7 +82,7 @@ def _map(a: Tensor, b: Tensor) -> Tensor:
     return _ssim(a.permute(2, 0, 1), b.permute(2, 0, 1))[0].permute(1, 2, 0).contiguous()
 
 
-_compiled_loss, _compiled_map = Compiled(_loss), Compiled(_map)
+_compiled_loss, _compiled_map = compiled(_loss, "the loss"), compiled(_map, "SSIM")
 
 
 @torch.no_grad()

@@ -9,6 +9,7 @@ Nothing here reads a tensor's values: the host waits once a picture, in gsplat, 
 
 from __future__ import annotations
 
+import functools
 from collections import OrderedDict
 from dataclasses import dataclass
 from typing import Any
@@ -17,14 +18,13 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError, Camera
+from ambiguous_wild.splat import readiness
 from ambiguous_wild.splat.effects.posed import PosedCamera
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
 from ambiguous_wild.splat.gpu import gsplat_seam as seam
-from ambiguous_wild.splat.gpu import options
 from ambiguous_wild.splat.gpu.footprint import visible
-from ambiguous_wild.splat.gpu.split_harmonics import shade_split
-from ambiguous_wild.splat.gpu.tiles import Visits, list_within
 from ambiguous_wild.splat.rendered import (
+    GSPLAT_SUMS,
     NOTHING,
     Cotangents,
     Gradients,
@@ -48,7 +48,6 @@ class OnDevice:
 
 
 _cameras: OrderedDict[tuple[int, torch.device], tuple[Camera, OnDevice]] = OrderedDict()
-_visits = Visits()
 _backgrounds: dict[tuple[tuple[float, float, float], torch.device], Tensor] = {}
 
 
@@ -95,12 +94,9 @@ class RenderedCuda:
         self._image, self._alpha, _ = self._blend(self._cut)
         self._depth: Tensor | None = None
         self.image, self.alpha = self._image.detach(), self._alpha.detach()
-        self.visible, self._shown = seen(splats, size), splats.radii
-
-    @property
-    def over(self) -> Tensor | None:
-        """[1] float32, 1 = tile lists were too short for this picture; None = they are exact."""
-        return self._tiles.over
+        there = seam.size_on(*size, splats.radii.device)
+        self.visible = visible(splats.radii, splats.means2d, splats.conics, splats.opacities, there)
+        self._shown = splats.radii
 
     @property
     def radii(self) -> Tensor:
@@ -129,7 +125,7 @@ class RenderedCuda:
             AwError: a statistic that is unknown, or that gsplat does not offer.
             RuntimeError: the picture was drawn under `torch.no_grad`, or had its backward pass.
         """
-        check_needs(needs, accelerated=True)
+        check_needs(needs, GSPLAT_SUMS)
         if not self._graph:
             raise RuntimeError("drawn under torch.no_grad: there is no backward pass")
         if self._done:
@@ -223,7 +219,9 @@ def render_cuda(
     Raises:
         AwError: gsplat is missing or cannot be used; says the command that mends it.
     """
-    seam.ready(gaussians.device.type)
+    seam.gsplat()
+    if gaussians.device.type == "cuda":
+        _check_gpu()
     cam = on_device(camera, gaussians.device)
     graph = torch.is_grad_enabled()
     leaves = {name: tensor.detach().requires_grad_(graph) for name, tensor in gaussians.items()}
@@ -239,46 +237,28 @@ def render_cuda(
         antialias=antialias,
         blur=blur,
     )
-    base = base_colours(leaves, splats, cam, min(sh_degree, gaussians.sh_degree))
+    base = _base_colours(leaves, splats, cam.centre, min(sh_degree, gaussians.sh_degree))
     shaded = None if shade is None else _shaded(shade, gaussians, base, splats)
     colours = (base if shaded is None else shaded.colours).clamp(min=0.0)
     size = (camera.width, camera.height)
-    tiles = _tiles(splats, camera) if graph else seam.sort(splats, *size)
-    behind = background_on(background, gaussians.device)
+    tiles = seam.sort(splats, *size)
+    behind = _background_on(background, gaussians.device)
     return RenderedCuda(leaves, splats, colours, tiles, behind, size, shaded)
 
 
-def _tiles(splats: seam.Splats, camera: Camera) -> seam.Tiles:
-    """Of a step; where the length of the lists is known, nobody waits for it."""
-    size, count = (camera.width, camera.height), len(splats.radii)
-    if options.current().tiles == "exact" or not count:
-        return seam.sort(splats, *size)
-    capacity = _visits.capacity(camera, count)
-    if capacity is None:
-        tiles = seam.sort(splats, *size)
-        _visits.note(camera, count, len(tiles.flatten_ids))
-        return tiles
-    listed = list_within(splats.means2d.detach(), splats.radii, splats.depths.detach(), *size, capacity)
-    _visits.note(camera, count, listed.count)
-    return seam.Tiles(listed.offsets, listed.flatten_ids, listed.over)
+@functools.cache
+def _check_gpu() -> None:
+    readiness.require(readiness.look())
 
 
-def seen(splats: seam.Splats, size: tuple[int, int]) -> Tensor:
-    """[N] bool, the Gaussians that cover a pixel centre of a picture of this width and height."""
-    there = seam.size_on(*size, splats.radii.device)
-    return visible(splats.radii, splats.means2d, splats.conics, splats.opacities, there)
-
-
-def base_colours(leaves: dict[str, Tensor], splats: seam.Splats, cam: OnDevice, degree: int) -> Tensor:
+def _base_colours(leaves: dict[str, Tensor], splats: seam.Splats, centre: Tensor, degree: int) -> Tensor:
     """[N, 3], SH + 0.5, not clamped; rows that are not visible may hold anything."""
     if degree == 0:
         return leaves["sh0"] * SH_C0 + 0.5
-    if options.current().harmonics == "split":
-        return shade_split(degree, leaves["means"], leaves["sh0"], leaves["sh_rest"], cam.centre) + 0.5
     active = leaves["sh_rest"][:, : (degree + 1) ** 2 - 1]
     coefficients = torch.cat([leaves["sh0"][:, None], active], dim=1)
     drawn = (splats.radii > 0).all(dim=1)
-    return seam.shade(degree, leaves["means"], cam.viewmat, cam.centre, coefficients, drawn) + 0.5
+    return seam.shade(degree, leaves["means"], centre, coefficients, drawn) + 0.5
 
 
 def _shaded(shade: Shade, gaussians: Gaussians, base: Tensor, splats: seam.Splats) -> Shaded:
@@ -318,7 +298,7 @@ def on_device(camera: Camera, device: torch.device) -> OnDevice:
     return found
 
 
-def background_on(background: tuple[float, float, float], device: torch.device) -> Tensor:
+def _background_on(background: tuple[float, float, float], device: torch.device) -> Tensor:
     key = (background, device)
     if key not in _backgrounds:
         _backgrounds[key] = torch.tensor([background], dtype=torch.float32).to(device)

@@ -80,7 +80,8 @@ class Sentinel:
         nothing = None if keep is None else (keep.amax() <= 0).to(torch.float32).reshape(1)
         if nothing is not None:
             self._empty[view : view + 1] += nothing
-        return self._called_off(nothing)
+        self._sound += 1.0 - self._broken
+        return self._broken.clone() if nothing is None else torch.maximum(self._broken, nothing)
 
     def _remember(self, before: Tensor, given: Mapping[str, Tensor]) -> None:
         """Copy the weights of the step, unless an earlier one was broken."""
@@ -91,16 +92,6 @@ class Sentinel:
                 known = flat.new_zeros(len(flat)) if known is None else _longer(known, len(flat))
                 self._weights[name] = known
             known[: len(flat)] = torch.where(before > 0, known[: len(flat)], flat)
-
-    def _called_off(self, nothing: Tensor | None) -> Tensor:
-        """[1] that `watch` returns, of the flag and of whether nothing is kept (None: something is)."""
-        self._sound += 1.0 - self._broken
-        return self._broken.clone() if nothing is None else torch.maximum(self._broken, nothing)
-
-    @property
-    def broken(self) -> Tensor:
-        """[1] float32, 1 = a value was not finite since the last look; a copy, nobody waits for it."""
-        return self._broken.clone()
 
     def first_broken(self) -> Broken | None:
         """The first step since the last look at which something was not finite. The host waits."""

@@ -245,10 +245,9 @@ def _scene(path: str, factor: int | None) -> Scene:
 
 def _prepare_cuda() -> None:
     """Prepare the GPU of a cluster's node; elsewhere this is done before any job starts."""
-    from ambiguous_wild.splat.gpu import readiness
+    from ambiguous_wild.splat import readiness
 
-    found = readiness.look()
-    lack = readiness.why_not(found)
-    if lack is not None:
-        raise AwError(f"{platform.node()} cannot use its GPU: {lack}")
-    readiness.make_ready(found, lambda text: None)
+    try:
+        readiness.require(readiness.look())
+    except AwError as error:
+        raise AwError(f"{platform.node()} cannot use its GPU: {error}") from None

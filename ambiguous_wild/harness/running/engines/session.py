@@ -119,7 +119,7 @@ class Session:
         if not self.engine.remote:
             if device == "cpu":
                 return device
-            from ambiguous_wild.splat.gpu.readiness import choose
+            from ambiguous_wild.splat.readiness import choose
 
             return choose(device, self.callbacks.say)
         if device != "auto":

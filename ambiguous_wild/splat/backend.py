@@ -1,0 +1,235 @@
+"""Where a run computes: Numba's kernels on the CPU, or torch and gsplat on a GPU.
+
+A run holds one of the two (`TrainData.backend`), and `backend_of` gives that of a tensor. Whatever differs
+between them is a call here, so that effects and methods are written once. Tests run the GPU's calls on the
+CPU, as numbers by letting `device.accelerated` say yes to every device, and without numbers on torch's `meta`
+device, where whatever would make the host wait raises.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from ambiguous_wild.core import Camera
+from ambiguous_wild.splat import device as devices
+from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.rendered import GSPLAT_SUMS, NEEDS, Rendered
+
+if TYPE_CHECKING:
+    from ambiguous_wild.splat.gpu.sentinel import Sentinel
+
+Photometric = tuple[float | Tensor, float | Tensor, Tensor]  # L1, 1 - SSIM, gradient [H, W, 3] of their mix
+_LANES = 64  # sums a label while a GPU adds up
+
+
+class Backend(ABC):
+    """What differs between the CPU and a GPU: calls, and what each can and cannot do."""
+
+    statistics: ClassVar[Sequence[str]]  # of `rendered.NEEDS`, what a backward pass can sum
+    kernels: ClassVar[bool]  # Numba's kernels take its tensors
+    reads_at_once: ClassVar[bool]  # a value is known at once; else the host waits for all queued work
+    same_bits: ClassVar[bool]  # one seed gives the same bits
+
+    # -- a step of training -----------------------------------------------------------------------
+
+    @abstractmethod
+    def render(self, gaussians: Gaussians, camera: Camera, **options: Any) -> Rendered:
+        """A picture with its backward pass; `render.render` with every option given."""
+
+    @abstractmethod
+    def photometric(
+        self, render: Tensor, photo: Tensor, keep: Tensor | None, lambda_dssim: float, weighting: str
+    ) -> Photometric:
+        """The parts of `losses.photometric`, of arguments that were checked."""
+
+    @abstractmethod
+    def ssim_map(self, a: Tensor, b: Tensor) -> Tensor:
+        """SSIM of every pixel and channel, [H, W, 3]."""
+
+    @abstractmethod
+    def prepare_loss(
+        self, device: torch.device, sizes: frozenset[tuple[int, int]], lambda_dssim: float, weighting: str
+    ) -> None:
+        """Before the clock starts: compile the loss for photos of these heights and widths."""
+
+    @abstractmethod
+    def sentinel(self, device: torch.device, views: int) -> Sentinel | None:
+        """Checks on the device that values are finite; None = the host looks at every step."""
+
+    @abstractmethod
+    def all_finite(self, tensors: Sequence[Tensor]) -> bool:
+        """Whether every value is finite; a large but sound sum may say no."""
+
+    @abstractmethod
+    def max_alpha(self, device: torch.device | str) -> float:
+        """Where alpha is clamped."""
+
+    @abstractmethod
+    def use_threads(self, n: int) -> None:
+        """Use n threads for torch's own work on the CPU: its sums, and so the bits of a run, depend on n."""
+
+    # -- what effects and methods need ------------------------------------------------------------
+
+    @abstractmethod
+    def number(self, value: Tensor) -> float | Tensor:
+        """The number in a 0-d tensor; on a GPU a float64 tensor, which `float(...)` reads later."""
+
+    @abstractmethod
+    def rows(self, visible: Callable[[], Tensor]) -> Tensor | slice:
+        """Rows [M] int64 where `visible()` [N] bool holds; on a GPU all rows, because the host would wait."""
+
+    @abstractmethod
+    def mean_of_rows(self, values: Tensor, visible: Callable[[], Tensor]) -> Tensor:
+        """Mean of values [M, ...] of `rows`; on a GPU of the rows [N, ...] where `visible()` holds."""
+
+    @abstractmethod
+    def label_sums(self, labels: Tensor, count: int, values: Tensor | None = None) -> Tensor:
+        """[count] float64: sums of values [P] float64 by labels [P] int64 below `count`; None counts them."""
+
+    @abstractmethod
+    def adam(self, parameters: Iterable[torch.nn.Parameter], lr: float) -> torch.optim.Adam:
+        """Adam on a net's parameters; on a GPU one kernel, which keeps the step count there."""
+
+
+class CpuBackend(Backend):
+    """Numba's kernels, and torch's on the CPU."""
+
+    statistics = NEEDS
+    kernels = reads_at_once = same_bits = True
+
+    def render(self, gaussians: Gaussians, camera: Camera, **options: Any) -> Rendered:
+        from ambiguous_wild.splat.cpu.render import render_cpu
+
+        return render_cpu(gaussians, camera, **options)
+
+    def photometric(
+        self, render: Tensor, photo: Tensor, keep: Tensor | None, lambda_dssim: float, weighting: str
+    ) -> Photometric:
+        from ambiguous_wild.splat.cpu.photometric import photometric_cpu
+
+        return photometric_cpu(render, photo, keep, lambda_dssim, weighting)
+
+    def ssim_map(self, a: Tensor, b: Tensor) -> Tensor:
+        from ambiguous_wild.splat.cpu.photometric import ssim_map_cpu
+
+        return ssim_map_cpu(a, b)
+
+    def prepare_loss(
+        self, device: torch.device, sizes: frozenset[tuple[int, int]], lambda_dssim: float, weighting: str
+    ) -> None:
+        pass  # the kernels are compiled for all sizes, before any run
+
+    def sentinel(self, device: torch.device, views: int) -> Sentinel | None:
+        return None
+
+    def all_finite(self, tensors: Sequence[Tensor]) -> bool:
+        from ambiguous_wild.splat.cpu.finite import all_finite
+
+        return all_finite(tensors)
+
+    def max_alpha(self, device: torch.device | str) -> float:
+        return 0.99
+
+    def use_threads(self, n: int) -> None:
+        from ambiguous_wild.splat.cpu.compile import threads
+
+        threads()  # starts Numba's pool, which sets the number of OpenMP's threads, torch's with it
+        torch.set_num_threads(n)
+
+    def number(self, value: Tensor) -> float | Tensor:
+        return float(value.detach())
+
+    def rows(self, visible: Callable[[], Tensor]) -> Tensor | slice:
+        return torch.nonzero(visible()).squeeze(1)
+
+    def mean_of_rows(self, values: Tensor, visible: Callable[[], Tensor]) -> Tensor:
+        return values.mean()
+
+    def label_sums(self, labels: Tensor, count: int, values: Tensor | None = None) -> Tensor:
+        return torch.bincount(labels, weights=values, minlength=count).double()
+
+    def adam(self, parameters: Iterable[torch.nn.Parameter], lr: float) -> torch.optim.Adam:
+        return torch.optim.Adam(parameters, lr=lr)
+
+
+class GpuBackend(Backend):
+    """torch and gsplat; the host waits once a picture, in gsplat."""
+
+    statistics = GSPLAT_SUMS
+    kernels = reads_at_once = same_bits = False
+
+    def render(self, gaussians: Gaussians, camera: Camera, **options: Any) -> Rendered:
+        from ambiguous_wild.splat.gpu.render import render_cuda
+
+        return render_cuda(gaussians, camera, **options)
+
+    def photometric(
+        self, render: Tensor, photo: Tensor, keep: Tensor | None, lambda_dssim: float, weighting: str
+    ) -> Photometric:
+        from ambiguous_wild.splat.gpu.fused_loss import photometric_fused
+
+        return photometric_fused(render, photo, keep, lambda_dssim, weighting)
+
+    def ssim_map(self, a: Tensor, b: Tensor) -> Tensor:
+        from ambiguous_wild.splat.gpu.fused_loss import ssim_map_fused
+
+        return ssim_map_fused(a, b)
+
+    def prepare_loss(
+        self, device: torch.device, sizes: frozenset[tuple[int, int]], lambda_dssim: float, weighting: str
+    ) -> None:
+        from ambiguous_wild.splat.gpu import fused_loss
+
+        fused_loss.prepare(device, sizes, lambda_dssim, weighting)
+
+    def sentinel(self, device: torch.device, views: int) -> Sentinel | None:
+        from ambiguous_wild.splat.gpu.sentinel import Sentinel
+
+        return Sentinel(device, views)
+
+    def all_finite(self, tensors: Sequence[Tensor]) -> bool:
+        # a sum each: several times as fast as isfinite().all(), which writes a tensor of its own
+        return bool(torch.isfinite(torch.stack([tensor.sum() for tensor in tensors])).all())
+
+    def max_alpha(self, device: torch.device | str) -> float:
+        from ambiguous_wild.splat.gpu.gsplat_seam import max_alpha
+
+        return max_alpha(str(device))
+
+    def use_threads(self, n: int) -> None:
+        torch.set_num_threads(n)
+
+    def number(self, value: Tensor) -> float | Tensor:
+        return value.detach().double()
+
+    def rows(self, visible: Callable[[], Tensor]) -> Tensor | slice:
+        return slice(None)
+
+    def mean_of_rows(self, values: Tensor, visible: Callable[[], Tensor]) -> Tensor:
+        inside = visible().to(values)
+        seen = inside.sum() * (values.numel() // max(len(values), 1))
+        return (values * inside.reshape(-1, *[1] * (values.dim() - 1))).sum() / seen.clamp(min=1.0)
+
+    def label_sums(self, labels: Tensor, count: int, values: Tensor | None = None) -> Tensor:
+        # `bincount` reads the largest label on the host. Neighbouring pixels mostly share a label and would
+        # wait for one address: each label has several.
+        values = torch.ones_like(labels, dtype=torch.float64) if values is None else values
+        lane = torch.arange(len(labels), device=labels.device) % _LANES
+        sums = values.new_zeros(count * _LANES).scatter_add_(0, labels * _LANES + lane, values)
+        return sums.reshape(count, _LANES).sum(dim=1)
+
+    def adam(self, parameters: Iterable[torch.nn.Parameter], lr: float) -> torch.optim.Adam:
+        return torch.optim.Adam(parameters, lr=lr, fused=True)
+
+
+_CPU, _GPU = CpuBackend(), GpuBackend()
+
+
+def backend_of(device: torch.device | str) -> Backend:
+    """The back end that computes with tensors on this device."""
+    return _GPU if devices.accelerated(device) else _CPU

@@ -1,0 +1,227 @@
+"""Whether torch and gsplat can use the GPU of this machine; if not, what is missing and its command.
+
+`look` collects the facts, functions without side effects judge them, and `load_kernels` draws one Gaussian.
+Only `torch_facts` imports torch, so that `aw doctor` can run it in a process of its own.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.util
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.core.extras import install_command, torch_command
+from ambiguous_wild.io.lock import patient_lock
+
+GSPLAT = "1.5.3"  # the release whose calls are known
+INSTALL_GSPLAT = f"{sys.executable} -m pip install 'gsplat=={GSPLAT}'"
+TOOLKIT = "https://developer.nvidia.com/cuda-toolkit-archive"
+COMPILE_S = 3600.0  # longest wait for another process that compiles gsplat's kernels
+
+
+@dataclass(frozen=True)
+class Lack:
+    """A missing dependency of the GPU."""
+
+    what: str
+    fix: str  # the command that mends it, or what to do
+
+    def __str__(self) -> str:
+        return f"{self.what}: {self.fix}"
+
+
+@dataclass(frozen=True)
+class GpuFacts:
+    """Facts about this machine."""
+
+    torch: Mapping[str, Any]  # see `torch_facts`
+    driver: str | None  # what nvidia-smi says of the first GPU; None = it is absent or sees none
+    gsplat: str | None  # installed version
+    prebuilt: bool  # its kernels came compiled, in a wheel of one's own
+    compiler: str | None  # path of the C++ compiler
+    hidden: str | None  # $CUDA_VISIBLE_DEVICES
+
+    @property
+    def has_gpu(self) -> bool:
+        """Whether there is a GPU, usable or not."""
+        return self.driver is not None or bool(self.torch["cuda"])
+
+
+def torch_facts() -> dict[str, Any]:
+    """torch's version, the GPUs that it sees and the CUDA toolkit that it compiles with, as plain values."""
+    import torch
+
+    cuda, error, toolkit = torch.cuda.is_available(), "", None
+    if cuda:
+        from torch.utils import cpp_extension
+
+        toolkit = cpp_extension.CUDA_HOME
+    elif torch.version.cuda is not None:
+        try:
+            torch.cuda.init()  # says why: no driver, or one that is too old
+        except (RuntimeError, AssertionError) as reason:
+            error = " ".join(str(reason).split())
+    return {
+        "version": torch.__version__,
+        "built": torch.version.cuda,
+        "cuda": cuda,
+        "names": [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count() if cuda else 0)],
+        "toolkit": toolkit,
+        "error": error,
+    }
+
+
+def look(torch: Mapping[str, Any] | None = None) -> GpuFacts:
+    """Collect the facts about this machine.
+
+    Args:
+        torch: result of `torch_facts`, if another process called it; None calls it here.
+    """
+    spec = importlib.util.find_spec("gsplat")
+    package = None if spec is None or spec.origin is None else Path(spec.origin).parent
+    return GpuFacts(
+        torch=torch_facts() if torch is None else torch,
+        driver=first_line("nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader"),
+        gsplat=_version("gsplat"),
+        prebuilt=package is not None and any(package.glob("csrc*.so")),
+        compiler=shutil.which(os.environ.get("CXX", "c++")),
+        hidden=os.environ.get("CUDA_VISIBLE_DEVICES"),
+    )
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def why_not(facts: GpuFacts) -> Lack | None:
+    """The first missing dependency of training on the GPU; None if there is none."""
+    return no_cuda(facts) or no_gsplat(facts) or no_compiler(facts)
+
+
+def no_cuda(facts: GpuFacts) -> Lack | None:
+    """Why torch cannot compute on the GPU."""
+    torch = facts.torch
+    if torch["cuda"]:
+        return None
+    if torch["built"] is None:
+        what = f"torch {torch['version']} is a CPU build"
+        return Lack(what, torch_command(torch["version"]) if facts.driver else "nothing to do without a GPU")
+    what = f"torch {torch['version']} is built for CUDA {torch['built']}, but sees no GPU"
+    if facts.driver is None:
+        return Lack(f"{what}, and no NVIDIA driver answers", "install the driver, see that nvidia-smi works")
+    if facts.hidden is not None and facts.hidden.strip() in ("", "-1"):
+        return Lack(f"{what}: CUDA_VISIBLE_DEVICES={facts.hidden!r} hides it", "unset CUDA_VISIBLE_DEVICES")
+    why = f" ({torch['error']})" if torch["error"] else ""
+    return Lack(f"{what}; the driver has {facts.driver}{why}", "install a newer driver, then restart")
+
+
+def no_gsplat(facts: GpuFacts) -> Lack | None:
+    """Why there is no gsplat that can be called."""
+    if facts.gsplat is None:
+        return Lack("gsplat is not installed", install_command("cuda"))
+    if facts.gsplat.partition("+")[0] != GSPLAT:
+        return Lack(f"gsplat {facts.gsplat} is installed, and {GSPLAT} is needed", INSTALL_GSPLAT)
+    return None
+
+
+def no_compiler(facts: GpuFacts) -> Lack | None:
+    """What gsplat needs to compile its kernels, once; to load them it looks for nvcc again."""
+    if facts.prebuilt:
+        return None
+    built = facts.torch["built"]
+    absent = {
+        f"nvcc (the CUDA toolkit {built}: {TOOLKIT}, then export CUDA_HOME=ITS_FOLDER)": facts.torch[
+            "toolkit"
+        ],
+        "a C++17 compiler (sudo apt-get install g++, or export CXX=ITS_PATH)": facts.compiler,
+    }
+    wanted = [text for text, found in absent.items() if not found]
+    if not wanted:
+        return None
+    names = " and ".join(text.partition(" (")[0] for text in wanted)
+    return Lack(
+        f"gsplat needs {names} to compile its kernels, and there is none", "install " + "; ".join(wanted)
+    )
+
+
+def load_kernels() -> None:
+    """Draw one Gaussian on the GPU; gsplat compiles its kernels before its first picture, for minutes.
+
+    One process at a time: gsplat's compiles of several break each other.
+
+    Raises:
+        AwError: the kernels cannot be compiled or loaded, or the installed gsplat takes other arguments.
+    """
+    from torch.utils.cpp_extension import get_default_build_root
+
+    from ambiguous_wild.splat.gpu.gsplat_seam import max_alpha
+
+    own = str(Path(sys.executable).parent)  # pip puts ninja there, also where nobody activated it
+    if own not in (path := os.environ.get("PATH", "")).split(os.pathsep):
+        os.environ["PATH"] = os.pathsep.join(filter(None, (path, own)))
+    with patient_lock(Path(get_default_build_root()) / "gsplat", "a compile of gsplat", COMPILE_S):
+        try:
+            max_alpha("cuda")
+        except Exception as error:  # of compilers, loaders and CUDA: many kinds
+            lines = str(error).strip().splitlines() or [type(error).__name__]
+            reason = next((line for line in lines if "error:" in line), lines[0]).strip()[:300]
+            raise AwError(
+                f"gsplat cannot draw on this GPU: {reason}; docs/gpu.md says what it needs, and "
+                f"{INSTALL_GSPLAT} --force-reinstall --no-deps installs it anew"
+            ) from error
+
+
+def require(facts: GpuFacts) -> None:
+    """Make sure that gsplat can draw on this machine's GPU.
+
+    Raises:
+        AwError: what is missing, and its command.
+    """
+    lack = why_not(facts)
+    if lack is not None:
+        raise AwError(str(lack))
+    load_kernels()
+
+
+def choose(device: str, say: Callable[[str], None], *, looking: Callable[[], GpuFacts] | None = None) -> str:
+    """ "cpu" or "cuda" for "auto", "cpu" or "cuda"; says so if a GPU stays unused.
+
+    Raises:
+        AwError: cuda was asked for and is not usable; says what is missing.
+    """
+    if device == "cpu":
+        return "cpu"
+    facts = (looking or look)()
+    try:
+        require(facts)
+        return "cuda"
+    except AwError as error:
+        problem = str(error)
+    if device == "cuda":
+        raise AwError(f"--device cuda: {problem}; 'aw doctor' tells more, --device cpu runs without")
+    if facts.has_gpu:
+        say(f"warning: the GPU is not used, the CPU is: {problem}")
+    return "cpu"
+
+
+def first_line(*words: str) -> str | None:
+    """The first line that a program prints; None if it is missing or fails."""
+    if shutil.which(words[0]) is None:
+        return None
+    try:
+        done = subprocess.run(words, capture_output=True, text=True, timeout=10, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    lines = done.stdout.strip().splitlines()
+    return lines[0] if done.returncode == 0 and lines else None

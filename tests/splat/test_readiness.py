@@ -1,0 +1,201 @@
+"""Every way in which a GPU cannot be used is one line that says what brings it; asked of made-up machines."""
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.splat import readiness
+from ambiguous_wild.splat.gpu import gsplat_seam
+from ambiguous_wild.splat.readiness import GpuFacts, choose, why_not
+
+TORCH = {
+    "version": "2.13.0",
+    "built": "13.0",
+    "cuda": True,
+    "names": ["Fine GPU"],
+    "toolkit": "/usr/local/cuda",
+    "error": "",
+}
+CPU_BUILD = {"version": "2.13.0+cpu", "built": None, "cuda": False, "names": [], "toolkit": None}
+
+
+def found(torch=None, **other):
+    """A machine that lacks nothing but what is said."""
+    values = {
+        "driver": "Fine GPU, 600.0", "gsplat": "1.5.3", "prebuilt": False, "compiler": "/usr/bin/c++",
+        "hidden": None,
+    }  # fmt: skip
+    return GpuFacts(torch=TORCH | (torch or {}), **(values | other))
+
+
+def blind(**other):
+    return found({"cuda": False, "names": [], "toolkit": None, **other.pop("torch", {})}, **other)
+
+
+@pytest.fixture
+def kernels(monkeypatch):
+    """Stands in for the first picture; `fails` is what it raises."""
+
+    class Kernels:
+        fails = None
+        drawn = 0
+
+        def __call__(self, device):
+            self.drawn += 1
+            if self.fails is not None:
+                raise self.fails
+            return 0.999
+
+    monkeypatch.setenv("PATH", "/bin")  # what is added to it is taken back
+    monkeypatch.setattr(gsplat_seam, "max_alpha", state := Kernels())
+    return state
+
+
+def test_a_machine_that_lacks_nothing_is_ready():
+    assert why_not(found()) is None
+    assert why_not(found({"toolkit": None}, compiler=None, prebuilt=True)) is None  # nothing to compile
+    assert why_not(found(gsplat="1.5.3+pt29cu130")) is None
+
+
+CASES = {
+    "cpu build": (
+        found(CPU_BUILD),
+        "torch 2.13.0+cpu is a CPU build",
+        f"{sys.executable} -m pip uninstall -y torch && {sys.executable} -m pip install",
+    ),
+    "no driver": (blind(driver=None), "sees no GPU, and no NVIDIA driver answers", "nvidia-smi"),
+    "hidden": (blind(hidden=""), "CUDA_VISIBLE_DEVICES='' hides it", "unset CUDA_VISIBLE_DEVICES"),
+    "old driver": (
+        blind(torch={"error": "The NVIDIA driver on your system is too old"}),
+        "the driver has Fine GPU, 600.0 (The NVIDIA driver on your system is too old)",
+        "install a newer driver",
+    ),
+    "no gsplat": (found(gsplat=None), "gsplat is not installed", "[cuda]"),
+    "other gsplat": (
+        found(gsplat="1.6.0"),
+        "gsplat 1.6.0 is installed, and 1.5.3 is needed",
+        f"{sys.executable} -m pip install 'gsplat==1.5.3'",
+    ),
+    "no nvcc": (
+        found({"toolkit": None}),
+        "gsplat needs nvcc to compile its kernels, and there is none",
+        "the CUDA toolkit 13.0",
+    ),
+    "no c++": (found(compiler=None), "needs a C++17 compiler to compile", "apt-get install g++"),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_each_lack_is_one_line_with_what_brings_it(case):
+    machine, what, fix = CASES[case]
+    lack = why_not(machine)
+    assert lack is not None and what in lack.what and fix in lack.fix
+    assert "\n" not in str(lack) and str(lack) == f"{lack.what}: {lack.fix}"
+
+
+def test_all_that_the_compiler_lacks_is_said_at_once():
+    lack = why_not(found({"toolkit": None}, compiler=None))
+    assert "needs nvcc and a C++17 compiler to compile" in lack.what
+    assert "toolkit" in lack.fix and "apt-get install g++" in lack.fix
+
+
+def test_the_command_replaces_a_cpu_build_by_the_same_release():
+    fix = why_not(found(CPU_BUILD)).fix
+    assert fix.endswith("'torch==2.13.0'") and "+cpu" not in fix
+
+
+# -- the choice -----------------------------------------------------------------------------------
+
+
+def test_auto_takes_the_gpu_or_says_why_it_lies_idle(kernels):
+    said = []
+    assert choose("auto", said.append, looking=found) == "cuda" and said == []
+    assert kernels.drawn == 1
+    machine = found(gsplat=None)
+    assert choose("auto", said.append, looking=lambda: machine) == "cpu"
+    (line,) = said
+    assert line.startswith("warning: the GPU is not used, the CPU is: gsplat is not installed: ")
+    assert "[cuda]" in line and "\n" not in line and kernels.drawn == 1
+
+
+def test_auto_says_nothing_where_there_is_no_gpu():
+    said = []
+    machine = found(CPU_BUILD, driver=None, gsplat=None)
+    assert choose("auto", said.append, looking=lambda: machine) == "cpu" and said == []
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_asking_for_the_gpu_is_an_error_with_the_same_words(case):
+    machine, what, fix = CASES[case]
+    with pytest.raises(AwError) as error:
+        choose("cuda", print, looking=lambda: machine)
+    assert str(error.value).startswith("--device cuda: ") and error.value.exit_code == 2
+    assert what in str(error.value) and fix in str(error.value)
+
+
+def test_the_cpu_is_taken_without_a_look():
+    assert choose("cpu", print, looking=lambda: pytest.fail("looked")) == "cpu"
+
+
+@pytest.mark.parametrize(
+    ("fails", "reason"),
+    [
+        (
+            RuntimeError("Error building 'gsplat_cuda'\n x.cu(3): error: no such\nmore"),
+            "x.cu(3): error: no such;",
+        ),
+        (AttributeError("'NoneType' object has no attribute 'intersect_tile'"), "'NoneType' object has no"),
+        (AssertionError(), "AssertionError;"),
+    ],
+)
+def test_kernels_that_cannot_be_made_are_one_line_with_the_command(kernels, fails, reason):
+    kernels.fails = fails
+    said = []
+    assert choose("auto", said.append, looking=found) == "cpu"
+    (line,) = said
+    assert f"gsplat cannot draw on this GPU: {reason}" in line and "\n" not in line
+    assert f"{readiness.INSTALL_GSPLAT} --force-reinstall --no-deps" in line
+    with pytest.raises(AwError, match="cannot draw on this GPU"):
+        choose("cuda", said.append, looking=found)
+
+
+def test_ninja_of_this_environment_is_found_though_nobody_activated_it(kernels):
+    for _ in range(2):
+        readiness.load_kernels()
+        assert os.environ["PATH"].split(":") == ["/bin", str(Path(sys.executable).parent)]
+
+
+# -- looking --------------------------------------------------------------------------------------
+
+
+def program(folder, name, text):
+    path = folder / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f"#!/bin/sh\necho '{text}'\n")
+    path.chmod(0o755)
+
+
+def test_what_is_looked_at_is_what_torch_and_gsplat_will_take(tmp_path, monkeypatch):
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    program(tmp_path / "bin", "nvidia-smi", "Fine GPU, 600.0")
+    program(tmp_path / "bin", "my-c++", "")
+    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:/bin")
+    monkeypatch.setenv("CXX", "my-c++")
+    for folder in ("gsplat", "gsplat-1.5.3.dist-info"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "gsplat/__init__.py").touch()
+    (tmp_path / "gsplat-1.5.3.dist-info/METADATA").write_text("Name: gsplat\nVersion: 1.5.3\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    seen = readiness.look(TORCH)
+    assert (seen.driver, seen.gsplat, seen.hidden) == ("Fine GPU, 600.0", "1.5.3", None)
+    assert seen.compiler == str(tmp_path / "bin/my-c++") and not seen.prebuilt
+    (tmp_path / "gsplat/csrc.cpython-312-x86_64-linux-gnu.so").touch()
+    assert readiness.look(TORCH).prebuilt
+
+
+def test_torch_is_asked_for_plain_values():
+    facts = readiness.torch_facts()
+    assert facts.keys() == TORCH.keys()

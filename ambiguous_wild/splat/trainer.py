@@ -130,8 +130,15 @@ class Trainer(Run):
         return self.drawing.neutral_model(self.gaussians, self.iteration)
 
     def render_fitted(self, camera: Camera, photo: Tensor, keep: Tensor) -> Tensor:
-        """A test view after its colour effects were fitted to the part of its photo that `keep` shows."""
+        """A test view [H, W, 3] after its colour effects were fitted to a part of its photo.
+
+        Args:
+            camera: of the test view.
+            photo: [H, W, 3] in [0, 1], on any device.
+            keep: [H, W], 1 where the fit may look, on any device.
+        """
         self.optimiser.flush()
+        photo, keep = photo.to(self.data.device), keep.to(self.data.device)
         return self.drawing.fit(self.gaussians, self.shot(camera, fitting=True), photo, keep)
 
     def make_step(self, iteration: int, view: int, divisor: int | None = None) -> Step:

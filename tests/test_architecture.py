@@ -173,6 +173,15 @@ def test_pycolmap_is_imported_by_the_guard_alone() -> None:
     assert found == ["io/safe_pycolmap.py"]
 
 
+def test_the_judge_is_independent() -> None:
+    # What it shares with the code that it judges, it cannot judge.
+    judge = PACKAGE / "splat" / "reference.py"
+    assert {of_ours(module) for module, _, _ in imports(judge)} <= {None, "core"}
+    name = module_of(judge)
+    users = {of_ours(module_of(p)) for p in FILES for m, _, _ in imports(p) if m.startswith(f"{name}.")}
+    assert users == {"stress"}  # which compares with it
+
+
 def test_core_needs_numpy_alone() -> None:
     allowed = set(sys.stdlib_module_names) | {"numpy", "ambiguous_wild"}
     late = {"tensor_files.py": {"torch", "safetensors"}}  # when a file is read

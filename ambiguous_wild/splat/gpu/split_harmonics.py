@@ -12,13 +12,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ambiguous_wild.splat.effects.placing import higher_harmonics
 from ambiguous_wild.splat.gaussians import SH_C0
 from ambiguous_wild.splat.gpu.compiled import Compiled
-from ambiguous_wild.splat.reference import harmonics
 
 
 def _bands(means: Tensor, centre: Tensor, degree: int) -> Tensor:
-    return harmonics(torch.nn.functional.normalize(means - centre, dim=1), degree)
+    return higher_harmonics(torch.nn.functional.normalize(means - centre, dim=1), degree)
 
 
 def _colours(means: Tensor, sh0: Tensor, sh_rest: Tensor, centre: Tensor, degree: int) -> Tensor:

@@ -24,7 +24,14 @@ from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.pace import Pace, TrainConfig
 from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.pyramid import Pyramid
-from ambiguous_wild.splat.rendered import Cotangents, Gradients, Rendered, as_cotangents, check_needs
+from ambiguous_wild.splat.rendered import (
+    Cotangents,
+    Gradients,
+    Rendered,
+    as_cotangents,
+    check_needs,
+    with_visible,
+)
 from ambiguous_wild.splat.run import Probe, Run
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Shot, Step, TrainData
 
@@ -229,6 +236,7 @@ class Trainer(Run):
                 self.watchdog.look_at_gradients(step, keep, loss, gradients)
             else:
                 called_off = self._watch(step, keep, extra, loss, gradients)
+                step, gradients = _counted(step, gradients, called_off)
         events = self._learn(step, keep, gradients, called_off)
         if "reset" in events:
             self.parts.mask.on_opacity_reset(step)
@@ -267,11 +275,6 @@ class Trainer(Run):
         over = getattr(step.rendered, "over", None)
         if over is not None:  # the picture is not whole
             called_off = torch.maximum(called_off, over)
-        # statistics of growth leave out such a step: neither its zeros nor its NaN are added
-        going = called_off == 0
-        step.rendered.visible = step.rendered.visible & going
-        if gradients.visible is not None:
-            gradients.visible = gradients.visible & going
         return called_off
 
     def _learn(
@@ -331,3 +334,15 @@ class Trainer(Run):
         self._look_back()
         view = self.pace.view(max(self.iteration, 1))
         self.watchdog.look_at_parameters(self.iteration, view, self.gaussians)
+
+
+def _counted(step: Step, gradients: Gradients, called_off: Tensor) -> tuple[Step, Gradients]:
+    """Both as statistics of growth count them: where the step was called off, no Gaussian was drawn.
+
+    So neither its zeros nor its NaN are added.
+    """
+    going = called_off == 0
+    step = replace(step, rendered=with_visible(step.rendered, step.rendered.visible & going))
+    if gradients.visible is not None:
+        gradients = replace(gradients, visible=gradients.visible & going)
+    return step, gradients

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError, Camera
-from ambiguous_wild.splat import device, snapshot
+from ambiguous_wild.splat import device
 from ambiguous_wild.splat.data import shrink_keep
 from ambiguous_wild.splat.density import DensityControl
 from ambiguous_wild.splat.drawing import Drawing
@@ -110,10 +110,23 @@ class Trainer(Run):
         return self.field.density
 
     def state(self) -> dict[str, Any]:
-        return snapshot.take(self)
+        others = self.drawing.state_dict()
+        return {
+            **super().state(),
+            **self.field.state_dict(),
+            **({"fields": others} if others else {}),
+            "mask": self.parts.mask.state_dict(),
+            **({} if self.effects is None else {"effects": self.effects.state_dict()}),
+        }
 
-    def restore(self, state: dict[str, Any], path: Path) -> None:
-        snapshot.restore(self, state, path)
+    def load_state(self, state: dict[str, Any]) -> None:
+        self.field.load_state_dict(state, self.data.device)
+        if self.drawing.others:
+            self.drawing.load_state_dict(state["fields"], self.data.device)
+        self.parts.mask.load_state_dict(state["mask"])
+        if self.effects is not None:
+            self.effects.load_state_dict(state["effects"])
+        super().load_state(state)
 
     def shot(self, camera: Camera, *, fitting: bool = False) -> Shot:
         """A picture of the model as it stands, of a camera that is no train photo's."""

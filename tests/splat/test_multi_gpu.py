@@ -185,7 +185,7 @@ def grown(ranks, tell, data, folder):
     if ranks.rank == 0:  # killed between the shards of one moment: only this rank got so far
         first.iteration += 2
         coming = shards.shard_path(folder / "parts", 0, 2, "next")
-        shards.checkpoint.save(coming, shards.snapshot.take(first))
+        shards.checkpoint.save(coming, first.state())
     ranks.wait()
     second = SharedTrainer(data, GROWTH, config, folder=folder / "parts", ranks=ranks, probe=bright)
     assert second.resume()

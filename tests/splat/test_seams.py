@@ -320,7 +320,7 @@ def test_a_start_of_ones_own(scene, tmp_path):
 
 
 def test_other_gaussians_may_be_drawn_under_the_smoothing_filter(scene, tmp_path):
-    parts = SmoothingFilter().change_parts(Parts(effects=(SmoothingFilter(),)))
+    parts = Parts(effects=(SmoothingFilter(),)).suited_to(SmoothingFilter())
     trainer = trainer_for(scene, tmp_path, parts)
     while trainer.iteration < 5:
         trainer.step()

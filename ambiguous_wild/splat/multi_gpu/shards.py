@@ -7,19 +7,15 @@ import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from safetensors import SafetensorError, safe_open
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.splat import checkpoint, snapshot
+from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.clock import clock_for
 from ambiguous_wild.splat.density_log import DensityLog, Places, Round
 from ambiguous_wild.splat.gaussians import Gaussians
-
-if TYPE_CHECKING:
-    from ambiguous_wild.splat.multi_gpu.trainer import SharedTrainer
-    from ambiguous_wild.splat.trainer import Trainer
 
 WHOLE = "whole.safetensors"
 _ANEW = "start anew with --overwrite always"
@@ -30,7 +26,7 @@ def shard_path(folder: Path, rank: int, size: int, which: str = "last") -> Path:
     return folder / "checkpoint" / f"{which}-rank{rank + 1}of{size}.safetensors"
 
 
-def save(trainer: SharedTrainer) -> None:
+def save(trainer: Any) -> None:
     """Write the shard of every rank.
 
     It becomes the last one when all ranks have written theirs: whenever the run is killed, there is an
@@ -38,12 +34,12 @@ def save(trainer: SharedTrainer) -> None:
     """
     rank, size = trainer.ranks.rank, trainer.ranks.size
     coming = shard_path(trainer.folder, rank, size, "next")
-    checkpoint.save(coming, snapshot.take(trainer))
+    checkpoint.save(coming, trainer.state())
     trainer.ranks.wait()
     os.replace(coming, shard_path(trainer.folder, rank, size))
 
 
-def restore(trainer: SharedTrainer) -> bool:
+def restore(trainer: Any) -> bool:
     """Go on from the newest iteration of which all ranks have a shard; False if no rank has any.
 
     Raises:
@@ -57,7 +53,7 @@ def restore(trainer: SharedTrainer) -> bool:
     if iteration is None:
         return False
     path = mine[iteration]
-    snapshot.restore(trainer, checkpoint.load(path), path)
+    trainer.load_state(checkpoint.load(path))
     if path == coming:
         os.replace(coming, last)
     coming.unlink(missing_ok=True)  # of a moment that others do not have
@@ -107,7 +103,7 @@ def _iteration(path: Path) -> int:
         raise AwError(f"cannot read checkpoint {path}: {error}; {_ANEW}") from None
 
 
-def write_whole(trainer: SharedTrainer, facts: dict[str, Any]) -> None:
+def write_whole(trainer: Any, facts: dict[str, Any]) -> None:
     """Rank 0 writes the whole model, and the state that a trainer on one GPU has at the end of a run.
 
     Args:
@@ -133,7 +129,7 @@ def write_whole(trainer: SharedTrainer, facts: dict[str, Any]) -> None:
     checkpoint.save(trainer.folder / "checkpoint" / WHOLE, state)
 
 
-def take_over(trainer: Trainer, folder: Path) -> list[dict[str, Any]]:
+def take_over(trainer: Any, folder: Path) -> list[dict[str, Any]]:
     """Make a trainer on one GPU what it would be had it trained the whole model; returns each rank's facts.
 
     For what follows training: pictures, measures, masks. It cannot train on: the moments stay in the shards.
@@ -145,7 +141,7 @@ def take_over(trainer: Trainer, folder: Path) -> list[dict[str, Any]]:
     trainer.clock = clock_for(trainer.data.device, state["elapsed_s"], dict(state["parts_s"]))
     trainer.timeline.rows = list(state["timeline"])
     trainer.density.log.load_state_dict(state["log"])
-    trainer.note_skipped(state["skipped"])
+    trainer._skipped = set(state["skipped"])
     return list(state["facts"])
 
 

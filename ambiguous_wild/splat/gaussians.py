@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -135,6 +136,7 @@ class Gaussians:
         return self._each(lambda name, tensor: torch.cat([tensor, theirs[name]]).contiguous())
 
     def to(self, device: torch.device | str) -> Gaussians:
+        """These on a device; tensors that lie there already are shared."""
         return self._each(lambda name, tensor: tensor.to(device).contiguous())
 
     def clone(self) -> Gaussians:
@@ -147,10 +149,10 @@ class Gaussians:
 
     def _each(self, change: Callable[[str, Tensor], Tensor]) -> Gaussians:
         self.settle()
-        return Gaussians(
-            **{name: change(name, tensor) for name, tensor in self.items()},
-            extra={name: change(name, tensor) for name, tensor in self.extra.items()},
-        )
+        changed: dict[str, Any] = {name: change(name, tensor) for name, tensor in self.items()}
+        extra = {name: change(name, tensor) for name, tensor in self.extra.items()}
+        shared = changed["sh_rest"] is self.sh_rest  # they lie on that device already: no copy was made
+        return Gaussians(**changed, extra=extra, postponed=self.postponed if shared else None)
 
     @classmethod
     def from_points(

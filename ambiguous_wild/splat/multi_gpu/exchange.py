@@ -54,7 +54,7 @@ def gather(
     first = ranks.rank == 0
     sends = [len(gaussians), *[0] * (ranks.size - 1)]
     receives = counts if first else [0] * ranks.size
-    found = {}
+    found: dict[str, Any] = {}
     for name, tensor in gaussians.rows():
         whole = _all_to_all(tensor.detach(), sends, receives)
         found[name] = whole if device is None else whole.to(device)

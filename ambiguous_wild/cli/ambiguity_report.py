@@ -72,13 +72,12 @@ def command(
 
     from ambiguous_wild.core.errors import AwError
     from ambiguous_wild.harness.ambiguity import measure, page, sources, summary
-    from ambiguous_wild.harness.ambiguity.run_background import check_run
     from ambiguous_wild.io.atomic import check_output, write_json
     from ambiguous_wild.io.scene_folder import load_scene, read_scene_json
 
     loaded = load_scene(scene)
     if run is not None:
-        check_run(loaded, run)
+        sources.check_run(loaded, run)
     found = sources.find_masks(loaded, masks, run, keep=masks_white == "keep")
     behind = sources.find_background(loaded, background, run, found)
     folder = out or scene.resolve().parent / f"{scene.resolve().name}-ambiguity"

@@ -171,7 +171,7 @@ def build(name: str, entries: Mapping[str, MethodEntry], options: Any) -> Parts:
         return dataclasses.replace(host, **changed)
     effects = donors["effects"].parts.effects
     for effect in effects:
-        host = effect.change_parts(host)
+        host = host.suited_to(effect)
     return dataclasses.replace(host, **changed, effects=effects)
 
 

@@ -11,7 +11,7 @@ from ambiguous_wild.splat.parts import MaskPolicy, Parts
 
 NOTHING = ("none", "3dgs")  # donors that leave a place empty
 # where an effect changes a picture, or the Gaussians that it shows
-_SEEN = ("change_parts", "camera", "model", "shade", "image", "pose", "after_step")
+_SEEN = ("first_points", "camera", "model", "shade", "image", "pose", "after_step")
 
 
 @dataclass(frozen=True)

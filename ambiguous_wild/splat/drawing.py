@@ -15,7 +15,7 @@ from ambiguous_wild.splat.fields import STATIC, Composite, FieldStart, renders_o
 from ambiguous_wild.splat.gaussians import PARAMETERS, Gaussians
 from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.render import render
-from ambiguous_wild.splat.rendered import Gradients, Rendered, Shade, check_needs
+from ambiguous_wild.splat.rendered import Gradients, Rendered, Shade, check_needs, with_visible
 from ambiguous_wild.splat.step import Shot, Step, TrainData
 
 
@@ -132,11 +132,11 @@ class Drawing:
             field = self.others[name]
             most = self._most[name]
             if called_off is not None and own.visible is not None:
-                own.visible = own.visible & (called_off == 0)
+                own = replace(own, visible=own.visible & (called_off == 0))
             # density control reads who was seen of the field's own render
             rendered = renders_of(step.rendered).get(name, step.rendered)
             if own.visible is not None and rendered is not step.rendered:
-                rendered.visible = own.visible
+                rendered = with_visible(rendered, own.visible)
             seen = replace(
                 step,
                 gaussians=field.gaussians,

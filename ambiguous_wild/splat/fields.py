@@ -9,12 +9,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from ambiguous_wild.splat.density import DensityControl
+from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.field import Rates
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.rendered import (
@@ -29,9 +30,6 @@ from ambiguous_wild.splat.rendered import (
     sum_own,
 )
 from ambiguous_wild.splat.step import Shot, Step, TrainData
-
-if TYPE_CHECKING:
-    from ambiguous_wild.splat.effects.base import Effect
 
 STATIC = "static"  # name of the first field, the one that is the result
 # dL/d(composed pictures) to those of every field's own pictures

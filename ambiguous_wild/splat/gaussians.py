@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,6 +16,30 @@ from ambiguous_wild.core import AwError
 LEAST_POINTS = 4  # to start from: a size is the distance of three neighbours
 PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "sh0", "sh_rest")
 SH_C0 = 0.28209479177387814  # zeroth real spherical harmonic, 1 / (2 sqrt(pi))
+
+
+class Postponed:
+    """Updates of the rows of `sh_rest` that an optimiser has put off until somebody reads them.
+
+    Gaussians that hold the optimiser's `sh_rest` share one object, so that each can have the updates made.
+    """
+
+    def __init__(self, make: Callable[[np.ndarray | None], None]) -> None:
+        """
+        Args:
+            make: lets these rows (int32 indices; None = all) take the updates that were put off.
+        """
+        self._make: Callable[[np.ndarray | None], None] | None = make
+
+    def make(self, rows: np.ndarray | None = None) -> None:
+        """Make the updates of these rows (indices; None = all)."""
+        if self._make is not None:
+            self._make(rows)
+
+    def end(self) -> None:
+        """Make all updates; the optimiser puts off none of these rows from now on."""
+        self.make()
+        self._make = None
 
 
 @dataclass
@@ -35,9 +59,9 @@ class Gaussians:
     # [N, ...] what a method carries with each Gaussian, by name; density control copies and drops it too
     extra: Mapping[str, Tensor] = field(default_factory=dict)
 
-    # Set on an instance by an optimiser that postpones updates of rows nobody sees: the renderer calls it
-    # with the rows about to be drawn before it reads their harmonics. Copies do not carry it.
-    before_colours: ClassVar[Any] = None
+    # Of an optimiser that puts off updates of rows nobody sees; None = `sh_rest` is up to date. The renderer
+    # has them made for the rows about to be drawn. `dataclasses.replace` keeps it, copies are up to date.
+    postponed: Postponed | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         n = self.means.shape[0]
@@ -83,18 +107,18 @@ class Gaussians:
         yield from self.extra.items()
 
     def settle(self) -> None:
-        """Let an optimiser that postponed updates make them now, so that `sh_rest` may be read."""
-        if self.before_colours is not None:
-            self.before_colours()
+        """Have updates made that an optimiser has put off, so that `sh_rest` may be read."""
+        if self.postponed is not None:
+            self.postponed.make()
 
     def settling_like(self, source: Gaussians) -> Gaussians:
-        """These, made of `source` for one picture with its `sh_rest`: postponed updates are made here too."""
-        if self is not source and "before_colours" in source.__dict__:
-            self.__dict__["before_colours"] = source.before_colours
+        """These, made anew of `source` for one picture with its `sh_rest`: its updates are made here too."""
+        if self.postponed is None:
+            self.postponed = source.postponed
         return self
 
     def select(self, rows: Tensor) -> Gaussians:
-        """The rows given by a bool mask [N] or an index tensor, copied."""
+        """The rows given by a bool mask [N] or an index tensor, copied and up to date."""
         return self._each(lambda name, tensor: tensor[rows].contiguous())
 
     def cat(self, other: Gaussians) -> Gaussians:
@@ -106,13 +130,16 @@ class Gaussians:
         if self.extra.keys() != other.extra.keys():
             differing = ", ".join(sorted(self.extra.keys() ^ other.extra.keys()))
             raise AwError(f"cannot join Gaussians: one side alone carries {differing}")
+        other.settle()
         theirs = dict(other.rows())
         return self._each(lambda name, tensor: torch.cat([tensor, theirs[name]]).contiguous())
 
     def to(self, device: torch.device | str) -> Gaussians:
+        """These on a device; tensors that lie there already are shared."""
         return self._each(lambda name, tensor: tensor.to(device).contiguous())
 
     def clone(self) -> Gaussians:
+        """A copy whose `sh_rest` is up to date."""
         return self._each(lambda name, tensor: tensor.clone())
 
     def carrying(self, extra: Mapping[str, Tensor]) -> Gaussians:
@@ -120,10 +147,11 @@ class Gaussians:
         return replace(self, extra={**self.extra, **extra})
 
     def _each(self, change: Callable[[str, Tensor], Tensor]) -> Gaussians:
-        return Gaussians(
-            **{name: change(name, tensor) for name, tensor in self.items()},
-            extra={name: change(name, tensor) for name, tensor in self.extra.items()},
-        )
+        self.settle()
+        changed: dict[str, Any] = {name: change(name, tensor) for name, tensor in self.items()}
+        extra = {name: change(name, tensor) for name, tensor in self.extra.items()}
+        shared = changed["sh_rest"] is self.sh_rest  # they lie on that device already: no copy was made
+        return Gaussians(**changed, extra=extra, postponed=self.postponed if shared else None)
 
     @classmethod
     def from_points(

@@ -3,7 +3,7 @@
 Culling reads means, quats, scales and opacity (and every view reads sh0): these 14 floats a Gaussian step
 at once, seen or not. The harmonics above the constant, 45 floats, are read only when a Gaussian is drawn:
 a row nobody sees is put off and takes its steps with gradient zero when the renderer is about to draw it
-(`Gaussians.before_colours`), or at `flush`. On an accelerator torch's fused kernel steps every row, one
+(`Gaussians.postponed`), or at `flush`. On an accelerator torch's fused kernel steps every row, one
 launch a tensor, and a flag there can call the step off without the host's knowing.
 """
 
@@ -19,7 +19,7 @@ from torch import Tensor
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.splat.backend import backend_of
-from ambiguous_wild.splat.gaussians import PARAMETERS, Gaussians
+from ambiguous_wild.splat.gaussians import PARAMETERS, Gaussians, Postponed
 from ambiguous_wild.splat.rendered import Gradients
 
 _LAZY = "sh_rest"
@@ -58,6 +58,7 @@ class SplatAdam:
         self._history = np.zeros((2, 256), np.float32)  # a step's lr / bias1 of sh_rest, and 1 / sqrt(bias2)
         self._rows = len(gaussians)
         self._bound: Gaussians | None = None
+        self._postponed: Postponed | None = None  # of the Gaussians bound now, where rows are put off
         self.bind(gaussians)
         self._set_rates(learning_rates)
 
@@ -84,12 +85,10 @@ class SplatAdam:
             raise RuntimeError(f"{len(gaussians)} Gaussians but moments for {self._rows} rows")
         if gaussians is self._bound:
             return
-        if self._bound is not None:
-            self.flush()
-            self._bound.__dict__.pop("before_colours", None)
+        self._unbind()
         self._bound = gaussians
         if self._lazy:
-            gaussians.__dict__["before_colours"] = self.catch_up
+            self._postponed = gaussians.postponed = Postponed(self.catch_up)
 
     def select(self, rows: Tensor) -> None:
         """Keep the moments of these rows (bool mask [N] or indices), in that order; `bind` comes next."""
@@ -130,10 +129,9 @@ class SplatAdam:
                     moment[rows] = 0.0
 
     def _unbind(self) -> None:
-        if self._bound is not None:
-            self.flush()
-            self._bound.__dict__.pop("before_colours", None)
-            self._bound = None
+        if self._postponed is not None:
+            self._postponed.end()
+        self._bound = self._postponed = None
 
     # -- steps ------------------------------------------------------------------------------------
 

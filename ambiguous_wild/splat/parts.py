@@ -150,6 +150,13 @@ class Parts:
     train_data: Callable[[TrainData], TrainData] | None = None
     effects: tuple[Effect, ...] = ()  # optional ones, see effects/; none = that code is never reached
 
+    def suited_to(self, effect: Effect) -> Parts:
+        """The method with what an effect that is added to it needs: points to start from, the 2D filter."""
+        more = (effect.first_points,) if effect.acts("first_points") else ()
+        return replace(
+            self, more_points=(*self.more_points, *more), antialias=self.antialias or effect.antialias
+        )
+
     def first_gaussians(self, data: TrainData, most: int = 0) -> Gaussians:
         """What training starts from.
 

@@ -7,6 +7,7 @@ in an object between the forward and the backward pass, so that two pictures of 
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Protocol
@@ -138,6 +139,13 @@ class Rendered(Protocol):
             needs: statistics beyond the signed sums, of `NEEDS`.
         """
         ...
+
+
+def with_visible(rendered: Rendered, visible: Tensor) -> Rendered:
+    """The same render, but these rows [N] bool count as drawn; the one given does not change."""
+    found = copy.copy(rendered)
+    found.visible = visible
+    return found
 
 
 def frame_of(rendered: Rendered) -> Frame:

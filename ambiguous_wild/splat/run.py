@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 from torch import Tensor
 
-from ambiguous_wild.core import Camera
+from ambiguous_wild.core import AwError, Camera
 from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.clock import Clock, clock_for
 from ambiguous_wild.splat.gaussians import Gaussians
@@ -92,17 +92,42 @@ class Run(ABC):
     def check_parameters(self) -> None:
         """Raise NonFinite, as of the last step, where a parameter is not finite."""
 
-    @abstractmethod
     def state(self) -> dict[str, Any]:
-        """Everything that decides how the run goes on."""
+        """Everything that decides how the run goes on; what is not there leaves no key.
 
-    @abstractmethod
-    def restore(self, state: dict[str, Any], path: Path) -> None:
-        """Go on from what `state` gave and `path` held.
+        Whoever inherits adds the model's.
+        """
+        rollbacks = self.watchdog.state_dict()
+        return {
+            "iteration": self.iteration,
+            "elapsed_s": self.clock.now(),
+            "setup_s": self.setup_s,
+            "parts_s": self.clock.parts_s,
+            "cpu_s": self.clock.cpu_s,
+            **({} if self.meter is None else {"meter": self.meter.state_dict()}),
+            "timeline": self.timeline.rows,
+            "loss": [float(self.timeline.loss_sum), self.timeline.loss_count],
+            "skipped": sorted(self.skipped),
+            **({"rollbacks": rollbacks} if rollbacks else {}),
+        }
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Go on from what `state` gave; exact, so that a resumed run gives the same bits.
 
         Raises:
-            AwError: a key is missing.
+            KeyError: a key is missing.
         """
+        self.iteration = state["iteration"]
+        self.setup_s = state["setup_s"]
+        self.clock = clock_for(self.data.device, state["elapsed_s"], dict(state["parts_s"]))
+        self.clock.cpu_s = state.get("cpu_s", 0.0)
+        if self.meter is not None and "meter" in state:
+            self.meter.load_state_dict(state["meter"])
+        self._marks = None  # they are those of the new state
+        self.timeline.rows = list(state["timeline"])
+        self.timeline.loss_sum, self.timeline.loss_count = state["loss"]
+        self._skipped = set(state["skipped"])
+        self.watchdog.load_state_dict(state.get("rollbacks", []))
 
     def progress(self, iteration: int) -> float:
         """Share of the run that lies behind after `iteration` steps, in [0, 1]."""
@@ -161,7 +186,7 @@ class Run(ABC):
             loss = self.step()
         except NonFinite as error:
             self.clock.stop()
-            self.watchdog.handle(self, error)
+            self._undo(error)
             return
         self.clock.stop()
         self.timeline.loss(loss)
@@ -186,19 +211,31 @@ class Run(ABC):
         done = (self.iteration, self.clock.now())
         return self.pace.marks(self.config.probes, *done), self.pace.marks(ROWS, *done)
 
-    def forget_marks(self) -> None:
-        """After the state was replaced: marks are those of the new state."""
-        self._marks = None
-
     def _save_if_sound(self) -> bool:
         """Save, unless a parameter is not finite: then it is as if the last step had found that."""
         try:
             self.check_parameters()
         except NonFinite as error:
-            self.watchdog.handle(self, error)
+            self._undo(error)
             return False
         self.save()
         return True
+
+    def _undo(self, error: NonFinite) -> None:
+        """Keep what reproduces a finding of the watchdog; then roll back, or raise it with where that lies.
+
+        Rolling back restores the last checkpoint and leaves the photo out for the rest of its epoch. The
+        seconds spent stay spent.
+        """
+        where = self.watchdog.keep(self.checkpoint_path, error)
+        if not self.watchdog.undoes:
+            raise self.watchdog.final(error, where)
+        spent, rollbacks = self.clock, list(self.watchdog.rollbacks)
+        self.resume()
+        self.clock = spent
+        epoch = self.pace.epoch(error.finding.iteration)
+        self.watchdog.note_rollback(error, rollbacks, epoch=epoch, iteration=self.iteration)
+        self.save()
 
     def _log(self, probing: bool) -> None:
         row = self.timeline.add(self.iteration, len(self.gaussians), self.clock)
@@ -229,10 +266,6 @@ class Run(ABC):
         """Those photos' indices."""
         return self._skipped | (self.sentinel.empty_views() if self.sentinel is not None else set())
 
-    def note_skipped(self, views: Iterable[int]) -> None:
-        """Of the part of the run before it was resumed."""
-        self._skipped = set(views)
-
     @property
     def checkpoint_path(self) -> Path:
         return self.folder / "checkpoint" / "last.safetensors"
@@ -243,10 +276,18 @@ class Run(ABC):
         self.timeline.write(self.folder / "timeline.csv")
 
     def resume(self) -> bool:
-        """Go on from the last checkpoint, if there is one; returns whether there was."""
-        if not self.checkpoint_path.exists():
+        """Go on from the last checkpoint, if there is one; returns whether there was.
+
+        Raises:
+            AwError: the checkpoint lacks something; names the file.
+        """
+        path = self.checkpoint_path
+        if not path.exists():
             return False
-        self.restore(checkpoint.load(self.checkpoint_path), self.checkpoint_path)
+        try:
+            self.load_state(checkpoint.load(path))
+        except (KeyError, TypeError) as error:
+            raise AwError(f"checkpoint {path} lacks {error}; train again with --overwrite always") from None
         if self.sentinel is not None:
             self.sentinel.reset()
         return True

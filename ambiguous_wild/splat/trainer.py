@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError, Camera
-from ambiguous_wild.splat import snapshot
 from ambiguous_wild.splat.data import shrink_keep
 from ambiguous_wild.splat.density import DensityControl
 from ambiguous_wild.splat.drawing import Drawing
@@ -23,7 +22,14 @@ from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.pace import Pace, TrainConfig
 from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.pyramid import Pyramid
-from ambiguous_wild.splat.rendered import Cotangents, Gradients, Rendered, as_cotangents, check_needs
+from ambiguous_wild.splat.rendered import (
+    Cotangents,
+    Gradients,
+    Rendered,
+    as_cotangents,
+    check_needs,
+    with_visible,
+)
 from ambiguous_wild.splat.run import Probe, Run
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Shot, Step, TrainData
 
@@ -98,10 +104,23 @@ class Trainer(Run):
         return self.field.density
 
     def state(self) -> dict[str, Any]:
-        return snapshot.take(self)
+        others = self.drawing.state_dict()
+        return {
+            **super().state(),
+            **self.field.state_dict(),
+            **({"fields": others} if others else {}),
+            "mask": self.parts.mask.state_dict(),
+            **({} if self.effects is None else {"effects": self.effects.state_dict()}),
+        }
 
-    def restore(self, state: dict[str, Any], path: Path) -> None:
-        snapshot.restore(self, state, path)
+    def load_state(self, state: dict[str, Any]) -> None:
+        self.field.load_state_dict(state, self.data.device)
+        if self.drawing.others:
+            self.drawing.load_state_dict(state["fields"], self.data.device)
+        self.parts.mask.load_state_dict(state["mask"])
+        if self.effects is not None:
+            self.effects.load_state_dict(state["effects"])
+        super().load_state(state)
 
     def shot(self, camera: Camera, *, fitting: bool = False) -> Shot:
         """A picture of the model as it stands, of a camera that is no train photo's."""
@@ -125,8 +144,15 @@ class Trainer(Run):
         return self.drawing.neutral_model(self.gaussians, self.iteration)
 
     def render_fitted(self, camera: Camera, photo: Tensor, keep: Tensor) -> Tensor:
-        """A test view after its colour effects were fitted to the part of its photo that `keep` shows."""
+        """A test view [H, W, 3] after its colour effects were fitted to a part of its photo.
+
+        Args:
+            camera: of the test view.
+            photo: [H, W, 3] in [0, 1], on any device.
+            keep: [H, W], 1 where the fit may look, on any device.
+        """
         self.optimiser.flush()
+        photo, keep = photo.to(self.data.device), keep.to(self.data.device)
         return self.drawing.fit(self.gaussians, self.shot(camera, fitting=True), photo, keep)
 
     def make_step(self, iteration: int, view: int, divisor: int | None = None) -> Step:
@@ -218,6 +244,7 @@ class Trainer(Run):
                 self.watchdog.look_at_gradients(step, keep, loss, gradients)
             else:
                 called_off = self._watch(step, keep, extra, loss, gradients)
+                step, gradients = _counted(step, gradients, called_off)
         events = self._learn(step, keep, gradients, called_off)
         if "reset" in events:
             self.parts.mask.on_opacity_reset(step)
@@ -252,13 +279,7 @@ class Trainer(Run):
         looked_at = list(self.watchdog.looked_at(gradients).values())
         value = torch.as_tensor(loss.value)
         self._divisors[step.iteration] = step.divisor
-        called_off = self.sentinel.watch(step.iteration, step.view, value, looked_at, keep, extra)
-        # statistics of growth leave out such a step: neither its zeros nor its NaN are added
-        going = called_off == 0
-        step.rendered.visible = step.rendered.visible & going
-        if gradients.visible is not None:
-            gradients.visible = gradients.visible & going
-        return called_off
+        return self.sentinel.watch(step.iteration, step.view, value, looked_at, keep, extra)
 
     def _learn(
         self, step: Step, keep: Tensor | None, gradients: Gradients, called_off: Tensor | None
@@ -317,3 +338,15 @@ class Trainer(Run):
         self._look_back()
         view = self.pace.view(max(self.iteration, 1))
         self.watchdog.look_at_parameters(self.iteration, view, self.gaussians)
+
+
+def _counted(step: Step, gradients: Gradients, called_off: Tensor) -> tuple[Step, Gradients]:
+    """Both as statistics of growth count them: where the step was called off, no Gaussian was drawn.
+
+    So neither its zeros nor its NaN are added.
+    """
+    going = called_off == 0
+    step = replace(step, rendered=with_visible(step.rendered, step.rendered.visible & going))
+    if gradients.visible is not None:
+        gradients = replace(gradients, visible=gradients.visible & going)
+    return step, gradients

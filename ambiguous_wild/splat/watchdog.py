@@ -15,7 +15,7 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -28,9 +28,6 @@ from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.losses import PhotometricLoss
 from ambiguous_wild.splat.rendered import Gradients
 from ambiguous_wild.splat.step import Step
-
-if TYPE_CHECKING:
-    from ambiguous_wild.splat.run import Run
 
 OnNonFinite = Literal["stop", "rollback"]
 FOLDER = "nonfinite"
@@ -138,30 +135,37 @@ class Watchdog:
         """Whether this photo is left out in this epoch: what it did there was undone."""
         return any(r["epoch"] == epoch and r["view"] == view for r in self.rollbacks)
 
-    def handle(self, run: Run, error: NonFinite) -> None:
-        """Keep what reproduces the finding; then roll back, or raise it with where that lies.
+    @property
+    def undoes(self) -> bool:
+        """Whether the run is to roll back from a finding."""
+        return self.action == "rollback" and len(self.rollbacks) < MOST_ROLLBACKS
 
-        Rolling back restores the last checkpoint and leaves the photo out for the rest of its epoch. The
-        seconds spent stay spent.
+    def note_rollback(
+        self, error: NonFinite, earlier: list[dict[str, Any]], *, epoch: int, iteration: int
+    ) -> None:
+        """The run went back: leave the photo out for the rest of its epoch.
+
+        Args:
+            error: the finding.
+            earlier: rollbacks before this one; the checkpoint may know fewer.
+            epoch: of the finding.
+            iteration: of the checkpoint.
         """
-        where = self._keep(run.checkpoint_path, error)
-        if self.action == "rollback" and len(self.rollbacks) < MOST_ROLLBACKS:
-            spent, rollbacks = run.clock, list(self.rollbacks)
-            run.resume()
-            back = {
-                "iteration": error.finding.iteration,
-                "epoch": run.pace.epoch(error.finding.iteration),
-                "view": error.view,
-                "photo": error.finding.view,
-                "what": str(error),
-                "to": run.iteration,
-            }
-            run.clock, self.rollbacks, self.every = spent, [*rollbacks, back], 1
-            run.save()
-            return
+        back = {
+            "iteration": error.finding.iteration,
+            "epoch": epoch,
+            "view": error.view,
+            "photo": error.finding.view,
+            "what": str(error),
+            "to": iteration,
+        }
+        self.rollbacks, self.every = [*earlier, back], 1
+
+    def final(self, error: NonFinite, where: Path) -> NonFinite:
+        """The finding that ends the run, with the folder where what reproduces it was kept."""
         tried = f" after {len(self.rollbacks)} rollbacks" if self.rollbacks else ""
         folder = shlex.quote(str(self.folder))
-        raise NonFinite(
+        return NonFinite(
             error.finding,
             error.view,
             error.seen,
@@ -169,8 +173,16 @@ class Watchdog:
             f"it again from the last good state; --on-nonfinite rollback leaves such a photo out and goes on",
         )
 
-    def _keep(self, good: Path, error: NonFinite) -> Path:
-        """Write report, last good checkpoint and what the step saw; returns the folder."""
+    def keep(self, good: Path, error: NonFinite) -> Path:
+        """Write what reproduces a finding: report, last good checkpoint and what the step saw.
+
+        Args:
+            good: the last checkpoint; it need not exist.
+            error: the finding.
+
+        Returns:
+            The folder.
+        """
         where = self.folder / FOLDER / f"{error.finding.iteration:06d}"
         where.mkdir(parents=True, exist_ok=True)
         if good.exists():

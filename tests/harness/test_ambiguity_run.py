@@ -13,8 +13,7 @@ from click.testing import CliRunner
 
 from ambiguous_wild.cli.ambiguity_report import command
 from ambiguous_wild.core import AwError, Camera
-from ambiguous_wild.harness.ambiguity.run_background import RunBackground, sees, unproject
-from ambiguous_wild.harness.ambiguity.sources import find_masks
+from ambiguous_wild.harness.ambiguity.sources import RunBackground, find_masks, sees, unproject
 from ambiguous_wild.harness.running.identity import scene_identity
 from ambiguous_wild.io.ply import write_splat_ply
 from ambiguous_wild.io.scene_folder import load_scene

@@ -104,6 +104,19 @@ def test_a_program_is_a_cell_like_any_other(scene, tmp_path):
     assert list(table["method"]) == ["nearest"]
 
 
+def test_of_half_test_photos_the_pictures_of_a_program_are_measured_as_they_are(scene, tmp_path):
+    _, report = run(describe(tmp_path), scene, tmp_path / "runs", protocol="half")
+    assert report.outcome == "trained", report.error
+    result = read_result(report.folder / "metrics.json")
+    assert len(result["per_image"]) == len(TEST)
+    for row in result["per_image"]:
+        drawn = read_png_rgb(report.folder / "renders" / "test" / row["name"])
+        photo = read_png_rgb(scene / "images" / row["name"])
+        right = slice(photo.shape[1] // 2, None)
+        halves = (np.ascontiguousarray(picture[:, right]) for picture in (drawn, photo))
+        assert row["psnr"] == pytest.approx(psnr(*halves))
+
+
 def test_options_and_variables_reach_the_program_and_are_part_of_the_run(scene, tmp_path):
     reference = describe(tmp_path, options={"gain": 1.0}, environment={"GAIN": "{gain}"})
     plain, _ = run(reference, scene, tmp_path / "a")

@@ -189,11 +189,13 @@ class Nothing(MaskPolicy):
     """Masks the whole of one photo."""
 
     def keep(self, step):
+        self.last = step
         return torch.zeros(step.photo.shape[:2]) if step.view == 2 else None
 
 
 def test_a_photo_that_is_all_masked_moves_nothing_and_is_said(scene, tmp_path, fake):
-    trainer = trainer_for(scene, tmp_path / "run", parts=Parts(mask=Nothing()), iterations=60, probes=0)
+    mask = Nothing()
+    trainer = trainer_for(scene, tmp_path / "run", parts=Parts(mask=mask), iterations=60, probes=0)
     moved = {}
     for iteration in range(1, 13):
         before = trainer.gaussians.clone()
@@ -201,6 +203,7 @@ def test_a_photo_that_is_all_masked_moves_nothing_and_is_said(scene, tmp_path, f
         trainer.step()
         if trainer.pace.view(iteration) == 2 and len(seen):
             assert torch.equal(trainer.density.seen, seen)  # nobody was looked at
+        assert mask.last.rendered.visible.any()  # what the method was shown does not change
         same = all(torch.equal(t, getattr(before, name)) for name, t in trainer.gaussians.items())
         moved[trainer.pace.view(iteration)] = not same
     assert moved == {view: view != 2 for view in range(6)}

@@ -1,6 +1,6 @@
 """The optimiser that puts rows off against torch's dense Adam and against its own dense mode."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -105,6 +105,66 @@ def test_the_renderer_sees_rows_up_to_date():
         behind |= not torch.equal(lazy.sh_rest, dense.sh_rest)
         assert torch.equal(render_cpu(lazy, cam).image, render_cpu(dense, cam).image)
     assert behind  # otherwise nothing was put off and this test shows nothing
+
+
+def stepped(seed=2, n=50):
+    """Gaussians with rows put off, the same ones stepped at once, and the optimisers of both."""
+    lazy, dense = gaussians(seed, n), gaussians(seed, n)
+    a, b = SplatAdam(lazy, RATES), SplatAdam(dense, RATES, lazy=False)
+    for step in range(12):
+        grads, visible = gradients_at(lazy, step)
+        a.step(grads, visible, RATES | {"sh_rest": 0.01})
+        b.step(grads, visible, RATES | {"sh_rest": 0.01})
+    assert not torch.equal(lazy.sh_rest, dense.sh_rest)  # otherwise nothing was put off
+    return lazy, dense, a, b
+
+
+@pytest.mark.parametrize("shared", [lambda g: replace(g, means=g.means + 0.1), lambda g: g.to("cpu")])
+def test_what_shares_harmonics_has_its_rows_brought_up_to_date_where_it_is_drawn(shared):
+    lazy, dense, a, b = stepped()
+    moved, wanted = shared(lazy), shared(dense)
+    for optimiser in (a, b):
+        optimiser.step(*gradients_at(lazy, 12))
+    assert not torch.equal(moved.sh_rest, wanted.sh_rest)
+    assert torch.equal(render_cpu(moved, camera()).image, render_cpu(wanted, camera()).image)
+
+
+ALL_ROWS = torch.ones(50, dtype=torch.bool)
+COPIES = {
+    "clone": lambda g: g.clone(),
+    "select": lambda g: g.select(ALL_ROWS),
+    "cat": lambda g: g.cat(gaussians(4, 3)).select(torch.arange(50)),
+    "cat to others": lambda g: gaussians(4, 3).cat(g).select(torch.arange(3, 53)),
+    "clone of what is carried on": lambda g: g.carrying({"more": torch.zeros(50)}).clone(),
+}
+
+
+@pytest.mark.parametrize("copied", COPIES.values(), ids=COPIES)
+def test_copies_are_up_to_date_and_belong_to_no_optimiser(copied):
+    lazy, dense, a, _ = stepped()
+    copy = copied(lazy)
+    assert equal(copy, dense) and copy.postponed is None
+    a.step(*gradients_at(lazy, 12))
+    copy.settle()
+    assert equal(copy, dense)
+
+
+def test_gaussians_that_were_left_behind_ask_for_no_more_updates():
+    lazy, dense, a, _ = stepped()
+    shared = replace(lazy, extra={"more": torch.zeros(50)})
+    stay = torch.arange(50) >= 10
+    a.select(stay)
+    assert equal(shared, dense)  # brought up to date before the rows went
+    fewer = lazy.select(stay)
+    a.bind(fewer)
+    for step in (12, 13):
+        a.step(*gradients_at(fewer, step))
+    put_off = fewer.sh_rest.clone()
+    shared.settle()
+    render_cpu(shared, camera())
+    assert equal(shared, dense) and torch.equal(fewer.sh_rest, put_off)
+    fewer.settle()
+    assert not torch.equal(fewer.sh_rest, put_off)  # otherwise nothing was put off
 
 
 def test_a_hundred_thousand_steps_without_gradient_stay_finite():

@@ -48,10 +48,10 @@ class Empty(Run):
         rows = [dict(row) for row in self.timeline.rows]
         return {"iteration": self.iteration, "elapsed_s": self.clock.elapsed_s, "rows": rows}
 
-    def restore(self, state: dict[str, Any], path: Any) -> None:
+    def load_state(self, state: dict[str, Any]) -> None:
         self.iteration, self.clock.elapsed_s = state["iteration"], state["elapsed_s"]
         self.timeline.rows = state["rows"]
-        self.forget_marks()
+        self._marks = None
 
     def probed(self) -> list[dict[str, Any]]:
         return [row for row in self.timeline.rows if row["psnr_probe"] is not None]
@@ -107,7 +107,7 @@ def test_a_run_that_goes_on_has_no_probe_twice_and_none_too_few(tmp_path, budget
     for stop in (1, 142, 143, 144, 500, 999, 1001):
         run = Empty(config, tmp_path)
         if state is not None:
-            run.restore(state, None)
+            run.load_state(state)
         while run.iteration < stop and not run.done:
             run._advance(None)
         state = run.state()

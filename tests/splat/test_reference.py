@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 
 from ambiguous_wild.core import Camera
+from ambiguous_wild.splat.effects.placing import higher_harmonics
 from ambiguous_wild.splat.reference import harmonics, render_reference, rotations
 
 from .scenes import camera, doubles, gaussians
@@ -72,6 +73,12 @@ def test_harmonics_are_the_real_ones_of_scipy():
             part = y.real if order == 0 else np.sqrt(2) * (y.imag if order < 0 else y.real)
             expected.append(part)  # with the Condon-Shortley phase, as 3DGS's constants have it
     np.testing.assert_allclose(harmonics(torch.from_numpy(d), 3).numpy(), np.stack(expected, 1), atol=1e-12)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_harmonics_of_effects_are_the_judges(degree):
+    d = torch.nn.functional.normalize(torch.from_numpy(np.random.default_rng(1).normal(size=(50, 3))), dim=1)
+    assert torch.equal(higher_harmonics(d, degree), harmonics(d, degree))
 
 
 def test_rotations_are_those_of_scipy():

@@ -20,7 +20,7 @@ from ambiguous_wild.splat.gaussians import PARAMETERS, Gaussians
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.parts import MaskPolicy, Parts
 from ambiguous_wild.splat.reference import render_reference
-from ambiguous_wild.splat.rendered import Cotangents, Gradients, ShadeGradients
+from ambiguous_wild.splat.rendered import Cotangents, Gradients, ShadeGradients, with_visible
 from ambiguous_wild.splat.trainer import Trainer
 from tests.splat.scenes import camera, cotangents, doubles, gaussians, given
 from tests.tiny_scene import write_tiny_scene
@@ -36,6 +36,17 @@ def scene(tmp_path_factory):
 def trainer_for(scene, folder, parts, **config) -> Trainer:
     data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=folder)
     return Trainer(data, parts, TrainConfig(**{"iterations": 80, "probes": 0} | config), folder=folder)
+
+
+def test_a_render_of_which_fewer_rows_count_is_another_value():
+    g, cam = gaussians(3), camera()
+    rendered = render_cpu(g, cam)
+    drawn, none = rendered.visible.clone(), torch.zeros(len(g), dtype=torch.bool)
+    changed = with_visible(rendered, none)
+    assert torch.equal(rendered.visible, drawn) and drawn.any() and not changed.visible.any()
+    assert changed.image is rendered.image and torch.equal(changed.radii, rendered.radii)
+    d = given(cotangents(cam.height, cam.width))
+    assert torch.equal(changed.backward(d).means.clone(), rendered.backward(d).means)
 
 
 def same(a: Gradients, b: Gradients) -> bool:
@@ -309,7 +320,7 @@ def test_a_start_of_ones_own(scene, tmp_path):
 
 
 def test_other_gaussians_may_be_drawn_under_the_smoothing_filter(scene, tmp_path):
-    parts = SmoothingFilter().change_parts(Parts(effects=(SmoothingFilter(),)))
+    parts = Parts(effects=(SmoothingFilter(),)).suited_to(SmoothingFilter())
     trainer = trainer_for(scene, tmp_path, parts)
     while trainer.iteration < 5:
         trainer.step()

@@ -47,7 +47,7 @@ def shares(camera, xyz):
 
 
 def test_it_lies_far_behind_cameras_and_points_where_photos_look(data):
-    xyz, rgb = Skybox().points(data, MANY)
+    xyz, rgb = Skybox().first_points(data, MANY)
     middle, radius = sphere_of(data.cameras, data.scene.points.xyz)
     assert xyz.shape == rgb.shape and rgb.dtype == np.uint8 and 0 < len(xyz) < COUNT
     np.testing.assert_allclose(np.linalg.norm(xyz - middle, axis=1), radius)
@@ -68,11 +68,11 @@ def test_directions_are_spread_evenly():
 
 def test_its_colour_is_the_median_of_the_photos(data):
     n = len(data.photos)
-    _, rgb = Skybox().points(painted(data, [(0.2, 0.4, 0.6)] * n), MANY)
+    _, rgb = Skybox().first_points(painted(data, [(0.2, 0.4, 0.6)] * n), MANY)
     assert (rgb == [51, 102, 153]).all()
     odd = [(0.2, 0.4, 0.6)] * n
     odd[0] = (1.0, 0.0, 0.0)  # a photo of another colour is outvoted wherever three look
-    xyz, rgb = Skybox().points(painted(data, odd), MANY)
+    xyz, rgb = Skybox().first_points(painted(data, odd), MANY)
     seen = np.sum([shares(camera, xyz) for camera in data.cameras], axis=0)
     assert (seen >= 3).any() and (rgb[seen >= 3] == [51, 102, 153]).all()
 
@@ -81,24 +81,24 @@ def test_what_the_capture_masks_is_no_background(data):
     n = len(data.photos)
     masked = [torch.zeros(p.shape[:2]) for p in data.photos[:1]] + [None] * (n - 1)
     odd = [(1.0, 0.0, 0.0)] + [(0.2, 0.4, 0.6)] * (n - 1)
-    _, rgb = Skybox().points(painted(data, odd, masked), MANY)
+    _, rgb = Skybox().first_points(painted(data, odd, masked), MANY)
     assert len(rgb) and (rgb == [51, 102, 153]).all()
     everything = [torch.zeros(p.shape[:2]) for p in data.photos]
-    assert len(Skybox().points(painted(data, odd, everything), MANY)[0]) == 0
+    assert len(Skybox().first_points(painted(data, odd, everything), MANY)[0]) == 0
 
 
 def test_with_little_room_it_is_coarser_and_still_all_around(data):
-    whole, _ = Skybox().points(data, MANY)
+    whole, _ = Skybox().first_points(data, MANY)
     _, radius = sphere_of(data.cameras, data.scene.points.xyz)
     effect = Skybox()
-    half, _ = effect.points(data, len(whole) - 1)
+    half, _ = effect.first_points(data, len(whole) - 1)
     assert effect.facts() == {"points": len(half)} and 0.3 * len(whole) < len(half) < len(whole)
     spacing = 3.6 / np.sqrt(COUNT / 2)  # of the coarser lattice, with a margin
     far = (whole[:, None] - half[None]) / radius
     assert np.linalg.norm(far, axis=2).min(axis=1).max() < 2 * spacing
-    assert len(Skybox().points(data, 0)[0]) == 0
+    assert len(Skybox().first_points(data, 0)[0]) == 0
     tiny = Skybox()
-    count = len(tiny.points(data, 3)[0])
+    count = len(tiny.first_points(data, 3)[0])
     assert count <= 3 and LEAST > 0
 
 
@@ -192,7 +192,7 @@ def test_without_it_far_gaussians_are_copied(data, tmp_path, monkeypatch):
     monkeypatch.setattr(skybox.Skybox, "spared", skybox.Effect.spared)
     parts = Parts(density_config=DensityConfig(**EAGER, prune_opacity=0.2))
     trainer = trainer_for(data, tmp_path, parts)
-    first = len(Skybox().points(data, MANY)[0])
+    first = len(Skybox().first_points(data, MANY)[0])
     trainer.train()
     middle, radius = sphere_of(data.cameras, data.scene.points.xyz)
     away = np.linalg.norm(trainer.gaussians.means.numpy() - middle, axis=1) > radius / 2

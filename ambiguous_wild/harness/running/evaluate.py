@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -26,6 +27,33 @@ from ambiguous_wild.splat.trainer import Trainer
 
 FPS_ROUNDS = 5
 FPS_SECONDS = 2.0  # of all rounds together: long enough to average over scheduling noise
+
+
+class Picture(Protocol):
+    """What `Renderable.render` gives."""
+
+    @property
+    def image(self) -> torch.Tensor:
+        """[H, W, 3] float32 in [0, 1] after clamping."""
+        ...
+
+
+class Renderable(Protocol):
+    """Draws test views: a trained model, splats that a program left, or the pictures that it left."""
+
+    def render(self, camera: Camera) -> Picture:
+        """The picture of a test view's camera."""
+        ...
+
+    def render_fitted(self, camera: Camera, photo: torch.Tensor, keep: torch.Tensor) -> torch.Tensor:
+        """The picture [H, W, 3] after colour effects, if there are any, were fitted to a part of the photo.
+
+        Args:
+            camera: of the test view.
+            photo: [H, W, 3] float32 in [0, 1], on the CPU.
+            keep: [H, W] float32 on the CPU, 1 where the fit may look.
+        """
+        ...
 
 
 @dataclass(frozen=True)
@@ -55,22 +83,22 @@ def mean_psnr(truth: list[TestPhoto], draw: Callable[[Camera], np.ndarray]) -> f
 
 
 def render_and_measure(
-    trainer: Trainer,
+    model: Renderable,
     truth: list[TestPhoto],
     folder: Path,
     *,
+    scene: Scene,
     half: bool = False,
-    scene: Scene | None = None,
 ) -> tuple[list[ImageRow], dict[str, str]]:
     """Render the test views to PNG and measure what was written.
 
     Args:
-        trainer: holds the model.
+        model: draws the test views.
         truth: the test photos.
         folder: for the PNG files.
+        scene: what the metrics of regions are about.
         half: NeRF-W's protocol: colour effects are fitted on the left half of each test photo, columns
             0 to ceil(W / 2), everything else stays, and the right half, from W // 2, is measured.
-        scene: what the metrics of regions are about; None = the trainer's.
 
     Returns:
         Per-image metrics, and for each metric that is missing the reason.
@@ -80,13 +108,13 @@ def render_and_measure(
         missing |= dict.fromkeys(FULL_IMAGE, "the scene has no test views")
         return [], missing
     sizes = [t.photo.shape[:2] for t in truth]
-    measures = measures_of(getattr(trainer.data, "scene", None) if scene is None else scene, sizes, half=half)
+    measures = measures_of(scene, sizes, half=half)
     rows: list[ImageRow] = []
     with atomic_dir(folder) as temporary:
         for t in truth:
             path = temporary / Path(t.view.name).with_suffix(".png")
             path.parent.mkdir(parents=True, exist_ok=True)
-            image = _fitted(trainer, t) if half else trainer.render(t.view.camera).image
+            image = _fitted(model, t) if half else model.render(t.view.camera).image
             write_png(path, to_uint8(image.cpu().numpy()))
             rows.append(image_row(t.view.name, measures(t.view.name, read_png_rgb(path), t.photo, half=half)))
     return rows, measures.missing
@@ -150,11 +178,11 @@ def measures_of(scene: Scene | None, sizes: Iterable[tuple[int, int]], *, half: 
     return Measures(networks, regions, missing)
 
 
-def _fitted(trainer: Trainer, test: TestPhoto) -> torch.Tensor:
-    photo = torch.from_numpy(test.photo.astype(np.float32) / 255.0).to(trainer.data.device)
-    keep = torch.zeros(photo.shape[:2], device=photo.device)
+def _fitted(model: Renderable, test: TestPhoto) -> torch.Tensor:
+    photo = torch.from_numpy(test.photo.astype(np.float32) / 255.0)
+    keep = torch.zeros(photo.shape[:2])
     keep[:, : -(-photo.shape[1] // 2)] = 1.0
-    return trainer.render_fitted(test.view.camera, photo, keep)
+    return model.render_fitted(test.view.camera, photo, keep)
 
 
 def write_masks(trainer: Trainer, folder: Path) -> MaskScores | None:

@@ -8,7 +8,6 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -27,7 +26,6 @@ from ambiguous_wild.methods.external.program import LOGS, WORK, Produced, Progra
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.render import render
 from ambiguous_wild.splat.rendered import Rendered
-from ambiguous_wild.splat.trainer import Trainer
 
 
 def run_program(cell: Cell, folder: Path) -> RunResult:
@@ -56,17 +54,13 @@ def run_program(cell: Cell, folder: Path) -> RunResult:
     )
     produced, time_cost = _timed(program, task)
     truth = evaluate.load_test_photos(cell.scene)
-    drawn: _Drawn | _Splats
+    drawn: evaluate.Renderable
     if produced.drawn_by_us:
         drawn = _Splats(produced, cell.device)
     else:
-        drawn = _Drawn(truth, produced.renders)
+        drawn = _Files(truth, produced.renders)
     per_image, missing = evaluate.render_and_measure(
-        cast(Trainer, drawn),
-        truth,
-        folder / "renders" / "test",
-        half=cell.protocol == "half",
-        scene=cell.scene,
+        drawn, truth, folder / "renders" / "test", half=cell.protocol == "half", scene=cell.scene
     )
     return finished_result(
         cell,
@@ -118,16 +112,12 @@ class _Picture:
     image: torch.Tensor  # [H, W, 3] float32 in [0, 1]
 
 
-class _Drawn:
-    """Stands in for a trained model: its renders are the program's files.
-
-    So every method is measured by the same function.
-    """
+class _Files:
+    """The pictures that the program wrote."""
 
     def __init__(self, truth: list[evaluate.TestPhoto], renders: Mapping[str, Path]) -> None:
         # Every view has a camera object of its own, which identifies the view.
         self.paths = {id(t.view.camera): (t.view, renders[t.view.name]) for t in truth}
-        self.data = SimpleNamespace(device=torch.device("cpu"))
 
     def render(self, camera: Camera) -> _Picture:
         view, path = self.paths[id(camera)]
@@ -140,7 +130,7 @@ class _Drawn:
 
 
 class _Splats:
-    """Stands in for a trained model: the program's splats, drawn by our renderer on a black background."""
+    """The program's splats, drawn by our renderer on a black background."""
 
     def __init__(self, produced: Produced, device: str) -> None:
         """
@@ -152,7 +142,6 @@ class _Splats:
             name: torch.from_numpy(values) for name, values in read_splat_ply(produced.ply).items()
         }
         self.gaussians = Gaussians(**known).to(device)
-        self.data = SimpleNamespace(device=torch.device(device))
 
     @torch.no_grad()
     def render(self, camera: Camera) -> Rendered:

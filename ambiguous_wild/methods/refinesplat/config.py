@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from ambiguous_wild.core import AwError
@@ -12,12 +12,12 @@ from ambiguous_wild.methods.refinesplat.density import EntropyDensityConfig
 from ambiguous_wild.methods.refinesplat.entropy import Statistic, Variant
 from ambiguous_wild.methods.refinesplat.first_look import FirstLookConfig
 from ambiguous_wild.methods.refinesplat.identity import PsiConfig
-from ambiguous_wild.methods.refinesplat.masking import Spread
 from ambiguous_wild.methods.refinesplat.multiview import MultiViewConfig
 from ambiguous_wild.methods.refinesplat.threshold import Form
 from ambiguous_wild.vision.backends import check_features, check_instances
 from ambiguous_wild.vision.segments import SegmentConfig
 
+Spread = Literal["var", "std", "robust", "hard"]  # of the threshold of M_global, see masking.global_mask
 _ANY = math.inf
 
 
@@ -96,6 +96,10 @@ class MaskConfig:
         for name in ("box", "dilation"):
             if getattr(self, name) % 2 == 0:
                 raise AwError(f"refinesplat.mask.{name} is an odd number, got {getattr(self, name)}")
+
+    def limited(self, most: float) -> MaskConfig:
+        """These settings for a photo of which no more than this share is masked."""
+        return replace(self, most=min(self.most, most))
 
     @property
     def floor(self) -> float:

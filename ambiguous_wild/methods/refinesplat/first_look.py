@@ -20,8 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -31,9 +30,6 @@ from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.methods.refinesplat.agreement import common_offset, quantile_of
 from ambiguous_wild.methods.refinesplat.multiview import nearest_views
 from ambiguous_wild.vision.sparse_surface import BEHIND, PIXELS, in_map, world_points
-
-if TYPE_CHECKING:
-    from ambiguous_wild.methods.refinesplat.config import MaskConfig
 
 _SETTLED = 0.005  # share of pixels: if fewer change in a round, it is the last
 _EDGE = 0.003  # variance of colours in [0, 1] that is an edge for the filter
@@ -102,10 +98,6 @@ class FirstLook:
     def factor(self, shape: tuple[int, int]) -> np.ndarray:
         """Factor of the evidence of later masks, [H, W] float32 in [1 / weight, weight]."""
         return np.power(np.float32(self.weight), 2.0 * _resized(self.passing, shape) - 1.0)
-
-    def limited(self, mask: MaskConfig) -> MaskConfig:
-        """How later masks of this photo are made: they cover no more than `most`."""
-        return replace(mask, most=min(mask.most, self.most))
 
 
 def first_look(

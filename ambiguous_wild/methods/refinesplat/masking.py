@@ -5,17 +5,14 @@ Masks here are bool, True = transient; keep = 1 - M_final. Statistics are in flo
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import get_args
 
 import cv2
 import numpy as np
 
 from ambiguous_wild.core.errors import unknown
+from ambiguous_wild.methods.refinesplat.config import MaskConfig, Spread
 
-if TYPE_CHECKING:
-    from ambiguous_wild.methods.refinesplat.config import MaskConfig
-
-Spread = Literal["var", "std", "robust", "hard"]
 GAPS = 1.25  # times its limit: as large may a mask be whose gaps are filled
 _COS_FLOOR = -1.0 + 1e-3  # U stays below 2000
 

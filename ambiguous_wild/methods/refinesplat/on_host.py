@@ -38,7 +38,7 @@ class HostMasks:
     ) -> None:
         self.config, self.looks, self.labels, self.static = config, looks, labels, static
         self.device, self.compare = device, compare
-        self.limited = {view: look.limited(config.mask) for view, look in looks.items()}
+        self.limited = {view: config.mask.limited(look.most) for view, look in looks.items()}
         self.pixels = PixelEvidence(
             photos,
             cameras,

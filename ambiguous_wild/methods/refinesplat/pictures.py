@@ -4,21 +4,44 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
 from ambiguous_wild.io.atomic import atomic_path
+from ambiguous_wild.io.motion_points import MotionPoints
 from ambiguous_wild.io.palette import GLOBAL, LOCAL, MASKED, NEUTRAL, faded, plot_colour, ramp, tint
 from ambiguous_wild.methods.refinesplat import masking
-from ambiguous_wild.splat.step import Step
+from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
+from ambiguous_wild.methods.refinesplat.evidence import Judged, Maps, Masks
+from ambiguous_wild.methods.refinesplat.inputs import FrozenInputs
+from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.moving import POINTS, draw_points
 
-if TYPE_CHECKING:
-    from ambiguous_wild.methods.refinesplat.policy import RefineSplatMask
+
+class Policy(Protocol):
+    """What pictures show of `RefineSplatMask`."""
+
+    config: RefineSplatConfig
+    data: TrainData
+    inputs: FrozenInputs
+    points: dict[str, MotionPoints]
+
+    @property
+    def w2(self) -> float: ...
+
+    @property
+    def shares(self) -> dict[int, tuple[float, float, float, float]]: ...
+
+    @property
+    def judged(self) -> dict[int, Judged]: ...
+
+    def examine(self, step: Step) -> tuple[Maps, Masks]: ...
+
+    def compare(self, step: Step) -> Maps: ...
 
 
-def panels(policy: RefineSplatMask, step: Step, *, begun: bool = True) -> dict[str, np.ndarray]:
+def panels(policy: Policy, step: Step, *, begun: bool = True) -> dict[str, np.ndarray]:
     """Entropy, instances by their statistic, and the local, global and final mask; [H, W, 3] uint8 each.
 
     Args:
@@ -61,7 +84,7 @@ def _outlined(image: np.ndarray, labels: np.ndarray) -> np.ndarray:
     return image
 
 
-def draw_entropies(policy: RefineSplatMask, folder: Path) -> list[Path]:
+def draw_entropies(policy: Policy, folder: Path) -> list[Path]:
     """entropies.png: instances of all photos when they were last judged, and their thresholds."""
     views = [v for v in sorted(policy.judged) if v in policy.shares and len(policy.judged[v].values)]
     if not views:

@@ -196,8 +196,8 @@ def render_cpu(
 ) -> RenderedCpu:
     """Render on the CPU; arguments and conventions as in `splat.render.render`.
 
-    Between the projection and the colours `gaussians.before_colours(rows)` is called if it is set: the
-    optimiser brings the harmonics of the rows about to be seen up to date there.
+    Between the projection and the colours the optimiser brings the harmonics of the rows about to be seen
+    up to date, see `Gaussians.postponed`.
 
     Raises:
         AwError: `sh_degree` is not between 0 and what the Gaussians hold.
@@ -218,8 +218,8 @@ def render_cpu(
     radii = _pool.take("radii", (n,))
     project.project(means, quats, log_scales, logits, cam, antialias, records, ids, counts, radii)
     slots = bins.visible_slots(ids, counts)
-    if gaussians.before_colours is not None:
-        gaussians.before_colours(ids[slots])
+    if gaussians.postponed is not None:
+        gaussians.postponed.make(ids[slots])
     base = None if shade is None else np.empty((n, 3), np.float32)
     harmonics.colours(means, sh0, sh_rest, sh_degree, centre, records, ids, counts, radii, base)
     slots = bins.visible_slots(ids, counts)

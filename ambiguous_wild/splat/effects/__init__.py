@@ -64,6 +64,6 @@ def with_effects(parts: Parts, names: Sequence[str]) -> Parts:
             continue
         module, cls, _ = EFFECTS[name]
         effect = getattr(importlib.import_module(f"{__name__}.{module}"), cls)()
-        parts = effect.change_parts(parts)
+        parts = parts.suited_to(effect)
         built.append(effect)
     return dataclasses.replace(parts, effects=(*parts.effects, *built))

@@ -8,8 +8,9 @@ Forward in that order, backward in reverse. The mask policy and the loss see the
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -27,9 +28,6 @@ from ambiguous_wild.splat.rendered import (
 )
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Shot, Step, TrainData
 
-if TYPE_CHECKING:
-    from ambiguous_wild.splat.parts import Parts
-
 State = dict[str, Any]
 
 
@@ -45,13 +43,15 @@ class Effect:
         False  # its colours come from the photo itself: of a test photo, from the part that may be read
     )
 
+    antialias = False  # whether the renderer is to use Mip-Splatting's 2D filter, whatever the method says
+
     def acts(self, hook: str) -> bool:
         """Whether that hook is to be called at all."""
         return getattr(type(self), hook) is not getattr(Effect, hook)
 
-    def change_parts(self, parts: Parts) -> Parts:
-        """The method's parts with what the effect needs of the renderer."""
-        return parts
+    def first_points(self, data: TrainData, most: int) -> tuple[np.ndarray, np.ndarray]:
+        """xyz [M, 3] and rgb [M, 3] uint8 of at most so many points to start from beside the method's."""
+        return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
 
     def setup(self, data: TrainData) -> None:
         """Called once before the first step, and again when a run resumes."""

@@ -7,8 +7,7 @@ al., 2025); we use plane sweeps instead of a matching network.
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -16,9 +15,6 @@ from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.effects.tracks import tracks_of
 from ambiguous_wild.splat.plane_sweep import dense_points
 from ambiguous_wild.splat.step import TrainData
-
-if TYPE_CHECKING:
-    from ambiguous_wild.splat.parts import Parts
 
 
 class DenseStart(Effect):
@@ -29,12 +25,7 @@ class DenseStart(Effect):
     def __init__(self) -> None:
         self.count = 0
 
-    def change_parts(self, parts: Parts) -> Parts:
-        return replace(parts, more_points=(*parts.more_points, self.points))
-
-    def points(self, data: TrainData, most: int) -> tuple[np.ndarray, np.ndarray]:
-        """xyz [M, 3] and rgb [M, 3] uint8 of at most so many points."""
-
+    def first_points(self, data: TrainData, most: int) -> tuple[np.ndarray, np.ndarray]:
         def photo(view: int) -> np.ndarray:  # one at a time: they may lie on a GPU
             return data.photos[view].cpu().numpy()
 

@@ -121,7 +121,8 @@ class Learnt(Effect):
         )
 
     def model(self, gaussians: Gaussians, shot: Shot) -> tuple[Gaussians, Pull]:
-        leaf, given = self._leaf(shot), {n: t.detach().clone() for n, t in gaussians.rows()}
+        leaf = self._leaf(shot)
+        given: dict[str, Any] = {name: tensor.detach().clone() for name, tensor in gaussians.rows()}
         graph = _Graph(leaf, given)
         with torch.enable_grad():
             extra = {name: given[name] for name in gaussians.extra}

@@ -18,9 +18,9 @@ from torch import Tensor
 from ambiguous_wild.core import Camera
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.effects.base import Effect, RowAdam, State, decayed, share_of
+from ambiguous_wild.splat.effects.placing import higher_harmonics
 from ambiguous_wild.splat.effects.posed import PosedCamera, left_jacobian, scaled, turned
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
-from ambiguous_wild.splat.reference import harmonics
 from ambiguous_wild.splat.rendered import Gradients
 from ambiguous_wild.splat.step import Shot, TrainData
 
@@ -200,5 +200,5 @@ def _through_direction(
         means = means.detach().requires_grad_(True)
         direction = torch.nn.functional.normalize(means - centre.to(means), dim=1)
         count = (degree + 1) ** 2 - 1
-        shade = torch.einsum("nk,nkc->nc", harmonics(direction, degree), rest[:, :count])
+        shade = torch.einsum("nk,nkc->nc", higher_harmonics(direction, degree), rest[:, :count])
         return torch.autograd.grad(shade, means, d_colour)[0].double()

@@ -8,8 +8,7 @@ density control leaves it alone: it learns light, not the distractors that stand
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,9 +20,6 @@ from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.effects.placing import inside, projected
 from ambiguous_wild.splat.gaussians import LEAST_POINTS
 from ambiguous_wild.splat.step import TrainData
-
-if TYPE_CHECKING:
-    from ambiguous_wild.splat.parts import Parts
 
 RADIUS = 8.0  # times the distance of the farthest camera, or of 99 % of the SfM points, from their middle
 COUNT = 4000  # on the whole sphere, some 3 degrees apart; those that a photo looks at are used
@@ -40,9 +36,6 @@ class Skybox(Effect):
     def __init__(self) -> None:
         self.count = 0
 
-    def change_parts(self, parts: Parts) -> Parts:
-        return replace(parts, more_points=(*parts.more_points, self.points))
-
     def setup(self, data: TrainData) -> None:
         middle, radius = sphere_of(data.cameras, data.scene.points.xyz)
         self._middle = torch.from_numpy(middle.astype(np.float32)).to(data.device)
@@ -53,8 +46,7 @@ class Skybox(Effect):
             return super().spared(means)
         return torch.linalg.vector_norm(means - self._middle, dim=1) > self._inner
 
-    def points(self, data: TrainData, most: int) -> tuple[np.ndarray, np.ndarray]:
-        """xyz [M, 3] and rgb [M, 3] uint8 of at most so many points."""
+    def first_points(self, data: TrainData, most: int) -> tuple[np.ndarray, np.ndarray]:
         middle, radius = sphere_of(data.cameras, data.scene.points.xyz)
         views = range(0, len(data.photos), -(-len(data.photos) // PHOTOS))
         count, self.count = COUNT, 0

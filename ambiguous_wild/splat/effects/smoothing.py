@@ -7,7 +7,7 @@ Source: Mip-Splatting (Yu et al., CVPR 2024), constants of its code. The screen 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,9 +17,6 @@ from ambiguous_wild.splat.effects.base import Effect, State
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.rendered import Gradients, Pull
 from ambiguous_wild.splat.step import Shot, TrainData
-
-if TYPE_CHECKING:
-    from ambiguous_wild.splat.parts import Parts
 
 VARIANCE = 0.2  # of the filter, in squared sampling intervals
 MARGIN = 0.15  # of the picture on each side still counts as seen
@@ -31,9 +28,7 @@ class SmoothingFilter(Effect):
     """s' = sqrt(s^2 + f^2), o' = o sqrt(prod s^2 / prod (s^2 + f^2)); f from the nearest train camera."""
 
     name = "antialias"
-
-    def change_parts(self, parts: Parts) -> Parts:
-        return replace(parts, antialias=True)
+    antialias = True
 
     def setup(self, data: TrainData) -> None:
         self.cameras = data.cameras

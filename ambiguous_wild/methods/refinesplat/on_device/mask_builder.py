@@ -60,7 +60,7 @@ class DeviceMasks:
             for view, look in looks.items()
             if look.weight != 1
         }
-        self.limited = {view: look.limited(config.mask) for view, look in looks.items()}
+        self.limited = {view: config.mask.limited(look.most) for view, look in looks.items()}
         self.keeps: dict[int, Tensor] = {}  # view: [H, W] float32; of the views that have a mask
         wide, views = torch.float64, len(photos)
         # [views, K] mean evidence of every instance when its mask was last made, NaN where there is none

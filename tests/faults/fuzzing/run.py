@@ -1,20 +1,16 @@
 """Give every reader damaged files; anything but a result or an AwError is a crash.
 
-    python benchmarks/fuzz.py [--inputs 10000] [--only NAME ...] [--json PATH] [--keep FOLDER]
+    python -m tests.faults.fuzzing.run [--inputs 10000] [--only NAME ...] [--keep FOLDER]
 
-Each reader (see `fuzz_readers`) gets valid files with seeded damage (see `fuzz_mutate`); the number of an
-input reproduces it. Readers run in a forked child with limits on memory (1 GB above the imports) and
-processor time (60 s per input), so that native crashes end only the child. A crash is any exception but
-AwError, a signal, or an exceeded limit. --keep writes the inputs that crash.
-
-The count is a total: the script resumes from the results file. Inputs that crashed before are tested first;
-those that no longer crash count as fixed.
+Each reader (see `readers`) gets valid files with seeded damage (see `mutate`); the number of an input
+reproduces it. Readers run in a forked child with limits on memory (1 GB above the imports) and processor
+time (60 s per input), so that native crashes end only the child. A crash is any exception but AwError, a
+signal, or an exceeded limit. --keep writes the inputs that crash. Exits with 1 if any did.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import random
 import resource
@@ -23,22 +19,16 @@ import signal
 import sys
 import tempfile
 import traceback
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
+from ambiguous_wild.core.errors import AwError
+from tests.faults.fuzzing.readers import READERS, Reader
 
-from fuzz_readers import READERS, Reader  # noqa: E402
-
-from ambiguous_wild.core.errors import AwError  # noqa: E402
-
-RESULTS = Path(__file__).parent / "results" / "fuzz.json"
 MEMORY = 1 << 30  # bytes above what is there before
 CPU_S = 60.0  # a slow machine zeroes a large picture in seconds; a loop without end takes more
 HUNG_S = 600
-_RECORD = 8  # bytes of an input's number
 
 
 @dataclass
@@ -48,7 +38,6 @@ class Tally:
     inputs: int = 0
     refused: int = 0
     crashes: dict[str, list[int]] = field(default_factory=dict)  # what happens -> input numbers
-    fixed: dict[str, list[int]] = field(default_factory=dict)  # what happened once, and no longer does
 
     def crash(self, what: str, number: int) -> None:
         self.crashes.setdefault(what, []).append(number)
@@ -61,26 +50,18 @@ def make_input(reader: Reader, number: int) -> bytes:
     return reader.mutate(dice.choice(samples), dice, dice.choice(samples))
 
 
-def run(reader: Reader, wanted: int, tally: Tally, keep: Path | None = None) -> None:
-    """Test earlier crashes again, then inputs up to `wanted`; crashes do not stop it."""
-    known, tally.crashes = tally.crashes, {}
-    for what, numbers in known.items():
-        for number in numbers:
-            again = Tally()
-            _child(reader, range(number, number + 1), again)
-            if again.crashes:
-                tally.crash(next(iter(again.crashes)), number)
-            else:
-                tally.fixed.setdefault(what, []).append(number)
-    at = tally.inputs
+def run(reader: Reader, wanted: int, keep: Path | None = None) -> Tally:
+    """Feed the first `wanted` inputs; crashes do not stop it."""
+    tally, at = Tally(), 0
     while at < wanted:
         at = _child(reader, range(at, wanted), tally)
     if keep is not None:
-        for what, found in tally.crashes.items():
+        for what, numbers in tally.crashes.items():
             folder = keep / reader.name
             folder.mkdir(parents=True, exist_ok=True)
-            (folder / f"{found[0]}{reader.suffix}").write_bytes(make_input(reader, found[0]))
-            (folder / f"{found[0]}.txt").write_text(what + "\n")
+            (folder / f"{numbers[0]}{reader.suffix}").write_bytes(make_input(reader, numbers[0]))
+            (folder / f"{numbers[0]}.txt").write_text(what + "\n")
+    return tally
 
 
 def _child(reader: Reader, numbers: range, tally: Tally) -> int:
@@ -177,50 +158,25 @@ def _where(error: BaseException) -> str:
     return f"{type(error).__name__} in {name}:{frame.name}: {first}"
 
 
-def table(results: dict[str, Any]) -> str:
-    """The Markdown table of docs/robustness.md."""
-    lines = [
-        "| reader | inputs | refused | crashes found | places | fixed | remaining |",
-        "|---|" + "---|" * 6,
-    ]
-    total = [0] * 6
-    for name, row in results.items():
-        fixed, left = (sum(map(len, row[key].values())) for key in ("fixed", "crashes"))
-        cells = [row["inputs"], row["refused"], fixed + left, _places(row), fixed, left]
-        total = [a + b for a, b in zip(total, cells)]
-        lines.append(f"| {name} | " + " | ".join(map(str, cells)) + " |")
-    return "\n".join([*lines, "| all | " + " | ".join(map(str, total)) + " |"])
-
-
-def _places(row: dict[str, Any]) -> int:
-    """Different types of crash, ignoring messages."""
-    return len({":".join(what.split(":")[:2]) for key in ("fixed", "crashes") for what in row[key]})
-
-
 def main() -> int:
-    """Fuzz, print and write the results; exit code 1 if anything crashed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    """Fuzz and print; exit code 1 if anything crashed."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--inputs", type=int, default=10_000)
     parser.add_argument("--only", nargs="+", choices=list(READERS), default=list(READERS), metavar="NAME")
-    parser.add_argument("--json", type=Path, default=RESULTS)
     parser.add_argument("--keep", type=Path, help="folder for inputs that crash")
     args = parser.parse_args()
-    from ambiguous_wild.io.atomic import write_json
-
-    results = json.loads(args.json.read_text()) if args.json.is_file() else {}
-    bad = 0
+    tallies = {}
     for name in args.only:
-        tally = Tally(**results.get(name, {}))
-        run(READERS[name], args.inputs, tally, args.keep)
-        results[name] = asdict(tally)
-        bad += len(tally.crashes)
-        write_json(args.json, results)
-        crashed = sum(len(v) for v in tally.crashes.values())
+        tally = tallies[name] = run(READERS[name], args.inputs, args.keep)
+        crashed = sum(map(len, tally.crashes.values()))
         print(f"{name}: {tally.inputs} inputs, {tally.refused} refused, {crashed} crashes", flush=True)
         for what, numbers in tally.crashes.items():
             print(f"    {len(numbers)} x {what} (input {numbers[0]})", flush=True)
-    print(table(results))
-    return 1 if bad else 0
+    print(
+        f"all {len(tallies)} readers: {sum(t.inputs for t in tallies.values())} inputs, "
+        f"{sum(t.refused for t in tallies.values())} refused"
+    )
+    return int(any(tally.crashes for tally in tallies.values()))
 
 
 if __name__ == "__main__":

@@ -149,7 +149,7 @@ def test_same_input_same_bits_for_any_number_of_threads_and_nothing_is_left_besi
 
 def test_second_call_has_nothing_to_do(scene, raw):
     before = (scene / "scene.json").stat().st_mtime_ns
-    result = build_scene(raw, scene, SETTINGS)
+    result = build_scene(raw, scene, SETTINGS, keep_work=True)
     assert result.up_to_date
     assert (scene / "scene.json").stat().st_mtime_ns == before
 

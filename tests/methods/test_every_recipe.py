@@ -7,6 +7,7 @@ from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.builtin import BUILTIN
 from ambiguous_wild.methods.uad import UncertaintyAware
+from ambiguous_wild.splat.effects import chain
 from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.trainer import Trainer
 from tests.host_reads import moved, no_transfers
@@ -35,7 +36,7 @@ HAND_MADE = {"features": "labhog", "instances": "graph", "psi.steps": "30"}
 RESUMED: dict[str, dict[str, str]] = {
     "3dgs": {},
     "3dgs+truth": {},
-    "refinesplat": {**GROWN, **MASKED},
+    "refinesplat": {**GROWN, **MASKED, "min_reset_pause": "2"},
     "refinesplat-paper": {**GROWN, **MASKED, **HAND_MADE},
     "refinesplat-printed": {**GROWN, **MASKED, **HAND_MADE},
     "robustsplat": {**GROWN, **MASKED},
@@ -102,7 +103,8 @@ def test_resuming_gives_the_same_bits(scene, tmp_path, method):
 
 
 @pytest.mark.parametrize("method", RECIPES)
-def test_a_test_photo_is_fitted_by_its_left_half(scene, tmp_path, method):
+def test_a_test_photo_is_fitted_by_its_left_half(scene, tmp_path, monkeypatch, method):
+    monkeypatch.setattr(chain, "FIT_STEPS", 12)
     trainer = trained(scene, tmp_path / "run", parts_of(method, **RECIPES[method]), iterations=20)
     camera, photo = trainer.data.cameras[0], trainer.data.photos[0]
     left = torch.zeros(photo.shape[:2])
@@ -121,7 +123,7 @@ def test_saving_changes_nothing(scene, tmp_path, method):
     """To save makes Adam's postponed updates at once: rows that nobody saw must not be drawn without them."""
     options = {**RECIPES.get(method, {}), **({"points": "400"} if method == "forestsplats" else {})}
     runs = [trainer_of(scene, tmp_path / name, parts_of(method, **options)) for name in ("quiet", "saved")]
-    for _ in range(40):
+    for _ in range(20):
         for trainer in runs:
             trainer.step()
         runs[1].state()

@@ -60,7 +60,7 @@ def test_it_trains_and_carries_its_embeddings(tmp_path):
 
     entry = get_method("wildgaussians")
     data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=tmp_path)
-    config = TrainConfig(iterations=130, probes=0, max_gaussians=500)
+    config = TrainConfig(iterations=60, probes=0, max_gaussians=500)
     whole = Trainer(data, entry.build(entry.options()), config, folder=tmp_path / "run")
     start = whole.gaussians.extra["wild_embedding"].clone()
     whole.train()

@@ -1,12 +1,12 @@
 """Test PSNR of `--effects auto` against effects picked by hand: presets, composites, real captures.
 
-    python benchmarks/auto.py --scenes DIR... --out DIR [--iterations 1500] [--seeds 0] [--jobs 2]
+    python benchmarks/auto.py --captures DIR... --out DIR [--iterations 1500] [--seeds 0] [--jobs 2]
 
 A DIR is a scene folder or a folder of them. On each scene RefineSplat is trained with `auto` and with sets of
 the effects among which it chooses: none, `dense`, `skybox`, and what may help there: on a preset what it was
 designed for (colour per photo once as exposure, once as appearance), elsewhere `exposure`, also with `dense`
 and `skybox`, and `antialias`. The set that `auto` chose is not trained again: the bits are the same. One
-thread a run. Finished runs are kept. Writes benchmarks/results/auto.json and .md.
+thread a run. Finished runs are kept. Writes benchmarks/results/auto.md.
 """
 
 from __future__ import annotations
@@ -21,20 +21,17 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from captures import find_scenes
-from ending import exit_code
-from presets import Stopped, aw
+from job_queue import aw, exit_code, find_scenes, parser_of
 
 from ambiguous_wild.core import AwError, Scene
-from ambiguous_wild.harness.running.environment import environment
 from ambiguous_wild.harness.running.result_file import RESULT, read_result
-from ambiguous_wild.io.atomic import write_json, write_text
+from ambiguous_wild.io.atomic import write_text
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.metrics import stats
 from ambiguous_wild.simulate.presets import PRESETS
 from ambiguous_wild.splat.effects import check_effects
 
-RESULTS = Path(__file__).parent / "results" / "auto"
+RESULTS = Path(__file__).parent / "results" / "auto.md"
 METHOD = "refinesplat"
 METRICS = {
     "psnr": "Whole photos.",
@@ -62,7 +59,7 @@ def train(scene: Scene, effects: str, out: Path, iterations: int, seeds: Sequenc
     """A run a seed: their metrics, the effects that were on, and what was tried before.
 
     Raises:
-        Stopped: the run failed, or is there with another configuration.
+        AwError: the run failed, or is there with another configuration.
     """
     folder = out / effects.replace(",", "+")
     runs = [folder / scene.name / METHOD / f"seed{seed}" for seed in seeds]
@@ -150,20 +147,17 @@ def to_markdown(data: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
+    parser = parser_of(__doc__, RESULTS, iterations=1500)
+    parser.set_defaults(seeds=[0])
+    return parser.parse_args(words)
+
+
 def main(words: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--scenes", nargs="+", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--out", type=Path, required=True, help="folder of the runs")
-    parser.add_argument("--iterations", type=int, default=1500)
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--results", type=Path, default=RESULTS)
-    args = parser.parse_args(words)
-    if args.jobs < 1 or args.iterations < 1 or min(args.seeds) < 0:
-        parser.error("--jobs and --iterations count from 1, --seeds from 0")
-    scenes = [load_scene(root) for root in find_scenes(args.scenes)]
+    args = arguments(words)
+    scenes = [load_scene(root) for root in find_scenes(args.captures)]
     if len({scene.name for scene in scenes}) < len(scenes):
-        parser.error("two scenes have the same name: their runs would share a folder")
+        raise AwError("two scenes have the same name: their runs would share a folder")
     rows: list[dict[str, Any]] = []
     failed: list[str] = []
     with ThreadPoolExecutor(args.jobs) as pool:
@@ -171,21 +165,15 @@ def main(words: Sequence[str] | None = None) -> int:
         for scene, done in zip(scenes, waiting, strict=True):
             try:
                 rows.append(done.result())
-            except (Stopped, AwError) as error:
+            except AwError as error:
                 failed.append(f"{scene.name}: {error}")
     for line in failed:
         print(f"failed: {line}", file=sys.stderr)
     if not rows:
         return 1
-    data = {
-        "environment": environment("cpu"),
-        "iterations": args.iterations,
-        "seeds": args.seeds,
-        "scenes": rows,
-    }
-    write_json(args.results.with_suffix(".json"), data)
-    write_text(args.results.with_suffix(".md"), to_markdown(data))
-    print(to_markdown(data))
+    table = to_markdown({"iterations": args.iterations, "seeds": args.seeds, "scenes": rows})
+    write_text(args.results, table)
+    print(table)
     return 1 if failed else 0
 
 

@@ -1,13 +1,12 @@
 """The trait that each method exists for, against 3dgs: a queue of `aw bench` runs that stops and goes on.
 
     python benchmarks/baselines.py --captures DIR... --out DIR [--sections transient appearance ...]
-        [--seeds 0 1 2] [--iterations 1500] [--max-gaussians 12000] [--only METHOD...] [--jobs 1] [--most N]
-        [--report-only]
+        [--seeds 0 1 2] [--iterations 1500] [--max-gaussians 12000] [--only METHOD...] [--jobs 2]
+        [--results FILE] [--report-only]
 
 A DIR is a scene folder or a folder of them; sections take the scenes whose names hold their words (SECTIONS).
 Each run has one thread; --jobs run at the same time. Finished runs are kept, stopped ones resume. Writes
-benchmarks/results/baselines.json, .md and -runs.tar.xz (from which it goes on elsewhere), and
-baselines-paper.md, the paper's main table with the runs of section main:
+benchmarks/results/baselines.md, which ends with the paper's main table of the runs of section main:
 
 transient    share of the gap between 3dgs and exact masks (3dgs+truth) that a method closes, in dB of PSNR
 appearance   dB above 3dgs on the right half of test photos, the left half fitted
@@ -19,7 +18,6 @@ resolution   dB above 3dgs at a quarter, half, once and twice the size that was 
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -30,17 +28,14 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from captures import find_scenes
-from ending import exit_code
-from job_queue import Run, archive_of, check_settings, keep, parser_of, restore, run_all
+from job_queue import Run, exit_code, find_scenes, parser_of, run_all
 
 from ambiguous_wild.core import AwError, Scene
-from ambiguous_wild.harness.running.environment import environment
 from ambiguous_wild.harness.running.result_file import RESULT, read_result
 from ambiguous_wild.harness.running.store import read_runs
 from ambiguous_wild.harness.tables.papers import paper
 from ambiguous_wild.harness.tables.plain_formats import to_markdown as to_layout
-from ambiguous_wild.io.atomic import write_json, write_text
+from ambiguous_wild.io.atomic import write_text
 from ambiguous_wild.io.images import read_png_rgb, to_uint8
 from ambiguous_wild.io.ply import read_splat_ply
 from ambiguous_wild.io.scene_folder import load_scene
@@ -49,7 +44,7 @@ from ambiguous_wild.metrics.image import psnr
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.render import render
 
-RESULTS = Path(__file__).parent / "results" / "baselines"
+RESULTS = Path(__file__).parent / "results" / "baselines.md"
 ROOT = Path(__file__).parents[1]
 
 
@@ -206,17 +201,11 @@ def row_of(
 def resolution_rows(jobs: Sequence[Job], args: argparse.Namespace) -> list[dict[str, Any]]:
     """PSNR of every run at other sizes than it was trained at, from its splats."""
     rows: list[dict[str, Any]] = []
-    written = args.results.with_name(args.results.name + ".json")
-    before = json.loads(written.read_text(encoding="utf-8"))["resolutions"] if written.is_file() else []
     for job in jobs:
         if result_of(job, args.out) is None:
             continue
-        path = job.folder(args.out) / "point_cloud.ply"
-        if not path.is_file():  # trained elsewhere: its texts were kept, and its row
-            rows += [row for row in before if row_key(row) == (job.method, load_name(job.scene), job.seed)]
-            continue
         scene = load_scene(job.scene)
-        known = read_splat_ply(path)
+        known = read_splat_ply(job.folder(args.out) / "point_cloud.ply")
         model = Gaussians(**{name: torch.from_numpy(values) for name, values in known.items()})  # type: ignore[arg-type]
         parts = get_method(job.method).build(get_method(job.method).options())
         row: dict[str, Any] = {"method": job.method, "scene": scene.name, "seed": job.seed}
@@ -231,10 +220,6 @@ def resolution_rows(jobs: Sequence[Job], args: argparse.Namespace) -> list[dict[
             row[f"psnr_{size:g}"] = fmean(values) if values else None
         rows.append(row)
     return rows
-
-
-def row_key(row: dict[str, Any]) -> tuple[str, str, int]:
-    return row["method"], row["scene"], row["seed"]
 
 
 def main_table(planned: dict[str, list[Job]], args: argparse.Namespace) -> str:
@@ -317,11 +302,9 @@ def report(planned: dict[str, list[Job]], args: argparse.Namespace) -> dict[str,
                 else:
                     rows.append(row)
     return {
-        "environment": environment("cpu"),
         "iterations": args.iterations,
         "max_gaussians": args.max_gaussians,
         "seeds": args.seeds,
-        "jobs": args.jobs,
         "lines": {name: recipe_lines(name) for name in dict.fromkeys(row["method"] for row in rows)},
         "rows": rows,
         "resolutions": resolution_rows(planned.get("resolution", []), args),
@@ -330,8 +313,8 @@ def report(planned: dict[str, list[Job]], args: argparse.Namespace) -> dict[str,
 
 
 def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
-    parser = parser_of(__doc__, iterations=1500, tables=".json and .md")
-    parser.set_defaults(results=RESULTS)
+    parser = parser_of(__doc__, RESULTS, iterations=1500)
+    parser.add_argument("--max-gaussians", type=int, default=12_000)
     parser.add_argument("--sections", nargs="+", choices=list(SECTIONS), default=list(SECTIONS))
     parser.add_argument("--only", nargs="+", default=[], metavar="METHOD", help="and the references")
     return parser.parse_args(words)
@@ -347,16 +330,12 @@ def main(words: Sequence[str] | None = None) -> int:
             f"no scene for {', '.join(args.sections)}: their names hold none of the sections' words"
         )
     runs = [job.run(args.out, args.iterations) for job in jobs]
-    check_settings(args.results, iterations=args.iterations, max_gaussians=args.max_gaussians)
-    restore(args.out, archive_of(args.results))
-    failed = [] if args.report_only else run_all(runs, args.jobs, args.most)
-    keep(args.out, archive_of(args.results))
-    data = report(planned, args)
-    write_json(args.results.with_name(args.results.name + ".json"), data)
-    write_text(args.results.with_name(args.results.name + ".md"), to_markdown(data))
+    failed = [] if args.report_only else run_all(runs, args.jobs)
+    text = to_markdown(report(planned, args))
     if table := main_table(planned, args):
-        write_text(args.results.with_name(args.results.name + "-paper.md"), table)
-    print(to_markdown(data))
+        text += f"\n## In the paper's layout\n\n{table}"
+    write_text(args.results, text)
+    print(text)
     for line in failed:
         print(f"failed: {line}", file=sys.stderr)
     return 1 if failed else 0

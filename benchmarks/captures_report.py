@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ambiguous_wild.core import AwError, Scene
+from ambiguous_wild.core import Scene
 from ambiguous_wild.harness.running.identity import scene_identity
 from ambiguous_wild.harness.running.regions import true_distractor
 from ambiguous_wild.harness.running.store import Runs
@@ -43,7 +41,7 @@ COLUMNS = (
 IMAGES = ("psnr", "psnr_supported", "ssim")  # means over the test photos
 TIMES = ("train_s", "setup_s", "ms_per_iteration")
 
-BOOK = ["capture", "method", "seed", "config_hash", "threads", *(key for key, _, _ in COLUMNS)]
+RUN_COLUMNS = ["capture", "method", "seed", "threads", *(key for key, _, _ in COLUMNS)]
 
 
 def facts_of(scene: Scene) -> dict[str, Any]:
@@ -83,57 +81,35 @@ def run_numbers(run: pd.Series, images: pd.DataFrame) -> dict[str, float]:
     }
 
 
-def book_of(runs: Runs) -> pd.DataFrame:
-    """A row per finished run: capture, method, seed, config_hash, threads and the columns."""
-    ok = runs.runs[runs.runs.status == "ok"] if len(runs.runs) else runs.runs
+def rows_of(runs: Runs | None, identities: Sequence[str]) -> pd.DataFrame:
+    """A row per finished run of these configurations: capture, method, seed, threads and the columns."""
+    if runs is None or not len(runs.runs):
+        return pd.DataFrame(columns=RUN_COLUMNS)
+    wanted = runs.runs[(runs.runs.status == "ok") & runs.runs.config_hash.isin(list(identities))]
     rows = [
         {
             "capture": run.scene,
             "method": run.method,
             "seed": int(run.seed),
-            "config_hash": run.config_hash,
             "threads": int(run.threads),
             **run_numbers(run, runs.images),
         }
-        for _, run in ok.iterrows()
+        for _, run in wanted.iterrows()
     ]
-    return pd.DataFrame(rows, columns=BOOK)
-
-
-def read_book(path: Path) -> pd.DataFrame:
-    """The recorded runs, without what older records lack; empty if there is no file.
-
-    Raises:
-        AwError: the file is damaged.
-    """
-    if not path.is_file():
-        return pd.DataFrame(columns=BOOK)
-    try:
-        return pd.read_csv(path, dtype={"config_hash": str}).reindex(columns=BOOK)
-    except ValueError as error:  # ParserError and UnicodeDecodeError are such
-        raise AwError(f"{path} is damaged ({error}); restore or delete it") from error
-
-
-def merged(old: pd.DataFrame, new: pd.DataFrame) -> pd.DataFrame:
-    """Both records, sorted; a run of `new` replaces the same run in `old`."""
-    filled = [book for book in (old, new) if len(book)]
-    if not filled:
-        return old
-    both = pd.concat(filled).drop_duplicates(["capture", "method", "seed"], keep="last")
-    return both.sort_values(["capture", "method", "seed"]).reset_index(drop=True)
+    return pd.DataFrame(rows, columns=RUN_COLUMNS)
 
 
 def tabulate(
-    book: pd.DataFrame, scenes: Sequence[str], methods: Sequence[str], seeds: Sequence[int]
+    runs: pd.DataFrame, scenes: Sequence[str], methods: Sequence[str], seeds: Sequence[int]
 ) -> list[Row]:
     """A row a capture and method: mean and sample deviation over the seeds, None where one is missing.
 
-    Times are those of the runs that have any: of a run on a shared machine the book keeps none.
+    Times are those of the runs that have any: a run on a shared machine has none.
     """
     rows = []
     for scene in scenes:
         for method in methods:
-            here = book[(book.capture == scene) & (book.method == method) & book.seed.isin(list(seeds))]
+            here = runs[(runs.capture == scene) & (runs.method == method) & runs.seed.isin(list(seeds))]
             row: Row = {"capture": scene, "method": method, "runs": len(here)}
             complete = len(here) == len(set(seeds))
             for key, _, _ in COLUMNS:
@@ -146,20 +122,15 @@ def tabulate(
     return rows
 
 
-def threads_of(book: pd.DataFrame) -> list[int]:
-    """Kernel threads of the runs; times with different threads cannot be compared."""
-    return sorted({int(count) for count in book["threads"]})
-
-
 def missing_runs(
-    book: pd.DataFrame,
+    finished: pd.DataFrame,
     runs: Runs | None,
     scenes: Sequence[str],
     methods: Sequence[str],
     seeds: Sequence[int],
 ) -> list[dict[str, Any]]:
-    """Every run that is not recorded: capture, method, seed, and whether it failed or is unfinished."""
-    known = set(zip(book.capture, book.method, book.seed, strict=True))
+    """Every run that is not finished: capture, method, seed, and whether it failed or is unfinished."""
+    known = set(zip(finished.capture, finished.method, finished.seed, strict=True))
     tried = set() if runs is None else {(r.scene, r.method, r.seed) for r in runs.runs.itertuples()}
     return [
         {
@@ -233,24 +204,15 @@ def _best(capture: str, methods: Sequence[str], value: Any) -> str | None:
     return max(found, key=lambda m: found[m]) if found else None
 
 
-def to_csv(rows: Sequence[Row]) -> str:
-    """All rows and columns; an empty cell is a missing value."""
-    text = io.StringIO()
-    names = ["capture", "method", "runs"] + [f"{k}{s}" for k, _, _ in COLUMNS for s in ("", "_sd")]
-    writer = csv.DictWriter(text, names, lineterminator="\n", restval="")
-    writer.writeheader()
-    writer.writerows({k: "" if v is None else v for k, v in row.items()} for row in rows)
-    return text.getvalue()
-
-
 def to_markdown(data: dict[str, Any]) -> str:
     """A table per capture, then the summary."""
     seeds = ", ".join(map(str, data["seeds"]))
+    settings = "".join(f"{setting}; " for setting in data["settings"])
     lines = [
         "# Captures with exact truth",
         "",
         f"{data['iterations']} iterations, seeds {seeds}, {data['jobs']} runs at a time, kernel threads a "
-        f"run: {' or '.join(map(str, data['threads']))}; effects: {data.get('effects', 'none')}; "
+        f"run: {' or '.join(map(str, data['threads']))}; effects: {data['effects']}; {settings}"
         f"{data['environment']['cpu']}. Mean +- sample "
         "deviation over the seeds; a cell that is `-` is missing. IoU, precision and recall are of masked "
         "pixels, counted over all train photos. Setup is what a method prepares before its first step, less "

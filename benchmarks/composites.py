@@ -6,13 +6,12 @@
 --data holds a folder a base: its photos, or images/ with them; cut-outs lie in --data/cutouts. Each base is
 built once (`aw build-scene`). Its test photos are those that the others support best: a surface counts as
 supported where three of them see it. Odd placements paste cut-outs, even ones the scene's own texture.
-Training and tables are those of captures.py, in benchmarks/results/placements*. Everything resumes.
+Training and tables are those of captures.py, in benchmarks/results/composites.md. Everything resumes.
 """
 
 from __future__ import annotations
 
 import argparse
-import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,30 +19,17 @@ from pathlib import Path
 
 import captures
 import numpy as np
-from ending import exit_code
+from job_queue import aw, exit_code
 
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.harness.running.covered import train_looks
 from ambiguous_wild.io.atomic import write_text
 from ambiguous_wild.io.scene_folder import load_scene
 
-RESULTS = Path(__file__).parent / "results" / "placements"
+RESULTS = Path(__file__).parent / "results" / "composites.md"
 BASES = ("seneca=5", "monstree=4", "sceaux=4", "skull=5")
 LYING = ("seneca",)  # photographed from above: distractors lie at any angle
 TEST_SHARE = 8  # every so many-th photo tests, at least three
-
-
-def aw(*words: str) -> None:
-    """Run a command of the project.
-
-    Raises:
-        AwError: with its last line.
-    """
-    done = subprocess.run(
-        [sys.executable, "-m", "ambiguous_wild.cli.main", *words], capture_output=True, text=True
-    )
-    if done.returncode:
-        raise AwError(f"aw {' '.join(words[:2])}: {(done.stderr.strip().splitlines() or ['no output'])[-1]}")
 
 
 def support(scene: Scene) -> dict[str, float]:

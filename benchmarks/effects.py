@@ -1,29 +1,24 @@
-"""Time of optional effects, and the decisions of `aw plan` on scenes with known effects.
+"""Time that each optional effect adds to an iteration.
 
-    python benchmarks/effects.py --cost SCENE [--rounds N]
-    python benchmarks/effects.py --scenes yard=exposure,masks street= [--no-probe] [--json PATH]
+    python benchmarks/effects.py SCENE [--rounds N]
 
---cost: ms per iteration of plain 3DGS, of 3DGS with an empty effect, and with each effect. All alternate
-within every round, so that machine load affects them alike; prints medians of the differences.
---scenes: FOLDER=EFFECTS, the effects each scene was made with; prints the confusion table per effect.
+ms per iteration of plain 3DGS, of 3DGS with an empty effect, and with each effect. All alternate within every
+round, so that machine load affects them alike; prints medians of the differences. docs/effects.md has them.
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 import tempfile
 import time
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from job_queue import exit_code
 
-from ambiguous_wild.core import Scene
-from ambiguous_wild.harness.planning.decide import Plan, plan_without_training
 from ambiguous_wild.harness.planning.probe import small_data
-from ambiguous_wild.harness.planning.probed import plan_with_probes
-from ambiguous_wild.io.atomic import write_json
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.cpu.warmup import warm_up
 from ambiguous_wild.splat.effects import ALL, with_effects
@@ -31,16 +26,6 @@ from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.trainer import Trainer
-
-# what a scene is said to call for -> the line of the plan
-LINES = {
-    "masks": "masks",
-    "exposure": "affine exposure",
-    "appearance": "appearance embedding",
-    "antialias": "antialiasing",
-    "poses": "pose refinement",
-    "sh": "SH degree",
-}
 
 
 def costs(path: Path, rounds: int, steps: int = 5) -> dict[str, Any]:
@@ -83,58 +68,18 @@ def costs(path: Path, rounds: int, steps: int = 5) -> dict[str, Any]:
         }
 
 
-def _probed(scene: Scene) -> Plan:
-    """The plan of `aw plan`, for a run of the full length."""
-    with tempfile.TemporaryDirectory() as name:
-        return plan_with_probes(
-            scene, TrainConfig(), Path(name), masks=True, prepare=lambda: warm_up(print), say=print
-        )
-
-
-def confusion(wanted: dict[Path, set[str]], probe: bool) -> dict[str, Any]:
-    """Confusion counts per effect, and all decisions."""
-    table: dict[str, Counter[str]] = {name: Counter() for name in LINES}
-    details = {}
-    for path, needs in wanted.items():
-        scene = load_scene(path)
-        plan = _probed(scene) if probe else plan_without_training(scene)
-        found = {d.effect: d for d in plan.decisions}
-        details[str(path)] = plan.plain()
-        for name, line in LINES.items():
-            if line in found:
-                table[name][f"{'has' if name in needs else 'lacks'} it, {found[line].decision}"] += 1
-    return {"table": {n: dict(c) for n, c in table.items()}, "plans": details}
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--cost", type=Path, metavar="SCENE")
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("scene", type=Path)
     parser.add_argument("--rounds", type=int, default=20)
-    parser.add_argument("--scenes", nargs="*", default=[], metavar="FOLDER=EFFECTS")
-    parser.add_argument("--no-probe", action="store_true")
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args()
-    result: dict[str, Any] = {}
-    if options.cost:
-        result["cost"] = costs(options.cost, options.rounds)
-        for name, row in result["cost"]["ms"].items():
-            print(f"{name:14} {row['cpu_ms']:8.2f} ms {row['more_ms']:+8.2f} ms")
-        print("an effect that does nothing changes no bit:", result["cost"]["same_bits"])
-    if options.scenes:
-        wanted = {}
-        for text in options.scenes:
-            folder, _, names = text.partition("=")
-            wanted[Path(folder)] = {n for n in names.split(",") if n}
-            if unknown := wanted[Path(folder)] - LINES.keys():
-                parser.error(f"{text}: no effect {', '.join(sorted(unknown))}; there is {', '.join(LINES)}")
-        result["confusion"] = confusion(wanted, not options.no_probe)
-        for name, counts in result["confusion"]["table"].items():
-            print(f"{name:12}", ", ".join(f"{kind}: {n}" for kind, n in sorted(counts.items())))
-    if options.json:
-        write_json(options.json, result)
+    args = parser.parse_args()
+    result = costs(args.scene, args.rounds)
+    print(f"{result['scene']}, {result['gaussians']} Gaussians")
+    for name, row in result["ms"].items():
+        print(f"{name:14} {row['cpu_ms']:8.2f} ms {row['more_ms']:+8.2f} ms")
+    print("an effect that does nothing changes no bit:", result["same_bits"])
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_code(main))

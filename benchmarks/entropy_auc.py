@@ -1,7 +1,7 @@
 """How well the printed entropy and other statistics find distractors, with each back end.
 
-    python benchmarks/entropy_auc.py --captures DIR... [--backends labhog sceneconv ...] [--iterations 700]
-        [--max-gaussians 12000] [--sigma sigmoid] [--results STEM] [--report-only]
+    python benchmarks/entropy_auc.py --captures DIR... --out DIR [--backends labhog sceneconv ...]
+        [--iterations 700] [--max-gaussians 12000] [--sigma sigmoid] [--results FILE]
 
 A DIR is a scene folder or a folder of them; scenes need exact masks. On each a plain 3DGS is trained and its
 renders of the train views are compared with the photos. Area under the ROC curve (0.5 = chance, below it the
@@ -11,8 +11,8 @@ with over half of their pixels in the mask). Entropies are those of psi(phi(rend
 It also gives the size of the gradients that L_id and L_cr send into the render, over that of L_GS: the L2
 norm over all pixels, mean of the views.
 
-A scene and back end that is in the results with the same settings is not computed again. Writes
-benchmarks/results/entropy-auc.json and .md, after each back end.
+Finished scenes and back ends are kept under --out, in a folder per settings. Writes
+benchmarks/results/entropy-auc.md.
 """
 
 from __future__ import annotations
@@ -29,12 +29,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from captures import find_scenes
-from ending import exit_code
+from job_queue import exit_code, find_scenes
 from scipy.stats import rankdata
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.running.environment import environment
 from ambiguous_wild.harness.running.regions import true_distractor
 from ambiguous_wild.io.atomic import write_json, write_text
 from ambiguous_wild.io.scene_folder import load_scene
@@ -52,7 +50,7 @@ from ambiguous_wild.splat.step import TrainData
 from ambiguous_wild.splat.trainer import Trainer
 from ambiguous_wild.vision.backends import CONV, make_features, make_instances
 
-RESULTS = Path(__file__).parent / "results" / "entropy-auc"
+RESULTS = Path(__file__).parent / "results" / "entropy-auc.md"
 BACKENDS = ("labhog", "efficientnet-lite0", "vgg16", "sceneconv")
 STATISTICS = ("entropy", "surprise", "contrast", "distance", "U / H", "residual")
 BOX = 5  # px, of the residual
@@ -178,60 +176,46 @@ def to_markdown(data: dict[str, Any]) -> str:
         cells += [f"{row['gradient_id']:.1f}", f"{row['gradient_cr']:.1f}"]
         lines.append(f"| {row['scene']} | {row['features']} | " + " | ".join(cells) + " |")
     lines += ["", "L_id, L_cr: L2 norm of the gradient to the render, over that of L_GS, weights of 1."]
-    if data["missing"]:
-        lines += ["", "Not computed yet: " + "; ".join(data["missing"]) + "."]
     return "\n".join(lines) + "\n"
 
 
 def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--captures", nargs="+", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--out", type=Path, required=True, help="folder of what is finished")
     parser.add_argument("--backends", nargs="+", default=list(BACKENDS))
     parser.add_argument("--iterations", type=int, default=700)
     parser.add_argument("--max-gaussians", type=int, default=12_000)
     parser.add_argument("--sigma", choices=("sigmoid", "softmax"), default="sigmoid")
-    parser.add_argument("--results", type=Path, default=RESULTS, help="where .json and .md go")
-    parser.add_argument("--report-only", action="store_true", help="compute nothing, tabulate what is there")
+    parser.add_argument("--results", type=Path, default=RESULTS, help="where the table goes")
     return parser.parse_args(words)
+
+
+def rows_of(root: Path, args: argparse.Namespace) -> list[dict[str, Any]]:
+    """A row per back end of one scene; those that are kept are not computed again."""
+    scene = load_scene(root)
+    kept = args.out / f"{args.iterations}-{args.max_gaussians}-{args.sigma}" / scene.name
+    todo = [backend for backend in args.backends if not (kept / f"{backend}.json").is_file()]
+    if todo:
+        with tempfile.TemporaryDirectory() as name:
+            data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=Path(name))
+            renders = renders_of(data, Path(name) / "run", args)
+            for backend in todo:
+                row = {"scene": scene.name, "features": backend}
+                row |= judged(data, renders, backend, args.sigma)
+                write_json(kept / f"{backend}.json", row)
+                print(json.dumps(row), flush=True)
+    return [json.loads((kept / f"{backend}.json").read_text(encoding="utf-8")) for backend in args.backends]
 
 
 def main(words: Sequence[str] | None = None) -> int:
     args = arguments(words)
     set_threads(1)
     torch.set_num_threads(1)
-    settings = {"iterations": args.iterations, "max_gaussians": args.max_gaussians, "sigma": args.sigma}
-    path = args.results.with_name(args.results.name + ".json")
-    rows: list[dict[str, Any]] = []
-    if path.is_file():
-        before = json.loads(path.read_text(encoding="utf-8"))
-        rows = before["rows"] if all(before[k] == v for k, v in settings.items()) else []
-    scenes = {folder: load_scene(folder) for folder in find_scenes(args.captures)}
-    wanted = [(scene.name, backend) for scene in scenes.values() for backend in args.backends]
-
-    def save() -> list[tuple[str, str]]:
-        """Write the tables; what is missing."""
-        known = {(row["scene"], row["features"]) for row in rows}
-        todo = [pair for pair in wanted if pair not in known]
-        missing = [f"{backend} on {name}" for name, backend in todo]
-        found = {"environment": environment("cpu"), **settings, "rows": rows, "missing": missing}
-        write_json(path, found)
-        write_text(path.with_suffix(".md"), to_markdown(found))
-        return todo
-
-    missing = save()
-    for scene in scenes.values():
-        todo = [backend for name, backend in missing if name == scene.name]
-        if not todo or args.report_only:
-            continue
-        with tempfile.TemporaryDirectory() as name:
-            data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=Path(name))
-            renders = renders_of(data, Path(name) / "run", args)
-            for backend in todo:
-                row = judged(data, renders, backend, args.sigma)
-                rows.append({"scene": scene.name, "features": backend, **row})
-                print(scene.name, backend, json.dumps(row), flush=True)
-                save()
-    print(path.with_suffix(".md").read_text(encoding="utf-8"))
+    rows = [row for root in find_scenes(args.captures) for row in rows_of(root, args)]
+    table = to_markdown({**vars(args), "rows": rows})
+    write_text(args.results, table)
+    print(table)
     return 0
 
 

@@ -1,20 +1,15 @@
-"""A queue of `aw bench` runs that stops and goes on: finished runs are kept, stopped ones resume.
+"""What the benchmarks share: scenes of folders, `aw` commands, and a queue of `aw bench` runs.
 
-The texts of finished runs (settings, metrics, machine; no models, no pictures) go into an archive beside the
-tables, so that the queue goes on at another machine and every figure can be traced.
+Finished runs of a queue are kept and stopped ones resume, so a benchmark can be stopped and started again.
 """
 
 from __future__ import annotations
 
 import argparse
-import io
-import json
-import lzma
 import os
 import subprocess
 import sys
-import tarfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,10 +20,48 @@ import yaml
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import flatten
 from ambiguous_wild.harness.running.result_file import RESULT, read_result
-from ambiguous_wild.harness.running.store import read_config, run_folders
-from ambiguous_wild.io.atomic import atomic_path
+from ambiguous_wild.harness.running.store import read_config
 
-TEXTS = ("config.yaml", "env.json", RESULT)
+
+def exit_code(main: Callable[[], int | None]) -> int | None:
+    """What `main` returns; 2 and one line on standard error where it raises AwError."""
+    try:
+        return main()
+    except AwError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+
+
+def aw(*words: str) -> str:
+    """Run a command of the project; returns its standard output.
+
+    Raises:
+        AwError: the command failed; holds its last line.
+    """
+    command = [sys.executable, "-m", "ambiguous_wild.cli.main", *words]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        lines = (done.stderr.strip() or done.stdout.strip() or f"exit code {done.returncode}").splitlines()
+        raise AwError(f"aw {' '.join(words[:2])}: {lines[-1]}")
+    return done.stdout
+
+
+def find_scenes(folders: Iterable[Path]) -> list[Path]:
+    """Scene folders among the folders and one level below them.
+
+    Raises:
+        AwError: a folder that is and holds none.
+    """
+    scenes: list[Path] = []
+    for folder in folders:
+        below = sorted(p.parent for p in folder.glob("*/scene.json")) if folder.is_dir() else []
+        if (folder / "sparse").is_dir() or (folder / "scene.json").is_file():
+            scenes.append(folder)
+        elif below:
+            scenes += below
+        else:
+            raise AwError(f"{folder} is no scene folder and holds none; 'aw build-scene' makes them")
+    return scenes
 
 
 @dataclass(frozen=True)
@@ -61,23 +94,21 @@ class Run:
         return f"{fmean(float(row['psnr']) for row in result['per_image']):.2f} dB"
 
 
-def parser_of(doc: str | None, iterations: int, tables: str) -> argparse.ArgumentParser:
+def parser_of(doc: str | None, results: Path, iterations: int) -> argparse.ArgumentParser:
     """The options that every queue has.
 
     Args:
         doc: of the script.
-        iterations: of a run, the default.
-        tables: endings of the files that hold the tables, in words.
+        results: the file that its table goes to by default.
+        iterations: of a run, by default.
     """
     parser = argparse.ArgumentParser(description=(doc or "").partition("\n")[0])
     parser.add_argument("--captures", nargs="+", type=Path, required=True, metavar="DIR")
     parser.add_argument("--out", type=Path, required=True, help="folder of the runs")
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--seeds", nargs="+", type=_seed, default=[0, 1, 2])
     parser.add_argument("--iterations", type=_count, default=iterations)
-    parser.add_argument("--max-gaussians", type=_count, default=12_000)
-    parser.add_argument("--jobs", type=_count, default=1, help="runs at a time")
-    parser.add_argument("--most", type=_count, help="runs of this call at most")
-    parser.add_argument("--results", type=Path, help=f"where {tables} go")
+    parser.add_argument("--jobs", type=_count, default=2, help="runs at a time")
+    parser.add_argument("--results", type=Path, default=results, help="where the table goes")
     parser.add_argument("--report-only", action="store_true", help="train nothing, tabulate what is there")
     return parser
 
@@ -88,16 +119,22 @@ def _count(text: str) -> int:
     return int(text)
 
 
-def run_all(runs: Sequence[Run], at_once: int = 1, most: int | None = None) -> list[str]:
-    """Run what has no result, at most `most` of it; returns a line for each failure.
+def _seed(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text!r} is no seed from 0 on")
+    return int(text)
+
+
+def run_all(runs: Sequence[Run], at_once: int = 1) -> list[str]:
+    """Run what has no result; returns a line for each failure.
 
     Methods with the same other words share a process: it loads packages, kernels and photos once.
     """
     todo = [run for run in runs if not run.finished]
     print(f"{len(runs)} runs: {len(runs) - len(todo)} finished before, {len(todo)} to go", flush=True)
+    # one thread each in whatever a run calls: those of libraries wait by spinning, on the others' cores
     env = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     failed = []
-    todo = todo[:most]
     count = 0
     with ThreadPoolExecutor(at_once) as pool:
         waiting = {
@@ -115,22 +152,22 @@ def run_all(runs: Sequence[Run], at_once: int = 1, most: int | None = None) -> l
             lines = [line.strip() for line in process.stderr.splitlines() if line.strip()] or ["no output"]
             for run in batch:
                 count += 1
-                told = run.psnr()
-                print(f"[{count}/{len(todo)}] {run.name}: {told or lines[-1]}", flush=True)
-                if told is None:
+                psnr = run.psnr()
+                print(f"[{count}/{len(todo)}] {run.name}: {psnr or lines[-1]}", flush=True)
+                if psnr is None:
                     failed.append(f"{run.name}: {lines[-1]}")
     return failed
 
 
 def batches(runs: Sequence[Run], largest: int = 8) -> list[list[Run]]:
     """Runs that differ in the method alone, at most `largest` together; each method once."""
-    found: dict[tuple[str, ...], list[list[Run]]] = {}
+    groups: dict[tuple[str, ...], list[list[Run]]] = {}
     for run in runs:
-        own = found.setdefault(run.words, [[]])
+        own = groups.setdefault(run.words, [[]])
         if len(own[-1]) == largest or any(run.method == other.method for other in own[-1]):
             own.append([])
         own[-1].append(run)
-    return [batch for own in found.values() for batch in own]
+    return [batch for own in groups.values() for batch in own]
 
 
 def command(batch: Sequence[Run]) -> list[str]:
@@ -141,61 +178,3 @@ def command(batch: Sequence[Run]) -> list[str]:
         for option in run.options:
             words += ["--set", f"{run.method}.{option}"]
     return [*words, *batch[0].words]
-
-
-def keep(root: Path, archive: Path) -> None:
-    """Write the texts of all finished runs below root into an archive; the same runs give the same bytes.
-
-    Folders of this machine are left out: a scene goes by its name.
-    """
-    with atomic_path(archive) as temporary, tarfile.open(temporary, "w:xz", preset=9) as tar:
-        for run in run_folders(root):
-            if not (run / RESULT).is_file():
-                continue
-            place = str((read_config(run).get("scene") or {}).get("path", ""))
-            for name in TEXTS:
-                text = (run / name).read_text(encoding="utf-8")
-                if Path(place).is_absolute():
-                    text = text.replace(place, Path(place).name)
-                info, data = tarfile.TarInfo(str((run / name).relative_to(root))), text.encode()
-                info.size = len(data)
-                tar.addfile(info, io.BytesIO(data))
-
-
-def archive_of(stem: Path) -> Path:
-    """The archive beside the tables stem.json and stem.md."""
-    return stem.with_name(stem.name + "-runs.tar.xz")
-
-
-def check_settings(stem: Path, **settings: object) -> None:
-    """Refuse to mix runs of other settings with those of stem.json.
-
-    Raises:
-        AwError: a setting differs from the one that the tables were made with.
-    """
-    path = stem.with_name(stem.name + ".json")
-    known = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    for name, value in settings.items():
-        if known.get(name, value) != value:
-            told = f"{path} is of {name} {known[name]}, not {value}: give --results another name"
-            raise AwError(told)
-
-
-def restore(root: Path, archive: Path) -> int:
-    """Put archived runs below root where none lies; returns how many.
-
-    Raises:
-        AwError: a damaged archive, or a path that leaves root.
-    """
-    if not archive.is_file():
-        return 0
-    root.mkdir(parents=True, exist_ok=True)
-    try:
-        with tarfile.open(archive, "r:xz") as tar:
-            members = [m for m in tar if not (root / m.name).parent.joinpath(RESULT).is_file()]
-            tar.extractall(root, members=members, filter="data")
-    except (OSError, tarfile.TarError, lzma.LZMAError, EOFError) as error:
-        raise AwError(
-            f"cannot read the kept runs {archive}: {error}; remove it to train them again"
-        ) from error
-    return sum(Path(m.name).name == RESULT for m in members)

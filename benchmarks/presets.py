@@ -3,7 +3,7 @@
     python benchmarks/presets.py --work DIR [--presets NAME ...] [--width 480] [--factor 2] [--iterations 600]
 
 For each preset: `aw simulate`, `aw build-scene`, `aw ambiguity-report`, `aw plan` and a short `aw bench` of
-3dgs, as on the command line. Writes benchmarks/results/presets.json and .md: photos registered, measured and
+3dgs, as on the command line. Writes benchmarks/results/presets.md: photos registered, measured and
 designed ambiguity class, each decision of the plan against the preset's design, and the confusion table. A
 finished preset (DIR/<preset>.json) is kept.
 """
@@ -12,20 +12,21 @@ from __future__ import annotations
 
 import argparse
 import json
-import subprocess
 import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ambiguous_wild.harness.running.environment import environment
+from job_queue import aw, exit_code
+
+from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.running.result_file import RESULT, read_result
 from ambiguous_wild.io.atomic import write_json, write_text
 from ambiguous_wild.metrics import stats
 from ambiguous_wild.simulate.presets import PRESETS
 
-RESULTS = Path(__file__).parent / "results" / "presets"
+RESULTS = Path(__file__).parent / "results" / "presets.md"
 # per question: what a preset is designed for, and the lines of the plan, any of which answers it
 QUESTIONS = {
     "masks": ("masks", ("masks",)),
@@ -36,34 +37,28 @@ QUESTIONS = {
 }
 
 
-class Stopped(Exception):
-    """A command of a preset failed; holds its last line."""
+def timed(*words: str) -> tuple[str, float]:
+    """Standard output and seconds of one command.
 
-
-def aw(*words: str) -> tuple[str, float]:
-    """Standard output and seconds of one command."""
+    Raises:
+        AwError: it failed.
+    """
     begin = time.perf_counter()
-    done = subprocess.run(
-        [sys.executable, "-m", "ambiguous_wild.cli.main", *words], capture_output=True, text=True, check=False
-    )
-    if done.returncode:
-        lines = (done.stderr.strip() or done.stdout.strip() or f"exit code {done.returncode}").splitlines()
-        raise Stopped(f"aw {words[0]}: {lines[-1]}")
-    return done.stdout, time.perf_counter() - begin
+    return aw(*words), time.perf_counter() - begin
 
 
 def measure(preset: str, args: argparse.Namespace) -> dict[str, Any]:
     """All there is to say of one preset.
 
     Raises:
-        Stopped: a command failed.
+        AwError: a command failed.
     """
     raw, scene, runs = args.work / "raw" / preset, args.work / "scenes" / preset, args.work / "runs"
     seconds: dict[str, float] = {}
     if not (raw / "truth" / "capture.json").is_file():
-        _, seconds["simulate"] = aw("simulate", preset, "-o", str(raw), "--width", str(args.width))
+        _, seconds["simulate"] = timed("simulate", preset, "-o", str(raw), "--width", str(args.width))
     size = ("--factor", str(args.factor))
-    _, seconds["build-scene"] = aw("build-scene", str(raw), "-o", str(scene), "--name", preset, *size)
+    _, seconds["build-scene"] = timed("build-scene", str(raw), "-o", str(scene), "--name", preset, *size)
     info = json.loads((scene / "scene.json").read_text(encoding="utf-8"))
     row: dict[str, Any] = {
         "preset": preset,
@@ -73,13 +68,13 @@ def measure(preset: str, args: argparse.Namespace) -> dict[str, Any]:
         "wanted": list(PRESETS[preset].designed.effects),
     }
     if PRESETS[preset].distractors:
-        text, seconds["ambiguity-report"] = aw("ambiguity-report", str(scene), "--no-record", "--json")
+        text, seconds["ambiguity-report"] = timed("ambiguity-report", str(scene), "--no-record", "--json")
         row["report"] = scores(json.loads(text))
-    text, seconds["plan"] = aw("plan", str(scene), "--json")
+    text, seconds["plan"] = timed("plan", str(scene), "--json")
     plan = json.loads(text)
     row["plan"] = {d["effect"]: [d["value"], d["decision"]] for d in plan["decisions"]}
     words = ("--method", "3dgs", "--iterations", str(args.iterations), "--effects", "none", "--no-pictures")
-    _, seconds["bench"] = aw("bench", *words, "--scene", str(scene), "-o", str(runs))
+    _, seconds["bench"] = timed("bench", *words, "--scene", str(scene), "-o", str(runs))
     row["psnr_3dgs"] = mean_psnr(read_result(runs / preset / "3dgs" / "seed0" / RESULT))
     return row | {"seconds": {name: round(s, 1) for name, s in seconds.items()}}
 
@@ -93,12 +88,6 @@ def check_presets(parser: argparse.ArgumentParser, names: Sequence[str]) -> None
     """End with a usage error if a name is no preset."""
     if unknown := set(names) - set(PRESETS):
         parser.error(f"no preset {', '.join(sorted(unknown))}; 'aw simulate --list' names them")
-
-
-def save(results: Path, data: dict[str, Any], text: str) -> None:
-    """Write the results as .json and .md."""
-    write_json(results.with_suffix(".json"), data)
-    write_text(results.with_suffix(".md"), text)
 
 
 def scores(facts: dict[str, Any]) -> dict[str, Any]:
@@ -183,7 +172,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         try:
             row = measure(preset, args)
             write_json(kept, row)
-        except Stopped as error:
+        except AwError as error:
             row = {"preset": preset, "error": str(error)}
         rows.append(row)
         shown = row.get("error") or f"{row['registered']} of {row['photos']}, {row['seconds']}"
@@ -191,17 +180,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     command = "python benchmarks/presets.py --work DIR"
     command += f" --width {args.width} --factor {args.factor} --iterations {args.iterations}"
     data = {
-        "environment": environment("cpu"),
         "command": command,
         "width": args.width,
         "factor": args.factor,
         "iterations": args.iterations,
         "presets": rows,
     }
-    save(args.results, data, to_markdown(data))
+    write_text(args.results, to_markdown(data))
     print(to_markdown(data))
     return 1 if any("error" in row for row in rows) else 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(exit_code(main))

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ending import exit_code
+from job_queue import exit_code
 
 from ambiguous_wild.harness.cost.read import CostRun, read_cost_runs
 from ambiguous_wild.harness.cost.recommend import CLOSE_DB, leave_out

@@ -22,6 +22,8 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from job_queue import aw, exit_code
+
 from ambiguous_wild.harness.running.result_file import RESULT, read_result
 from ambiguous_wild.harness.running.store import read_runs, run_folders
 from ambiguous_wild.harness.running.timing import timing_of
@@ -56,19 +58,14 @@ class Cell:
         return self.reference_s[1] / self.reference_s[0] - 1.0
 
 
-def aw(*words: object) -> None:
-    """One command of this package."""
-    subprocess.run([sys.executable, "-m", "ambiguous_wild.cli.main", *map(str, words)], check=True)
-
-
 def captures(folder: Path, width: int) -> list[Path]:
     """The two captures as scenes; made once."""
     scenes = []
     for name in PRESETS:
         scene = folder / f"{name}-scene"
         if not scene.is_dir():
-            aw("simulate", name, "-o", folder / name, "--width", width)
-            aw("build-scene", folder / name, "-o", scene, "--factor", 2)
+            aw("simulate", name, "-o", str(folder / name), "--width", str(width))
+            aw("build-scene", str(folder / name), "-o", str(scene), "--factor", "2")
         scenes.append(scene)
     return scenes
 
@@ -96,7 +93,7 @@ def grid(scenes: Sequence[Path], out: Path, methods: Sequence[str], seeds: int, 
         words += ["--scene", scene]
     for seed in range(seeds):
         words += ["--seed", seed]
-    aw(*words)
+    aw(*map(str, words))
 
 
 def compared(quiet: Path, loud: Path) -> list[Cell]:
@@ -129,7 +126,7 @@ def kernel_seconds(folder: Path) -> float:
     return statistics.median(seconds for record in records for _, seconds in record["samples"])
 
 
-def main() -> None:
+def main() -> int:
     """Run both grids, or what is missing of them; print and write the comparison."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-o", "--output", type=Path, required=True)
@@ -168,8 +165,8 @@ def main() -> None:
         {"passed": passed, "command": sys.argv, **facts, "cells": [asdict(cell) for cell in cells]},
     )
     print(json.dumps({"passed": passed, **facts}, indent=2))
-    sys.exit(0 if passed else 1)
+    return 0 if passed else 1
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_code(main))

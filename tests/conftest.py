@@ -1,7 +1,8 @@
-"""Tests that need a GPU are skipped elsewhere. Parallel test processes use one kernel thread each.
+"""Tests that need a GPU are skipped elsewhere, and slow ones without AW_SLOW_TESTS=1.
 
-The calibration of the machine is a small one in tests: their runs are shorter than the real one. Weights that
-lie on the machine are not seen, for methods choose their features by them; `machine_weights` shows them.
+Parallel test processes use one kernel thread each. The calibration of the machine is a small one in tests:
+their runs are shorter than the real one. Weights that lie on the machine are not seen, for methods choose
+their features by them; `machine_weights` shows them.
 """
 
 from __future__ import annotations
@@ -25,6 +26,20 @@ if os.environ.get("AW_WEIGHTS") != NO_WEIGHTS:  # parallel test processes inheri
 def machine_weights(monkeypatch):
     """Weights that lie on the machine, for tests that compare published networks."""
     monkeypatch.setenv("AW_WEIGHTS", os.environ["AW_TEST_WEIGHTS"])
+
+
+@pytest.fixture(scope="session")
+def built(tmp_path_factory):
+    """A folder with a capture of two walls, `raw`, its `scene`, and the finished stages of the build.
+
+    Built once; whoever changes something works on a copy of `scene` and of `.scene.build` beside it.
+    """
+    from ambiguous_wild.builder.pipeline import build_scene
+    from tests.builder.capture_maker import SETTINGS, write_split_capture
+
+    root = tmp_path_factory.mktemp("built")
+    build_scene(write_split_capture(root / "raw"), root / "scene", SETTINGS, jobs=2, keep_work=True)
+    return root
 
 
 def pytest_collection_modifyitems(config, items):

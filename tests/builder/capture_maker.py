@@ -11,6 +11,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from ambiguous_wild.builder.settings import BuildSettings
+from ambiguous_wild.io.images import write_png
+
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
 _TEXELS = 512  # a side of a wall's texture
 
@@ -70,3 +73,24 @@ def write_capture(folder: Path, count: int = 6, prefix: str = "p") -> list[Path]
         )
         paths.append(path)
     return paths
+
+
+# -- the scene that many tests share: `built` in tests/conftest.py ----------------------------------------
+
+SETTINGS = BuildSettings(factor=2, max_features=800, name="walls", license="CC0-1.0")
+COUNT = 6  # photos
+
+
+def write_split_capture(root: Path) -> Path:
+    """train/ and test/ as the simulator lays them out, with truth and masks; returns `root`."""
+    paths = write_capture(root / "train", COUNT)
+    (root / "test").mkdir()
+    for path in (paths[1], paths[4]):
+        path.rename(root / "test" / path.name)
+    for i in range(COUNT):
+        distractor = np.zeros((HEIGHT, WIDTH), np.uint8)
+        distractor[: HEIGHT // 2, : 20 * i] = 255
+        write_png(root / "truth" / "distractor" / f"p{i:02d}.png", distractor)
+        write_png(root / "truth" / "clean" / f"p{i:02d}.png", np.full((HEIGHT, WIDTH, 3), 40 * i, np.uint8))
+    (root / "truth" / "capture.json").write_text('{"seed": 1}')
+    return root

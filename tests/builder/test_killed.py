@@ -14,6 +14,7 @@ from ambiguous_wild.builder.settings import BuildSettings
 from tests.builder.capture_maker import write_capture
 from tests.builder.test_pipeline import hashes
 
+pytestmark = pytest.mark.slow
 SETTINGS = BuildSettings(factor=2, max_features=500, name="walls")
 
 # Each line makes the builder end its own process at one moment; nothing of the builder knows.

@@ -70,32 +70,27 @@ def test_a_dng_is_not_read_as_its_preview(tmp_path):
         read_photo(tmp_path / "a.dng")
 
 
-def test_one_photo_in_two_formats_counts_once(tmp_path):
+def test_one_photo_in_two_formats_counts_once_and_bursts_are_told(tmp_path):
     paths = write_capture(tmp_path / "raw", 6)
+    for i, path in enumerate(paths):
+        with_exif(path, taken=f"2026:11:23 10:00:{i:02d}")
     small = cv2.resize(cv2.imread(str(paths[2])), None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     cv2.imwrite(str(paths[2].with_suffix(".png")), small)
     other = cv2.imread(str(paths[5]))
     cv2.imwrite(str(paths[0].with_suffix(".webp")), other)  # the same name, another photo
     (tmp_path / "raw" / "p01.MOV").write_bytes(b"video")
+    twin = tmp_path / "raw" / "p03b.jpg"
+    twin.write_bytes(paths[3].read_bytes())
+    with_exif(twin, taken="2026:11:23 10:00:03")
     info = build_scene(tmp_path / "raw", tmp_path / "scene", SETTINGS, jobs=2).info
     assert info["skipped"] == [
         {"source": "p02.png", "skipped": "the same photo in another format as p02.jpg"}
     ]
     assert any("1 videos of live photos are left out: p01.MOV" in w for w in info["warnings"])
-    assert info["counts"]["registered"] >= 6
-
-
-def test_bursts_are_told(tmp_path):
-    paths = write_capture(tmp_path / "raw", 6)
-    for i, path in enumerate(paths):
-        with_exif(path, taken=f"2026:11:23 10:00:{i:02d}")
-    twin = tmp_path / "raw" / "p03b.jpg"
-    twin.write_bytes(paths[3].read_bytes())
-    with_exif(twin, taken="2026:11:23 10:00:03")
-    info = build_scene(tmp_path / "raw", tmp_path / "scene", SETTINGS, jobs=2).info
     assert any(
         "1 bursts of near-identical photos" in w and "p03.jpg and 1 more" in w for w in info["warnings"]
     )
+    assert info["counts"]["registered"] >= 6
 
 
 def test_one_camera_a_device(tmp_path):

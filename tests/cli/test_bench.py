@@ -74,6 +74,7 @@ def test_an_output_that_cannot_be_is_one_line(scene, tmp_path, output):
     assert (tmp_path / "file").read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_killed_in_mid_training_the_same_command_ends_with_the_same_renders(scene, tmp_path):
     """kill -9 once a checkpoint is there; the second command resumes and equals an undisturbed run."""
     arguments = ["bench", "--method", "3dgs", "--scene", scene, "--iterations", "650"]

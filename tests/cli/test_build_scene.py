@@ -124,6 +124,7 @@ def test_output_that_cannot_be_written(aw, tmp_path):
     assert "cannot write" in fails(aw, "raw", "-o", "file/scene")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not (DATA / "tiny_aerial").is_dir(), reason="real photos: ../shared/data is not there")
 def test_real_photos_of_fields(aw, tmp_path):
     code, out, _ = aw(DATA / "tiny_aerial", "-o", "scene", "--license", "CC0-1.0")

@@ -120,7 +120,7 @@ def test_read_only_folders_end_with_one_line(scene, tmp_path, capsys):
 
 
 def test_a_clock_that_jumps_changes_no_result(scene, tmp_path, capsys, monkeypatch):
-    from benchmarks.fault_compare import state
+    from tests.faults.compare import state
 
     assert aw(capsys, *bench_words(scene, tmp_path / "steady" / "runs"))[0] == 0
     dice = random.Random(0)

@@ -1,13 +1,9 @@
-"""Row 27: disk full, process killed: run again, and it ends with the same files.
+"""Row 27: disk full: run again, and it ends with the same files.
 
-Kills of every stage of build-scene stand in tests/builder/test_killed.py; a hundred kills at random moments
-are benchmarks/faults.py, of which a few run here.
+Kills are in tests/builder/test_killed.py (stages of build-scene) and tests/faults/test_killed_at_random.py.
 """
 
 import json
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
@@ -16,22 +12,11 @@ from ambiguous_wild.harness.running.grid import cell_folder, plan_cells, run_cel
 from ambiguous_wild.io.atomic import write_json
 from ambiguous_wild.io.images import write_png
 from ambiguous_wild.splat.pace import TrainConfig
-from benchmarks.fault_compare import half_written, state
+from tests.faults.compare import half_written, state
 from tests.faults.small_disks import grow, small_disk
 from tests.tiny_scene import write_tiny_scene
 
-ROOT = Path(__file__).parents[2]
 SHORT = TrainConfig(iterations=40, probes=0, checkpoint_every_s=0.1)
-
-
-def test_a_bench_killed_at_random_moments_and_run_again_ends_with_the_same_files(tmp_path):
-    report = tmp_path / "faults.json"
-    words = [sys.executable, str(ROOT / "benchmarks/faults.py"), "--kills", "bench=3", "--json", str(report)]
-    done = subprocess.run(words, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    tally = json.loads(report.read_text())["bench"]
-    assert tally["kills"] == 3
-    assert tally["half_written"] == tally["lost_or_different"] == tally["left_behind"] == 0
 
 
 @pytest.fixture(scope="module")

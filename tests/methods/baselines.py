@@ -64,27 +64,11 @@ def step_of(
     )
 
 
-def resumed_equals_whole(scene: Path, tmp_path: Path, make: object, stop: int = 71) -> None:
-    """Stop after `stop` of 120 iterations, go on in a new trainer: parameters and policy state agree."""
-    whole = trained(scene, tmp_path / "whole", make())  # type: ignore[operator]
-    first = trainer_of(scene, tmp_path / "parts", make())  # type: ignore[operator]
-    while first.iteration < stop:
-        first.step()
-    first.save()
-    second = trainer_of(scene, tmp_path / "parts", make())  # type: ignore[operator]
-    assert second.resume()
-    assert second.iteration == stop
-    second.train()
-    assert bits(second) == bits(whole)
-    assert _same(second.parts.mask.state_dict(), whole.parts.mask.state_dict())
-    assert second.parts.mask.facts() == whole.parts.mask.facts()
-
-
-def _same(a: object, b: object) -> bool:
+def same(a: object, b: object) -> bool:
     if isinstance(a, dict) and isinstance(b, dict):
-        return a.keys() == b.keys() and all(_same(a[k], b[k]) for k in a)
+        return a.keys() == b.keys() and all(same(a[k], b[k]) for k in a)
     if isinstance(a, (list, tuple)) and isinstance(b, (list, tuple)):
-        return len(a) == len(b) and all(map(_same, a, b))
+        return len(a) == len(b) and all(map(same, a, b))
     if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor):
         return torch.equal(a, b)
     return bool(a == b)

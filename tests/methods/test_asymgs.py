@@ -9,7 +9,7 @@ import torch
 from ambiguous_wild.methods.asymgs import AsymGsConfig, AsymMask
 from ambiguous_wild.splat.effects.slow import SlowAverage, SlowDensity, slow, slow_gaussians
 from ambiguous_wild.vision.support import standing, unsupported
-from tests.methods.baselines import data_of, parts_of, resumed_equals_whole, step_of, trained, trainer_of
+from tests.methods.baselines import data_of, parts_of, step_of, trained, trainer_of
 from tests.splat.scenes import gaussians
 from tests.tiny_scene import write_tiny_scene
 
@@ -137,10 +137,6 @@ def make():
     return parts_of(
         "asymgs", **{"density.every": "2000", "density.min_every": "10", "density.grow_scale": "0.001"}
     )
-
-
-def test_it_resumes_to_the_same_bits(scene, tmp_path):
-    resumed_equals_whole(scene, tmp_path, make)
 
 
 def test_growth_carries_the_average(scene, tmp_path):

@@ -10,7 +10,7 @@ from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.fields import STATIC
 from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.rendered import Frame
-from tests.methods.baselines import data_of, parts_of, resumed_equals_whole, trained
+from tests.methods.baselines import data_of, parts_of, trained
 from tests.tiny_scene import write_tiny_scene
 
 
@@ -88,10 +88,6 @@ def test_both_models_learn_and_grow_and_differ(scene, tmp_path):
     second = trainer.drawing._draw(other.gaussians, trainer.shot(camera), None).image
     assert 0.0 < float((first - second).abs().mean()) < 0.1
     assert torch.equal(trainer.render(camera).image, first)  # the result is the first model
-
-
-def test_it_resumes_to_the_same_bits(scene, tmp_path):
-    resumed_equals_whole(scene, tmp_path, make)
 
 
 def test_both_models_grow_under_effects_and_keep_their_skybox(scene, tmp_path):

@@ -14,7 +14,7 @@ from ambiguous_wild.methods.dronesplat import (
     threshold,
 )
 from ambiguous_wild.splat.step import TrainData
-from tests.methods.baselines import data_of, parts_of, resumed_equals_whole, step_of
+from tests.methods.baselines import data_of, step_of
 from tests.tiny_scene import write_tiny_scene
 
 
@@ -122,7 +122,3 @@ def test_smaller_labels_are_those_at_pixel_centres():
     labels = torch.arange(48).reshape(6, 8)
     assert nearest(labels, 3, 4).tolist() == labels[1::2, 1::2].tolist()
     assert nearest(labels, 6, 8) is labels
-
-
-def test_a_resumed_run_gives_the_same_bits(scene, tmp_path):
-    resumed_equals_whole(scene, tmp_path, lambda: parts_of("dronesplat", min_mask_start="20"))

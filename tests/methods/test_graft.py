@@ -25,7 +25,7 @@ from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.effects.exposure import AffineExposure
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.parts import MaskPolicy, Parts
-from tests.methods.baselines import bits, parts_of, resumed_equals_whole, trained
+from tests.methods.baselines import bits, parts_of, trained
 from tests.tiny_scene import write_tiny_scene
 
 TRUE_3DGS = "3dgs@mask=truth"
@@ -364,18 +364,6 @@ def test_the_regulariser_sees_the_hosts_keep_map():
     assert seen == ["kept"]
     assert policy.predict(None) == "kept"
     assert compose(Regulariser(), Masks()).cotangent(None, None) is None  # Masks has no loss of its own
-
-
-def test_a_resumed_graft_gives_the_same_bits(scene, tmp_path):
-    options = {
-        "mask.min_mask_start": "20",
-        "regulariser.min_mask_start": "20",
-        "regulariser.lambda_cr": "0.2",
-        "regulariser.lambda_id": "0.01",
-        "regulariser.psi.steps": "30",
-    }
-    name = "3dgs@mask=robustsplat,density=refinesplat,regulariser=refinesplat"
-    resumed_equals_whole(scene, tmp_path, lambda: parts_of(name, **options))
 
 
 def test_grafts_are_ordinary_runs_from_the_command_line(scene, tmp_path):

@@ -19,7 +19,7 @@ from ambiguous_wild.methods.uad import UadConfig, UncertaintyAware, footprint_me
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.effects.smoothing import SmoothingFilter, filter_sizes
 from ambiguous_wild.splat.rendered import GSPLAT_SUMS, check_needs
-from tests.methods.baselines import bits, data_of, parts_of, resumed_equals_whole, trained, trainer_of
+from tests.methods.baselines import bits, data_of, parts_of, trained, trainer_of
 from tests.splat.scenes import camera, gaussians
 from tests.tiny_scene import write_tiny_scene
 
@@ -82,14 +82,6 @@ def test_options_decide_the_growth():
         parts_of("mip-splatting", growth="both")
     with pytest.raises(AwError, match=r"mip-splatting\.kernel"):
         parts_of("mip-splatting", kernel="0")
-
-
-@pytest.mark.parametrize("method", ["mip-splatting", "uad"])
-def test_resuming_gives_the_same_bits(scene, tmp_path, method):
-    place = "" if method == "uad" else "density."
-    options = {f"{place}every": "2000", f"{place}min_every": "10"}
-    options |= {"growth": "absolute"} if method == "mip-splatting" else {}
-    resumed_equals_whole(scene, tmp_path, lambda: parts_of(method, **options))
 
 
 # -- UAD ------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""SpotLessSplats: Ward's clusters, bounds, votes and annealing by hand; density; resume."""
+"""SpotLessSplats: Ward's clusters, bounds, votes and annealing by hand; density."""
 
 from types import SimpleNamespace
 
@@ -12,7 +12,7 @@ from ambiguous_wild.methods.spotlesssplats.density import PruningDensity, SpotLe
 from ambiguous_wild.methods.spotlesssplats.net import PlacedNet, placed
 from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.vision.ward import ward_clusters
-from tests.methods.baselines import data_of, parts_of, resumed_equals_whole, step_of, trained
+from tests.methods.baselines import data_of, parts_of, step_of, trained
 from tests.splat.scenes import gaussians
 from tests.tiny_scene import TRAIN, write_tiny_scene
 
@@ -185,12 +185,6 @@ def test_what_cannot_be_is_refused():
         parts_of("spotlesssplats", upper="1.5")
     with pytest.raises(AwError, match="labhog"):
         parts_of("spotlesssplats", features="labhogg")
-
-
-@pytest.mark.parametrize("method", ["spotlesssplats", "spotlesssplats-cluster"])
-def test_resuming_gives_the_same_bits(scene, tmp_path, method):
-    growing = {"density.every": "2000", "density.min_every": "10", "clusters": "30"}
-    resumed_equals_whole(scene, tmp_path, lambda: parts_of(method, **growing))
 
 
 def test_no_draw_is_one():

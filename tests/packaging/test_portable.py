@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parents[2]
 # gsplat, Ray, viser and transformers are extras; a module of ours that needs one imports it late.
 CODE = """

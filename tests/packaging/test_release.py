@@ -34,19 +34,6 @@ def test_every_dependency_has_a_tested_version() -> None:
     assert [name for name in asked if name not in pinned] == []
 
 
-def test_the_page_on_gpus_names_the_opencv_that_the_package_asks_for() -> None:
-    """A machine with few packages may bring an older one, which no installer checks there."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    opencv = "opencv-contrib-python-headless"
-    (least,) = [text.removeprefix(f"{opencv}>=") for text in project["dependencies"] if opencv in text]
-    page = (ROOT / "docs" / "gpu.md").read_text(encoding="utf-8")
-    assert set(re.findall(r"OpenCV >= ([\d.]*\d)", page)) == {least}
-    pinned = re.search(rf"^{opencv}==(.+)$", (ROOT / "constraints.txt").read_text(encoding="utf-8"), re.M)
-    assert pinned is not None
-    tested, asked = ([int(part) for part in text.split(".")] for text in (pinned[1], least))
-    assert tested >= asked
-
-
 def test_the_commands_of_the_checklist_exist() -> None:
     from ambiguous_wild.cli.main import COMMANDS
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 
+pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parents[2]
 # What a build reads; the rest of a checkout is none of a wheel's business.
 SOURCES = ("ambiguous_wild", "pyproject.toml", "README.md", "LICENSE")
@@ -97,7 +98,6 @@ def test_light_commands_work_outside_a_checkout(installed: Path, tmp_path: Path)
     assert json.loads(run(installed, tmp_path, "methods", "--json").stdout)
 
 
-@pytest.mark.slow
 def test_a_capture_becomes_a_scene_a_table_and_a_page(installed: Path, tmp_path: Path) -> None:
     run(installed, tmp_path, "simulate", "courtyard", "-o", "raw", "--views", 12, "--width", 240)
     run(installed, tmp_path, "build-scene", "raw", "-o", "scene", "--factor", 2)

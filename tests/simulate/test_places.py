@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -106,8 +105,3 @@ def test_a_place_is_named_in_the_file_and_has_limits_of_its_own():
         parse_spec("world: {place: beach}")
     with pytest.raises(AwError, match="into a wall of the room"):
         capture.plan(parse_spec("world: {place: room}\ndetail_px_per_m: 5"), 0)
-
-
-def test_the_docs_name_every_preset():
-    page = (Path(__file__).parents[2] / "docs" / "simulation.md").read_text()
-    assert [name for name in PRESETS if f"`{name}`" not in page] == []

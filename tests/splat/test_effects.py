@@ -146,13 +146,13 @@ STARTS = (("dense",), ("skybox", "dense"))
 
 @pytest.mark.parametrize("names", [*((name,) for name in ALL), ALL, ("sh1",), *STARTS], ids="+".join)
 def test_a_resumed_run_equals_an_undisturbed_one(scene, tmp_path, names):
-    whole = trainer_for(scene, tmp_path / "whole", names, iterations=140)
+    whole = trainer_for(scene, tmp_path / "whole", names, iterations=20)
     whole.train()
-    first = trainer_for(scene, tmp_path / "parts", names, iterations=140)
-    while first.iteration < 71:
+    first = trainer_for(scene, tmp_path / "parts", names, iterations=20)
+    while first.iteration < 11:
         first.step()
     first.save()
-    second = trainer_for(scene, tmp_path / "parts", names, iterations=140)
+    second = trainer_for(scene, tmp_path / "parts", names, iterations=20)
     assert second.resume()
     second.train()
     assert bits(second) == bits(whole)
@@ -162,7 +162,7 @@ def test_a_resumed_run_equals_an_undisturbed_one(scene, tmp_path, names):
 
 
 def test_a_render_between_steps_changes_nothing(scene, tmp_path):
-    plain, probed = (trainer_for(scene, tmp_path / n, ALL, iterations=140) for n in ("plain", "probed"))
+    plain, probed = (trainer_for(scene, tmp_path / n, ALL, iterations=20) for n in ("plain", "probed"))
     plain.train()
     probed.train(tick=lambda t: (t.picture(t.data.cameras[0]), t.make_step(t.iteration, 1)))
     assert bits(probed) == bits(plain)

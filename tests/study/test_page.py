@@ -13,7 +13,7 @@ from tests.chromium import Browser, needs_chromium
 from tests.study.studies import write_runs
 from tests.tiny_scene import TEST, TRAIN
 
-pytestmark = needs_chromium
+pytestmark = [pytest.mark.slow, needs_chromium]
 ASKED = len(TRAIN) + 3 * len(TEST)
 
 

@@ -21,7 +21,7 @@ from tests.chromium import Browser, needs_chromium
 from tests.tiny_scene import TEST, TRAIN, write_tiny_scene
 from tests.viewing.wall_runs import write_shown_run
 
-pytestmark = needs_chromium
+pytestmark = [pytest.mark.slow, needs_chromium]
 HOSTILE = "</script><img src=x onerror=alert(1)>"
 SETTLED = """(() => {
   const models = panes().filter((p) => p.choice !== PHOTO);

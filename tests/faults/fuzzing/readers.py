@@ -15,8 +15,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import fuzz_mutate
-import fuzz_samples
 import numpy as np
 import yaml
 
@@ -35,6 +33,8 @@ from ambiguous_wild.study.answers import read_answers
 from ambiguous_wild.study.key import read_key
 from ambiguous_wild.vision.cache import cached
 from ambiguous_wild.vision.label_maps import read_labels
+from tests.faults.fuzzing import mutate as damages
+from tests.faults.fuzzing import samples as valid
 
 Mutate = Callable[[bytes, random.Random, bytes], bytes]
 
@@ -52,7 +52,7 @@ class Reader:
     suffix: str
     samples: Callable[[], list[bytes]]
     read: Callable[[Path], Any]
-    mutate: Mutate = fuzz_mutate.damage
+    mutate: Mutate = damages.damage
 
 
 def _scene_images(path: Path) -> None:
@@ -66,22 +66,22 @@ def _scene_images(path: Path) -> None:
         raise first
 
 
-def _inside_scene(title: str, name: str, mutate: Mutate = fuzz_mutate.damage) -> Reader:
+def _inside_scene(title: str, name: str, mutate: Mutate = damages.damage) -> Reader:
     """A reader of one file of a scene folder, by opening the scene."""
 
     def read(path: Path) -> None:
-        shutil.copyfile(path, fuzz_samples.scene(name) / name)
-        scene_folder.load_scene(fuzz_samples.scene(name))
+        shutil.copyfile(path, valid.scene(name) / name)
+        scene_folder.load_scene(valid.scene(name))
 
     @functools.cache
     def samples() -> list[bytes]:
-        return [(fuzz_samples.scene(name) / name).read_bytes()]
+        return [(valid.scene(name) / name).read_bytes()]
 
     return Reader(title, Path(name).suffix, samples, read, mutate)
 
 
 def _config(path: Path) -> None:
-    run = fuzz_samples.workshop() / "runs" / "seed0"
+    run = valid.workshop() / "runs" / "seed0"
     run.mkdir(parents=True, exist_ok=True)
     (run / "checkpoint").mkdir(exist_ok=True)
     shutil.copyfile(path, run / "config.yaml")
@@ -90,7 +90,7 @@ def _config(path: Path) -> None:
 
 
 def _scene_json(path: Path) -> None:
-    root = fuzz_samples.scene("scene.json")
+    root = valid.scene("scene.json")
     shutil.copyfile(path, root / "scene.json")
     scene_folder.load_scene(root)
 
@@ -99,14 +99,14 @@ def _result(path: Path) -> None:
     from ambiguous_wild.harness.tables.comparison import comparison
     from ambiguous_wild.harness.tables.plain_formats import to_wide_csv
 
-    runs = fuzz_samples.workshop() / "results" / "scene" / "m" / "seed0"
+    runs = valid.workshop() / "results" / "scene" / "m" / "seed0"
     runs.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(path, runs / "metrics.json")
-    to_wide_csv(comparison(read_runs(fuzz_samples.workshop() / "results")))
+    to_wide_csv(comparison(read_runs(valid.workshop() / "results")))
 
 
 def _capture(path: Path) -> None:
-    truth = fuzz_samples.workshop() / "captured" / "truth"
+    truth = valid.workshop() / "captured" / "truth"
     truth.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(path, truth / "capture.json")
     (truth.parent / "a").write_text("x")
@@ -128,7 +128,7 @@ def _board_images(path: Path) -> None:
 
 
 def _answer(path: Path) -> None:
-    read_answers([path], read_key(fuzz_samples.workshop() / "study.key.json"))
+    read_answers([path], read_key(valid.workshop() / "study.key.json"))
 
 
 def _unpack(path: Path) -> None:
@@ -167,12 +167,12 @@ def _cache(path: Path) -> None:
 
 def _many() -> list[Reader]:
     photos = [
-        Reader(f"photo {k}", s, functools.partial(fuzz_samples.photos, k), read_photo, m)
+        Reader(f"photo {k}", s, functools.partial(valid.photos, k), read_photo, m)
         for k, s, m in (
-            ("jpeg", ".jpg", fuzz_mutate.damage),
-            ("png", ".png", fuzz_mutate.png),
-            ("tiff", ".tif", fuzz_mutate.damage),
-            ("bmp, webp, jp2", ".img", fuzz_mutate.damage),
+            ("jpeg", ".jpg", damages.damage),
+            ("png", ".png", damages.png),
+            ("tiff", ".tif", damages.damage),
+            ("bmp, webp, jp2", ".img", damages.damage),
         )
     ]
     models = [
@@ -180,49 +180,49 @@ def _many() -> list[Reader]:
         for kind in ("bin", "txt")
         for n in ("cameras", "images", "points3D")
     ]
-    yaml_tree = fuzz_mutate.tree(yaml.safe_load, yaml.safe_dump)
-    tree = fuzz_mutate.json_tree
+    yaml_tree = damages.tree(yaml.safe_load, yaml.safe_dump)
+    tree = damages.json_tree
     return [
         *photos,
-        Reader("EXIF", ".jpg", fuzz_samples.with_exif, read_photo, fuzz_mutate.exif),
+        Reader("EXIF", ".jpg", valid.with_exif, read_photo, damages.exif),
         Reader(
             "scene image png",
             ".png",
-            functools.partial(fuzz_samples.photos, "png"),
+            functools.partial(valid.photos, "png"),
             _scene_images,
-            fuzz_mutate.png,
+            damages.png,
         ),
-        Reader("scene image jpeg", ".jpg", functools.partial(fuzz_samples.photos, "jpeg"), _scene_images),
-        Reader("scene image tiff", ".tif", functools.partial(fuzz_samples.photos, "tiff"), _scene_images),
+        Reader("scene image jpeg", ".jpg", functools.partial(valid.photos, "jpeg"), _scene_images),
+        Reader("scene image tiff", ".tif", functools.partial(valid.photos, "tiff"), _scene_images),
         *models,
         _inside_scene("split list", "train_list.txt"),
-        Reader("splat PLY", ".ply", fuzz_samples.plys, ply.read_splat_ply),
-        Reader("spec YAML", ".yaml", fuzz_samples.specs, spec_file.read_spec, yaml_tree),
-        Reader("config YAML", ".yaml", fuzz_samples.configs, _config),
-        Reader("scene.json", ".json", fuzz_samples.scene_jsons, _scene_json, tree),
-        Reader("metrics.json", ".json", fuzz_samples.results, _result, tree),
-        Reader("plan JSON", ".json", fuzz_samples.plans, read_plan, tree),
-        Reader("capture.json", ".json", fuzz_samples.captures, _capture, tree),
-        Reader("study key", ".json", fuzz_samples.keys, read_key, tree),
-        Reader("answers JSON", ".json", functools.partial(fuzz_samples.answers, "json"), _answer, tree),
-        Reader("answers CSV", ".csv", functools.partial(fuzz_samples.answers, "csv"), _answer),
-        Reader("audit CSV", ".csv", fuzz_samples.tables, lambda path: read_tables([path])),
-        Reader("leaderboard CSV", ".csv", fuzz_samples.boards, _board),
-        Reader("leaderboard images", ".csv", fuzz_samples.board_images, _board_images),
-        Reader("archive zip", ".zip", functools.partial(fuzz_samples.archives, "zip"), _unpack),
-        Reader("archive tar", ".tar", functools.partial(fuzz_samples.archives, "tar"), _unpack),
-        Reader("checkpoint", ".safetensors", fuzz_samples.checkpoints, checkpoint.load),
-        Reader("LPIPS weights", ".pth", fuzz_samples.weights, read_tensors),
+        Reader("splat PLY", ".ply", valid.plys, ply.read_splat_ply),
+        Reader("spec YAML", ".yaml", valid.specs, spec_file.read_spec, yaml_tree),
+        Reader("config YAML", ".yaml", valid.configs, _config),
+        Reader("scene.json", ".json", valid.scene_jsons, _scene_json, tree),
+        Reader("metrics.json", ".json", valid.results, _result, tree),
+        Reader("plan JSON", ".json", valid.plans, read_plan, tree),
+        Reader("capture.json", ".json", valid.captures, _capture, tree),
+        Reader("study key", ".json", valid.keys, read_key, tree),
+        Reader("answers JSON", ".json", functools.partial(valid.answers, "json"), _answer, tree),
+        Reader("answers CSV", ".csv", functools.partial(valid.answers, "csv"), _answer),
+        Reader("audit CSV", ".csv", valid.tables, lambda path: read_tables([path])),
+        Reader("leaderboard CSV", ".csv", valid.boards, _board),
+        Reader("leaderboard images", ".csv", valid.board_images, _board_images),
+        Reader("archive zip", ".zip", functools.partial(valid.archives, "zip"), _unpack),
+        Reader("archive tar", ".tar", functools.partial(valid.archives, "tar"), _unpack),
+        Reader("checkpoint", ".safetensors", valid.checkpoints, checkpoint.load),
+        Reader("LPIPS weights", ".pth", valid.weights, read_tensors),
         Reader(
             "label map PNG",
             ".png",
-            functools.partial(fuzz_samples.label_maps, "png"),
+            functools.partial(valid.label_maps, "png"),
             read_labels,
-            fuzz_mutate.png,
+            damages.png,
         ),
-        Reader("label map npy", ".npy", functools.partial(fuzz_samples.label_maps, "npy"), read_labels),
-        Reader("cut-out", ".png", fuzz_samples.cutouts, _cutout, fuzz_mutate.png),
-        Reader("feature and mask cache", ".npz", fuzz_samples.caches, _cache),
+        Reader("label map npy", ".npy", functools.partial(valid.label_maps, "npy"), read_labels),
+        Reader("cut-out", ".png", valid.cutouts, _cutout, damages.png),
+        Reader("feature and mask cache", ".npz", valid.caches, _cache),
     ]
 
 

@@ -23,6 +23,7 @@ _CLOCK = {
     "seconds", "train_s", "setup_s", "elapsed_s", "parts_s", "ms_per_iteration", "ms_parts", "fps",
     "fps_low", "fps_high", "peak_rss_mb", "wall_s", "taken_s", "written", "created", "cpu_s", "reference_s",
     "timing", "meter", "first_pass_s",
+    "cores",  # that the process may use: whoever shares the machine may change it between two starts
 }  # fmt: skip
 _MACHINE = {"env.json"}  # says when and on what a run was made
 

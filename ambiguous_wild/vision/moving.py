@@ -21,7 +21,8 @@ from ambiguous_wild.vision.protocols import Instances, PromptedInstances
 from ambiguous_wild.vision.sparse_surface import PIXELS
 
 POINTS = "features: green stay, red move"  # caption of `draw_points`
-REACH_PX = 3.0  # of a feature, standard deviation on a map of `PIXELS`
+# reach of a feature, standard deviation on a map of `PIXELS`: what stays must not speak for what hides it
+MOVING_PX, STATIC_PX = 3.0, 2.0
 VOTES = 3  # photos of a feature count at most as much
 SEGMENT_VOTES = 1.0  # of a segment, at most
 UNSURE = 1.0  # votes on either side that leave the answer half open
@@ -38,9 +39,10 @@ def moving_map(points: MotionPoints, labels: np.ndarray, shape: tuple[int, int])
     h, w = shape
     segments = np.maximum(cv2.resize(labels, (w, h), interpolation=cv2.INTER_NEAREST), 0)
     column, row = np.clip(points.xy * [w, h], 0, [w - 1, h - 1]).astype(int).T
-    reach = REACH_PX * math.sqrt(h * w / PIXELS)
     near, of_segment = [], []
-    for mine, votes in ((points.moves, points.moving), (~points.moves, points.static)):
+    of_kind = (points.moves, points.moving, MOVING_PX), (~points.moves, points.static, STATIC_PX)
+    for mine, votes, reach_px in of_kind:
+        reach = reach_px * math.sqrt(h * w / PIXELS)
         weight = np.where(mine, np.minimum(votes, VOTES), 0).astype(np.float32)
         at_feature = np.zeros(shape, np.float32)
         np.add.at(at_feature, (row, column), weight)
@@ -48,9 +50,10 @@ def moving_map(points: MotionPoints, labels: np.ndarray, shape: tuple[int, int])
         total = np.bincount(segments[row, column], weight, minlength=int(segments.max()) + 1)
         total[0] = 0.0
         of_segment.append(total.astype(np.float32))
-    # a segment may be large and hold both kinds, so its vote is small: it decides only far from features
-    less = np.float32(SEGMENT_VOTES) / np.maximum(of_segment[0] + of_segment[1], SEGMENT_VOTES)
-    moving, static = (a + (less * b)[segments] for a, b in zip(near, of_segment))
+    # Only what moves spreads in its segment: a distractor of the background's colour shares the background's.
+    # Large segments hold both kinds, so their vote is small and decides only far from features.
+    excess = np.maximum(of_segment[0] - of_segment[1], 0.0) / np.maximum(of_segment[0] + of_segment[1], 1.0)
+    moving, static = near[0] + np.float32(SEGMENT_VOTES) * excess[segments], near[1]
     return np.asarray((moving + UNSURE / 2) / (moving + static + UNSURE), np.float32)
 
 

@@ -23,7 +23,8 @@ from ambiguous_wild.io.colmap_records import ModelCamera
 from ambiguous_wild.io.motion_points import FILE, MotionPoints, write_motion_points
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
-CLEARLY = 2.0  # a match that moves is off by more than so many times what fits; `LEAST` of a motion are
+CLEARLY = 2.0  # times what fits: by as much is a match off that moves
+LEAST_FITTING = 0.25  # of a photo's partners must share a motion that fits its pose
 
 
 @dataclass
@@ -33,6 +34,8 @@ class Votes:
     static: np.ndarray  # [N] photos
     moving: np.ndarray  # [N] photos
     motions: list[np.ndarray] = field(default_factory=list)  # features of each motion that is not the place's
+    partners: int = 0  # photos with which it shares a motion
+    fitting: int = 0  # of these, photos of which some motion fits its pose
 
 
 def count_votes(
@@ -50,10 +53,14 @@ def count_votes(
     for (a, b), rows in matched.matches.items():
         if a not in votes or b not in votes:
             continue
-        off = matched.misfit((a, b), poses[a], poses[b], rays)
-        for motion in matched.motions.get((a, b), []):
+        off, found = matched.misfit((a, b), poses[a], poses[b], rays), matched.motions.get((a, b), [])
+        fits = [bool(np.mean(off[motion.matches] <= 1.0) >= FITS) for motion in found]
+        for photo in (a, b):
+            votes[photo].partners += bool(found)
+            votes[photo].fitting += any(fits)
+        for motion, fit in zip(found, fits):
             of_motion = off[motion.matches]
-            if np.mean(of_motion <= 1.0) >= FITS:
+            if fit:
                 fitting = rows[motion.matches[of_motion <= 1.0]]
                 votes[a].static[fitting[:, 0]] += 1
                 votes[b].static[fitting[:, 1]] += 1
@@ -74,6 +81,8 @@ def motion_points(
 ) -> dict[str, MotionPoints]:
     """Points of the train photos, by their names in the scene.
 
+    A photo whose pose fits few of its partners has none: all of it would seem to move.
+
     Args:
         matched: with motions, and with the model's cameras.
         poses: photo -> [3, 4] camera from world.
@@ -87,7 +96,11 @@ def motion_points(
         fx, fy, cx, cy = camera.pinhole()
         xy = (rays[photo] * [fx, fy] + [cx, cy]) / [camera.width, camera.height]
         # undistortion cuts the rim off
-        some = np.flatnonzero((votes.static + votes.moving > 0) & ((xy >= 0) & (xy <= 1)).all(axis=1))
+        heard = (votes.static + votes.moving) * (votes.fitting >= LEAST_FITTING * votes.partners)
+        some = np.flatnonzero((heard > 0) & ((xy >= 0) & (xy <= 1)).all(axis=1))
+        # several features of one place, turned otherwise, are one point: that with most votes
+        some = some[np.argsort(-heard[some], kind="stable")]
+        some = np.sort(some[np.unique(matched.features[photo][some], axis=0, return_index=True)[1]])
         static, moving = (x.clip(max=255).astype(np.uint8) for x in (votes.static, votes.moving))
         motion = _together(votes, moving > static)
         found[voters[photo]] = MotionPoints(
@@ -119,6 +132,7 @@ def write_motion(
     return {
         "static": sum(int((~p.moves).sum()) for p in points.values()),
         "moving": sum(int(p.moves.sum()) for p in points.values()),
+        "silent": sum(not len(p.xy) for p in points.values()),
     }
 
 

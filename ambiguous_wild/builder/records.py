@@ -132,6 +132,7 @@ class MotionResult(TypedDict):
 
     static: int
     moving: int  # they fit another motion than the place's
+    silent: int  # photos without any
 
 
 class DownsampleResult(TypedDict):

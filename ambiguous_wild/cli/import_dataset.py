@@ -37,7 +37,7 @@ KINDS = (
     type=click.IntRange(0),
     default=0,
     show_default=True,
-    help="Seed of random points, for a dataset without points.",
+    help="Seed of matching and of random points.",
 )
 @click.option("--overwrite", is_flag=True, help="Replace a scene imported from other files or settings.")
 @click.option("--json", "as_json", is_flag=True, help="Print the same facts as JSON.")

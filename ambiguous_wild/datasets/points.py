@@ -15,7 +15,7 @@ import numpy as np
 from ambiguous_wild.builder.moving import write_motion
 from ambiguous_wild.builder.pairs import MOTIONS
 from ambiguous_wild.builder.progress import Bar
-from ambiguous_wild.builder.records import ScreenedPhoto
+from ambiguous_wild.builder.records import MotionResult, ScreenedPhoto
 from ambiguous_wild.builder.settings import BuildSettings, Effort
 from ambiguous_wild.builder.sfm import DATABASE, extract_features, match, run_job
 from ambiguous_wild.builder.sfm_jobs import MotionJob, TriangulationJob
@@ -142,7 +142,9 @@ def triangulate(
     return Model(model.cameras, images, found.points)
 
 
-def find_motion(scene: Path, scratch: Path, train: Sequence[str], *, seed: int, jobs: int, bar: Bar) -> None:
+def find_motion(
+    scene: Path, scratch: Path, train: Sequence[str], *, seed: int, jobs: int, bar: Bar
+) -> MotionResult:
     """Match the train photos of a scene folder and write what moves in them (motion.npz) into it.
 
     Args:
@@ -152,6 +154,12 @@ def find_motion(scene: Path, scratch: Path, train: Sequence[str], *, seed: int, 
         seed: of matching.
         jobs: threads.
         bar: progress.
+
+    Returns:
+        Numbers of features that stay and move.
+
+    Raises:
+        AwError: the poses do not fit the photos' own matches.
     """
     shutil.rmtree(scratch, ignore_errors=True)
     model = read_model(scene / "sparse" / "0")
@@ -169,7 +177,13 @@ def find_motion(scene: Path, scratch: Path, train: Sequence[str], *, seed: int, 
     run_job(job, scratch, lambda: None)
     bar.finish()
     names = {name: name for name in train}
-    write_motion(scene, database, scratch / MOTIONS, scratch / "known", scene / "sparse" / "0", names)
+    found = write_motion(scene, database, scratch / MOTIONS, scratch / "known", scene / "sparse" / "0", names)
+    if 2 * found["silent"] > len(names):
+        raise AwError(
+            f"in {found['silent']} of {len(names)} train photos no matches fit the given poses, so nothing "
+            "tells what moves; import without --motion, or place the photos anew with 'aw build-scene'"
+        )
+    return found
 
 
 def _match_posed(

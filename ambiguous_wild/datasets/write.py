@@ -193,7 +193,8 @@ def _fill(
     scene_model = _write_model(folder, model, placed)
     if settings.motion:
         train = sorted(n for n, s in sides.items() if s == "train")
-        find_motion(folder, work / "motion", train, seed=settings.seed, jobs=jobs, bar=bar)
+        motion = find_motion(folder, work / "motion", train, seed=settings.seed, jobs=jobs, bar=bar)
+        notes.append(f"{motion['static']} features of train photos stay, {motion['moving']} move")
     for side in SIDES:
         lines = sorted(n for n, s in sides.items() if s == side)
         write_text(folder / f"{side}_list.txt", "".join(f"{n}\n" for n in lines))

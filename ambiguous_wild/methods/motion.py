@@ -6,6 +6,7 @@ its segment, that they fit another rigid motion than the place's. Where none say
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
 import cv2
@@ -53,11 +54,18 @@ class MotionMask(FixedMasks):
         self.data = data
         points = self.points = read_motion_points(data.scene.root)
         names = [view.name for view in data.scene.train]
-        if not any(name in points for name in names):
+        with_points = [name for name in names if name in points and len(points[name].xy)]
+        if not with_points:
             raise AwError(
                 f"scene {data.scene.name} does not say what moves (motion.npz has none of its train photos): "
                 "build it from its photos with this version of 'aw build-scene', or make a copy with "
                 "'aw import SCENE -o NEW --motion'"
+            )
+        if len(with_points) < len(names):
+            warnings.warn(
+                f"scene {data.scene.name}: nothing tells what moves in {len(names) - len(with_points)} of "
+                f"{len(names)} train photos; they are not masked",
+                stacklevel=2,
             )
         config, self.keeps = self.config, []
         instances = make_instances(config.instances)

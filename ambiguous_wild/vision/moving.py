@@ -25,6 +25,7 @@ POINTS = "features: green stay, red move"  # caption of `draw_points`
 MOVING_PX, STATIC_PX = 3.0, 2.0
 VOTES = 3  # photos of a feature count at most as much
 SEGMENT_VOTES = 1.0  # of a segment, at most
+LEAST_PROMPT = 3  # features of a motion that are a prompt
 UNSURE = 1.0  # votes on either side that leave the answer half open
 
 
@@ -72,7 +73,7 @@ def moving_labels(
         points: of the photo.
         folder: of the cache.
     """
-    motions = np.arange(1, int(points.motion.max(initial=0)) + 1)
+    motions = np.flatnonzero(np.bincount(points.motion)[1:] >= LEAST_PROMPT) + 1
     if not isinstance(instances, PromptedInstances) or not len(motions):
         return labels
     xy = points.xy * labels.shape[::-1]
@@ -83,7 +84,8 @@ def moving_labels(
 
     key = cache_key("moving", instances.name, None, xy, points.motion, photo.detach().cpu().numpy())
     labels = labels.copy()
-    for mask in cached(folder, key, {"masks": np.bool_}, compute)["masks"]:
+    # the largest motion comes last and wins where masks overlap
+    for mask in cached(folder, key, {"masks": np.bool_}, compute)["masks"][::-1]:
         labels[mask] = labels.max() + 1
     return labels
 

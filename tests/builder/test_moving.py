@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -134,6 +135,21 @@ def test_a_scene_from_elsewhere_can_be_asked_what_moves(sliding, tmp_path):
     assert inside > 0.7 and outside < 0.05
 
 
+def test_poses_that_do_not_fit_the_photos_tell_nothing(sliding, tmp_path):
+    export_scene(sliding[0], "nerfstudio", tmp_path / "turned")
+    path = tmp_path / "turned" / "transforms.json"
+    facts = json.loads(path.read_text())
+    for k, frame in enumerate(facts["frames"]):
+        turn = cv2.Rodrigues(np.radians(np.random.default_rng(k).uniform(-4, 4, 3)))[0]
+        pose = np.array(frame["transform_matrix"])
+        pose[:3, :3] = pose[:3, :3] @ turn
+        frame["transform_matrix"] = pose.tolist()
+    path.write_text(json.dumps(facts))
+    with pytest.raises(AwError, match="fit the given poses"):
+        import_scene(tmp_path / "turned", tmp_path / "scene", ImportSettings(motion=True))
+    assert not (tmp_path / "scene").exists()
+
+
 def test_what_moves_is_a_prompt(tmp_path):
     class Disc:
         name = "disc"
@@ -142,13 +158,14 @@ def test_what_moves_is_a_prompt(tmp_path):
             return np.zeros(photo.shape[:2], np.int32)
 
         def at_points(self, photo, groups, outside):
-            np.testing.assert_allclose(groups[0], [[12, 10]])
+            np.testing.assert_allclose(groups, [[[12, 10]] * 3])
             np.testing.assert_allclose(outside, [[108, 90]])
             mask = np.zeros((1, 100, 120), bool)
             mask[0, :40, :50] = True
             return mask
 
     points = two_points()
+    points = MotionPoints(*(np.concatenate([x[:1], x[:1], x]) for x in vars(points).values()))
     labels = moving_labels(Disc(), torch.zeros(100, 120, 3), np.ones((100, 120), np.int32), points, tmp_path)
     assert (labels[:40, :50] == 2).all() and (labels[40:] == 1).all()
     assert moving_map(points, labels, (100, 120))[38, 48] > 0.6  # far from the feature, in its segment

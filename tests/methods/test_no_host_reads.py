@@ -15,7 +15,7 @@ from ambiguous_wild.methods.robustsplat.net import MaskNet, adam_of, adam_state,
 from ambiguous_wild.splat import checkpoint, device
 from ambiguous_wild.splat.step import Step
 from tests.host_reads import READ, moved, no_transfers
-from tests.methods.baselines import _same, data_of, parts_of, step_of
+from tests.methods.baselines import data_of, parts_of, same, step_of
 from tests.tiny_scene import TRAIN, write_tiny_scene
 
 STEPS = 8
@@ -191,7 +191,7 @@ def test_the_state_goes_from_an_accelerator_to_a_cpu_and_back(scene, cache, monk
         policy = robustsplat_on(scene, cache)
         policy.load_state_dict(checkpoint.load(tmp_path / "state"))
         checkpoint.save(tmp_path / "again", policy.state_dict())
-        assert _same(*(checkpoint.load(tmp_path / name) for name in ("again", "state")))
+        assert same(*(checkpoint.load(tmp_path / name) for name in ("again", "state")))
         assert policy.facts() == facts
         for step in steps[5:]:
             policy.keep(step)

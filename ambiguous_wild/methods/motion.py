@@ -21,7 +21,7 @@ from ambiguous_wild.methods.fixed_masks import FixedMasks
 from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.backends import check_instances, make_instances
-from ambiguous_wild.vision.moving import POINTS, draw_points, moving_labels, moving_map
+from ambiguous_wild.vision.moving import MOVES, POINTS, draw_points, moving_labels, moving_map
 from ambiguous_wild.vision.precompute import instance_labels
 from ambiguous_wild.vision.sparse_surface import map_size
 
@@ -30,7 +30,7 @@ from ambiguous_wild.vision.sparse_surface import map_size
 class MotionConfig:
     """Options of `3dgs+motion`."""
 
-    threshold: float = 0.6  # share of the votes around a pixel above which it is masked
+    threshold: float = MOVES  # of `moving_map`, above which a pixel is masked
     instances: str = "graph"  # back end of segments, see docs/foundation-models.md
 
     def __post_init__(self) -> None:

@@ -20,6 +20,7 @@ from ambiguous_wild.vision.cache import cache_key, cached
 from ambiguous_wild.vision.protocols import Instances, PromptedInstances
 from ambiguous_wild.vision.sparse_surface import PIXELS
 
+MOVES = 0.6  # of `moving_map`: above, a pixel moves
 POINTS = "features: green stay, red move"  # caption of `draw_points`
 # reach of a feature, standard deviation on a map of `PIXELS`: what stays must not speak for what hides it
 MOVING_PX, STATIC_PX = 3.0, 2.0

@@ -11,7 +11,7 @@ from ambiguous_wild.io.motion_points import MotionPoints
 from ambiguous_wild.methods.refinesplat.structure import GREY, correlation
 from ambiguous_wild.metrics import ambiguity as am
 from ambiguous_wild.metrics import semantic as sem
-from ambiguous_wild.vision.moving import moving_map
+from ambiguous_wild.vision.moving import MOVES, moving_map
 
 KINDS = ("colour", "structure", "features", "motion")
 TOLD = 0.5  # share of a distractor's pixels from which on an evidence tells it
@@ -76,7 +76,7 @@ def distractors(
                 int(pixels),
                 _most(differs, at, sure),
                 _most(unlike, at, sure),
-                None if moves is None or bool(np.all(moves[at] == 0.5)) else _most(moves > 0.5, at, None),
+                None if moves is None or bool(np.all(moves[at] == 0.5)) else _most(moves > MOVES, at, None),
             )
         )
     return found

@@ -56,6 +56,10 @@ def _leaves(tree: Any) -> Iterable[bytes]:
         for name in sorted(tree):
             yield name.encode()
             yield from _leaves(tree[name])
+    elif isinstance(tree, list | tuple):
+        yield f"{len(tree)}".encode()
+        for value in tree:
+            yield from _leaves(value)
     elif hasattr(tree, "numpy"):
         array = tree.numpy()
         yield f"{array.dtype}{array.shape}".encode()

@@ -7,7 +7,7 @@ from importlib import metadata
 
 from ambiguous_wild import __version__
 
-BUILDER = 10  # raised when a stage gives another result for the same input
+BUILDER = 11  # raised when a stage gives another result for the same input
 _LIBRARIES = ("pycolmap", "OpenImageIO", "opencv-contrib-python-headless", "pillow", "numpy")
 
 

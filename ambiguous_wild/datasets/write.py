@@ -28,7 +28,6 @@ from ambiguous_wild.io import colmap_binary
 from ambiguous_wild.io.atomic import check_output, write_json, write_text
 from ambiguous_wild.io.colmap_records import Model
 from ambiguous_wild.io.foreign_files import refuse_foreign_files
-from ambiguous_wild.io.motion_points import FILE
 from ambiguous_wild.io.scene_folder import SCENE_SCHEMA, read_scene_json, verify_files
 
 
@@ -192,8 +191,6 @@ def _fill(
     bar.finish()
     sides = {p.image.name: foreign.split[plan.image.name] for plan, p in zip(plans, placed)}
     scene_model = _write_model(folder, model, placed)
-    if not settings.motion and (foreign.root / FILE).is_file():
-        notes.append("features that move are not taken over; --motion finds them anew")
     if settings.motion:
         train = sorted(n for n, s in sides.items() if s == "train")
         motion = find_motion(folder, work / "motion", train, seed=settings.seed, jobs=jobs, bar=bar)

@@ -58,8 +58,8 @@ class MotionMask(FixedMasks):
         if not with_points:
             raise AwError(
                 f"scene {data.scene.name} does not say what moves (motion.npz has none of its train photos): "
-                "build it from its photos with this version of 'aw build-scene', or make a copy with "
-                "'aw import SCENE -o NEW --motion'"
+                "build it from its photos with this version of 'aw build-scene', or import the data set "
+                "again with 'aw import ... --motion'"
             )
         if len(with_points) < len(names):
             warnings.warn(

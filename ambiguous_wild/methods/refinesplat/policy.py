@@ -78,7 +78,8 @@ class RefineSplatMask(PausingMask):
     def _moving(self, surfaces: list[np.ndarray | None]) -> list[np.ndarray | None]:
         """What moves in each photo, of its surface's shape; None where nothing is known."""
         points = self.points = read_motion_points(self.data.scene.root)
-        data, found = self.data, list[np.ndarray | None]([None] * len(surfaces))
+        data = self.data
+        found: list[np.ndarray | None] = [None] * len(surfaces)
         for k, (view, surface) in enumerate(zip(data.scene.train, surfaces, strict=True)):
             known, photo, labels = points.get(view.name), data.photos[k], self.inputs.labels[k]
             if known is not None and surface is not None:

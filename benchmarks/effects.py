@@ -20,7 +20,7 @@ from job_queue import exit_code
 
 from ambiguous_wild.harness.planning.probe import small_data
 from ambiguous_wild.io.scene_folder import load_scene
-from ambiguous_wild.splat.cpu.warmup import warm_up
+from ambiguous_wild.splat.calibration import warm_up
 from ambiguous_wild.splat.effects import ALL, with_effects
 from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.pace import TrainConfig

@@ -38,8 +38,8 @@ from ambiguous_wild.splat import readiness
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.device import wait
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.gpu.fused_loss import photometric_fused
 from ambiguous_wild.splat.gpu.gsplat_seam import gsplat
+from ambiguous_wild.splat.gpu.kernels import photometric_fused
 from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.step import TrainData

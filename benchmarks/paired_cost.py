@@ -37,7 +37,7 @@ from ambiguous_wild.core.config import with_options
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import get_method
 from ambiguous_wild.splat.cpu import set_threads
-from ambiguous_wild.splat.cpu.warmup import warm_up
+from ambiguous_wild.splat.calibration import warm_up
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer

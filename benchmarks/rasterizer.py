@@ -24,10 +24,10 @@ import torch
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.io.atomic import write_json
+from ambiguous_wild.splat.calibration import warm_up
 from ambiguous_wild.splat.cpu import blend
 from ambiguous_wild.splat.cpu.compile import threads
 from ambiguous_wild.splat.cpu.render import render_cpu
-from ambiguous_wild.splat.cpu.warmup import warm_up
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.optim import SplatAdam

@@ -182,7 +182,7 @@ def _numba(found: Probe) -> list[Check]:
         return [Check("core", "numba", False, found.error, fix)]
     layer = f"{found.facts['threads']} threads, threading layer {found.facts['layer']}"
     checks = [Check("core", "numba", True, layer)]
-    from ambiguous_wild.splat.cpu.cache import kernel_cache
+    from ambiguous_wild.splat.cpu.compile import kernel_cache
 
     folder = kernel_cache()
     existing = next(p for p in (folder, *folder.parents) if p.exists())

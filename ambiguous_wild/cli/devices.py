@@ -22,8 +22,8 @@ def choose_device(device: str) -> str:
 
 def prepare_cpu(threads: int | None) -> None:
     """Set the number of threads and compile the CPU kernels, once per machine."""
+    from ambiguous_wild.splat.calibration import warm_up
     from ambiguous_wild.splat.cpu import set_threads
-    from ambiguous_wild.splat.cpu.warmup import warm_up
 
     if threads is not None:
         set_threads(threads)

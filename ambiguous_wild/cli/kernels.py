@@ -11,7 +11,7 @@ from contextlib import contextmanager
 _CODE = (
     "import os\n"
     "if hasattr(os, 'nice'): os.nice(19)\n"
-    "from ambiguous_wild.splat.cpu.warmup import warm_up\n"
+    "from ambiguous_wild.splat.calibration import warm_up\n"
     "warm_up()\n"
 )
 
@@ -44,6 +44,6 @@ def kernels_meanwhile() -> Iterator[None]:
 
 def _compiled() -> bool:
     """Whether the kernel that is compiled last is on disk for this state of the source."""
-    from ambiguous_wild.splat.cpu.cache import kernel_cache
+    from ambiguous_wild.splat.cpu.compile import kernel_cache
 
     return any(kernel_cache().rglob("*catch_up_all*.nbi"))

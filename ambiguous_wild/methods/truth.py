@@ -20,9 +20,8 @@ from ambiguous_wild.core import AwError, Scene, View
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.io.images import load_image_float, read_gray
 from ambiguous_wild.methods.entry import NoOptions
-from ambiguous_wild.splat.data import shrink_keep
+from ambiguous_wild.splat.data import on_device, shrink_keep
 from ambiguous_wild.splat.parts import MaskPolicy, Parts
-from ambiguous_wild.splat.photos import on_device
 from ambiguous_wild.splat.step import Step, TrainData
 
 

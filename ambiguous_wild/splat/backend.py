@@ -8,9 +8,8 @@ device, where whatever would make the host wait raises.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -20,89 +19,22 @@ from ambiguous_wild.splat import device as devices
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.rendered import GSPLAT_SUMS, NEEDS, Rendered
 
-if TYPE_CHECKING:
-    from ambiguous_wild.splat.gpu.sentinel import Sentinel
-
 Photometric = tuple[float | Tensor, float | Tensor, Tensor]  # L1, 1 - SSIM, gradient [H, W, 3] of their mix
 _LANES = 64  # sums a label while a GPU adds up
 
 
-class Backend(ABC):
-    """What differs between the CPU and a GPU: calls, and what each can and cannot do."""
+class Backend:
+    """Every call, as the CPU answers it: by Numba's kernels, or torch's."""
 
-    statistics: ClassVar[Sequence[str]]  # of `rendered.NEEDS`, what a backward pass can sum
-    kernels: ClassVar[bool]  # Numba's kernels take its tensors
-    reads_at_once: ClassVar[bool]  # a value is known at once; else the host waits for all queued work
-    same_bits: ClassVar[bool]  # one seed gives the same bits
+    statistics: ClassVar[Sequence[str]] = NEEDS  # what a backward pass can sum
+    kernels: ClassVar[bool] = True  # Numba's kernels take its tensors
+    reads_at_once: ClassVar[bool] = True  # a value is known at once; else the host waits for all queued work
+    same_bits: ClassVar[bool] = True  # one seed gives the same bits
 
     # -- a step of training -----------------------------------------------------------------------
 
-    @abstractmethod
     def render(self, gaussians: Gaussians, camera: Camera, **options: Any) -> Rendered:
         """A picture with its backward pass; `render.render` with every option given."""
-
-    @abstractmethod
-    def photometric(
-        self, render: Tensor, photo: Tensor, keep: Tensor | None, lambda_dssim: float, weighting: str
-    ) -> Photometric:
-        """The parts of `losses.photometric`, of arguments that were checked."""
-
-    @abstractmethod
-    def ssim_map(self, a: Tensor, b: Tensor) -> Tensor:
-        """SSIM of every pixel and channel, [H, W, 3]."""
-
-    @abstractmethod
-    def prepare_loss(
-        self, device: torch.device, sizes: frozenset[tuple[int, int]], lambda_dssim: float, weighting: str
-    ) -> None:
-        """Before the clock starts: compile the loss for photos of these heights and widths."""
-
-    @abstractmethod
-    def sentinel(self, device: torch.device, views: int) -> Sentinel | None:
-        """Checks on the device that values are finite; None = the host looks at every step."""
-
-    @abstractmethod
-    def all_finite(self, tensors: Sequence[Tensor]) -> bool:
-        """Whether every value is finite; a large but sound sum may say no."""
-
-    @abstractmethod
-    def max_alpha(self, device: torch.device | str) -> float:
-        """Where alpha is clamped."""
-
-    @abstractmethod
-    def use_threads(self, n: int) -> None:
-        """Use n threads for torch's own work on the CPU: its sums, and so the bits of a run, depend on n."""
-
-    # -- what effects and methods need ------------------------------------------------------------
-
-    @abstractmethod
-    def number(self, value: Tensor) -> float | Tensor:
-        """The number in a 0-d tensor; on a GPU a float64 tensor, which `float(...)` reads later."""
-
-    @abstractmethod
-    def rows(self, visible: Callable[[], Tensor]) -> Tensor | slice:
-        """Rows [M] int64 where `visible()` [N] bool holds; on a GPU all rows, because the host would wait."""
-
-    @abstractmethod
-    def mean_of_rows(self, values: Tensor, visible: Callable[[], Tensor]) -> Tensor:
-        """Mean of values [M, ...] of `rows`; on a GPU of the rows [N, ...] where `visible()` holds."""
-
-    @abstractmethod
-    def label_sums(self, labels: Tensor, count: int, values: Tensor | None = None) -> Tensor:
-        """[count] float64: sums of values [P] float64 by labels [P] int64 below `count`; None counts them."""
-
-    @abstractmethod
-    def adam(self, parameters: Iterable[torch.nn.Parameter], lr: float) -> torch.optim.Adam:
-        """Adam on a net's parameters; on a GPU one kernel, which keeps the step count there."""
-
-
-class CpuBackend(Backend):
-    """Numba's kernels, and torch's on the CPU."""
-
-    statistics = NEEDS
-    kernels = reads_at_once = same_bits = True
-
-    def render(self, gaussians: Gaussians, camera: Camera, **options: Any) -> Rendered:
         from ambiguous_wild.splat.cpu.render import render_cpu
 
         return render_cpu(gaussians, camera, **options)
@@ -110,11 +42,13 @@ class CpuBackend(Backend):
     def photometric(
         self, render: Tensor, photo: Tensor, keep: Tensor | None, lambda_dssim: float, weighting: str
     ) -> Photometric:
+        """The parts of `losses.photometric`, of arguments that were checked."""
         from ambiguous_wild.splat.cpu.photometric import photometric_cpu
 
         return photometric_cpu(render, photo, keep, lambda_dssim, weighting)
 
     def ssim_map(self, a: Tensor, b: Tensor) -> Tensor:
+        """SSIM of every pixel and channel, [H, W, 3]."""
         from ambiguous_wild.splat.cpu.photometric import ssim_map_cpu
 
         return ssim_map_cpu(a, b)
@@ -122,38 +56,81 @@ class CpuBackend(Backend):
     def prepare_loss(
         self, device: torch.device, sizes: frozenset[tuple[int, int]], lambda_dssim: float, weighting: str
     ) -> None:
-        pass  # the kernels are compiled for all sizes, before any run
+        """Before the clock starts: compile the loss for photos of these heights and widths.
 
-    def sentinel(self, device: torch.device, views: int) -> Sentinel | None:
-        return None
+        The CPU's kernels are compiled for all sizes, before any run.
+        """
+
+    def adam_step(
+        self,
+        parameter: Tensor,
+        gradient: Tensor,
+        moments: tuple[Tensor, Tensor],
+        rate: float,
+        steps: int | Tensor,
+        betas: tuple[float, float],
+        eps: float,
+        called_off: Tensor | None,
+    ) -> None:
+        """One step of Adam on a tensor and its moments, float32, contiguous, in place.
+
+        Args:
+            parameter, gradient: of one shape.
+            moments: mean and mean square.
+            rate: learning rate.
+            steps: that were taken, this one included; on a GPU 0-d there.
+            betas, eps: Adam's.
+            called_off: on a GPU, [1] float32 there: 1 = change nothing.
+        """
+        from ambiguous_wild.splat.cpu import adam
+
+        assert isinstance(steps, int)
+        adam.dense_step(parameter, gradient, moments, rate, steps, betas, eps)
 
     def all_finite(self, tensors: Sequence[Tensor]) -> bool:
-        from ambiguous_wild.splat.cpu.finite import all_finite
+        """Whether every value is finite; on a GPU a large but sound sum may say no."""
+        from ambiguous_wild.splat.cpu.adam import all_finite
 
         return all_finite(tensors)
 
     def max_alpha(self, device: torch.device | str) -> float:
+        """Where alpha is clamped."""
         return 0.99
 
     def use_threads(self, n: int) -> None:
+        """Use n threads for torch's own work on the CPU: its sums, and so the bits of a run, depend on n."""
         from ambiguous_wild.splat.cpu.compile import threads
 
         threads()  # starts Numba's pool, which sets the number of OpenMP's threads, torch's with it
         torch.set_num_threads(n)
 
+    # -- what effects and methods need ------------------------------------------------------------
+
     def number(self, value: Tensor) -> float | Tensor:
+        """The number in a 0-d tensor; on a GPU a float64 tensor, which `float(...)` reads later."""
         return float(value.detach())
 
     def rows(self, visible: Callable[[], Tensor]) -> Tensor | slice:
+        """Rows [M] int64 where `visible()` [N] bool holds; on a GPU all rows, because the host would wait."""
         return torch.nonzero(visible()).squeeze(1)
 
     def mean_of_rows(self, values: Tensor, visible: Callable[[], Tensor]) -> Tensor:
+        """Mean of values [M, ...] of `rows`; on a GPU of the rows [N, ...] where `visible()` holds."""
         return values.mean()
 
+    def neighbours(self, points: Tensor, count: int) -> Tensor:
+        """Rows [M, count] int64 of the points [M, 3] nearest to each, the nearest, itself, first."""
+        from scipy.spatial import cKDTree
+
+        xyz = points.detach().numpy()
+        return torch.from_numpy(cKDTree(xyz).query(xyz, k=list(range(1, count + 1)))[1])
+
     def label_sums(self, labels: Tensor, count: int, values: Tensor | None = None) -> Tensor:
+        """[count] float64: sums of values [P] float64 by labels [P] int64 below `count`; None counts them."""
         return torch.bincount(labels, weights=values, minlength=count).double()
 
     def adam(self, parameters: Iterable[torch.nn.Parameter], lr: float) -> torch.optim.Adam:
+        """Adam on a net's parameters; on a GPU one kernel, which keeps the step count there."""
         return torch.optim.Adam(parameters, lr=lr)
 
 
@@ -171,26 +148,39 @@ class GpuBackend(Backend):
     def photometric(
         self, render: Tensor, photo: Tensor, keep: Tensor | None, lambda_dssim: float, weighting: str
     ) -> Photometric:
-        from ambiguous_wild.splat.gpu.fused_loss import photometric_fused
+        from ambiguous_wild.splat.gpu.kernels import photometric_fused
 
         return photometric_fused(render, photo, keep, lambda_dssim, weighting)
 
     def ssim_map(self, a: Tensor, b: Tensor) -> Tensor:
-        from ambiguous_wild.splat.gpu.fused_loss import ssim_map_fused
+        from ambiguous_wild.splat.gpu.kernels import ssim_map_fused
 
         return ssim_map_fused(a, b)
 
     def prepare_loss(
         self, device: torch.device, sizes: frozenset[tuple[int, int]], lambda_dssim: float, weighting: str
     ) -> None:
-        from ambiguous_wild.splat.gpu import fused_loss
+        from ambiguous_wild.splat.gpu.kernels import prepare
 
-        fused_loss.prepare(device, sizes, lambda_dssim, weighting)
+        prepare(device, sizes, lambda_dssim, weighting)
 
-    def sentinel(self, device: torch.device, views: int) -> Sentinel | None:
-        from ambiguous_wild.splat.gpu.sentinel import Sentinel
-
-        return Sentinel(device, views)
+    def adam_step(
+        self,
+        parameter: Tensor,
+        gradient: Tensor,
+        moments: tuple[Tensor, Tensor],
+        rate: float,
+        steps: int | Tensor,
+        betas: tuple[float, float],
+        eps: float,
+        called_off: Tensor | None,
+    ) -> None:
+        assert isinstance(steps, Tensor)
+        torch._fused_adam_(
+            [parameter], [gradient], [moments[0]], [moments[1]], [], [steps],
+            lr=rate, beta1=betas[0], beta2=betas[1], weight_decay=0.0, eps=eps,
+            amsgrad=False, maximize=False, grad_scale=None, found_inf=called_off,
+        )  # fmt: skip
 
     def all_finite(self, tensors: Sequence[Tensor]) -> bool:
         # a sum each: several times as fast as isfinite().all(), which writes a tensor of its own
@@ -215,6 +205,11 @@ class GpuBackend(Backend):
         seen = inside.sum() * (values.numel() // max(len(values), 1))
         return (values * inside.reshape(-1, *[1] * (values.dim() - 1))).sum() / seen.clamp(min=1.0)
 
+    def neighbours(self, points: Tensor, count: int) -> Tensor:
+        from ambiguous_wild.splat.gpu.nearest import nearest
+
+        return nearest(points, count)
+
     def label_sums(self, labels: Tensor, count: int, values: Tensor | None = None) -> Tensor:
         # `bincount` reads the largest label on the host. Neighbouring pixels mostly share a label and would
         # wait for one address: each label has several.
@@ -227,7 +222,7 @@ class GpuBackend(Backend):
         return torch.optim.Adam(parameters, lr=lr, fused=True)
 
 
-_CPU, _GPU = CpuBackend(), GpuBackend()
+_CPU, _GPU = Backend(), GpuBackend()
 
 
 def backend_of(device: torch.device | str) -> Backend:

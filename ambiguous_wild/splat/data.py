@@ -1,8 +1,15 @@
-"""Photos of the training side, in memory, at every resolution the schedule asks for."""
+"""Photos of the training side: read, at every resolution of the schedule, where the training reads them.
+
+Photos that fit into `RESIDENT` of a GPU's free memory stay there for the whole run. Others stay in pinned
+memory of the host, as 8-bit codes if their files have 8 bits: a quarter of the bytes. The loop announces the
+next view (`prefetch`), its photo is copied while the GPU computes, and the GPU, not the host, waits for it.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any, Protocol, overload
 
 import numpy as np
 import torch
@@ -10,14 +17,13 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError, Camera, Scene, View
 from ambiguous_wild.io.images import as_float, load_image_codes, read_keep_map
-from ambiguous_wild.splat.photos import CudaCopies, Photos, fit
 from ambiguous_wild.splat.step import TrainData
 
 
 def load_train_data(scene: Scene, *, device: torch.device, seed: int, cache_dir: Path) -> TrainData:
     """Read the train photos and the user's own keep masks.
 
-    Masks lie on the device; so do photos, unless they would fill it (`splat/photos.py`).
+    Masks lie on the device; so do photos, unless they would fill it (`splat/data.py`).
 
     Raises:
         AwError: no train view, or a photo whose size is not its camera's.
@@ -89,3 +95,137 @@ def shrink_keep(keep: Tensor, divisor: int) -> Tensor:
 def shrink_camera(camera: Camera, divisor: int) -> Camera:
     """The camera of `shrink`'s image."""
     return camera if divisor == 1 else camera.resized(camera.width // divisor, camera.height // divisor)
+
+
+class Pyramid:
+    """Smaller photos are made when they are first asked for."""
+
+    def __init__(self, data: TrainData) -> None:
+        self._data = data
+        self._photos: dict[tuple[int, int], Tensor] = {}
+        self._cameras: dict[tuple[int, int], Camera] = {}
+        # where photos do not fit on the device: copies the next one there while a step runs
+        self.prefetch = getattr(data.photos, "prefetch", None)
+
+    def sizes(self, divisors: Iterable[int]) -> frozenset[tuple[int, int]]:
+        """Heights and widths of all photos at these divisors."""
+        full = {(camera.height, camera.width) for camera in self._data.cameras}
+        return frozenset((h // d, w // d) for h, w in full for d in divisors)
+
+    def photo(self, view: int, divisor: int) -> Tensor:
+        """[H // divisor, W // divisor, 3] of a train photo."""
+        if divisor == 1:
+            return self._data.photos[view]
+        if (
+            self.prefetch is not None
+        ):  # photos do not fit on the device: neither would smaller ones beside them
+            return shrink(self._data.photos[view], divisor)
+        if (view, divisor) not in self._photos:
+            self._photos[view, divisor] = shrink(self._data.photos[view], divisor)
+        return self._photos[view, divisor]
+
+    def camera(self, view: int, divisor: int) -> Camera:
+        """Its camera. Made once: what a back end keeps of a camera it finds again by the object."""
+        if (view, divisor) not in self._cameras:
+            self._cameras[view, divisor] = shrink_camera(self._data.cameras[view], divisor)
+        return self._cameras[view, divisor]
+
+
+RESIDENT = 0.25  # of a GPU's free memory; Gaussians, their moments and gsplat's lists need the rest
+READY = 3  # photos on the device at a time: of this step, of the next, and one more for comparisons
+
+
+class Copies(Protocol):
+    """Sends tensors to a device without making the host wait."""
+
+    def hold(self, tensor: Tensor) -> Tensor:
+        """The tensor in memory that it can be sent from."""
+
+    def begin(self, tensor: Tensor) -> Any:
+        """Start to send it; returns what `finish` needs."""
+
+    def finish(self, sent: Any) -> Tensor:
+        """The tensor on the device, for what is launched from now on."""
+
+
+class CudaCopies:
+    """Copies on a stream of their own."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.device, self.stream = device, torch.cuda.Stream(device)
+
+    def hold(self, tensor: Tensor) -> Tensor:
+        try:
+            return tensor.pin_memory()
+        except RuntimeError:  # the system pins no more: the host waits for such a copy
+            return tensor
+
+    def begin(self, tensor: Tensor) -> tuple[Tensor, Any]:
+        with torch.cuda.stream(self.stream):
+            there = tensor.to(self.device, non_blocking=True)
+        return there, self.stream.record_event()
+
+    def finish(self, sent: tuple[Tensor, Any]) -> Tensor:
+        there, arrived = sent
+        current = torch.cuda.current_stream(self.device)
+        current.wait_event(arrived)
+        there.record_stream(current)  # its memory is not given away before `current` has read it
+        return there
+
+
+class Photos(Sequence[Tensor]):
+    """Photos [H, W, 3] float32 in [0, 1] on the device, of which a few lie there at a time."""
+
+    def __init__(self, held: Sequence[Tensor], device: torch.device, copies: Copies) -> None:
+        """
+        Args:
+            held: [H, W, 3] each, in the host's memory: uint8 codes, or float32.
+            device: where they are read.
+            copies: sends them there.
+        """
+        self._held, self._device, self._copies = held, device, copies
+        # On the device: by a number of the host, torch's division there multiplies by its reciprocal.
+        self._most = torch.tensor(255.0, device=device)
+        self._coming: dict[int, Any] = {}
+        self._ready: dict[int, Tensor] = {}
+
+    def __len__(self) -> int:
+        return len(self._held)
+
+    @overload
+    def __getitem__(self, index: int) -> Tensor: ...
+    @overload
+    def __getitem__(self, index: slice) -> Photos: ...
+    def __getitem__(self, index: int | slice) -> Tensor | Photos:
+        if isinstance(index, slice):
+            return Photos(self._held[index], self._device, self._copies)
+        index = range(len(self._held))[index]
+        photo = self._ready.pop(index, None)
+        if photo is None:
+            self.prefetch(index)
+            photo = self._copies.finish(self._coming.pop(index))
+            photo = photo if photo.dtype == torch.float32 else photo.float() / self._most
+        self._ready[index] = photo  # last: read most recently
+        while len(self._ready) > READY:
+            del self._ready[next(iter(self._ready))]
+        return photo
+
+    def prefetch(self, index: int) -> None:
+        """Start to send this photo, unless it is there or on its way."""
+        if index not in self._ready and index not in self._coming:
+            while len(self._coming) >= READY:  # announced and never read
+                del self._coming[next(iter(self._coming))]
+            self._coming[index] = self._copies.begin(self._held[index])
+
+
+def fit(needed: int, device: torch.device) -> bool:
+    """Whether so many bytes of photos may lie on the device for the whole run."""
+    return device.type != "cuda" or needed <= RESIDENT * torch.cuda.mem_get_info(device)[0]
+
+
+def on_device(photos: Sequence[Tensor], device: torch.device) -> Sequence[Tensor]:
+    """Photos [H, W, 3] float32 of the host where the training reads them, all there or a few at a time."""
+    if fit(sum(4 * photo.numel() for photo in photos), device):
+        return [photo.to(device) for photo in photos]
+    copies = CudaCopies(device)
+    return Photos([copies.hold(photo) for photo in photos], device, copies)

@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core.config import check_limits
-from ambiguous_wild.splat.density_log import DensityLog
 from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.records import DensityLog
 from ambiguous_wild.splat.rendered import Gradients
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData
 

@@ -44,16 +44,15 @@ class SplatAdam:
         lazy: bool = True,  # False steps every row of sh_rest at once: the same bits, more memory traffic
     ) -> None:
         self.betas, self.eps = betas, eps
-        self._kernels = backend_of(gaussians.device).kernels
-        self.steps = 0  # a GPU counts for itself, see `_count`
-        self._count = torch.zeros((), device=gaussians.device)
+        self._backend = backend_of(gaussians.device)
+        self.steps: int | Tensor = self._counted(0, gaussians)
         self._rates: dict[str, float] = {}
         self._moments = {
             name: (torch.zeros_like(tensor), torch.zeros_like(tensor))
             for name, tensor in gaussians.rows()
             if name in PARAMETERS or name in learning_rates
         }
-        self._lazy = lazy and self._kernels
+        self._lazy = lazy and self._backend.kernels
         self._taken = np.zeros(len(gaussians), np.int64)  # steps each row of sh_rest has taken
         self._history = np.zeros((2, 256), np.float32)  # a step's lr / bias1 of sh_rest, and 1 / sqrt(bias2)
         self._rows = len(gaussians)
@@ -96,8 +95,8 @@ class SplatAdam:
         self._moments = {
             name: (m[rows].contiguous(), v[rows].contiguous()) for name, (m, v) in self._moments.items()
         }
-        self._taken = np.full(len(self._moments["means"][0]), self.steps, np.int64)
-        self._rows = len(self._taken)
+        self._rows = len(self._moments["means"][0])
+        self._all_took()
 
     def append(self, n: int) -> None:
         """n rows of zero moments at the end; `bind` comes next."""
@@ -108,7 +107,7 @@ class SplatAdam:
 
         self._moments = {name: (longer(m), longer(v)) for name, (m, v) in self._moments.items()}
         self._rows += n
-        self._taken = np.full(self._rows, self.steps, np.int64)
+        self._all_took()
 
     @property
     def rates(self) -> Mapping[str, float]:
@@ -135,10 +134,6 @@ class SplatAdam:
 
     # -- steps ------------------------------------------------------------------------------------
 
-    def prepare(self, camera: Any = None) -> None:
-        """Before a render: nothing to do for the rows (the renderer asks), only the binding is checked."""
-        _ = self.gaussians
-
     def step(
         self,
         grads: Gradients,
@@ -155,14 +150,34 @@ class SplatAdam:
         if learning_rates is not None:
             self._set_rates(learning_rates)
         gaussians = self.gaussians
-        if not self._kernels:
-            self._step_fused(gaussians, grads, called_off)
-            return
-        now, self.steps = self.steps, self.steps + 1
-        bias1 = 1 - self.betas[0] ** self.steps
-        root = (1 - self.betas[1] ** self.steps) ** -0.5
-        steps = {name: rate / bias1 for name, rate in self._rates.items()}
-        self._step_cpu(gaussians, grads, visible, now, steps, root)
+        self.steps += 1
+        for name, tensor in self._learnt(gaussians):
+            gradient = _of(grads, name, tensor)
+            if name == _LAZY and self._lazy:
+                self._step_visible(tensor, gradient, visible)
+            elif tensor.numel():
+                self._backend.adam_step(
+                    tensor, gradient, self._moments[name], self._rates[name], self.steps, self.betas,
+                    self.eps, called_off,
+                )  # fmt: skip
+        if called_off is not None:
+            self.steps -= called_off.reshape(())
+
+    def _step_visible(self, parameter: Tensor, gradient: Tensor, visible: Tensor) -> None:
+        """The step of the visible rows of sh_rest; the others are put off."""
+        from ambiguous_wild.splat.cpu import adam
+        from ambiguous_wild.splat.cpu.compile import threads
+
+        steps = int(self.steps)
+        if steps > self._history.shape[1]:
+            self._history = np.concatenate([self._history, np.zeros_like(self._history)], axis=1)
+        self._history[:, steps - 1] = adam.step_size(self._rates[_LAZY], steps, self.betas)
+        if parameter.shape[1]:
+            adam.sparse(
+                visible.numpy(), 3 * parameter.shape[1], *adam.flat(parameter, self._moments[_LAZY]),
+                gradient.numpy().reshape(-1), self._taken, steps - 1, *self._history,
+                *adam.constants(self.betas, self.eps), 8 * threads(),
+            )  # fmt: skip
 
     def catch_up(self, rows: np.ndarray | None = None) -> None:
         """Let these rows of sh_rest (indices; None: all) take the steps they were put off."""
@@ -172,80 +187,27 @@ class SplatAdam:
         from ambiguous_wild.splat.cpu.compile import threads
 
         p = self.gaussians.sh_rest
-        width = 3 * p.shape[1]
-        tail = (
-            self._taken,
-            self.steps,
-            self._history[0],
-            self._history[1],
-            *self._constants(),
-            8 * threads(),
-        )
+        arrays = 3 * p.shape[1], *adam.flat(p, self._moments[_LAZY])
+        constants = adam.constants(self.betas, self.eps)
+        tail = self._taken, self.steps, *self._history, *constants, 8 * threads()
         if rows is None:
-            adam.catch_up_all(width, *self._flat(_LAZY, p), *tail)
+            adam.catch_up_all(*arrays, *tail)
         else:
-            adam.catch_up(np.ascontiguousarray(rows), width, *self._flat(_LAZY, p), *tail)
+            adam.catch_up(np.ascontiguousarray(rows), *arrays, *tail)
 
     def flush(self) -> None:
         """Bring every row up to date."""
         self.catch_up(None)
 
-    def _constants(self) -> tuple[np.float32, ...]:
-        # 1 - beta is rounded after the difference: float32(0.999) alone is off by 5e-5 of 0.001.
-        return tuple(np.float32(c) for c in (*(c for b in self.betas for c in (b, 1 - b)), self.eps))
+    def _counted(self, steps: int, gaussians: Gaussians) -> int | Tensor:
+        """So many steps, as this back end counts them; a GPU does it for itself."""
+        if self._backend.reads_at_once:
+            return steps
+        return torch.full((), float(steps), device=gaussians.device)
 
-    def _flat(self, name: str, parameter: Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        m, v = self._moments[name]
-        if not parameter.is_contiguous():
-            raise RuntimeError(f"{name} is not contiguous: the optimiser changes it in place")
-        return parameter.detach().numpy().reshape(-1), m.numpy().reshape(-1), v.numpy().reshape(-1)
-
-    def _step_cpu(
-        self,
-        gaussians: Gaussians,
-        grads: Gradients,
-        visible: Tensor,
-        now: int,
-        steps: dict[str, float],
-        root: float,
-    ) -> None:
-        from ambiguous_wild.splat.cpu import adam
-        from ambiguous_wild.splat.cpu.compile import threads
-
-        if now >= self._history.shape[1]:
-            self._history = np.concatenate([self._history, np.zeros_like(self._history)], axis=1)
-        self._history[:, now] = steps[_LAZY], root
-        parts = 8 * threads()
-        for name, tensor in self._learnt(gaussians):
-            if name != _LAZY or not self._lazy:
-                gradient = _of(grads, name, tensor).numpy().reshape(-1)
-                rate, scale = np.float32(steps[name]), np.float32(root)
-                adam.dense(*self._flat(name, tensor), gradient, rate, scale, *self._constants(), parts)
-        if not self._lazy:
-            self._taken[:] = self.steps
-        elif gaussians.sh_rest.shape[1]:
-            gradient = grads.sh_rest.detach().to(torch.float32).contiguous().numpy()
-            adam.sparse(
-                visible.numpy(), 3 * gaussians.sh_rest.shape[1], *self._flat(_LAZY, gaussians.sh_rest),
-                gradient.reshape(-1), self._taken, now, self._history[0], self._history[1],
-                *self._constants(), parts,
-            )  # fmt: skip
-
-    @torch.no_grad()
-    def _step_fused(self, gaussians: Gaussians, grads: Gradients, called_off: Tensor | None) -> None:
-        self._count += 1
-        for name, tensor in self._learnt(gaussians):
-            if tensor.numel() == 0:
-                continue
-            gradient = _of(grads, name, tensor)
-            mean, square = self._moments[name]
-            torch._fused_adam_(
-                [tensor], [gradient], [mean], [square], [], [self._count],
-                lr=self._rates[name], beta1=self.betas[0], beta2=self.betas[1], weight_decay=0.0,
-                eps=self.eps, amsgrad=False, maximize=False, grad_scale=None, found_inf=called_off,
-            )  # fmt: skip
-        if called_off is not None:
-            self._count -= called_off.reshape(())
+    def _all_took(self) -> None:
+        """No row of sh_rest has steps put off."""
+        self._taken = np.full(self._rows, self.steps if self._lazy else 0, np.int64)
 
     def _learnt(self, gaussians: Gaussians) -> Iterator[tuple[str, Tensor]]:
         return ((name, tensor) for name, tensor in gaussians.rows() if name in self._moments)
@@ -265,7 +227,7 @@ class SplatAdam:
         """Steps and moments as plain tensors, every row up to date; the parameters are the caller's."""
         self.flush()
         return {
-            "steps": self.steps if self._kernels else int(self._count),
+            "steps": int(self.steps),
             "rates": dict(self._rates),
             "first": {name: m for name, (m, _) in self._moments.items()},
             "second": {name: v for name, (_, v) in self._moments.items()},
@@ -289,12 +251,12 @@ class SplatAdam:
                 )
             moments[name] = pair
         self._moments = moments
-        self.steps = int(state["steps"])
-        self._count.fill_(self.steps)
+        steps = int(state["steps"])
+        self.steps = self._counted(steps, gaussians)
         self._rates = {name: float(rate) for name, rate in state["rates"].items()}
-        self._taken = np.full(len(gaussians), self.steps, np.int64)
+        self._all_took()
         size = 256
-        while size <= self.steps:
+        while size <= steps:
             size *= 2
         self._history = np.zeros((2, size), np.float32)
 

@@ -13,18 +13,17 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError, Camera
 from ambiguous_wild.splat import checkpoint
-from ambiguous_wild.splat.clock import Clock, clock_for
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.interrupt import Stopped, deferred
 from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.pace import Pace, TrainConfig
+from ambiguous_wild.splat.records import ROWS, Clock, Timeline, clock_for
 from ambiguous_wild.splat.rendered import Rendered
 from ambiguous_wild.splat.step import TrainData
-from ambiguous_wild.splat.timeline import ROWS, Timeline
 from ambiguous_wild.splat.watchdog import NonFinite, Watchdog
 
 if TYPE_CHECKING:
-    from ambiguous_wild.splat.gpu.sentinel import Sentinel
+    from ambiguous_wild.splat.watchdog import Sentinel
 
 Probe = Callable[[Callable[[Camera], Tensor]], float]
 
@@ -246,10 +245,11 @@ class Run(ABC):
 
     @torch.no_grad()
     def picture(self, camera: Camera) -> Tensor:
-        """What a camera sees, [H, W, 3], between two steps; the run ends with the same bits as without it."""
-        # Rows the optimiser has put off are brought up to date first; it computes what a later step
-        # would have computed, so that probing changes nothing (a test compares the bits).
-        self.optimiser.prepare(camera)
+        """What a camera sees, [H, W, 3], between two steps; the run ends with the same bits as without it.
+
+        Rows that the optimiser has put off are brought up to date: it computes what a later step would have
+        computed.
+        """
         return self.render(camera).image
 
     @property

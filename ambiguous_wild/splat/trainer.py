@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError, Camera
-from ambiguous_wild.splat.data import shrink_keep
+from ambiguous_wild.splat.data import Pyramid, shrink_keep
 from ambiguous_wild.splat.density import DensityControl
 from ambiguous_wild.splat.drawing import Drawing
 from ambiguous_wild.splat.effects.chain import Chain
@@ -21,7 +21,6 @@ from ambiguous_wild.splat.losses import PhotometricLoss, photometric
 from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.pace import Pace, TrainConfig
 from ambiguous_wild.splat.parts import Parts
-from ambiguous_wild.splat.pyramid import Pyramid
 from ambiguous_wild.splat.rendered import (
     Cotangents,
     Gradients,
@@ -32,6 +31,7 @@ from ambiguous_wild.splat.rendered import (
 )
 from ambiguous_wild.splat.run import Probe, Run
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Shot, Step, TrainData
+from ambiguous_wild.splat.watchdog import Sentinel
 
 
 class Trainer(Run):
@@ -62,7 +62,8 @@ class Trainer(Run):
         self.pyramid = Pyramid(data)
         self._divisors: dict[int, int] = {}  # of the steps since the sentinel's last look
         # where the host must not wait, what would make it wait is written down there and looked at later
-        self.sentinel = data.backend.sentinel(data.device, len(data.photos))
+        views = len(data.photos)
+        self.sentinel = None if data.backend.reads_at_once else Sentinel(data.device, views)
         check_needs(parts.density.needs, data.backend.statistics)
         most = parts.density_config.max_gaussians
         room = Pace(config, parts.schedule, data, start=0, most=most).most
@@ -171,7 +172,6 @@ class Trainer(Run):
         if self.effects is not None:
             shot = replace(shot, camera=self.effects.camera(shot))
         with self.clock.part("render"):
-            self.optimiser.prepare(shot.camera)
             rendered = self.drawing(self.gaussians, shot)
         known = {f.name: getattr(shot, f.name) for f in fields(Shot)}
         return Step(

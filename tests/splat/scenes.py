@@ -1,11 +1,16 @@
-"""Small random scenes for the tests of this folder."""
+"""Small random scenes and short trainings for tests."""
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from ambiguous_wild.core import Camera
+from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.rendered import Cotangents
+from ambiguous_wild.splat.trainer import Trainer
 
 
 def camera(width=37, height=29, *, angle=0.3, fx=30.0, fy=33.0, cx=None, cy=None) -> Camera:
@@ -16,6 +21,13 @@ def camera(width=37, height=29, *, angle=0.3, fx=30.0, fy=33.0, cx=None, cy=None
     cx = width / 2 + 1 if cx is None else cx
     cy = height / 2 - 2 if cy is None else cy
     return Camera(width, height, fx, fy, cx, cy, pose)
+
+
+def disturbed(camera: Camera, rotation, shift) -> np.ndarray:
+    """The camera's pose [4, 4] followed by a turn (rotation vector, rad) and a shift, both in camera axes."""
+    motion = np.eye(4)
+    motion[:3, :3], motion[:3, 3] = Rotation.from_rotvec(rotation).as_matrix(), shift
+    return motion @ camera.cam_from_world
 
 
 def gaussians(seed=0, n=60, *, rest=15, size=-1.5) -> Gaussians:
@@ -51,3 +63,21 @@ def given(d: dict[str, torch.Tensor]) -> Cotangents:
     """`cotangents` as a render takes them."""
     names = ("d_image", "d_image_extra", "d_alpha", "d_depth")
     return Cotangents(*(d.get(name) for name in names))
+
+
+def trainer_for(scene, folder, *, parts=None, probe=None, change=None, **config) -> Trainer:
+    """60 iterations on the CPU, unless asked otherwise; `change` makes other data of what was read."""
+    data = load_train_data(scene, device=torch.device("cpu"), seed=config.get("seed", 0), cache_dir=folder)
+    data = data if change is None else change(data)
+    config = TrainConfig(**{"iterations": 60, "probes": 0} | config)
+    return Trainer(data, parts or Parts(), config, folder=folder, probe=probe)
+
+
+def trained(scene, folder, **kw) -> Trainer:
+    trainer = trainer_for(scene, folder, **kw)
+    trainer.train()
+    return trainer
+
+
+def bits(trainer: Trainer) -> dict[str, bytes]:
+    return {name: tensor.numpy().tobytes() for name, tensor in trainer.gaussians.items()}

@@ -8,34 +8,26 @@ import numpy as np
 import pytest
 import torch
 
-from ambiguous_wild.io.scene_folder import load_scene
-from ambiguous_wild.splat import clock
-from ambiguous_wild.splat.gpu import fused_loss
-from ambiguous_wild.splat.gpu.compiled import compiled
-from ambiguous_wild.splat.gpu.sentinel import Sentinel
+from ambiguous_wild.splat.gpu import kernels
+from ambiguous_wild.splat.gpu.kernels import compiled
 from ambiguous_wild.splat.losses import photometric, ssim_map
 from ambiguous_wild.splat.parts import MaskPolicy, Parts
+from ambiguous_wild.splat.records import SAMPLED, Clock, GpuClock, clock_for
 from ambiguous_wild.splat.reference import photometric_reference, ssim_map_reference
 from ambiguous_wild.splat.rendered import Cotangents
-from ambiguous_wild.splat.watchdog import NonFinite
+from ambiguous_wild.splat.watchdog import NonFinite, Sentinel
 from tests.host_reads import READ, moved, no_transfers
-from tests.tiny_scene import with_points, write_tiny_scene
+from tests.tiny_scene import with_points
 
 from . import fake_gsplat
+from .scenes import trained, trainer_for
 from .test_losses import pictures
-from .test_trainer import trained, trainer_for
 from .test_watchdog import Poison
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return with_points(load_scene(write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")), 150)
-
-
-@pytest.fixture
-def fake(monkeypatch):
-    with fake_gsplat.installed(monkeypatch):
-        yield
+def scene(scene):
+    return with_points(scene, 150)
 
 
 def error_of(trainer) -> float:
@@ -265,10 +257,10 @@ def test_the_fused_loss_reads_nothing_and_is_one_graph_for_a_compiler():
     a, b, keep = (t.to("meta") for t in pictures(17, 23))
     assert photometric(a, b, keep).d_image.shape == a.shape
     # `fullgraph` raises where tracing would have to fall back to Python in between
-    traced = torch.compile(fused_loss._loss, fullgraph=True, backend="eager")
+    traced = torch.compile(kernels._loss, fullgraph=True, backend="eager")
     a, b, keep = pictures(17, 23)
     for mask, inside in ((None, False), (keep, False), (keep, True)):
-        for x, y in zip(traced(a, b, mask, 0.2, inside), fused_loss._loss(a, b, mask, 0.2, inside)):
+        for x, y in zip(traced(a, b, mask, 0.2, inside), kernels._loss(a, b, mask, 0.2, inside)):
             assert torch.equal(x, y)
 
 
@@ -326,8 +318,8 @@ def test_parts_are_timed_by_the_devices_own_events_now_and_then():
         def elapsed_time(self, other):
             return other.at - self.at
 
-    gpu = clock.GpuClock(event=Event)
-    for _ in range(3 * clock.SAMPLED):
+    gpu = GpuClock(event=Event)
+    for _ in range(3 * SAMPLED):
         gpu.start()
         with gpu.part("render"):
             Event.now += 2.0  # ms
@@ -339,9 +331,9 @@ def test_parts_are_timed_by_the_devices_own_events_now_and_then():
     assert Event.waited == 0 and gpu.parts_s == {}
     gpu.settle()
     assert Event.waited == 1
-    steps = 3 * clock.SAMPLED
+    steps = 3 * SAMPLED
     assert gpu.parts_s == pytest.approx({"render": steps * 2e-3, "loss": steps * 0.5e-3})
     gpu.settle()
     assert gpu.parts_s == pytest.approx({"render": steps * 2e-3, "loss": steps * 0.5e-3})
-    assert type(clock.clock_for(torch.device("cpu"))) is clock.Clock
-    assert type(clock.clock_for(torch.device("cuda"))) is clock.GpuClock
+    assert type(clock_for(torch.device("cpu"))) is Clock
+    assert type(clock_for(torch.device("cuda"))) is GpuClock

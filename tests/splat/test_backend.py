@@ -1,22 +1,24 @@
 """The two back ends answer alike, and only they ask where tensors lie."""
 
+import math
+
 import pytest
 import torch
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.splat import device
-from ambiguous_wild.splat.backend import CpuBackend, GpuBackend, backend_of
+from ambiguous_wild.splat.backend import Backend, GpuBackend, backend_of
 from ambiguous_wild.splat.rendered import check_needs
 from tests.host_reads import no_transfers
 
-CPU, GPU = CpuBackend(), GpuBackend()
+CPU, GPU = Backend(), GpuBackend()
 
 
 def test_a_tensor_has_the_back_end_of_its_device(monkeypatch):
-    assert isinstance(backend_of("cpu"), CpuBackend) and isinstance(backend_of("cuda:1"), GpuBackend)
-    assert isinstance(backend_of(torch.device("meta")), GpuBackend)
+    assert type(backend_of("cpu")) is Backend
+    assert {type(backend_of(there)) for there in ("cuda:1", torch.device("meta"))} == {GpuBackend}
     monkeypatch.setattr(device, "accelerated", lambda _: True)  # as tests run the GPU's calls on the CPU
-    assert isinstance(backend_of("cpu"), GpuBackend)
+    assert type(backend_of("cpu")) is GpuBackend
 
 
 @pytest.mark.parametrize("labels", [[0, 2, 2, 5], [], [7] * 200])
@@ -41,6 +43,14 @@ def test_the_mean_is_of_visible_rows(shape):
     assert float(GPU.mean_of_rows(values, lambda: nothing)) == 0.0
 
 
+@pytest.mark.parametrize(("points", "count"), [(5, 1), (5, 5), (700, 4)])
+def test_the_nearest_points(points, count):
+    xyz = torch.rand(points, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    expected = torch.cdist(xyz, xyz).argsort(dim=1)[:, :count]
+    for backend in (CPU, GPU):
+        assert torch.equal(backend.neighbours(xyz, count), expected)
+
+
 def test_a_number_for_later_is_the_number():
     value = torch.tensor(0.1, requires_grad=True)
     kept = GPU.number(value * 1)
@@ -48,12 +58,15 @@ def test_a_number_for_later_is_the_number():
     assert isinstance(kept, torch.Tensor) and not kept.requires_grad
 
 
-@pytest.mark.parametrize("bad", [None, float("nan"), float("inf")])
-def test_values_that_are_not_finite_are_found(bad):
-    tensors = [torch.ones(3, 4), torch.zeros(5)]
-    if bad is not None:
-        tensors[1][2] = bad
-    assert [b.all_finite(tensors) for b in (CPU, GPU)] == [bad is None] * 2
+@pytest.mark.parametrize("value", [math.nan, -math.nan, math.inf, -math.inf, 3.4e38, -1e-45, -0.0])
+@pytest.mark.parametrize("at", [0, 17, 2999])
+def test_values_that_are_not_finite_are_found(value, at):
+    sound, tensor = torch.ones(7), torch.zeros(1000, 3)
+    tensor.view(-1)[at] = value
+    for backend in (CPU, GPU):
+        assert backend.all_finite([sound, tensor]) == backend.all_finite([tensor, sound])
+        assert backend.all_finite([tensor, sound]) == math.isfinite(value)
+    assert CPU.all_finite([torch.full((100,), 3e38), torch.zeros(0, 3)])  # their sum overflows
 
 
 def test_a_gpu_reads_nothing_on_the_host():

@@ -5,7 +5,7 @@ import stat
 
 import pytest
 
-from ambiguous_wild.splat.cpu import cache
+from ambiguous_wild.splat.cpu import compile as cache
 
 
 @pytest.fixture

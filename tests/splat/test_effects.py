@@ -7,41 +7,28 @@ import pytest
 import torch
 
 from ambiguous_wild.core import AwError, Points, Scene, View
-from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.effects import ALL, EFFECTS, check_effects, dense, with_effects
 from ambiguous_wild.splat.effects.appearance import AppearanceEmbedding
 from ambiguous_wild.splat.effects.base import Effect, RowAdam
 from ambiguous_wild.splat.effects.chain import Chain
 from ambiguous_wild.splat.effects.exposure import AffineExposure
-from ambiguous_wild.splat.effects.poses import PoseRefinement, moved
+from ambiguous_wild.splat.effects.poses import PoseRefinement
 from ambiguous_wild.splat.effects.smoothing import SmoothingFilter, filter_sizes
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.parts import START_SHARE, Parts
 from ambiguous_wild.splat.reference import render_reference
 from ambiguous_wild.splat.rendered import Cotangents, Frame, Gradients
 from ambiguous_wild.splat.step import Shot, TrainData
 from ambiguous_wild.splat.trainer import Trainer
+from tests.splat.scenes import bits, disturbed
 from tests.splat.scenes import camera as make_camera
 from tests.splat.scenes import gaussians as random_gaussians
-from tests.tiny_scene import write_tiny_scene
+from tests.splat.scenes import trainer_for as trainer_of
 
 
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return load_scene(write_tiny_scene(tmp_path_factory.mktemp("data") / "scene", distractors=False))
-
-
-def trainer_for(scene, folder, names=(), change=None, **config) -> Trainer:
-    data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=folder)
-    data = change(data) if change else data
-    config = TrainConfig(**{"iterations": 60, "probes": 0} | config)
-    return Trainer(data, with_effects(Parts(), names), config, folder=folder)
-
-
-def bits(trainer):
-    return {name: tensor.numpy().tobytes() for name, tensor in trainer.gaussians.items()}
+def trainer_for(scene, folder, names=(), **config) -> Trainer:
+    return trainer_of(scene, folder, parts=with_effects(Parts(), names), **config)
 
 
 # -- nothing where none is asked ------------------------------------------------------------------
@@ -67,10 +54,7 @@ def test_a_run_without_effects_never_calls_one_and_has_the_same_bits(scene, tmp_
 def test_an_effect_that_does_nothing_leaves_the_bits_alone(scene, tmp_path):
     plain = trainer_for(scene, tmp_path / "plain")
     plain.train()
-    data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=tmp_path)
-    idle = Trainer(
-        data, Parts(effects=(Effect(),)), TrainConfig(iterations=60, probes=0), folder=tmp_path / "idle"
-    )
+    idle = trainer_of(scene, tmp_path / "idle", parts=Parts(effects=(Effect(),)))
     idle.train()
     assert bits(idle) == bits(plain)
 
@@ -78,13 +62,8 @@ def test_an_effect_that_does_nothing_leaves_the_bits_alone(scene, tmp_path):
 def test_only_overridden_hooks_are_called(scene, tmp_path):
     trainer = trainer_for(scene, tmp_path, ("exposure",))
     chain = trainer.effects
-    assert [len(chain._with(hook)) for hook in ("camera", "model", "shade", "pose", "image")] == [
-        0,
-        0,
-        0,
-        0,
-        1,
-    ]
+    acting = [hook for hook in ("camera", "model", "shade", "pose", "image") if chain._with(hook)]
+    assert acting == ["image"]
     assert chain._with("image", without=("exposure",)) == ()
 
 
@@ -141,10 +120,7 @@ def test_a_dense_start_leaves_room_to_grow(scene, tmp_path, monkeypatch):
 # -- state ----------------------------------------------------------------------------------------
 
 
-STARTS = (("dense",), ("skybox", "dense"))
-
-
-@pytest.mark.parametrize("names", [*((name,) for name in ALL), ALL, ("sh1",), *STARTS], ids="+".join)
+@pytest.mark.parametrize("names", [ALL, ("sh1",), ("skybox", "dense", "near")], ids="+".join)
 def test_a_resumed_run_equals_an_undisturbed_one(scene, tmp_path, names):
     whole = trainer_for(scene, tmp_path / "whole", names, iterations=20)
     whole.train()
@@ -323,6 +299,7 @@ def test_the_cameras_gradient_against_finite_differences_of_the_reference(degree
     effect.setup(tiny_data([cam]))
     if started:
         effect.adam.values[0] = torch.tensor([0.05, -0.04, 0.03, 0.01, -0.02, 0.015])
+        effect.adam.steps[0] = 1
     parameters = {name: tensor.clone().requires_grad_(True) for name, tensor in g.items()}
     r = render_reference(parameters, effect.camera(shot_of(0, cam)), sh_degree=degree)
     (r.image * weight).sum().backward()
@@ -333,7 +310,7 @@ def test_the_cameras_gradient_against_finite_differences_of_the_reference(degree
     own = effect.pose(g, gradients, shot_of(0, effect.camera(shot_of(0, cam))))
 
     def loss(delta):
-        pose = moved(cam.cam_from_world, delta[:3].numpy(), effect.depth * delta[3:].numpy())
+        pose = disturbed(cam, delta[:3].numpy(), effect.depth * delta[3:].numpy())
         frozen = {name: tensor.detach() for name, tensor in parameters.items()}
         return (
             render_reference(frozen, replace(cam, cam_from_world=pose), sh_degree=degree).image * weight

@@ -8,14 +8,11 @@ import torch
 
 from ambiguous_wild.core import Points, Scene, View
 from ambiguous_wild.io.scene_folder import load_scene
-from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.effects import with_effects
-from ambiguous_wild.splat.effects.poses import moved
 from ambiguous_wild.splat.effects.tracks import photo_gains
-from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.step import Shot
-from ambiguous_wild.splat.trainer import Trainer
+from tests.splat.scenes import bits, disturbed, trainer_for
 from tests.splat.scenes import camera as make_camera
 from tests.tiny_scene import write_tiny_scene
 
@@ -23,17 +20,6 @@ from tests.tiny_scene import write_tiny_scene
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     return load_scene(write_tiny_scene(tmp_path_factory.mktemp("data") / "scene", distractors=False))
-
-
-def trainer_for(scene, folder, names=(), change=None, **config) -> Trainer:
-    data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=folder)
-    data = change(data) if change else data
-    config = TrainConfig(**{"iterations": 60, "probes": 0} | config)
-    return Trainer(data, with_effects(Parts(), names), config, folder=folder)
-
-
-def bits(trainer):
-    return {name: tensor.numpy().tobytes() for name, tensor in trainer.gaussians.items()}
 
 
 def shot_of(view, camera=None) -> Shot:
@@ -59,7 +45,13 @@ GAINS = [0.8, 1.05, 0.9, 1.1, 0.75, 1.0]
 def test_colour_effects_explain_drifting_exposure(scene, tmp_path, name):
     drift = lambda data: brightened(data, GAINS)  # noqa: E731
     runs = {
-        n: trainer_for(scene, tmp_path / (n or "none"), [n] if n else [], drift, iterations=300)
+        n: trainer_for(
+            scene,
+            tmp_path / (n or "none"),
+            parts=with_effects(Parts(), [n] if n else []),
+            change=drift,
+            iterations=200,
+        )
         for n in ("", name)
     }
     for run in runs.values():
@@ -92,12 +84,12 @@ def test_poses_return_when_they_were_disturbed(scene, tmp_path):
 
     def disturb(data):
         noise = rng.normal(size=(len(truth), 3)) * 0.012
-        cameras = [
-            replace(c, cam_from_world=moved(c.cam_from_world, n, np.zeros(3))) for c, n in zip(truth, noise)
-        ]
+        cameras = [replace(c, cam_from_world=disturbed(c, n, np.zeros(3))) for c, n in zip(truth, noise)]
         return replace(data, cameras=cameras)
 
-    trainer = trainer_for(scene, tmp_path, ("poses",), disturb, iterations=400)
+    trainer = trainer_for(
+        scene, tmp_path, parts=with_effects(Parts(), ("poses",)), change=disturb, iterations=400
+    )
 
     def error(cameras):
         """Px by which a point of the wall moves from photo to photo, but for a turn that all share."""

@@ -5,29 +5,20 @@ from dataclasses import replace
 import pytest
 import torch
 
-from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.cpu.render import render_cpu
 from ambiguous_wild.splat.density import DensityConfig
-from ambiguous_wild.splat.gpu import fused_loss
+from ambiguous_wild.splat.gpu import kernels
 from ambiguous_wild.splat.parts import MaskPolicy, Parts
 from ambiguous_wild.splat.reference import render_reference
 from ambiguous_wild.splat.render import render
-from tests.tiny_scene import with_points, write_tiny_scene
+from tests.tiny_scene import with_points
 
-from . import fake_gsplat
-from .scenes import camera, cotangents, doubles, gaussians
-from .test_trainer import trainer_for
-
-
-@pytest.fixture
-def fake(monkeypatch):
-    with fake_gsplat.installed(monkeypatch):
-        yield
+from .scenes import camera, cotangents, doubles, gaussians, trainer_for
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return with_points(load_scene(write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")), 60)
+def scene(scene):
+    return with_points(scene, 60)
 
 
 # -- splats ---------------------------------------------------------------------------------------
@@ -116,10 +107,10 @@ def test_every_size_of_the_run_is_compiled_before_it_starts(scene, tmp_path, fak
     def record(render, photo, keep, lambda_dssim, weighting):
         seen.append((*render.shape[:2], keep is not None))
 
-    monkeypatch.setattr(fused_loss, "compiles", lambda device: True)
-    monkeypatch.setattr(fused_loss, "photometric_fused", record)
-    monkeypatch.setattr("ambiguous_wild.splat.resolution.SMALLEST_SIDE", 10)
-    fused_loss.prepare.cache_clear()
+    monkeypatch.setattr(kernels, "compiles", lambda device: True)
+    monkeypatch.setattr(kernels, "photometric_fused", record)
+    monkeypatch.setattr("ambiguous_wild.splat.pace.SMALLEST_SIDE", 10)
+    kernels.prepare.cache_clear()
     trainer = trainer_for(scene, tmp_path, iterations=30, probes=0, resolution="coarse-to-fine")
     sizes = {(48 // d, 64 // d) for d in trainer.pace.divisors}
     assert len(sizes) > 1
@@ -127,11 +118,11 @@ def test_every_size_of_the_run_is_compiled_before_it_starts(scene, tmp_path, fak
     before = len(seen)
     trainer_for(scene, tmp_path, iterations=30, probes=0, resolution="coarse-to-fine")
     assert len(seen) == before  # once a process
-    fused_loss.prepare.cache_clear()
+    kernels.prepare.cache_clear()
 
 
 def test_photos_of_several_sizes_are_all_counted(scene, tmp_path):
-    from ambiguous_wild.splat.pyramid import Pyramid
+    from ambiguous_wild.splat.data import Pyramid
 
     trainer = trainer_for(scene, tmp_path, iterations=2, probes=0)
     cameras = [c.resized(40, 30) if i % 2 else c for i, c in enumerate(trainer.data.cameras)]

@@ -8,25 +8,17 @@ import pytest
 import torch
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.effects.base import hurried
 from ambiguous_wild.splat.effects.chain import Chain
 from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_leaves
 from ambiguous_wild.splat.field import Row
-from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.render import render
 from ambiguous_wild.splat.step import Shot
-from ambiguous_wild.splat.trainer import Trainer
 from tests.splat.scenes import camera, gaussians
-from tests.tiny_scene import write_tiny_scene
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return load_scene(write_tiny_scene(tmp_path_factory.mktemp("data") / "scene", distractors=False))
+from tests.splat.scenes import trainer_for as trainer_of
 
 
 class Everything(Learnt):
@@ -106,27 +98,10 @@ def test_all_three_places_against_finite_differences(scene, tmp_path):
         assert slope == pytest.approx(expected, rel=0.03, abs=0.05), name
 
 
-def trainer_for(scene, folder, effect, **config) -> Trainer:
-    data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=folder)
+def trainer_for(scene, folder, effect):
     growth = DensityConfig(start=0, every=1, min_every=20, grow_grad=1e-9, min_reset_spacing=10**9)
     parts = Parts(effects=(effect,), density_config=growth)
-    config = TrainConfig(**{"iterations": 60, "probes": 0, "max_gaussians": 600} | config)
-    return Trainer(data, parts, config, folder=folder)
-
-
-def test_a_resumed_run_has_the_same_bits(scene, tmp_path):
-    whole = trainer_for(scene, tmp_path / "whole", Everything())
-    whole.train()
-    first = trainer_for(scene, tmp_path / "cut", Everything())
-    while first.iteration < 31:
-        first.step()
-    first.save()
-    second = trainer_for(scene, tmp_path / "cut", Everything())
-    assert second.resume()
-    second.train()
-    for (name, a), (_, b) in zip(whole.gaussians.rows(), second.gaussians.rows(), strict=True):
-        assert torch.equal(a, b), name
-    assert str(whole.effects.state_dict()) == str(second.effects.state_dict())
+    return trainer_of(scene, folder, parts=parts, max_gaussians=600)
 
 
 def test_a_photo_that_was_not_trained_on(scene, tmp_path):

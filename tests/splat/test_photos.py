@@ -7,9 +7,7 @@ import torch
 from ambiguous_wild.io.images import load_image_float, write_png
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat import data as data_module
-from ambiguous_wild.splat import photos as photos_module
-from ambiguous_wild.splat.data import load_train_data
-from ambiguous_wild.splat.photos import READY, CudaCopies, Photos, fit
+from ambiguous_wild.splat.data import READY, CudaCopies, Photos, fit, load_train_data
 from tests.tiny_scene import write_tiny_scene
 
 CPU = torch.device("cpu")
@@ -125,7 +123,6 @@ def test_photos_that_do_not_fit_stay_with_the_host_as_their_files_have_them(scen
 
 def test_a_share_of_the_free_memory_decides(monkeypatch):
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (1000, 8000))
-    assert photos_module.RESIDENT == 0.25
     assert fit(250, torch.device("cuda")) and not fit(251, torch.device("cuda"))
     assert fit(10**15, CPU)
 

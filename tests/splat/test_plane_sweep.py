@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import AwError, Camera
-from ambiguous_wild.splat.plane_sweep import SweepConfig, dense_points
+from ambiguous_wild.splat.effects.dense import SweepConfig, dense_points
 
 H, W, F = 60, 80, 80.0
 WALL, BOX = 5.0, 3.5  # depths of the back wall and of a box before it

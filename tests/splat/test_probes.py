@@ -11,8 +11,8 @@ import torch
 
 from ambiguous_wild.splat.pace import Pace, TrainConfig
 from ambiguous_wild.splat.parts import Schedule
+from ambiguous_wild.splat.records import ROWS
 from ambiguous_wild.splat.run import Run
-from ambiguous_wild.splat.timeline import ROWS
 
 COUNTS = (1, 3, 7, 8, 16)
 

@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.cpu.render import render_cpu
 from ambiguous_wild.splat.density import DensityControl
 from ambiguous_wild.splat.effects import with_effects
@@ -17,26 +16,18 @@ from ambiguous_wild.splat.gaussians import PARAMETERS
 from ambiguous_wild.splat.gpu.render import render_cuda
 from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.rendered import Cotangents, Gradients, ShadeGradients
-from tests.host_reads import moved, no_transfers
-from tests.tiny_scene import with_points, write_tiny_scene
+from tests.tiny_scene import with_points
 
 from . import fake_gsplat
-from .scenes import camera, cotangents, gaussians, given
-from .test_trainer import trainer_for
+from .scenes import camera, cotangents, gaussians, given, trainer_for
 
 TOLERANCE = 3e-5  # of float32 sums in another order
 OPTIONS = {"sh_degree": 2, "background": (0.1, 0.5, 0.9), "antialias": True}
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return with_points(load_scene(write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")), 60)
-
-
-@pytest.fixture
-def fake(monkeypatch):
-    with fake_gsplat.installed(monkeypatch):
-        yield
+def scene(scene):
+    return with_points(scene, 60)
 
 
 @pytest.fixture(params=["cpu", "accelerator"])
@@ -248,19 +239,6 @@ def test_a_net_sees_nothing_of_rows_that_gsplat_leaves_out(fake, monkeypatch):
 def test_a_shading_function_must_give_one_colour_a_row(fake):
     with pytest.raises(AwError, match=r"must give colours \[60, 3\], got \[60, 4\]"):
         render_cuda(gaussians(3), camera(), **OPTIONS, shade=lambda base, rows: (torch.ones(60, 4), None))
-
-
-def test_shading_leaves_the_host_alone(fake):
-    g, cam = gaussians(3), camera()
-    g, d, weight = moved([g.carrying({"tint": g.means.clone()}), given(cotangents(29, 37)), torch.ones(3)])
-    for watched in (False, True):  # the camera is copied at its first use
-        draw = lambda: render_cuda(g, cam, **OPTIONS, shade=shade_of(g, weight)).backward(d)  # noqa: E731
-        if watched:
-            with no_transfers():
-                found = draw()
-        else:
-            found = draw()
-        assert found.extra["tint"].shape == (60, 3)
 
 
 # -- what gsplat does not offer -------------------------------------------------------------------

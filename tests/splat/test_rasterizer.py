@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from ambiguous_wild.core import AwError, Camera
+from ambiguous_wild.splat.calibration import warm_up
 from ambiguous_wild.splat.cpu.render import render_cpu
-from ambiguous_wild.splat.cpu.warmup import warm_up
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.reference import render_reference
 from ambiguous_wild.splat.rendered import Cotangents
@@ -275,19 +275,6 @@ def test_same_bits_for_one_two_and_four_threads():
     assert len(set(digests)) == 1
 
 
-def test_the_second_cotangent_adds_and_is_told_apart():
-    g, cam = gaussians(12), camera()
-    d = cotangents(cam.height, cam.width)
-    rendered = render_cpu(g, cam)
-    both = rendered.backward(Cotangents(d["d_image"], d["d_image_extra"]))
-    one, two = rendered.backward(d["d_image"]), rendered.backward(d["d_image_extra"])
-    assert one.screen_extra is None
-    for name in NAMES:
-        close(name, getattr(both, name), getattr(one, name).double() + getattr(two, name), 1e-5)
-    close("screen", both.screen, one.screen.double(), 1e-5)
-    close("screen_extra", both.screen_extra, two.screen.double(), 1e-5)
-
-
 def test_screen_abs_sums_magnitudes_over_pixels():
     g, cam = gaussians(13, n=12), camera(20, 18)
     rendered = render_cpu(g, cam)
@@ -345,7 +332,7 @@ def test_warming_up_says_so_only_where_kernels_are_missing(tmp_path):
     warm_up(said.append)
     assert said == []
     done = subprocess.run(
-        [sys.executable, "-c", "from ambiguous_wild.splat.cpu.warmup import _cached; print(_cached())"],
+        [sys.executable, "-c", "from ambiguous_wild.splat.calibration import _cached; print(_cached())"],
         env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)},
         capture_output=True,
         text=True,

@@ -94,6 +94,9 @@ def test_each_lack_is_one_line_with_what_brings_it(case):
     lack = why_not(machine)
     assert lack is not None and what in lack.what and fix in lack.fix
     assert "\n" not in str(lack) and str(lack) == f"{lack.what}: {lack.fix}"
+    with pytest.raises(AwError) as error:
+        choose("cuda", print, looking=lambda: machine)
+    assert str(error.value).startswith(f"--device cuda: {lack}") and error.value.exit_code == 2
 
 
 def test_all_that_the_compiler_lacks_is_said_at_once():
@@ -125,15 +128,6 @@ def test_auto_says_nothing_where_there_is_no_gpu():
     said = []
     machine = found(CPU_BUILD, driver=None, gsplat=None)
     assert choose("auto", said.append, looking=lambda: machine) == "cpu" and said == []
-
-
-@pytest.mark.parametrize("case", CASES)
-def test_asking_for_the_gpu_is_an_error_with_the_same_words(case):
-    machine, what, fix = CASES[case]
-    with pytest.raises(AwError) as error:
-        choose("cuda", print, looking=lambda: machine)
-    assert str(error.value).startswith("--device cuda: ") and error.value.exit_code == 2
-    assert what in str(error.value) and fix in str(error.value)
 
 
 def test_the_cpu_is_taken_without_a_look():
@@ -194,8 +188,3 @@ def test_what_is_looked_at_is_what_torch_and_gsplat_will_take(tmp_path, monkeypa
     assert seen.compiler == str(tmp_path / "bin/my-c++") and not seen.prebuilt
     (tmp_path / "gsplat/csrc.cpython-312-x86_64-linux-gnu.so").touch()
     assert readiness.look(TORCH).prebuilt
-
-
-def test_torch_is_asked_for_plain_values():
-    facts = readiness.torch_facts()
-    assert facts.keys() == TORCH.keys()

@@ -17,24 +17,12 @@ from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import get_method
 from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.cpu import set_threads
-from ambiguous_wild.splat.data import load_train_data, shrink, shrink_keep
+from ambiguous_wild.splat.data import shrink, shrink_keep
 from ambiguous_wild.splat.effects import with_effects
-from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.pace import Level, ceiling_at, coarse_to_fine, divisor_at
 from ambiguous_wild.splat.parts import MaskPolicy, Parts
-from ambiguous_wild.splat.resolution import Level, ceiling_at, coarse_to_fine, divisor_at
-from ambiguous_wild.splat.trainer import Trainer
+from tests.splat.scenes import bits, trained, trainer_for
 from tests.tiny_scene import write_tiny_scene
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return load_scene(write_tiny_scene(tmp_path_factory.mktemp("data") / "scene"))
-
-
-def trainer_for(scene, folder, *, parts=None, probe=None, **config) -> Trainer:
-    config = {"iterations": 120, "probes": 4} | config
-    data = load_train_data(scene, device=torch.device("cpu"), seed=config.get("seed", 0), cache_dir=folder)
-    return Trainer(data, parts or Parts(), TrainConfig(**config), folder=folder, probe=probe)
 
 
 def parts_of(method: str) -> Parts:
@@ -45,16 +33,6 @@ def parts_of(method: str) -> Parts:
         psi, density = replace(options.psi, steps=40), replace(options.density, min_every=20, merge_every=1.0)
         options = replace(options, psi=psi, density=density, min_mask_start=20, min_reset_pause=10)
     return entry.build(options)
-
-
-def bits(trainer: Trainer) -> dict[str, bytes]:
-    return {name: tensor.numpy().tobytes() for name, tensor in trainer.gaussians.items()}
-
-
-def trained(scene, folder, **kw) -> Trainer:
-    trainer = trainer_for(scene, folder, **kw)
-    trainer.train()
-    return trainer
 
 
 def test_training_learns_the_scene(tmp_path):
@@ -75,14 +53,16 @@ def test_same_seed_same_bits_for_one_and_two_threads(scene, tmp_path, method):
     try:
         for threads in (1, 2):
             set_threads(threads)
-            results.append(bits(trained(scene, tmp_path / str(threads), parts=parts_of(method))))
+            run = trained(scene, tmp_path / str(threads), parts=parts_of(method), iterations=80)
+            results.append(bits(run))
     finally:
         set_threads(2)
     assert results[0] == results[1]
 
 
 def test_another_seed_gives_other_bits(scene, tmp_path):
-    assert bits(trained(scene, tmp_path / "a", seed=0)) != bits(trained(scene, tmp_path / "b", seed=1))
+    runs = [trained(scene, tmp_path / str(seed), seed=seed, iterations=10) for seed in (0, 1)]
+    assert bits(runs[0]) != bits(runs[1])
 
 
 SCRIPT = """
@@ -152,7 +132,7 @@ class FakeTime:
 @pytest.fixture
 def fake_time(monkeypatch):
     clock = FakeTime()
-    for module in ("run", "clock"):
+    for module in ("run", "records"):
         monkeypatch.setattr(f"ambiguous_wild.splat.{module}.time", clock)
     return clock
 
@@ -196,7 +176,7 @@ def test_the_timeline_is_a_table(scene, tmp_path):
     trainer = trained(scene, tmp_path)
     table = pd.read_csv(tmp_path / "timeline.csv")
     assert table["iteration"].is_monotonic_increasing
-    assert table["iteration"].iloc[-1] == 120
+    assert table["iteration"].iloc[-1] == 60
     assert {"wall_s", "loss", "gaussians", "ms_render", "ms_backward"} <= set(table.columns)
     assert table["gaussians"].iloc[-1] == len(trainer.gaussians)
 

@@ -8,18 +8,12 @@ import pytest
 import torch
 
 from ambiguous_wild.harness.running.grid import plan_cells
-from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.parts import MaskPolicy, Parts
 from ambiguous_wild.splat.watchdog import FOLDER, GOOD, MOST_ROLLBACKS, REPORT, STEP, NonFinite, Watchdog
-from tests.splat.test_trainer import bits, parts_of, trained, trainer_for
-from tests.tiny_scene import write_tiny_scene
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return load_scene(write_tiny_scene(tmp_path_factory.mktemp("data") / "scene"))
+from tests.splat.scenes import bits, trained, trainer_for
+from tests.splat.test_trainer import parts_of
 
 
 class Poison(MaskPolicy):

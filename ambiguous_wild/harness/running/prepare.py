@@ -50,8 +50,8 @@ def prepare_cpu(threads: int | None, say: Callable[[str], None] = lambda text: N
         threads: of the kernels; None = as many as there are.
         say: told when something is compiled.
     """
+    from ambiguous_wild.splat.calibration import warm_up
     from ambiguous_wild.splat.cpu import set_threads
-    from ambiguous_wild.splat.cpu.warmup import warm_up
 
     if threads is not None:
         set_threads(threads)

@@ -1,15 +1,19 @@
-"""Adam's arithmetic in sixteen lanes, one definition for every row, seen or not.
+"""Kernels over flat arrays: Adam in sixteen lanes, and whether all values are finite.
 
-A row nobody sees has gradient zero: its moments decay and it moves on momentum alone. Both the dense step
-and the postponed one run `_advance`, so that postponing changes no bit.
+Adam has one definition for every row, seen or not: a row nobody sees has gradient zero, its moments decay
+and it moves on momentum alone. Both the dense step and the postponed one run `_moments` and `_change`, so
+that postponing changes no bit.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numba
 import numpy as np
+from torch import Tensor
 
-from ambiguous_wild.splat.cpu.compile import kernel, parallel_kernel
+from ambiguous_wild.splat.cpu.compile import kernel, parallel_kernel, threads
 from ambiguous_wild.splat.cpu.simd import (
     any_lane,
     fma,
@@ -155,3 +159,64 @@ def sparse(visible, width, p, m, v, g, last, now, rates, roots, beta1, rest1, be
             tail = (rates[now], roots[now], beta1, rest1, beta2, rest2, eps)
             _dense_range(begin * width, row * width, p, m, v, g, *tail)
             row += 1
+
+
+def flat(parameter: Tensor, moments: tuple[Tensor, Tensor]) -> tuple[np.ndarray, ...]:
+    """A parameter and its moments as flat arrays on the same memory.
+
+    Raises:
+        RuntimeError: the parameter is not contiguous.
+    """
+    if not parameter.is_contiguous():
+        raise RuntimeError(f"a parameter {list(parameter.shape)} is not contiguous: Adam changes it in place")
+    return tuple(tensor.detach().numpy().reshape(-1) for tensor in (parameter, *moments))
+
+
+def step_size(rate: float, steps: int, betas: tuple[float, float]) -> tuple[np.float32, np.float32]:
+    """lr / bias1 and 1 / sqrt(bias2) of the step that makes it so many."""
+    return np.float32(rate / (1 - betas[0] ** steps)), np.float32((1 - betas[1] ** steps) ** -0.5)
+
+
+def constants(betas: tuple[float, float], eps: float) -> tuple[np.float32, ...]:
+    """beta1, 1 - beta1, beta2, 1 - beta2 and eps, as the kernels take them."""
+    # 1 - beta is rounded after the difference: float32(0.999) alone is off by 5e-5 of 0.001.
+    return tuple(np.float32(c) for c in (*(c for b in betas for c in (b, 1 - b)), eps))
+
+
+def dense_step(
+    parameter: Tensor,
+    gradient: Tensor,
+    moments: tuple[Tensor, Tensor],
+    rate: float,
+    steps: int,
+    betas: tuple[float, float],
+    eps: float,
+) -> None:
+    """One step of every value, in place; arguments as of `Backend.adam_step`."""
+    dense(
+        *flat(parameter, moments),
+        gradient.numpy().reshape(-1),
+        *step_size(rate, steps, betas),
+        *constants(betas, eps),
+        8 * threads(),
+    )
+
+
+_MAGNITUDE = np.int32(0x7FFFFFFF)  # all of a float32 but its sign
+_INFINITY = np.int32(0x7F800000)  # as an integer: every finite magnitude lies below, every NaN above
+
+
+@kernel
+def _largest(arrays):
+    """The largest magnitude as an integer, in which magnitudes order as they do as numbers."""
+    largest = np.int32(0)
+    for bits in arrays:
+        for i in range(bits.shape[0]):
+            largest = max(largest, bits[i] & _MAGNITUDE)
+    return largest
+
+
+def all_finite(tensors: Iterable[Tensor]) -> bool:
+    """Whether every value of these contiguous float32 tensors on the CPU is a finite number."""
+    bits = tuple([t.numpy().reshape(-1).view(np.int32) for t in tensors])
+    return bool(_largest(bits) < _INFINITY)

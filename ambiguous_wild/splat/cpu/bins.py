@@ -1,8 +1,12 @@
-"""Who is drawn in which tile, front to back: one depth sort of what is visible, then a counting sort by tile.
+"""Who is drawn in which tile, front to back, and which blocks of pixels of a tile a Gaussian can reach.
 
-The tile test is exact (fast-training.md eq. 3): for each row of tiles the interval of x the 1/255 contour
-reaches among that row's pixel centres. Every loop splits into a fixed number of parts, so the lists do
-not depend on the number of threads.
+One depth sort of what is visible, then a counting sort by tile. The tile test is exact (fast-training.md
+eq. 3): for each row of tiles the interval of x the 1/255 contour reaches among that row's pixel centres.
+Every loop splits into a fixed number of parts, so the lists do not depend on the number of threads.
+
+A tile's pixels lie in memory as blocks of 4 x 4, each one vector. Most Gaussians are a few pixels wide: of
+the 32 000 of a trained capture at 240 px, 185 000 blocks of 4 x 4 hold a pixel that is drawn, but 208 000
+of 8 x 2 and 290 000 rows of 16.
 """
 
 from __future__ import annotations
@@ -218,3 +222,54 @@ def scatter(order, records, width, columns, spans, offsets, histogram, tile_slot
                     tile_slots[at] = slot
                     tile_instances[at] = instance
                     instance += 1
+
+
+PIXELS = TILE * TILE
+SIDE = 4  # px, both ways, of a block
+BLOCK = SIDE * SIDE
+ACROSS = TILE // SIDE  # blocks of a tile, both ways; block b lies in row b // 4 and column b % 4 of them
+
+
+@kernel
+def in_tile(x, y):
+    """Where pixel (x, y) of a tile stands in its planes: block after block, each row by row."""
+    return ((y // SIDE) * ACROSS + x // SIDE) * BLOCK + (y % SIDE) * SIDE + x % SIDE
+
+
+@kernel
+def aligned_planes(count):
+    """[count, 256] float32 zeros that start on a cache line: a block that lies across two costs twice."""
+    room = np.zeros(count * PIXELS + BLOCK, np.float32)
+    start = (-room.ctypes.data % (4 * BLOCK)) // 4
+    return room[start : start + count * PIXELS].reshape(count, PIXELS)
+
+
+@kernel
+def pixel_centres():
+    """x and y [256] of the pixel centres of a tile, in the order of its planes."""
+    planes = aligned_planes(2)
+    x_centres, y_centres = planes[0], planes[1]
+    for y in range(TILE):
+        for x in range(TILE):
+            x_centres[in_tile(x, y)] = np.float32(x) + np.float32(0.5)
+            y_centres[in_tile(x, y)] = np.float32(y) + np.float32(0.5)
+    return x_centres, y_centres
+
+
+@kernel
+def _block_range(middle, extent):
+    """First and one past the last block, along one axis, with pixel centres within `extent` of `middle`."""
+    low = math.ceil(middle - extent - np.float32(0.501))
+    high = math.floor(middle + extent - np.float32(0.499))
+    return np.int64(max(low, 0)) // SIDE, np.int64(min(high, TILE - 1)) // SIDE + 1
+
+
+@kernel
+def candidates(record, mx, my):
+    """Blocks that the box around the contour reaches, as bits; (mx, my) is the centre in the tile."""
+    left, right = _block_range(mx, record[EXTENT_X])
+    low, high = _block_range(my, record[EXTENT_Y])
+    if left >= right or low >= high:
+        return np.int64(0)
+    columns = ((1 << right) - (1 << left)) * 0x1111
+    return np.int64(columns & ((1 << (ACROSS * high)) - (1 << (ACROSS * low))))

@@ -14,7 +14,15 @@ import math
 import numba
 import numpy as np
 
-from ambiguous_wild.splat.cpu.bins import TILE
+from ambiguous_wild.splat.cpu.bins import (
+    BLOCK,
+    PIXELS,
+    TILE,
+    aligned_planes,
+    candidates,
+    in_tile,
+    pixel_centres,
+)
 from ambiguous_wild.splat.cpu.compile import kernel, parallel_kernel
 from ambiguous_wild.splat.cpu.project import (
     BLUE,
@@ -43,7 +51,6 @@ from ambiguous_wild.splat.cpu.simd import (
     sum_lanes,
     trailing_zeros,
 )
-from ambiguous_wild.splat.cpu.tile import BLOCK, PIXELS, aligned_planes, candidates, in_tile, pixel_centres
 
 MAX_ALPHA = np.float32(0.99)
 STOP = np.float32(1e-4)  # a Gaussian that would bring the transmittance to or below it is not drawn

@@ -1,5 +1,8 @@
 """How kernels are compiled: one place for the cache, the threads and the threading layer.
 
+Numba's own cache compares a kernel's file alone, so that a change in a function it calls, in another file,
+would go unnoticed. Here compiled kernels lie in a folder whose name is a hash over all of them.
+
 The layer is OpenMP where Numba finds it, which shares two cores with torch's own pool without loss: a step
 of 11 ms and torch work of 7 ms took 20 ms one after the other. Numba's work queue took 35 to 80 ms: torch's
 threads wait on the core its worker needs. The queue, used where there is no OpenMP, allows one caller at a
@@ -8,17 +11,53 @@ time, so parallel kernels run under a lock. OpenMP does not survive a fork: star
 
 from __future__ import annotations
 
+import hashlib
 import os
+import stat
+import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numba
 from numba.extending import intrinsic as _intrinsic
 
 from ambiguous_wild.io.numba_cache import rebuild_damaged_cache as forgiving
-from ambiguous_wild.splat.cpu.cache import kernel_cache
+
+
+def kernel_cache() -> Path:
+    """The user's own NUMBA_CACHE_DIR first, then the home cache, then a private temporary folder."""
+    explicit = os.environ.get("NUMBA_CACHE_DIR")
+    if explicit:
+        return Path(explicit)
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.read_bytes())
+    name = f"kernels-{digest.hexdigest()[:12]}"
+    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ambiguous_wild"
+    try:
+        base.mkdir(parents=True, exist_ok=True)
+        writable = os.access(base, os.W_OK)
+    except OSError:
+        writable = False
+    return base / name if writable else _private_temporary() / name
+
+
+def _private_temporary() -> Path:
+    """A temporary folder of this user alone: compiled code is loaded from it."""
+    user = os.getuid() if hasattr(os, "getuid") else None  # Windows: its temporary folder is the user's own
+    folder = Path(tempfile.gettempdir()) / f"ambiguous_wild-{'user' if user is None else user}"
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        status = folder.lstat()
+    except OSError:
+        return Path(tempfile.mkdtemp(prefix="ambiguous_wild-"))
+    mine = user is None or (status.st_uid == user and not status.st_mode & 0o022)
+    mine = mine and stat.S_ISDIR(status.st_mode)
+    return folder if mine else Path(tempfile.mkdtemp(prefix="ambiguous_wild-"))
+
 
 LAYERS = ["omp", "tbb", "workqueue"]  # the first that is there
 _config: Any = numba.config

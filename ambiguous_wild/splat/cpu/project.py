@@ -18,7 +18,7 @@ import numba
 import numpy as np
 
 from ambiguous_wild.splat.cpu.compile import fused_kernel, parallel_kernel
-from ambiguous_wild.splat.cpu.simd64 import (
+from ambiguous_wild.splat.cpu.simd import (
     LANES,
     at_least,
     at_most,
@@ -26,7 +26,7 @@ from ambiguous_wild.splat.cpu.simd64 import (
     ceiling,
     exp,
     floor,
-    load,
+    load8,
     log,
     magnitude,
     square_root,
@@ -109,9 +109,9 @@ def take(given, k, i, means, quats, log_scales, opacity_logits):
 @fused_kernel
 def in_camera(given, at, cam):
     """The centres of columns at .. at + 7 as the camera sees them."""
-    m0 = load(given, at)
-    m1 = load(given, GROUP + at)
-    m2 = load(given, 2 * GROUP + at)
+    m0 = load8(given, at)
+    m1 = load8(given, GROUP + at)
+    m2 = load8(given, 2 * GROUP + at)
     return (
         cam[0] * m0 + cam[1] * m1 + cam[2] * m2 + cam[3],
         cam[4] * m0 + cam[5] * m1 + cam[6] * m2 + cam[7],
@@ -122,16 +122,16 @@ def in_camera(given, at, cam):
 @fused_kernel
 def shape_of(given, at):
     """Unit quaternion, the norm it had, and the scales of columns at .. at + 7."""
-    w_ = load(given, 3 * GROUP + at)
-    qx = load(given, 4 * GROUP + at)
-    qy = load(given, 5 * GROUP + at)
-    qz = load(given, 6 * GROUP + at)
+    w_ = load8(given, 3 * GROUP + at)
+    qx = load8(given, 4 * GROUP + at)
+    qy = load8(given, 5 * GROUP + at)
+    qz = load8(given, 6 * GROUP + at)
     norm = square_root(w_ * w_ + qx * qx + qy * qy + qz * qz)
     inv = 1.0 / norm
     scales = (
-        exp(load(given, 7 * GROUP + at)),
-        exp(load(given, 8 * GROUP + at)),
-        exp(load(given, 9 * GROUP + at)),
+        exp(load8(given, 7 * GROUP + at)),
+        exp(load8(given, 8 * GROUP + at)),
+        exp(load8(given, 9 * GROUP + at)),
     )
     return (w_ * inv, qx * inv, qy * inv, qz * inv), norm, scales
 
@@ -143,7 +143,7 @@ def _project_eight(given, at, cam, antialias, found):
     x, y, z = in_camera(given, at, cam)
     # Comparisons are written so that NaN fails them: a broken Gaussian is culled.
     seen = (z >= NEAR) & (z < _HUGE)
-    logit = load(given, 10 * GROUP + at)
+    logit = load8(given, 10 * GROUP + at)
     seen = seen & (logit > -5.6)  # sigmoid below 1/255
     quat, norm, scales = shape_of(given, at)
     seen = seen & (norm > _SHORT) & (norm < _HUGE)

@@ -34,10 +34,7 @@ from ambiguous_wild.splat.cpu.project import (
     shape_of,
     take,
 )
-from ambiguous_wild.splat.cpu.simd import load as load_row
-from ambiguous_wild.splat.cpu.simd import splat
-from ambiguous_wild.splat.cpu.simd import store as store_row
-from ambiguous_wild.splat.cpu.simd64 import LANES, exp, load, select, store
+from ambiguous_wild.splat.cpu.simd import LANES, exp, load, load8, select, splat, store
 
 _PER_LOG2 = 1.3862943611198906  # 2 / log2(e): curvatures of the records are of 2 to the power
 
@@ -111,17 +108,17 @@ def _reverse_eight(given, at, cam, antialias, found):
     p, q, a, b, rot = footprint(quat, cam, x, y, z)
     f1 = (p[0] * s[0], p[1] * s[1], p[2] * s[2])
     f2 = (q[0] * s[0], q[1] * s[1], q[2] * s[2])
-    s_h = load(given, 11 * GROUP + at)
+    s_h = load8(given, 11 * GROUP + at)
     sums = (
         s_h,
-        load(given, 12 * GROUP + at),
-        load(given, 13 * GROUP + at),
-        load(given, 14 * GROUP + at),
-        load(given, 15 * GROUP + at),
-        load(given, 16 * GROUP + at),
+        load8(given, 12 * GROUP + at),
+        load8(given, 13 * GROUP + at),
+        load8(given, 14 * GROUP + at),
+        load8(given, 15 * GROUP + at),
+        load8(given, 16 * GROUP + at),
     )
     du, dv, g1, g2, inv_v, inv_y, slant = _covariance_gradient(sums, f1, f2, antialias, cam[22], cam[23])
-    opacity = 1.0 / (1.0 + exp(0.0 - load(given, 10 * GROUP + at)))
+    opacity = 1.0 / (1.0 + exp(0.0 - load8(given, 10 * GROUP + at)))
     store(found, 7 * GROUP + at, g1[0] * f1[0] + g2[0] * f2[0])
     store(found, 8 * GROUP + at, g1[1] * f1[1] + g2[1] * f2[1])
     store(found, 9 * GROUP + at, g1[2] * f1[2] + g2[2] * f2[2])
@@ -157,7 +154,7 @@ def _reverse_eight(given, at, cam, antialias, found):
     ry = y * near
     cx = du * cam[12] * near
     cy = dv * cam[13] * near
-    cz = load(given, 17 * GROUP + at) - (cx * x + cy * y) * near
+    cz = load8(given, 17 * GROUP + at) - (cx * x + cy * y) * near
     cz = cz - (ga0 * a[0] + ga1 * a[1] + ga2 * a[2] + gb0 * b[0] + gb1 * b[1] + gb2 * b[2]) * near
     slope = -cam[12] * near * near * (ga0 * cam[8] + ga1 * cam[9] + ga2 * cam[10])
     slope = select((rx >= cam[18]) & (rx <= cam[19]), slope, 0.0)
@@ -285,8 +282,8 @@ def _reverse_chunk(
             if ids[slot] >= 0:
                 row = splat(np.float32(0.0))
                 for at in range(offsets[slot], offsets[slot] + instances[slot]):
-                    row = row + load_row(sums, at * ROW)
-                store_row(totals, count * ROW, row)
+                    row = row + load(sums, at * ROW)
+                store(totals, count * ROW, row)
                 take(given, count, ids[slot], means, quats, log_scales, opacity_logits)
                 for k in range(6):
                     given[11 + k, count] = totals[count, SUM_H + k]

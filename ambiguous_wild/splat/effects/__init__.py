@@ -24,7 +24,7 @@ EFFECTS: dict[str, tuple[str, str, str]] = {
     "poses": ("poses", "PoseRefinement", "a small correction of every camera's pose"),
     "skybox": ("skybox", "Skybox", "first Gaussians on a far sphere too, for what lies behind the scene"),
     "dense": ("dense", "DenseStart", "first Gaussians on dense points too, for few photos"),
-    "near": ("near", "NearSpace", "no Gaussians close before a camera"),
+    "near": ("skybox", "NearSpace", "no Gaussians close before a camera"),
     "sh0": ("", "", "colours that do not depend on the direction"),
     "sh1": ("", "", "spherical harmonics up to degree 1"),
     "sh2": ("", "", "spherical harmonics up to degree 2"),

@@ -3,17 +3,27 @@
 Where photos overlap little, 3DGS's growth puts Gaussians where they explain one photo, often close to its
 camera. Points on which several photos agree leave less to be guessed. The idea is that of EDGS (Kotovenko et
 al., 2025); we use plane sweeps instead of a matching network.
+
+A plane sweep (Collins, CVPR 1996) tries planes parallel to a photo's image plane. On each of them the
+neighbouring photos are drawn into the photo, and compared by the correlation of small windows (ZNCC), which
+does not see exposure. A depth is kept where the correlation is high at one depth only and where other photos'
+depths agree. A distractor that moves has no depth on which two other photos agree.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 
+from ambiguous_wild.core import Camera
+from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.effects.tracks import tracks_of
-from ambiguous_wild.splat.plane_sweep import dense_points
 from ambiguous_wild.splat.step import TrainData
 
 
@@ -36,3 +46,290 @@ class DenseStart(Effect):
 
     def facts(self) -> dict[str, Any]:
         return {"points": self.count}
+
+
+_LEAST_POINTS = 10  # of the sparse model in a photo, for the range of its depths
+_MOST_POINTS = 5000  # that choose neighbours where there are no tracks
+# degrees between two photos' rays: the best, its spread below and above, and the least in the median
+_ANGLE, _BELOW, _ABOVE, _LEAST_ANGLE = 8.0, 4.0, 12.0, 1.0
+_NOISE = 1e-5  # variance of grey in [0, 1] that is no structure
+_PEAK = 3  # planes around the best one that belong to its peak
+
+
+@dataclass(frozen=True)
+class SweepConfig:
+    """How photos are compared, and which depths are kept."""
+
+    side: int = 160  # px, the longer side at which photos are compared
+    photos: int = 64  # at most so many, evenly chosen
+    planes: int = 64  # evenly spaced in inverse depth
+    views: int = 4  # neighbours that a photo is compared with; the best two count
+    window: int = 7  # px
+    correlation: float = 0.75  # at least, in the mean of the best two neighbours
+    margin: float = 0.02  # above that of all other depths
+    tolerance: float = 0.02  # relative difference of depths that agree
+    agreeing: int = 2  # photos whose depth must agree, of twice `views`
+
+    def __post_init__(self) -> None:
+        check_limits(
+            self, "sweep", side=(16, 4096), photos=(2, math.inf), planes=(8, 1024), views=(1, 64),
+            window=(3, 63), correlation=(-1, 1), margin=(0, 1), tolerance=(1e-6, 1), agreeing=(1, 128),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Photo:
+    """One photo, made small."""
+
+    camera: Camera  # of the small photo
+    rgb: np.ndarray  # [h, w, 3] float32
+    grey: np.ndarray  # [h, w] float32
+    shown: np.ndarray  # the same, -1 where it is masked
+    judged: np.ndarray  # [h, w] bool, static by the capture's own masks
+    seen: np.ndarray  # indices of the sparse points it sees
+
+
+def dense_points(
+    cameras: Sequence[Camera],
+    photo: Callable[[int], np.ndarray],
+    sparse: np.ndarray,
+    tracks: Sequence[np.ndarray],
+    keep: Sequence[np.ndarray | None],
+    most: int,
+    config: SweepConfig | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points on surfaces that at least three photos see at the same depth.
+
+    Args:
+        cameras: of the photos.
+        photo: of a camera's index, [H, W, 3] in [0, 1], sRGB.
+        sparse: [N, 3] points of the sparse model, which give the range of depths.
+        tracks: of each photo, the indices of points that were found in it; may be empty.
+        keep: of each photo, [H, W], 1 = used; None = all is used.
+        most: points to return at most.
+        config: settings.
+
+    Returns:
+        xyz [M, 3] float64 and rgb [M, 3] uint8. M is 0 where nothing agrees.
+    """
+    config = config or SweepConfig()
+    count = len(cameras)
+    if most < 1 or not count:
+        return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    chosen = sorted({k * count // min(count, config.photos) for k in range(min(count, config.photos))})
+    small = [_small(cameras[k], photo(k), keep[k], sparse, tracks[k], config.side) for k in chosen]
+    near = [_neighbours(small, k, sparse, 2 * config.views) for k in range(len(small))]
+    depths = [
+        _depth(own, [small[j] for j in near[k][: config.views]], sparse, config)
+        for k, own in enumerate(small)
+    ]
+    found = [
+        _agreeing(small[k], depths[k], [(small[j], depths[j]) for j in near[k]], config)
+        for k in range(len(small))
+    ]
+    xyz, rgb = _thinned(small, found, most, config.tolerance)
+    return xyz, np.clip(np.rint(rgb * 255.0), 0, 255).astype(np.uint8)
+
+
+def _small(
+    camera: Camera, photo: np.ndarray, keep: np.ndarray | None, xyz: np.ndarray, track: np.ndarray, side: int
+) -> _Photo:
+    share = min(1.0, side / max(photo.shape[:2]))
+    size = tuple(max(round(n * share), 8) for n in photo.shape[1::-1])
+    rgb = cv2.resize(np.ascontiguousarray(photo, np.float32), size, interpolation=cv2.INTER_AREA)
+    judged = np.ones(rgb.shape[:2], bool)
+    if keep is not None:
+        judged = cv2.resize(np.ascontiguousarray(keep, np.float32), size, interpolation=cv2.INTER_AREA) > 0.99
+    shrunk = camera.resized(*size)
+    seen = np.asarray(track, np.int64)
+    if len(seen) < _LEAST_POINTS:  # a model without tracks: all points in the frame
+        some = np.arange(0, len(xyz), max(-(-len(xyz) // _MOST_POINTS), 1))
+        pixels, z = _projected(shrunk, xyz[some])
+        seen = some[_inside(pixels, z, rgb.shape[:2])]
+    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    return _Photo(shrunk, rgb, grey, np.where(judged, grey, np.float32(-1.0)), judged, seen)
+
+
+def _neighbours(small: Sequence[_Photo], at: int, xyz: np.ndarray, most: int) -> list[int]:
+    """The photos with most sparse points in common under good angles, the best first (as MVSNet chooses)."""
+    own, scores = small[at], []
+    for k, other in enumerate(small):
+        both = np.intersect1d(own.seen, other.seen, assume_unique=True) if k != at else own.seen[:0]
+        if len(both):
+            a, b = xyz[both] - own.camera.center, xyz[both] - other.camera.center
+            cosine = (a * b).sum(axis=1) / np.linalg.norm(a, axis=1) / np.linalg.norm(b, axis=1)
+            angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+            if not np.median(angle) >= _LEAST_ANGLE:  # from one place every depth looks the same
+                continue
+            spread = np.where(angle < _ANGLE, _BELOW, _ABOVE)
+            scores.append((-float(np.exp(-0.5 * ((angle - _ANGLE) / spread) ** 2).sum()), k))
+    return [k for _, k in sorted(scores)[:most]]
+
+
+def _depth(photo: _Photo, others: Sequence[_Photo], xyz: np.ndarray, config: SweepConfig) -> np.ndarray:
+    """Depth [h, w] float32 of a photo; 0 where it is not known."""
+    shape = photo.grey.shape
+    z = _projected(photo.camera, xyz[photo.seen])[1]
+    z = z[z > 0]
+    if len(z) < _LEAST_POINTS or len(others) < 2:
+        return np.zeros(shape, np.float32)
+    # a few wrong points must not spread the planes
+    near, middle, far = np.quantile(z, [0.02, 0.5, 0.98])
+    near, far = max(near, middle / 4.0), min(far, 20.0 * middle)
+    inverse = np.linspace(1.0 / (1.5 * far), 1.0 / (0.8 * near), config.planes)
+    mean, variance = _moments(photo.grey, config.window)
+    scores = np.empty((config.planes, *shape), np.float32)
+    parts = [_plane_warp(photo.camera, other.camera) for other in others]
+    for k, nearness in enumerate(inverse):
+        first = np.full(shape, -1.0, np.float32)
+        second = first.copy()
+        for other, (turn, shift) in zip(others, parts):
+            warp = turn + nearness * shift
+            score = _correlation(photo.grey, mean, variance, other.shown, warp, config.window)
+            second = np.maximum(second, np.minimum(first, score))
+            first = np.maximum(first, score)
+        scores[k] = 0.5 * (first + second)
+    best = scores.argmax(axis=0)
+    inner = np.clip(best, 1, config.planes - 2)
+    below, top, above = (np.take_along_axis(scores, (inner + d)[None], axis=0)[0] for d in (-1, 0, 1))
+    away = np.abs(np.arange(config.planes)[:, None, None] - best[None]) > _PEAK
+    rival = np.where(away, scores, -1.0).max(axis=0)
+    bend = below - 2.0 * top + above  # of a parabola through the three scores around the best one
+    offset = np.where(bend < 0, 0.5 * (below - above) / np.where(bend < 0, bend, -1.0), 0.0).clip(-0.5, 0.5)
+    depth = 1.0 / (inverse[0] + (inner + offset) * (inverse[1] - inverse[0]))
+    sure = (inner == best) & (top > config.correlation) & (rival < top - config.margin)
+    return np.where(sure & photo.judged & (variance > 10 * _NOISE), depth, 0.0).astype(np.float32)
+
+
+def _plane_warp(camera: Camera, other: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """(A, B), [3, 3] each: A + B / z takes pixels of a camera, on the plane of depth z, to the other's."""
+    to_other = other.cam_from_world @ np.linalg.inv(camera.cam_from_world)
+    inner = _intrinsics(other)
+    turn = inner @ to_other[:3, :3] @ np.linalg.inv(_intrinsics(camera))
+    return turn, np.outer(inner @ to_other[:3, 3], [0.0, 0.0, 1.0])
+
+
+def _correlation(
+    grey: np.ndarray, mean: np.ndarray, variance: np.ndarray, other: np.ndarray, warp: np.ndarray, window: int
+) -> np.ndarray:
+    """ZNCC [h, w] of windows around each pixel and where `warp` takes them in `other`; -1 outside of it."""
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    drawn = cv2.warpPerspective(other, warp, grey.shape[::-1], flags=flags, borderValue=-1.0)
+    height, width = grey.shape
+    ends = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]]) @ warp[2]
+    if ends.min() <= 0:  # a part of the plane lies behind the other camera
+        return np.full(grey.shape, -1.0, np.float32)
+    outside = drawn < 0
+    drawn[outside] = 0.0
+    their_mean, their_variance = _moments(drawn, window)
+    both = _box(grey * drawn, window) - mean * their_mean
+    score = both / np.sqrt((variance + _NOISE) * (their_variance + _NOISE))
+    score[outside] = -1.0
+    return score
+
+
+def _moments(grey: np.ndarray, window: int) -> tuple[np.ndarray, np.ndarray]:
+    mean = _box(grey, window)
+    return mean, np.maximum(_box(grey * grey, window) - mean * mean, 0.0)
+
+
+def _box(x: np.ndarray, window: int) -> np.ndarray:
+    return cv2.blur(x, (window, window), borderType=cv2.BORDER_REFLECT)
+
+
+def _agreeing(
+    photo: _Photo, depth: np.ndarray, others: Sequence[tuple[_Photo, np.ndarray]], config: SweepConfig
+) -> np.ndarray:
+    """The depths [h, w] that enough others agree with; 0 elsewhere."""
+    rows, columns = np.nonzero(depth > 0)
+    world = _world(photo.camera, columns, rows, depth[rows, columns])
+    votes = np.zeros(len(world), np.int64)
+    for other, theirs in others:
+        votes += _same_surface(other.camera, theirs, world, config.tolerance)
+    found = np.zeros_like(depth)
+    sure = votes >= config.agreeing
+    found[rows[sure], columns[sure]] = depth[rows[sure], columns[sure]]
+    return found
+
+
+def _same_surface(camera: Camera, depth: np.ndarray, world: np.ndarray, tolerance: float) -> np.ndarray:
+    """Which world points [N, 3] lie at the depth [h, w] of a camera's map, [N] bool."""
+    pixels, z = _projected(camera, world)
+    same = _inside(pixels, z, depth.shape)
+    at = np.clip(np.rint(np.nan_to_num(pixels[same])).astype(np.int64), 0, np.array(depth.shape[::-1]) - 1)
+    there = depth[at[:, 1], at[:, 0]]
+    same[same] = (there > 0) & (np.abs(there - z[same]) < tolerance * z[same])
+    return same
+
+
+def _thinned(
+    small: Sequence[_Photo], depths: Sequence[np.ndarray], most: int, tolerance: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Evenly over the photos, each surface once: xyz [M, 3] and rgb [M, 3] in [0, 1], at most `most`.
+
+    Cells of the photos are as large as needed: a close surface gets closer points than a far one.
+    """
+    cell, longest = 2, max(max(photo.grey.shape) for photo in small)
+    while True:
+        xyz, rgb = _one_a_cell(small, depths, cell, tolerance)
+        if len(xyz) <= most or cell > longest:
+            # more photos than points: evenly chosen
+            some = np.arange(min(len(xyz), most)) * len(xyz) // max(min(len(xyz), most), 1)
+            return xyz[some], rgb[some]
+        # points fall with the square of the cell
+        cell = max(cell + 1, math.floor(cell * math.sqrt(len(xyz) / most)))
+
+
+def _one_a_cell(
+    small: Sequence[_Photo], depths: Sequence[np.ndarray], cell: int, tolerance: float
+) -> tuple[np.ndarray, np.ndarray]:
+    xyz, rgb = np.zeros((0, 3)), np.zeros((0, 3))
+    for photo, depth in zip(small, depths):
+        shape = depth.shape
+        taken = np.zeros((shape[0] // cell + 1, shape[1] // cell + 1), bool)
+        pixels, z = _projected(photo.camera, xyz)
+        at = np.flatnonzero(_inside(pixels, z, shape))
+        x, y = np.clip(np.rint(pixels[at]).astype(np.int64), 0, np.array(shape[::-1]) - 1).T
+        # a point that this photo does not see, because something is before it, takes no cell
+        shown = (depth[y, x] == 0) | (z[at] < (1.0 + 2 * tolerance) * depth[y, x])
+        taken[y[shown] // cell, x[shown] // cell] = True
+        rows, columns = np.nonzero(depth > 0)
+        free = ~taken[rows // cell, columns // cell]
+        rows, columns = rows[free], columns[free]
+        # of a free cell the pixel that is nearest to its centre
+        away = np.hypot(rows % cell - (cell - 1) / 2, columns % cell - (cell - 1) / 2)
+        order = np.lexsort((columns, rows, away))
+        cells = rows // cell * taken.shape[1] + columns // cell
+        _, first = np.unique(cells[order], return_index=True)
+        rows, columns = rows[order][first], columns[order][first]
+        xyz = np.concatenate([xyz, _world(photo.camera, columns, rows, depth[rows, columns])])
+        rgb = np.concatenate([rgb, photo.rgb[rows, columns]])
+    return xyz, rgb
+
+
+def _intrinsics(camera: Camera) -> np.ndarray:
+    """[3, 3] for pixels whose centres are whole numbers, as OpenCV's are."""
+    found = camera.intrinsics
+    found[:2, 2] -= 0.5
+    return found
+
+
+def _projected(camera: Camera, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (x, y) [N, 2], whole at their centres, and depths [N] of world points."""
+    local = xyz @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+    z = local[:, 2]
+    safe = np.where(z > 0, z, 1.0)
+    pixels = local[:, :2] / safe[:, None] * [camera.fx, camera.fy] + [camera.cx - 0.5, camera.cy - 0.5]
+    return pixels, z
+
+
+def _inside(pixels: np.ndarray, z: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    return (z > 0) & (pixels > -0.5).all(axis=1) & (pixels < np.array(shape[1::-1]) - 0.5).all(axis=1)
+
+
+def _world(camera: Camera, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """World points [N, 3] of pixels at depths z."""
+    local = np.stack(
+        [(x + 0.5 - camera.cx) / camera.fx * z, (y + 0.5 - camera.cy) / camera.fy * z, z], axis=1
+    ).astype(np.float64)
+    return (local - camera.cam_from_world[:3, 3]) @ camera.cam_from_world[:3, :3]

@@ -1,8 +1,4 @@
-"""Where Gaussians lie for a camera, and codes of positions: what recipes with nets share.
-
-What comes from the camera is copied to the Gaussians' device once a camera: a copy in every step makes the
-host of an accelerator wait.
-"""
+"""Where Gaussians lie for a camera, and codes of positions: what recipes with nets share."""
 
 from __future__ import annotations
 
@@ -16,24 +12,13 @@ from torch import Tensor
 from ambiguous_wild.core import Camera
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.effects.learnt import Leaf
-from ambiguous_wild.splat.effects.posed import PosedCamera
+from ambiguous_wild.splat.effects.posed import on_device
 from ambiguous_wild.splat.gaussians import SH_C0
-
-_MOST = 8192  # cameras kept
-_known: dict[tuple[int, str, torch.dtype], tuple[Camera, Tensor]] = {}
 
 
 def pose_like(camera: Camera, like: Tensor) -> Tensor:
     """cam_from_world [3, 4] in the type and place of `like`."""
-    if isinstance(camera, PosedCamera):  # of pose refinement: another one in every step, made there
-        return camera.pose[:3].to(like)
-    key = (id(camera), str(like.device), like.dtype)
-    if key not in _known:
-        if len(_known) >= _MOST:
-            _known.clear()
-        pose = torch.as_tensor(camera.cam_from_world[:3].copy(), dtype=like.dtype, device=like.device)
-        _known[key] = (camera, pose)  # the camera too: as long as it lives, its id is its own
-    return _known[key][1]
+    return on_device(camera, like.device, like.dtype).viewmat[0, :3]
 
 
 def directions(means: Tensor, camera: Camera) -> Tensor:

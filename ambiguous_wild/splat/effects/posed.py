@@ -1,18 +1,51 @@
-"""A camera whose pose was learnt on an accelerator and stays there, and the rigid motions it is made of.
+"""Cameras where tensors lie: their matrices, copied once, and poses that were learnt there.
 
-The renderer takes `pose`, `intrinsics_there` and `centre` as they lie. Whoever asks for the numpy pose of
-`Camera` gets it too, and makes the host wait for it.
+The renderer takes `pose`, `intrinsics_there` and `centre` of a learnt pose as they lie. Whoever asks for
+the numpy pose of `Camera` gets it too, and makes the host of an accelerator wait for it.
 """
 
 from __future__ import annotations
 
 import functools
+from collections import OrderedDict
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ambiguous_wild.core import Camera
+
+_REMEMBERED = 8192  # cameras; a thousand photos at three sizes, and their test views
+
+
+@dataclass(frozen=True)
+class OnDevice:
+    """A camera's matrices on a device."""
+
+    viewmat: Tensor  # [1, 4, 4] cam_from_world
+    intrinsics: Tensor  # [1, 3, 3]
+    centre: Tensor  # [3]
+
+
+_cameras: OrderedDict[tuple[int, torch.device, torch.dtype], tuple[Camera, OnDevice]] = OrderedDict()
+
+
+def on_device(camera: Camera, device: torch.device, dtype: torch.dtype = torch.float32) -> OnDevice:
+    """The camera's matrices there, copied once: a copy from the host in every step would make it wait."""
+    if isinstance(camera, PosedCamera):  # of pose refinement: another one in every step, made there
+        return OnDevice(
+            camera.pose.to(dtype)[None], camera.intrinsics_there.to(dtype)[None], camera.centre.to(dtype)
+        )
+    key = (id(camera), device, dtype)
+    if key not in _cameras:
+        host = camera.cam_from_world[None], camera.intrinsics[None], camera.center
+        there = OnDevice(*(torch.tensor(matrix).to(dtype).to(device) for matrix in host))
+        _cameras[key] = (camera, there)  # the camera itself too: as long as it lives, its id is its own
+        if len(_cameras) > _REMEMBERED:
+            _cameras.popitem(last=False)
+    _cameras.move_to_end(key)
+    return _cameras[key][1]
 
 
 class PosedCamera(Camera):
@@ -61,37 +94,3 @@ def scaled(intrinsics: Tensor, x: float, y: float) -> Tensor:
     out[0] *= x
     out[1] *= y
     return out
-
-
-def hat(vector: Tensor) -> Tensor:
-    """[3, 3] matrix of x -> vector x x."""
-    eye = torch.eye(3, dtype=vector.dtype, device=vector.device)
-    return torch.linalg.cross(vector.expand(3, 3), eye).T
-
-
-def turned(rotation: Tensor) -> Tensor:
-    """exp(w) [3, 3] of a rotation vector [3], rad; smooth at zero and without a look at its length."""
-    a, b, _ = _coefficients(rotation)
-    cross = hat(rotation)
-    eye = torch.eye(3, dtype=rotation.dtype, device=rotation.device)
-    return eye + a * cross + b * cross @ cross
-
-
-def left_jacobian(rotation: Tensor) -> Tensor:
-    """J [3, 3] of exp(w + dw) = exp(J dw) exp(w)."""
-    _, b, c = _coefficients(rotation)
-    cross = hat(rotation)
-    eye = torch.eye(3, dtype=rotation.dtype, device=rotation.device)
-    return eye + b * cross + c * cross @ cross
-
-
-def _coefficients(rotation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """sin t / t, (1 - cos t) / t^2 and (t - sin t) / t^3 of the angle t, 0-d each."""
-    squared = (rotation * rotation).sum()
-    angle = squared.sqrt()
-    a = torch.sinc(angle / torch.pi)
-    b = 0.5 * torch.sinc(angle / (2 * torch.pi)) ** 2
-    # below 0.01 rad the difference loses digits that two terms of the series have
-    series = 1.0 / 6.0 - squared / 120.0
-    c = torch.where(squared < 1e-4, series, (1.0 - a) / squared.clamp(min=1e-8))
-    return a, b, c

@@ -1,9 +1,13 @@
-"""A skybox: Gaussians on a far sphere, which explain what lies behind the scene.
+"""Where Gaussians belong: a skybox behind the scene, and nothing close before a camera.
 
-SfM points lie on the scene alone. What the photos show behind it (a dark room, the sky) is else explained by
-haze: large, faint Gaussians anywhere before the cameras, which a test photo sees from the side. A skybox is
-that of Kerbl et al., "A Hierarchical 3D Gaussian Representation", SIGGRAPH 2024. Here it is coarse, and
+SfM points lie on the scene alone. What the photos show behind it (a dark room, the sky) is else explained
+by haze: large, faint Gaussians anywhere before the cameras, which a test photo sees from the side. A skybox
+is that of Kerbl et al., "A Hierarchical 3D Gaussian Representation", SIGGRAPH 2024. Here it is coarse, and
 density control leaves it alone: it learns light, not the distractors that stand before it.
+
+Close before a camera lie floaters that explain one photo and that no other photo corrects. What lies in a
+camera's picture nearer than a share of its nearest SfM points becomes transparent. While density control
+works, it removes it.
 """
 
 from __future__ import annotations
@@ -18,8 +22,9 @@ from torch import Tensor
 from ambiguous_wild.core import Camera
 from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.effects.placing import inside, projected
-from ambiguous_wild.splat.gaussians import LEAST_POINTS
-from ambiguous_wild.splat.step import TrainData
+from ambiguous_wild.splat.effects.tracks import tracks_of
+from ambiguous_wild.splat.gaussians import LEAST_POINTS, Gaussians
+from ambiguous_wild.splat.step import Step, TrainData
 
 RADIUS = 8.0  # times the distance of the farthest camera, or of 99 % of the SfM points, from their middle
 COUNT = 4000  # on the whole sphere, some 3 degrees apart; those that a photo looks at are used
@@ -110,3 +115,41 @@ def _colours(
         found[k, rows] = cv2.blur(photo, (side, side))[v, u]
     median = np.ma.median(np.ma.masked_invalid(found), axis=0).filled(0.0)
     return np.clip(np.rint(median * 255.0), 0, 255).astype(np.uint8)
+
+
+SHARE = 0.6  # of the depth of the nearest points
+NEAREST = 0.02  # quantile of depths that stands for them
+FEW_POINTS = 20  # a camera with fewer says nothing
+EVERY = 50  # iterations
+GONE = -9.0  # logit of opacity: Adam does not bring it back above what density control removes in a round
+
+
+class NearSpace(Effect):
+    """Keeps the space before every train camera empty."""
+
+    name = "near"
+
+    def setup(self, data: TrainData) -> None:
+        xyz = data.scene.points.xyz
+        self.empty: list[tuple[Camera, float]] = []  # camera, depth up to which nothing belongs
+        for camera, seen in zip(data.cameras, tracks_of(data.scene)):
+            depth = xyz[seen] @ camera.cam_from_world[2, :3] + camera.cam_from_world[2, 3]
+            depth = depth[depth > 0]
+            if len(depth) >= FEW_POINTS:
+                self.empty.append((camera, SHARE * float(np.quantile(depth, NEAREST))))
+
+    @torch.no_grad()
+    def after_step(self, step: Step, gaussians: Gaussians) -> None:
+        if step.iteration % EVERY == 0:
+            gaussians.opacity_logits[self.holds(gaussians.means)] = GONE
+
+    def holds(self, means: Tensor) -> Tensor:
+        """[N] bool of means [N, 3]: in the empty space of any camera."""
+        found = torch.zeros(len(means), dtype=torch.bool, device=means.device)
+        for camera, depth in self.empty:
+            pixels, z = projected(means, camera)
+            found |= inside(pixels, z, camera, margin=0.0) & (z < depth)
+        return found
+
+    def facts(self) -> dict[str, Any]:
+        return {"cameras": len(self.empty)}

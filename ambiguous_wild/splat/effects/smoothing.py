@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.splat.effects.base import Effect, State
+from ambiguous_wild.splat.effects.placing import pose_like
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.rendered import Gradients, Pull
 from ambiguous_wild.splat.step import Shot, TrainData
@@ -33,7 +34,6 @@ class SmoothingFilter(Effect):
     def setup(self, data: TrainData) -> None:
         self.cameras = data.cameras
         self.size = torch.zeros(0, device=data.device)  # [N] f, world units
-        self._poses: list[Tensor] = []  # of the cameras, where the Gaussians are
         self._stale = True  # rows changed since
         self._at = 0
 
@@ -41,7 +41,7 @@ class SmoothingFilter(Effect):
         size = self.size
         due = self._stale or (not shot.neutral and shot.iteration - self._at >= EVERY)
         if due or shot.other_gaussians:
-            size = filter_sizes(gaussians.means, self.cameras, self._poses_like(gaussians.means))
+            size = filter_sizes(gaussians.means, self.cameras)
             if not shot.neutral and not shot.other_gaussians:  # a probe changes no state
                 self.size, self._at, self._stale = size, shot.iteration, False
         variance = (2 * gaussians.log_scales).exp()
@@ -63,12 +63,6 @@ class SmoothingFilter(Effect):
 
         return replace(gaussians, log_scales=0.5 * wide.log(), opacity_logits=torch.logit(opacity)), pull
 
-    def _poses_like(self, means: Tensor) -> list[Tensor]:
-        """Copied there once: copies in between steps make the host of an accelerator wait."""
-        if not self._poses or (self._poses[0].dtype, self._poses[0].device) != (means.dtype, means.device):
-            self._poses = poses_like(means, self.cameras)
-        return self._poses
-
     def rows_changed(self) -> None:
         self._stale = True
 
@@ -83,25 +77,17 @@ class SmoothingFilter(Effect):
         self._at, self._stale = int(state["at"]), bool(state["stale"])
 
 
-def poses_like(means: Tensor, cameras: list[Camera]) -> list[Tensor]:
-    """cam_from_world [4, 4] of every camera, in the type and place of `means`."""
-    return [
-        torch.as_tensor(camera.cam_from_world.copy(), dtype=means.dtype, device=means.device)
-        for camera in cameras
-    ]
-
-
 @torch.no_grad()
-def filter_sizes(means: Tensor, cameras: list[Camera], poses: list[Tensor] | None = None) -> Tensor:
+def filter_sizes(means: Tensor, cameras: list[Camera]) -> Tensor:
     """f [N] in world units: sqrt(0.2) z / F, z to the nearest camera that sees it, F the longest focal.
 
     Args:
         means: [N, 3] world.
         cameras: of the train photos, at full size.
-        poses: `poses_like` of them, where they are at hand.
     """
     nearest = torch.full_like(means[:, 0], torch.inf)
-    for camera, pose in zip(cameras, poses_like(means, cameras) if poses is None else poses):
+    for camera in cameras:
+        pose = pose_like(camera, means)
         x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
         depth = z.clamp(min=1e-3)
         u = (camera.fx * x / depth + camera.cx) / camera.width

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.extras import install_command
-from ambiguous_wild.splat.gpu.footprint import compensation
+from ambiguous_wild.splat.gpu.kernels import compensation
 
 NEAR = 0.01  # world units, as on the CPU
 BLUR = 0.3  # px^2, as on the CPU

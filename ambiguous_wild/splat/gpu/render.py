@@ -10,7 +10,6 @@ Nothing here reads a tensor's values: the host waits once a picture, in gsplat, 
 from __future__ import annotations
 
 import functools
-from collections import OrderedDict
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,10 +18,10 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError, Camera
 from ambiguous_wild.splat import readiness
-from ambiguous_wild.splat.effects.posed import PosedCamera
+from ambiguous_wild.splat.effects.posed import on_device
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
 from ambiguous_wild.splat.gpu import gsplat_seam as seam
-from ambiguous_wild.splat.gpu.footprint import visible
+from ambiguous_wild.splat.gpu.kernels import visible
 from ambiguous_wild.splat.rendered import (
     GSPLAT_SUMS,
     NOTHING,
@@ -35,19 +34,6 @@ from ambiguous_wild.splat.rendered import (
     spread,
 )
 
-_REMEMBERED = 8192  # cameras; a thousand photos at three sizes, and their test views
-
-
-@dataclass(frozen=True)
-class OnDevice:
-    """A camera as gsplat wants it."""
-
-    viewmat: Tensor  # [1, 4, 4]
-    intrinsics: Tensor  # [1, 3, 3]
-    centre: Tensor  # [3]
-
-
-_cameras: OrderedDict[tuple[int, torch.device], tuple[Camera, OnDevice]] = OrderedDict()
 _backgrounds: dict[tuple[tuple[float, float, float], torch.device], Tensor] = {}
 
 
@@ -274,28 +260,6 @@ def _shaded(shade: Shade, gaussians: Gaussians, base: Tensor, splats: seam.Splat
     if colours.shape != base.shape:
         raise AwError(f"a shading function must give colours {list(base.shape)}, got {list(colours.shape)}")
     return Shaded(gaussians, base, colours.detach(), pull)
-
-
-def on_device(camera: Camera, device: torch.device) -> OnDevice:
-    """The camera's matrices there, copied once: a copy from the host in every step would make it wait."""
-    if isinstance(camera, PosedCamera):  # of pose refinement: another one in every step, made there
-        return OnDevice(
-            camera.pose.float()[None], camera.intrinsics_there.float()[None], camera.centre.float()
-        )
-    key = (id(camera), device)
-    if key in _cameras:
-        _cameras.move_to_end(key)
-        return _cameras[key][1]
-    pose = torch.from_numpy(camera.cam_from_world.astype("float32"))
-    found = OnDevice(
-        pose[None].to(device),
-        torch.from_numpy(camera.intrinsics.astype("float32"))[None].to(device),
-        torch.from_numpy(camera.center.astype("float32")).to(device),
-    )
-    _cameras[key] = (camera, found)  # the camera itself too: as long as it lives, its id is its own
-    while len(_cameras) > _REMEMBERED:
-        _cameras.popitem(last=False)
-    return found
 
 
 def _background_on(background: tuple[float, float, float], device: torch.device) -> Tensor:

@@ -40,7 +40,6 @@ from ambiguous_wild.splat.device import wait
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.gpu.gsplat_seam import gsplat
 from ambiguous_wild.splat.gpu.kernels import photometric_fused
-from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.step import TrainData
 from ambiguous_wild.splat.trainer import Trainer
@@ -122,8 +121,7 @@ def trainer_of(args: argparse.Namespace, method: str, iterations: int) -> Traine
 
 def late(trainer: Trainer, gaussians: Gaussians) -> Trainer:
     """The trainer in the middle of its run, with these Gaussians and no density control."""
-    trainer.gaussians = gaussians.clone()
-    trainer.optimiser = SplatAdam(trainer.gaussians, trainer.pace.learning_rates(0.5))
+    trainer.field.start_from(gaussians.clone())
     trainer.iteration = trainer.config.iterations // 2  # masks have begun, all harmonics are on
     # nothing grows, is reset or is dropped; statistics are gathered all the same
     trainer.density.config = dataclasses.replace(

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.splat.density import DensityConfig, DensityControl, Growth, largest
-from ambiguous_wild.splat.effects.smoothing import SmoothingFilter, filter_sizes, poses_like
+from ambiguous_wild.splat.effects.smoothing import SmoothingFilter, filter_sizes
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.rendered import Gradients
@@ -59,8 +59,7 @@ class MipDensity(DensityControl):
         self.cameras = data.cameras
 
     def reset_opacity(self, gaussians: Gaussians) -> None:
-        poses = poses_like(gaussians.means, self.cameras)
-        factor = opacity_factor(gaussians.log_scales, filter_sizes(gaussians.means, self.cameras, poses))
+        factor = opacity_factor(gaussians.log_scales, filter_sizes(gaussians.means, self.cameras))
         target = (torch.sigmoid(gaussians.opacity_logits) * factor).clamp(max=self.config.reset_opacity)
         gaussians.opacity_logits.copy_(torch.logit((target / factor).clamp(1e-7, 1 - 1e-6)))
 

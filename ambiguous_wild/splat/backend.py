@@ -68,24 +68,21 @@ class Backend:
         moments: tuple[Tensor, Tensor],
         rate: float,
         steps: int | Tensor,
-        betas: tuple[float, float],
-        eps: float,
         called_off: Tensor | None,
     ) -> None:
-        """One step of Adam on a tensor and its moments, float32, contiguous, in place.
+        """One step of Adam (0.9, 0.999, 1e-15) on a tensor and its moments, float32, contiguous, in place.
 
         Args:
             parameter, gradient: of one shape.
             moments: mean and mean square.
             rate: learning rate.
             steps: that were taken, this one included; on a GPU 0-d there.
-            betas, eps: Adam's.
             called_off: on a GPU, [1] float32 there: 1 = change nothing.
         """
         from ambiguous_wild.splat.cpu import adam
 
         assert isinstance(steps, int)
-        adam.dense_step(parameter, gradient, moments, rate, steps, betas, eps)
+        adam.dense_step(parameter, gradient, moments, rate, steps)
 
     def all_finite(self, tensors: Sequence[Tensor]) -> bool:
         """Whether every value is finite; on a GPU a large but sound sum may say no."""
@@ -171,14 +168,12 @@ class GpuBackend(Backend):
         moments: tuple[Tensor, Tensor],
         rate: float,
         steps: int | Tensor,
-        betas: tuple[float, float],
-        eps: float,
         called_off: Tensor | None,
     ) -> None:
         assert isinstance(steps, Tensor)
         torch._fused_adam_(
             [parameter], [gradient], [moments[0]], [moments[1]], [], [steps],
-            lr=rate, beta1=betas[0], beta2=betas[1], weight_decay=0.0, eps=eps,
+            lr=rate, beta1=0.9, beta2=0.999, weight_decay=0.0, eps=1e-15,
             amsgrad=False, maximize=False, grad_scale=None, found_inf=called_off,
         )  # fmt: skip
 

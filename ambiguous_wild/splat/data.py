@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, Protocol, overload
+from typing import Any, overload
 
 import numpy as np
 import torch
@@ -135,37 +135,27 @@ RESIDENT = 0.25  # of a GPU's free memory; Gaussians, their moments and gsplat's
 READY = 3  # photos on the device at a time: of this step, of the next, and one more for comparisons
 
 
-class Copies(Protocol):
-    """Sends tensors to a device without making the host wait."""
-
-    def hold(self, tensor: Tensor) -> Tensor:
-        """The tensor in memory that it can be sent from."""
-
-    def begin(self, tensor: Tensor) -> Any:
-        """Start to send it; returns what `finish` needs."""
-
-    def finish(self, sent: Any) -> Tensor:
-        """The tensor on the device, for what is launched from now on."""
-
-
 class CudaCopies:
-    """Copies on a stream of their own."""
+    """Sends tensors to a GPU on a stream of their own, without making the host wait."""
 
     def __init__(self, device: torch.device) -> None:
         self.device, self.stream = device, torch.cuda.Stream(device)
 
     def hold(self, tensor: Tensor) -> Tensor:
+        """The tensor in memory that it can be sent from."""
         try:
             return tensor.pin_memory()
         except RuntimeError:  # the system pins no more: the host waits for such a copy
             return tensor
 
     def begin(self, tensor: Tensor) -> tuple[Tensor, Any]:
+        """Start to send it; returns what `finish` needs."""
         with torch.cuda.stream(self.stream):
             there = tensor.to(self.device, non_blocking=True)
         return there, self.stream.record_event()
 
     def finish(self, sent: tuple[Tensor, Any]) -> Tensor:
+        """The tensor on the device, for what is launched from now on."""
         there, arrived = sent
         current = torch.cuda.current_stream(self.device)
         current.wait_event(arrived)
@@ -176,7 +166,7 @@ class CudaCopies:
 class Photos(Sequence[Tensor]):
     """Photos [H, W, 3] float32 in [0, 1] on the device, of which a few lie there at a time."""
 
-    def __init__(self, held: Sequence[Tensor], device: torch.device, copies: Copies) -> None:
+    def __init__(self, held: Sequence[Tensor], device: torch.device, copies: CudaCopies) -> None:
         """
         Args:
             held: [H, W, 3] each, in the host's memory: uint8 codes, or float32.

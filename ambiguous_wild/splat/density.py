@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.gaussians import rotation_matrices as rotation_matrices
 from ambiguous_wild.splat.records import DensityLog
 from ambiguous_wild.splat.rendered import Gradients
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData
@@ -332,17 +333,6 @@ def shaped(noise: Tensor, gaussians: Gaussians) -> Tensor:
     """Normal draws [N, 3] as offsets from the means [N, 3], with the Gaussians' covariances."""
     local = noise * gaussians.log_scales.exp()
     return (rotation_matrices(gaussians.quats) @ local[:, :, None]).squeeze(2)
-
-
-def rotation_matrices(quats: Tensor) -> Tensor:
-    """Rotation matrices [N, 3, 3] of quaternions [N, 4] (w, x, y, z), normalised here."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return torch.stack(rows, dim=1).reshape(-1, 3, 3)
 
 
 def _logit(p: float) -> float:

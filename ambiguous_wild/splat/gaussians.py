@@ -161,7 +161,6 @@ class Gaussians:
         *,
         sh_degree: int = 3,
         opacity: float = 0.1,
-        min_scale: float = 1e-7,
         device: torch.device | str = "cpu",
     ) -> Gaussians:
         """3DGS's start: one isotropic Gaussian a point, as large as its three neighbours are far.
@@ -171,7 +170,6 @@ class Gaussians:
             rgb: their colours, uint8.
             sh_degree: largest SH degree to hold, 0 to 3.
             opacity: of every Gaussian.
-            min_scale: floor of the scale, so that coincident points stay finite.
             device: where the Gaussians lie.
 
         Raises:
@@ -185,7 +183,7 @@ class Gaussians:
         from scipy.spatial import cKDTree
 
         distances = cKDTree(xyz).query(xyz, k=4)[0][:, 1:]  # of the three nearest other points
-        scale = np.sqrt((distances**2).mean(axis=1)).clip(min=min_scale)
+        scale = np.sqrt((distances**2).mean(axis=1)).clip(min=1e-7)  # coincident points stay finite
         n = len(xyz)
         quats = torch.zeros(n, 4)
         quats[:, 0] = 1.0
@@ -198,3 +196,14 @@ class Gaussians:
             sh0=torch.from_numpy(((rgb.astype(np.float64) / 255.0 - 0.5) / SH_C0).astype(np.float32)),
             sh_rest=torch.zeros(n, rest, 3),
         ).to(device)
+
+
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """Rotation matrices [N, 3, 3] of quaternions [N, 4] (w, x, y, z), normalised here."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, dim=1).reshape(-1, 3, 3)

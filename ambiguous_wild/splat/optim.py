@@ -38,12 +38,9 @@ class SplatAdam:
         gaussians: Gaussians,
         # one a tensor, names as Gaussians.rows(); what is carried (`extra`) and has none is not learnt
         learning_rates: Mapping[str, float],
-        betas: tuple[float, float] = (0.9, 0.999),
-        eps: float = 1e-15,
         *,
         lazy: bool = True,  # False steps every row of sh_rest at once: the same bits, more memory traffic
     ) -> None:
-        self.betas, self.eps = betas, eps
         self._backend = backend_of(gaussians.device)
         self.steps: int | Tensor = self._counted(0, gaussians)
         self._rates: dict[str, float] = {}
@@ -157,9 +154,8 @@ class SplatAdam:
                 self._step_visible(tensor, gradient, visible)
             elif tensor.numel():
                 self._backend.adam_step(
-                    tensor, gradient, self._moments[name], self._rates[name], self.steps, self.betas,
-                    self.eps, called_off,
-                )  # fmt: skip
+                    tensor, gradient, self._moments[name], self._rates[name], self.steps, called_off
+                )
         if called_off is not None:
             self.steps -= called_off.reshape(())
 
@@ -171,12 +167,11 @@ class SplatAdam:
         steps = int(self.steps)
         if steps > self._history.shape[1]:
             self._history = np.concatenate([self._history, np.zeros_like(self._history)], axis=1)
-        self._history[:, steps - 1] = adam.step_size(self._rates[_LAZY], steps, self.betas)
+        self._history[:, steps - 1] = adam.step_size(self._rates[_LAZY], steps)
         if parameter.shape[1]:
             adam.sparse(
                 visible.numpy(), 3 * parameter.shape[1], *adam.flat(parameter, self._moments[_LAZY]),
-                gradient.numpy().reshape(-1), self._taken, steps - 1, *self._history,
-                *adam.constants(self.betas, self.eps), 8 * threads(),
+                gradient.numpy().reshape(-1), self._taken, steps - 1, *self._history, 8 * threads(),
             )  # fmt: skip
 
     def catch_up(self, rows: np.ndarray | None = None) -> None:
@@ -188,8 +183,7 @@ class SplatAdam:
 
         p = self.gaussians.sh_rest
         arrays = 3 * p.shape[1], *adam.flat(p, self._moments[_LAZY])
-        constants = adam.constants(self.betas, self.eps)
-        tail = self._taken, self.steps, *self._history, *constants, 8 * threads()
+        tail = self._taken, self.steps, *self._history, 8 * threads()
         if rows is None:
             adam.catch_up_all(*arrays, *tail)
         else:

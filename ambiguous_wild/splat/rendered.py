@@ -38,7 +38,7 @@ class Cotangents:
     own: Own = field(default_factory=dict)  # collected on the way by effects that act on pictures
 
     def __add__(self, other: Cotangents) -> Cotangents:
-        sums = {name: _sum(getattr(self, name), getattr(other, name)) for name in _PICTURES}
+        sums = {name: sum_where(getattr(self, name), getattr(other, name)) for name in _PICTURES}
         return Cotangents(**sums, own=sum_own(self.own, other.own))
 
 
@@ -80,13 +80,13 @@ class Gradients:
     def __add__(self, other: Gradients) -> Gradients:
         """The gradients of the sum of two losses, for the same Gaussians and camera."""
         plain = {f.name for f in fields(self)} - {"visible", "extra", "own", "fields"}
-        sums: dict[str, Any] = {name: _sum(getattr(self, name), getattr(other, name)) for name in plain}
+        sums: dict[str, Any] = {name: sum_where(getattr(self, name), getattr(other, name)) for name in plain}
         seen = [g.visible for g in (self, other) if g.visible is not None]
         shared = self.fields.keys() & other.fields.keys()
         return Gradients(
             **sums,
             visible=torch.stack(seen).any(dim=0) if seen else None,
-            extra=_sum_named(self.extra, other.extra),
+            extra=sum_named(self.extra, other.extra),
             own=sum_own(self.own, other.own),
             fields={**self.fields, **other.fields, **{k: self.fields[k] + other.fields[k] for k in shared}},
         )
@@ -212,16 +212,18 @@ def sum_own(a: Own, b: Own) -> Own:
     """Both, summed where both have one."""
     if not a or not b:
         return a or b
-    return {name: _sum_named(a.get(name, {}), b.get(name, {})) for name in {**a, **b}}
+    return {name: sum_named(a.get(name, {}), b.get(name, {})) for name in {**a, **b}}
 
 
-def _sum_named(a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+def sum_named(a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+    """Both, summed under the names that both have."""
     if not a or not b:
         return a or b
     return {name: a[name] + b[name] if name in a and name in b else {**a, **b}[name] for name in {**a, **b}}
 
 
-def _sum(a: Tensor | None, b: Tensor | None) -> Tensor | None:
+def sum_where(a: Tensor | None, b: Tensor | None) -> Tensor | None:
+    """The sum; None is zero."""
     if a is None or b is None:
         return a if b is None else b
     return a + b

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -14,7 +17,6 @@ from torch import Tensor
 from ambiguous_wild.core import AwError, Camera
 from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.interrupt import Stopped, deferred
 from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.pace import Pace, TrainConfig
 from ambiguous_wild.splat.records import ROWS, Clock, Timeline, clock_for
@@ -26,6 +28,33 @@ if TYPE_CHECKING:
     from ambiguous_wild.splat.watchdog import Sentinel
 
 Probe = Callable[[Callable[[Camera], Tensor]], float]
+
+
+class Stopped(KeyboardInterrupt):
+    """Ctrl-C during training; the checkpoint holds the run as it was after its last iteration."""
+
+
+@contextmanager
+def deferred() -> Iterator[Callable[[], bool]]:
+    """Meanwhile Ctrl-C is only noted; yields whether it was. A second Ctrl-C interrupts at once.
+
+    Nothing is changed outside of the main thread, or where somebody else answers the signal.
+    """
+    main = threading.current_thread() is threading.main_thread()
+    if not main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield lambda: False
+        return
+    noted = threading.Event()
+
+    def note(number: int, frame: Any) -> None:
+        noted.set()
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield noted.is_set
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 class Meter(Protocol):
@@ -148,18 +177,15 @@ class Run(ABC):
         """
         if self.config.on_nonfinite == "rollback" and not self.checkpoint_path.exists():
             self.save()  # something to go back to, from the first iteration on
-        if self.meter is None or self.done:
-            self._train(tick)
-            return
-        self.meter.begin(self.clock.now())
+        meter = None if self.done else self.meter
+        if meter is not None:
+            meter.begin(self.clock.now())
         try:
-            self._train(tick)
+            with deferred() as interrupted:
+                self._loop(tick, interrupted)
         finally:
-            self.meter.end(self.clock.now())
-
-    def _train(self, tick: Callable[[Any], None] | None) -> None:
-        with deferred() as interrupted:
-            self._loop(tick, interrupted)
+            if meter is not None:
+                meter.end(self.clock.now())
 
     def _loop(self, tick: Callable[[Any], None] | None, interrupted: Callable[[], bool]) -> None:
         last_save = time.monotonic()

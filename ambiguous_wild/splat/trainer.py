@@ -87,17 +87,9 @@ class Trainer(Run):
     def gaussians(self) -> Gaussians:
         return self.field.gaussians
 
-    @gaussians.setter
-    def gaussians(self, gaussians: Gaussians) -> None:
-        self.field.gaussians = gaussians
-
     @property
     def optimiser(self) -> SplatAdam:
         return self.field.optimiser
-
-    @optimiser.setter
-    def optimiser(self, optimiser: SplatAdam) -> None:
-        self.field.optimiser = optimiser
 
     @property
     def density(self) -> DensityControl:

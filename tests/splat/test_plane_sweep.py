@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from ambiguous_wild.core import AwError, Camera
-from ambiguous_wild.splat.effects.dense import SweepConfig, dense_points
+from ambiguous_wild.core import Camera
+from ambiguous_wild.splat.effects.dense import dense_points
 
 H, W, F = 60, 80, 80.0
 WALL, BOX = 5.0, 3.5  # depths of the back wall and of a box before it
@@ -54,13 +54,13 @@ def sparse() -> np.ndarray:
 VIEWS = [camera(x, y) for x, y in ((0, 0), (0.5, 0), (-0.5, 0), (0, 0.5), (0.5, 0.5), (-0.5, -0.5))]
 
 
-def found(photos=None, keep=None, most=5000, points=None, **options):
+def found(photos=None, keep=None, most=5000, points=None):
     points = sparse() if points is None else points
     photos = photos if photos is not None else [photo(v) for v in VIEWS]
     tracks = [np.arange(len(points))] * len(photos)
     keep = keep or [None] * len(photos)
     views = VIEWS[: len(photos)]
-    return dense_points(views, photos.__getitem__, points, tracks, keep, most, SweepConfig(**options))
+    return dense_points(views, photos.__getitem__, points, tracks, keep, most)
 
 
 def off_surface(xyz: np.ndarray) -> np.ndarray:
@@ -163,8 +163,3 @@ def test_a_model_without_tracks_and_photos_of_other_sizes():
 def test_the_same_points_again():
     for a, b in zip(found(), found()):
         np.testing.assert_array_equal(a, b)
-
-
-def test_settings_out_of_range_are_named():
-    with pytest.raises(AwError, match="planes"):
-        SweepConfig(planes=2)

@@ -27,7 +27,7 @@ from ambiguous_wild.io.ply import write_splat_ply
 from ambiguous_wild.methods.fixed_masks import FixedMasks
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.effects import with_effects
-from ambiguous_wild.splat.interrupt import Stopped
+from ambiguous_wild.splat.run import Stopped
 from ambiguous_wild.splat.trainer import Trainer
 
 STOPPED = "stopped"  # folder of a run that Ctrl-C stopped: the model as it was then; gone when the run ends

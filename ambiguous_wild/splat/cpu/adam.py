@@ -27,6 +27,10 @@ from ambiguous_wild.splat.cpu.simd import (
     store_some,
 )
 
+BETAS, EPS = (0.9, 0.999), 1e-15
+# 1 - beta is rounded after the difference: float32(0.999) alone is off by 5e-5 of 0.001.
+_BETA1, _REST1, _BETA2, _REST2 = (np.float32(c) for b in BETAS for c in (b, 1 - b))
+_EPS = np.float32(EPS)
 # Denormal numbers cost a hundred cycles an operation and move nothing: at |m| < 1e-30 a step is below
 # 1e-15 of the learning rate even if v is 0 and only eps = 1e-15 is left below the line.
 _TINY_M = np.float32(1e-30)
@@ -34,16 +38,16 @@ _TINY_V = np.float32(1.2e-38)
 
 
 @kernel
-def _moments(m, v, g, beta1, rest1, beta2, rest2):
-    m = fma(g, rest1, m * beta1)
-    v = fma(g * g, rest2, v * beta2)
+def _moments(m, v, g):
+    m = fma(g, _REST1, m * _BETA1)
+    v = fma(g * g, _REST2, v * _BETA2)
     return select(magnitude(m) >= _TINY_M, m, np.float32(0.0)), select(v >= _TINY_V, v, np.float32(0.0))
 
 
 @kernel
-def _change(m, v, rate, root, eps):
-    """rate m / (sqrt(v) root + eps), with rate = lr / bias1 and root = 1 / sqrt(bias2)."""
-    return m * rate / fma(square_root(v), root, eps)
+def _change(m, v, rate, root):
+    """rate m / (sqrt(v) root + EPS), with rate = lr / bias1 and root = 1 / sqrt(bias2)."""
+    return m * rate / fma(square_root(v), root, _EPS)
 
 
 @kernel
@@ -62,36 +66,34 @@ def _write(array, at, value, count):
 
 
 @kernel
-def _dense_range(begin, end, p, m, v, g, rate, root, beta1, rest1, beta2, rest2, eps):
+def _dense_range(begin, end, p, m, v, g, rate, root):
     """One step of values begin .. end - 1 of flat arrays."""
     for at in range(begin, end, 16):
         count = min(16, end - at)
-        mean, square = _moments(
-            _read(m, at, count), _read(v, at, count), _read(g, at, count), beta1, rest1, beta2, rest2
-        )
+        mean, square = _moments(_read(m, at, count), _read(v, at, count), _read(g, at, count))
         _write(m, at, mean, count)
         _write(v, at, square, count)
-        _write(p, at, _read(p, at, count) - _change(mean, square, rate, root, eps), count)
+        _write(p, at, _read(p, at, count) - _change(mean, square, rate, root), count)
 
 
 @kernel
-def _dense_part(part, parts, p, m, v, g, rate, root, beta1, rest1, beta2, rest2, eps):
+def _dense_part(part, parts, p, m, v, g, rate, root):
     """The part-th of `parts` slices of a flat array, one step."""
     blocks = (p.shape[0] + 15) // 16
     begin = part * blocks // parts * 16
     end = min((part + 1) * blocks // parts * 16, p.shape[0])
-    _dense_range(begin, end, p, m, v, g, rate, root, beta1, rest1, beta2, rest2, eps)
+    _dense_range(begin, end, p, m, v, g, rate, root)
 
 
 @parallel_kernel
-def dense(p, m, v, g, rate, root, beta1, rest1, beta2, rest2, eps, parts):
+def dense(p, m, v, g, rate, root, parts):
     """One step of a flat array."""
     for part in numba.prange(parts):
-        _dense_part(part, parts, p, m, v, g, rate, root, beta1, rest1, beta2, rest2, eps)
+        _dense_part(part, parts, p, m, v, g, rate, root)
 
 
 @kernel
-def _advance(p, m, v, at, count, first, last, rates, roots, beta1, rest1, beta2, rest2, eps):
+def _advance(p, m, v, at, count, first, last, rates, roots):
     """Steps first .. last - 1 with gradient zero for up to 16 values from flat index `at`."""
     value = _read(p, at, count)
     mean = _read(m, at, count)
@@ -99,9 +101,9 @@ def _advance(p, m, v, at, count, first, last, rates, roots, beta1, rest1, beta2,
     zero = splat(np.float32(0.0))
     moving = any_lane(magnitude(mean) > np.float32(0.0))
     for k in range(first, last):
-        mean, square = _moments(mean, square, zero, beta1, rest1, beta2, rest2)
+        mean, square = _moments(mean, square, zero)
         if moving:
-            change = _change(mean, square, rates[k], roots[k], eps)
+            change = _change(mean, square, rates[k], roots[k])
             value = value - change
             # The change shrinks by beta1 / sqrt(beta2) a step: once a thousand times it would be lost in
             # rounding, later ones are too, unless the rate rises a thousandfold.
@@ -116,34 +118,34 @@ def _advance(p, m, v, at, count, first, last, rates, roots, beta1, rest1, beta2,
 
 
 @kernel
-def _row_catch_up(row, width, p, m, v, last, now, rates, roots, beta1, rest1, beta2, rest2, eps):
+def _row_catch_up(row, width, p, m, v, last, now, rates, roots):
     if last[row] < now:
         for at in range(row * width, row * width + width, 16):
             count = min(16, row * width + width - at)
-            _advance(p, m, v, at, count, last[row], now, rates, roots, beta1, rest1, beta2, rest2, eps)
+            _advance(p, m, v, at, count, last[row], now, rates, roots)
         last[row] = now
 
 
 @parallel_kernel
-def catch_up(rows, width, p, m, v, last, now, rates, roots, beta1, rest1, beta2, rest2, eps, parts):
+def catch_up(rows, width, p, m, v, last, now, rates, roots, parts):
     """Bring rows up to step `now`; last[row] counts a row's steps, the flat arrays hold `width` a row."""
     n = rows.shape[0]
     for part in numba.prange(parts):
         for k in range(part * n // parts, (part + 1) * n // parts):
-            _row_catch_up(rows[k], width, p, m, v, last, now, rates, roots, beta1, rest1, beta2, rest2, eps)
+            _row_catch_up(rows[k], width, p, m, v, last, now, rates, roots)
 
 
 @parallel_kernel
-def catch_up_all(width, p, m, v, last, now, rates, roots, beta1, rest1, beta2, rest2, eps, parts):
+def catch_up_all(width, p, m, v, last, now, rates, roots, parts):
     """`catch_up` of every row."""
     n = last.shape[0]
     for part in numba.prange(parts):
         for row in range(part * n // parts, (part + 1) * n // parts):
-            _row_catch_up(row, width, p, m, v, last, now, rates, roots, beta1, rest1, beta2, rest2, eps)
+            _row_catch_up(row, width, p, m, v, last, now, rates, roots)
 
 
 @parallel_kernel
-def sparse(visible, width, p, m, v, g, last, now, rates, roots, beta1, rest1, beta2, rest2, eps, parts):
+def sparse(visible, width, p, m, v, g, last, now, rates, roots, parts):
     """Step `now` (counted from 0) of the visible rows with their gradient; the others are left for later."""
     n = visible.shape[0]
     for part in numba.prange(parts):
@@ -152,12 +154,11 @@ def sparse(visible, width, p, m, v, g, last, now, rates, roots, beta1, rest1, be
         while row < stop:
             begin = row
             while row < stop and visible[row]:
-                _row_catch_up(row, width, p, m, v, last, now, rates, roots, beta1, rest1, beta2, rest2, eps)
+                _row_catch_up(row, width, p, m, v, last, now, rates, roots)
                 last[row] = now + 1
                 row += 1
             # neighbours in one go: a row alone ends in a vector that is not full
-            tail = (rates[now], roots[now], beta1, rest1, beta2, rest2, eps)
-            _dense_range(begin * width, row * width, p, m, v, g, *tail)
+            _dense_range(begin * width, row * width, p, m, v, g, rates[now], roots[now])
             row += 1
 
 
@@ -172,34 +173,17 @@ def flat(parameter: Tensor, moments: tuple[Tensor, Tensor]) -> tuple[np.ndarray,
     return tuple(tensor.detach().numpy().reshape(-1) for tensor in (parameter, *moments))
 
 
-def step_size(rate: float, steps: int, betas: tuple[float, float]) -> tuple[np.float32, np.float32]:
+def step_size(rate: float, steps: int) -> tuple[np.float32, np.float32]:
     """lr / bias1 and 1 / sqrt(bias2) of the step that makes it so many."""
-    return np.float32(rate / (1 - betas[0] ** steps)), np.float32((1 - betas[1] ** steps) ** -0.5)
-
-
-def constants(betas: tuple[float, float], eps: float) -> tuple[np.float32, ...]:
-    """beta1, 1 - beta1, beta2, 1 - beta2 and eps, as the kernels take them."""
-    # 1 - beta is rounded after the difference: float32(0.999) alone is off by 5e-5 of 0.001.
-    return tuple(np.float32(c) for c in (*(c for b in betas for c in (b, 1 - b)), eps))
+    return np.float32(rate / (1 - BETAS[0] ** steps)), np.float32((1 - BETAS[1] ** steps) ** -0.5)
 
 
 def dense_step(
-    parameter: Tensor,
-    gradient: Tensor,
-    moments: tuple[Tensor, Tensor],
-    rate: float,
-    steps: int,
-    betas: tuple[float, float],
-    eps: float,
+    parameter: Tensor, gradient: Tensor, moments: tuple[Tensor, Tensor], rate: float, steps: int
 ) -> None:
     """One step of every value, in place; arguments as of `Backend.adam_step`."""
-    dense(
-        *flat(parameter, moments),
-        gradient.numpy().reshape(-1),
-        *step_size(rate, steps, betas),
-        *constants(betas, eps),
-        8 * threads(),
-    )
+    arrays = *flat(parameter, moments), gradient.numpy().reshape(-1)
+    dense(*arrays, *step_size(rate, steps), 8 * threads())
 
 
 _MAGNITUDE = np.int32(0x7FFFFFFF)  # all of a float32 but its sign

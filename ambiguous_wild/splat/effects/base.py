@@ -138,8 +138,10 @@ class RowAdam:
     A row moves only when its photo was seen: Adam's momentum would carry the others along for nothing.
     """
 
-    def __init__(self, values: Tensor, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-15) -> None:
-        self.values, self.betas, self.eps = values, betas, eps
+    betas, eps = (0.9, 0.999), 1e-15
+
+    def __init__(self, values: Tensor) -> None:
+        self.values = values
         self.first, self.second = torch.zeros_like(values), torch.zeros_like(values)
         self.steps = [0] * len(values)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -28,7 +28,9 @@ from ambiguous_wild.splat.rendered import (
     ShadePull,
     as_cotangents,
     frame_of,
+    sum_named,
     sum_own,
+    sum_where,
 )
 from ambiguous_wild.splat.step import Shot, Step, TrainData
 
@@ -199,15 +201,11 @@ def _pull_all(pulls: Sequence[ShadePull], d_colours: Tensor) -> ShadeGradients:
     found = ShadeGradients(d_colours)
     for pull in reversed(pulls):
         one = pull(found.base)
-        means = [m for m in (one.means, found.means) if m is not None]
-        extra: Mapping[str, Tensor] = {
-            name: one.extra[name] + found.extra[name]
-            if name in one.extra and name in found.extra
-            else {**one.extra, **found.extra}[name]
-            for name in {**one.extra, **found.extra}
-        }
         found = ShadeGradients(
-            one.base, extra, sum(means[1:], means[0]) if means else None, sum_own(found.own, one.own)
+            one.base,
+            sum_named(one.extra, found.extra),
+            sum_where(one.means, found.means),
+            sum_own(found.own, one.own),
         )
     return found
 

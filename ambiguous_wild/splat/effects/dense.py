@@ -21,7 +21,6 @@ import cv2
 import numpy as np
 
 from ambiguous_wild.core import Camera
-from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.effects.tracks import tracks_of
 from ambiguous_wild.splat.step import TrainData
@@ -50,31 +49,19 @@ class DenseStart(Effect):
 
 _LEAST_POINTS = 10  # of the sparse model in a photo, for the range of its depths
 _MOST_POINTS = 5000  # that choose neighbours where there are no tracks
+SIDE = 160  # px, the longer side at which photos are compared
+PHOTOS = 64  # at most so many, evenly chosen
+PLANES = 64  # evenly spaced in inverse depth
+VIEWS = 4  # neighbours that a photo is compared with; the best two count
+WINDOW = 7  # px
+CORRELATION = 0.75  # at least, in the mean of the best two neighbours
+ALONE = 0.02  # above that of all other depths
+TOLERANCE = 0.02  # relative difference of depths that agree
+AGREEING = 2  # photos whose depth must agree, of twice `VIEWS`
 # degrees between two photos' rays: the best, its spread below and above, and the least in the median
 _ANGLE, _BELOW, _ABOVE, _LEAST_ANGLE = 8.0, 4.0, 12.0, 1.0
 _NOISE = 1e-5  # variance of grey in [0, 1] that is no structure
 _PEAK = 3  # planes around the best one that belong to its peak
-
-
-@dataclass(frozen=True)
-class SweepConfig:
-    """How photos are compared, and which depths are kept."""
-
-    side: int = 160  # px, the longer side at which photos are compared
-    photos: int = 64  # at most so many, evenly chosen
-    planes: int = 64  # evenly spaced in inverse depth
-    views: int = 4  # neighbours that a photo is compared with; the best two count
-    window: int = 7  # px
-    correlation: float = 0.75  # at least, in the mean of the best two neighbours
-    margin: float = 0.02  # above that of all other depths
-    tolerance: float = 0.02  # relative difference of depths that agree
-    agreeing: int = 2  # photos whose depth must agree, of twice `views`
-
-    def __post_init__(self) -> None:
-        check_limits(
-            self, "sweep", side=(16, 4096), photos=(2, math.inf), planes=(8, 1024), views=(1, 64),
-            window=(3, 63), correlation=(-1, 1), margin=(0, 1), tolerance=(1e-6, 1), agreeing=(1, 128),
-        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -96,7 +83,6 @@ def dense_points(
     tracks: Sequence[np.ndarray],
     keep: Sequence[np.ndarray | None],
     most: int,
-    config: SweepConfig | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points on surfaces that at least three photos see at the same depth.
 
@@ -107,27 +93,21 @@ def dense_points(
         tracks: of each photo, the indices of points that were found in it; may be empty.
         keep: of each photo, [H, W], 1 = used; None = all is used.
         most: points to return at most.
-        config: settings.
 
     Returns:
         xyz [M, 3] float64 and rgb [M, 3] uint8. M is 0 where nothing agrees.
     """
-    config = config or SweepConfig()
     count = len(cameras)
     if most < 1 or not count:
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
-    chosen = sorted({k * count // min(count, config.photos) for k in range(min(count, config.photos))})
-    small = [_small(cameras[k], photo(k), keep[k], sparse, tracks[k], config.side) for k in chosen]
-    near = [_neighbours(small, k, sparse, 2 * config.views) for k in range(len(small))]
-    depths = [
-        _depth(own, [small[j] for j in near[k][: config.views]], sparse, config)
-        for k, own in enumerate(small)
-    ]
+    chosen = sorted({k * count // min(count, PHOTOS) for k in range(min(count, PHOTOS))})
+    small = [_small(cameras[k], photo(k), keep[k], sparse, tracks[k], SIDE) for k in chosen]
+    near = [_neighbours(small, k, sparse, 2 * VIEWS) for k in range(len(small))]
+    depths = [_depth(own, [small[j] for j in near[k][:VIEWS]], sparse) for k, own in enumerate(small)]
     found = [
-        _agreeing(small[k], depths[k], [(small[j], depths[j]) for j in near[k]], config)
-        for k in range(len(small))
+        _agreeing(small[k], depths[k], [(small[j], depths[j]) for j in near[k]]) for k in range(len(small))
     ]
-    xyz, rgb = _thinned(small, found, most, config.tolerance)
+    xyz, rgb = _thinned(small, found, most, TOLERANCE)
     return xyz, np.clip(np.rint(rgb * 255.0), 0, 255).astype(np.uint8)
 
 
@@ -166,7 +146,7 @@ def _neighbours(small: Sequence[_Photo], at: int, xyz: np.ndarray, most: int) ->
     return [k for _, k in sorted(scores)[:most]]
 
 
-def _depth(photo: _Photo, others: Sequence[_Photo], xyz: np.ndarray, config: SweepConfig) -> np.ndarray:
+def _depth(photo: _Photo, others: Sequence[_Photo], xyz: np.ndarray) -> np.ndarray:
     """Depth [h, w] float32 of a photo; 0 where it is not known."""
     shape = photo.grey.shape
     z = _projected(photo.camera, xyz[photo.seen])[1]
@@ -176,28 +156,28 @@ def _depth(photo: _Photo, others: Sequence[_Photo], xyz: np.ndarray, config: Swe
     # a few wrong points must not spread the planes
     near, middle, far = np.quantile(z, [0.02, 0.5, 0.98])
     near, far = max(near, middle / 4.0), min(far, 20.0 * middle)
-    inverse = np.linspace(1.0 / (1.5 * far), 1.0 / (0.8 * near), config.planes)
-    mean, variance = _moments(photo.grey, config.window)
-    scores = np.empty((config.planes, *shape), np.float32)
+    inverse = np.linspace(1.0 / (1.5 * far), 1.0 / (0.8 * near), PLANES)
+    mean, variance = _moments(photo.grey, WINDOW)
+    scores = np.empty((PLANES, *shape), np.float32)
     parts = [_plane_warp(photo.camera, other.camera) for other in others]
     for k, nearness in enumerate(inverse):
         first = np.full(shape, -1.0, np.float32)
         second = first.copy()
         for other, (turn, shift) in zip(others, parts):
             warp = turn + nearness * shift
-            score = _correlation(photo.grey, mean, variance, other.shown, warp, config.window)
+            score = _correlation(photo.grey, mean, variance, other.shown, warp, WINDOW)
             second = np.maximum(second, np.minimum(first, score))
             first = np.maximum(first, score)
         scores[k] = 0.5 * (first + second)
     best = scores.argmax(axis=0)
-    inner = np.clip(best, 1, config.planes - 2)
+    inner = np.clip(best, 1, PLANES - 2)
     below, top, above = (np.take_along_axis(scores, (inner + d)[None], axis=0)[0] for d in (-1, 0, 1))
-    away = np.abs(np.arange(config.planes)[:, None, None] - best[None]) > _PEAK
+    away = np.abs(np.arange(PLANES)[:, None, None] - best[None]) > _PEAK
     rival = np.where(away, scores, -1.0).max(axis=0)
     bend = below - 2.0 * top + above  # of a parabola through the three scores around the best one
     offset = np.where(bend < 0, 0.5 * (below - above) / np.where(bend < 0, bend, -1.0), 0.0).clip(-0.5, 0.5)
     depth = 1.0 / (inverse[0] + (inner + offset) * (inverse[1] - inverse[0]))
-    sure = (inner == best) & (top > config.correlation) & (rival < top - config.margin)
+    sure = (inner == best) & (top > CORRELATION) & (rival < top - ALONE)
     return np.where(sure & photo.judged & (variance > 10 * _NOISE), depth, 0.0).astype(np.float32)
 
 
@@ -237,17 +217,15 @@ def _box(x: np.ndarray, window: int) -> np.ndarray:
     return cv2.blur(x, (window, window), borderType=cv2.BORDER_REFLECT)
 
 
-def _agreeing(
-    photo: _Photo, depth: np.ndarray, others: Sequence[tuple[_Photo, np.ndarray]], config: SweepConfig
-) -> np.ndarray:
+def _agreeing(photo: _Photo, depth: np.ndarray, others: Sequence[tuple[_Photo, np.ndarray]]) -> np.ndarray:
     """The depths [h, w] that enough others agree with; 0 elsewhere."""
     rows, columns = np.nonzero(depth > 0)
     world = _world(photo.camera, columns, rows, depth[rows, columns])
     votes = np.zeros(len(world), np.int64)
     for other, theirs in others:
-        votes += _same_surface(other.camera, theirs, world, config.tolerance)
+        votes += _same_surface(other.camera, theirs, world, TOLERANCE)
     found = np.zeros_like(depth)
-    sure = votes >= config.agreeing
+    sure = votes >= AGREEING
     found[rows[sure], columns[sure]] = depth[rows[sure], columns[sure]]
     return found
 

@@ -19,6 +19,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ambiguous_wild.splat.gaussians import rotation_matrices
+
 
 def compiled(function: Callable[..., Any], what: str) -> Callable[..., Any]:
     """The function, compiled at its first call on a GPU, for tensors of any size.
@@ -215,24 +217,13 @@ def _ratio(
     v = torch.minimum(torch.maximum(y / z, -cy / fy - margin_y), (size[1] - cy) / fy + margin_y)
     right = (fx / z)[:, None] * (pose[0, :3] - u[:, None] * pose[2, :3])
     down = (fy / z)[:, None] * (pose[1, :3] - v[:, None] * pose[2, :3])
-    axes = _rotations(quats) * scales[:, None, :]
+    axes = rotation_matrices(quats) * scales[:, None, :]
     p = (right[:, :, None] * axes).sum(1)
     q = (down[:, :, None] * axes).sum(1)
     # the determinant as the square of a cross product: the difference of products cancels for needles
     sharp = torch.linalg.cross(p, q).square().sum(1)
     blurred = sharp + blur * (p.square().sum(1) + q.square().sum(1)) + blur * blur
     return (sharp / blurred).clamp(min=_SMALLEST).sqrt()
-
-
-def _rotations(quats: Tensor) -> Tensor:
-    """[N, 3, 3] of (w, x, y, z), any length."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return torch.stack(rows, 1).view(-1, 3, 3)
 
 
 def _pull(

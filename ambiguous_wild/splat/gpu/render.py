@@ -34,8 +34,6 @@ from ambiguous_wild.splat.rendered import (
     spread,
 )
 
-_backgrounds: dict[tuple[tuple[float, float, float], torch.device], Tensor] = {}
-
 
 @dataclass(frozen=True)
 class Shaded:
@@ -262,11 +260,10 @@ def _shaded(shade: Shade, gaussians: Gaussians, base: Tensor, splats: seam.Splat
     return Shaded(gaussians, base, colours.detach(), pull)
 
 
+@functools.cache
 def _background_on(background: tuple[float, float, float], device: torch.device) -> Tensor:
-    key = (background, device)
-    if key not in _backgrounds:
-        _backgrounds[key] = torch.tensor([background], dtype=torch.float32).to(device)
-    return _backgrounds[key]
+    """[1, 3], copied once."""
+    return torch.tensor([background], dtype=torch.float32).to(device)
 
 
 def _pull(

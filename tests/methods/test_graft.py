@@ -22,7 +22,7 @@ from ambiguous_wild.methods.robustsplat.policy import RobustSplatMask
 from ambiguous_wild.methods.truth import TruthMask
 from ambiguous_wild.splat.density import DensityControl
 from ambiguous_wild.splat.effects import with_effects
-from ambiguous_wild.splat.effects.exposure import AffineExposure
+from ambiguous_wild.splat.effects.colour import AffineExposure
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.parts import MaskPolicy, Parts
 from tests.methods.baselines import bits, parts_of, trained

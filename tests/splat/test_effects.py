@@ -9,10 +9,9 @@ import torch
 from ambiguous_wild.core import AwError, Points, Scene, View
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.effects import ALL, EFFECTS, check_effects, dense, with_effects
-from ambiguous_wild.splat.effects.appearance import AppearanceEmbedding
 from ambiguous_wild.splat.effects.base import Effect, RowAdam
 from ambiguous_wild.splat.effects.chain import Chain
-from ambiguous_wild.splat.effects.exposure import AffineExposure
+from ambiguous_wild.splat.effects.colour import AffineExposure, AppearanceEmbedding
 from ambiguous_wild.splat.effects.poses import PoseRefinement
 from ambiguous_wild.splat.effects.smoothing import SmoothingFilter, filter_sizes
 from ambiguous_wild.splat.gaussians import Gaussians
@@ -236,7 +235,7 @@ def test_gradients_of_the_model_effects(kind):
     if kind == "appearance":
         effect.rows_of_photos = RowAdam(torch.from_numpy(rng.normal(size=(3, 4))))
         effect.net = {name: w.double() for name, w in effect.net.items()}
-        effect.centre, effect.spread = effect.centre.double(), effect.spread.double()
+        effect.unit.centre, effect.unit.spread = effect.unit.centre.double(), effect.unit.spread.double()
     weights = {name: torch.from_numpy(rng.normal(size=tuple(t.shape))) for name, t in g.items()}
     _, pull = effect.model(g, shot_of(1))
     effect.model(g, shot_of(0))  # another picture in between changes nothing

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 # name -> (module, class, what it is for), in the order in which they act on a render
 EFFECTS: dict[str, tuple[str, str, str]] = {
-    "exposure": ("exposure", "AffineExposure", "an affine change of colour per photo"),
-    "appearance": ("appearance", "AppearanceEmbedding", "light that changes by photo and place"),
+    "exposure": ("colour", "AffineExposure", "an affine change of colour per photo"),
+    "appearance": ("colour", "AppearanceEmbedding", "light that changes by photo and place"),
     "antialias": ("smoothing", "SmoothingFilter", "Mip-Splatting's filters, for photos from near and far"),
     "poses": ("poses", "PoseRefinement", "a small correction of every camera's pose"),
     "skybox": ("skybox", "Skybox", "first Gaussians on a far sphere too, for what lies behind the scene"),

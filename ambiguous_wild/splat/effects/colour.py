@@ -1,9 +1,14 @@
-"""Appearance embedding: a few numbers per photo change the colour of every Gaussian, by where it is.
+"""Colours that change from photo to photo: an affine exposure, and an embedding that asks where Gaussians lie.
 
-After WildGaussians (Kulhanek et al. 2024), smaller and with a neutral that is exact: the change is *linear*
-in the photo's embedding, and embeddings sum to zero over the train photos, so that an embedding of zero is
-both the unchanged model and the mean of all photos. Positions enter as Fourier features, which needs no
-state per Gaussian and so nothing of density control.
+Affine exposure is 3DGS's option (Kerbl et al., later release): each photo sees the scene's colours through
+a 3x3 matrix and an offset of its own. With a constraint: over the train photos the changes sum to zero, so
+that the scene cannot drift darker while all photos grow brighter, and a test view, which has no photo, is
+drawn as the mean train photo sees it.
+
+The embedding is after WildGaussians (Kulhanek et al. 2024), smaller and with a neutral that is exact: a few
+numbers per photo change the colour of every Gaussian; the change is *linear* in them, and they sum to zero
+over the train photos, so that zero is both the unchanged model and the mean of all photos. Positions enter
+as Fourier features, which needs no state per Gaussian and so nothing of density control.
 """
 
 from __future__ import annotations
@@ -16,14 +21,85 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ambiguous_wild.splat.effects.base import Effect, RowAdam, State, decayed, same
+from ambiguous_wild.splat.effects.base import Effect, RowAdam, State, decayed, same, unchanged
+from ambiguous_wild.splat.effects.placing import Unit
+from ambiguous_wild.splat.effects.tracks import photo_gains
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
-from ambiguous_wild.splat.rendered import Gradients, Pull
+from ambiguous_wild.splat.rendered import Cotangents, Frame, FramePull, Gradients, Own, Pull, sum_own
 from ambiguous_wild.splat.step import Shot, TrainData
+
+EXPOSURE_RATE, EXPOSURE_RATE_FINAL = 0.01, 0.001  # 3DGS's exposure_lr
+EXPOSURE_FIT_RATE = 0.02
+
+
+class AffineExposure(Effect):
+    """toned = image (I + P_v)[:, :3]^T + offset; P_v [3, 4] per photo, their sum over photos is zero."""
+
+    name = "exposure"
+
+    def setup(self, data: TrainData) -> None:
+        self.views = len(data.photos)
+        table = torch.zeros(self.views + 1, 3, 4, device=data.device)  # the last row is a test photo's
+        gains = photo_gains(data.scene, [p.cpu().numpy() for p in data.photos])
+        table[: self.views, range(3), range(3)] = torch.from_numpy(gains.astype("float32") - 1).to(table)
+        self.adam = RowAdam(table)
+        self._close()
+
+    def _close(self) -> None:
+        rows = self.adam.values[: self.views]
+        rows -= rows.mean(dim=0)
+
+    def _affine(self, view: int) -> tuple[Tensor, Tensor]:
+        row = self.adam.values[view]
+        return row[:, :3] + torch.eye(3, dtype=row.dtype, device=row.device), row[:, 3]
+
+    def image(self, frame: Frame, shot: Shot) -> tuple[Frame, FramePull]:
+        row = shot.row(self.views)
+        if row is None:
+            return frame, unchanged
+        matrix, offset = self._affine(row)
+        before = frame.image
+
+        def pull(cotangents: Cotangents) -> Cotangents:
+            image, extra = (
+                None if d is None else (d @ matrix).contiguous() for d in (cotangents.image, cotangents.extra)
+            )
+            own: Own = {}
+            if cotangents.image is not None:
+                flat = cotangents.image.reshape(-1, 3)
+                gradient = torch.cat([flat.T @ before.reshape(-1, 3), flat.sum(dim=0)[:, None]], dim=1)
+                own = {self.name: {"affine": gradient.to(self.adam.values)}}
+            return replace(cotangents, image=image, extra=extra, own=sum_own(cotangents.own, own))
+
+        return replace(frame, image=(before @ matrix.T + offset).contiguous()), pull
+
+    def step(self, own: Mapping[str, Tensor], shot: Shot, called_off: Tensor | None = None) -> None:
+        assert shot.view is not None
+        self.adam.step(
+            shot.view, own["affine"], decayed(EXPOSURE_RATE, EXPOSURE_RATE_FINAL, shot.progress), called_off
+        )
+        self._close()
+
+    def begin_fit(self) -> None:
+        self.adam.reset(self.views)
+
+    def fit(self, own: Mapping[str, Tensor]) -> None:
+        self.adam.step(self.views, own["affine"], EXPOSURE_FIT_RATE)
+
+    def facts(self) -> dict[str, Any]:
+        gains = self.adam.values[: self.views, range(3), range(3)] + 1
+        return {"gain_lowest": float(gains.min()), "gain_highest": float(gains.max())}
+
+    def state_dict(self) -> State:
+        return self.adam.state_dict()
+
+    def load_state_dict(self, state: State) -> None:
+        self.adam.load_state_dict(state)
+
 
 SIZE, HIDDEN, OCTAVES = 4, 32, 4  # of the embedding, of the net, of the Fourier features
 RATE_ROWS, RATE_NET, FINAL = 0.02, 2e-3, 0.1  # both decay to this share
-FIT_RATE = 0.1  # WildGaussians
+EMBEDDING_FIT_RATE = 0.1  # WildGaussians
 
 
 class AppearanceEmbedding(Effect):
@@ -33,10 +109,7 @@ class AppearanceEmbedding(Effect):
 
     def setup(self, data: TrainData) -> None:
         self.views = len(data.photos)
-        xyz = data.scene.points.xyz
-        self.centre = torch.tensor(np.median(xyz, axis=0), dtype=torch.float32, device=data.device)
-        spread = np.maximum(np.quantile(np.abs(xyz - np.median(xyz, axis=0)), 0.97, axis=0), 1e-6)
-        self.spread = torch.tensor(spread, dtype=torch.float32, device=data.device)
+        self.unit = Unit(data.scene.points.xyz, data.device)
         rng = np.random.default_rng([data.seed, 0xA9])
 
         def weights(*shape: int) -> Tensor:
@@ -50,7 +123,7 @@ class AppearanceEmbedding(Effect):
 
     def features(self, means: Tensor) -> Tensor:
         """[N, 25]: Fourier features of positions, as WildGaussians starts its embeddings from, and 1."""
-        unit = ((means - self.centre) / self.spread).clamp(-1.5, 1.5)
+        unit = self.unit(means).clamp(-1.5, 1.5)
         angles = torch.cat([unit * (torch.pi * 2.0**k / 2) for k in range(OCTAVES)], dim=1)
         return torch.cat([angles.sin(), angles.cos(), torch.ones_like(unit[:, :1])], dim=1)
 
@@ -93,7 +166,7 @@ class AppearanceEmbedding(Effect):
         self.rows_of_photos.reset(self.views)
 
     def fit(self, own: Mapping[str, Tensor]) -> None:
-        self.rows_of_photos.step(self.views, own["row"], FIT_RATE)
+        self.rows_of_photos.step(self.views, own["row"], EMBEDDING_FIT_RATE)
 
     def facts(self) -> dict[str, Any]:
         return {"embedding_std": float(self.rows_of_photos.values[: self.views].std(unbiased=False))}

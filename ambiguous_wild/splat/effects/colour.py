@@ -1,4 +1,4 @@
-"""Colours that change from photo to photo: an affine exposure, and an embedding that asks where Gaussians lie.
+"""Colours that change from photo to photo: affine exposure, and an embedding that asks where Gaussians lie.
 
 Affine exposure is 3DGS's option (Kerbl et al., later release): each photo sees the scene's colours through
 a 3x3 matrix and an offset of its own. With a constraint: over the train photos the changes sum to zero, so

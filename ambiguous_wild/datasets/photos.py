@@ -15,7 +15,7 @@ import numpy as np
 from ambiguous_wild.builder.downsample import downsample_mask, downsample_photo, downsampled_size
 from ambiguous_wild.builder.undistort import Lens, make_lens
 from ambiguous_wild.core.errors import AwError, shortlist
-from ambiguous_wild.datasets.foreign import ForeignScene, camera_size, find_photo, without_suffix
+from ambiguous_wild.datasets.foreign import ForeignScene, find_photo, without_suffix
 from ambiguous_wild.datasets.readers.colmap import file_size
 from ambiguous_wild.io.colmap_records import ModelCamera, ModelImage
 from ambiguous_wild.io.image_header import MAX_PIXELS
@@ -72,7 +72,7 @@ def plan_photos(scene: ForeignScene) -> list[PhotoPlan]:
                 f"{image.name} ({size[0]}x{size[1]}, more than {MAX_PIXELS // 1_000_000} megapixels)"
             )
         elif not _same_shape(size, (camera.width, camera.height)):
-            wrong.append(f"{image.name} ({size[0]}x{size[1]}, its camera {camera_size(camera)})")
+            wrong.append(f"{image.name} ({size[0]}x{size[1]}, its camera {camera.width}x{camera.height})")
         else:
             plans.append(_plan(scene, image, source, camera, size, only_small))
     _refuse_same_stems(scene)

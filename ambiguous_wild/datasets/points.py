@@ -22,10 +22,8 @@ from ambiguous_wild.builder.sfm_jobs import MotionJob, TriangulationJob
 from ambiguous_wild.builder.sfm_plans import plans
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.scene import Split
-from ambiguous_wild.datasets.foreign import no_points, points_without_tracks
-from ambiguous_wild.io import colmap_binary
-from ambiguous_wild.io.colmap_model import read_model
-from ambiguous_wild.io.colmap_records import MODELS, Model, ModelImage, ModelPoints
+from ambiguous_wild.io.colmap_model import read_model, write_model
+from ambiguous_wild.io.colmap_records import MODELS, Model, ModelImage, ModelPoints, points_without_tracks
 
 RANDOM_POINTS = 100_000  # as 3DGS has for Blender scenes, and gsplat for its random start
 BLENDER_SIDE = 1.3  # half the side of 3DGS's cube for Blender scenes
@@ -46,20 +44,9 @@ def drop_test_only(model: Model, split: Mapping[str, Split]) -> tuple[Model, int
     """
     points = model.points
     train = [i.image_id for i in model.images.values() if split.get(i.name) == "train"]
-    lengths = np.diff(points.track_offsets)
-    owner = np.repeat(np.arange(len(lengths)), lengths)
-    seen = np.bincount(owner, weights=np.isin(points.track_image_ids, train), minlength=len(lengths))
-    keep = (seen > 0) | (lengths == 0)
-    rows = keep[owner] if len(owner) else np.zeros(0, bool)
-    kept = ModelPoints(
-        points.ids[keep],
-        points.xyz[keep],
-        points.rgb[keep],
-        points.error_px[keep],
-        np.concatenate([[0], np.cumsum(lengths[keep])]).astype(np.int64),
-        points.track_image_ids[rows],
-        points.track_point2d[rows],
-    )
+    lengths, in_train = np.diff(points.track_offsets), np.isin(points.track_image_ids, train)
+    keep = (np.bincount(points.owners, weights=in_train, minlength=len(lengths)) > 0) | (lengths == 0)
+    kept = points.subset(keep, np.ones(len(in_train), bool))
     images = {
         number: dataclasses.replace(
             image, point_ids=np.where(np.isin(image.point_ids, kept.ids), image.point_ids, -1)
@@ -209,7 +196,6 @@ def _match_posed(
     extract_features(folder / "features", photos, facts, settings, plan, jobs, camera, None, bar)
     _set_cameras(folder / "features" / DATABASE, folder / "known", model, used)
     match(folder / "matches", folder / "features", facts, settings, plan, jobs, bar, posed=True)
-    colmap_binary.write_points(folder / "known" / "points3D.bin", no_points())
     return folder / "matches" / DATABASE
 
 
@@ -218,7 +204,7 @@ def _set_cameras(database: Path, known: Path, model: Model, used: Mapping[str, M
     with closing(sqlite3.connect(database)) as db, db:
         rows = db.execute("SELECT name, image_id, camera_id FROM images").fetchall()
         sizes = {n: (w, h) for n, w, h in db.execute("SELECT camera_id, width, height FROM cameras")}
-        cameras, images = {}, []
+        cameras, images = {}, {}
         for name, image_id, camera_id in rows:
             camera = model.cameras[used[name].camera_id]
             if sizes[camera_id] != (camera.width, camera.height):
@@ -227,15 +213,14 @@ def _set_cameras(database: Path, known: Path, model: Model, used: Mapping[str, M
                     f"{camera.height}: points cannot be triangulated; use the photos that the poses belong to"
                 )
             cameras[camera_id] = dataclasses.replace(camera, camera_id=camera_id)
-            images.append(dataclasses.replace(used[name], image_id=image_id, camera_id=camera_id))
+            images[image_id] = dataclasses.replace(used[name], image_id=image_id, camera_id=camera_id)
         for camera in cameras.values():
             params = np.array(camera.params, "<f8").tobytes()
             db.execute(
                 "UPDATE cameras SET model = ?, params = ?, prior_focal_length = 1 WHERE camera_id = ?",
                 (MODELS[camera.model][0], params, camera.camera_id),
             )
-    colmap_binary.write_cameras(known / "cameras.bin", cameras.values())
-    colmap_binary.write_images(known / "images.bin", images)
+    write_model(known, Model(cameras, images, points_without_tracks()))
 
 
 def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:

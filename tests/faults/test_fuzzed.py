@@ -23,8 +23,7 @@ from ambiguous_wild.harness.running.result_file import read_result
 from ambiguous_wild.harness.running.store import read_config
 from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.colmap_model import read_model, write_model
-from ambiguous_wild.io.image_header import header_size
-from ambiguous_wild.io.images import read_png_rgb, write_png
+from ambiguous_wild.io.images import header_size, read_png_rgb, write_png
 from ambiguous_wild.io.scene_folder import load_scene, read_scene_json
 from ambiguous_wild.simulate.spec_file import parse_spec
 from ambiguous_wild.splat import checkpoint

@@ -21,9 +21,10 @@ from ambiguous_wild.datasets.foreign import (
     split_by_lists,
 )
 from ambiguous_wild.datasets.points import read_point_ply
-from ambiguous_wild.datasets.readers.colmap import file_size, has_lists, read_lists
+from ambiguous_wild.datasets.readers.colmap import has_lists, read_lists
 from ambiguous_wild.io.colmap_model import check_camera
 from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage, points_without_tracks
+from ambiguous_wild.io.images import header_size
 from ambiguous_wild.io.scene_folder import TEST_EVERY
 
 _LARGEST = 100_000_000  # bytes
@@ -96,7 +97,7 @@ def frame_camera(
 
     width, height = value("w"), value("h")
     if width is None or height is None:
-        size = file_size(photo)
+        size = header_size(photo)
         if size is None:
             raise AwError(f"{path} states no w and h, and {photo} is absent or no image")
         width, height = map(float, size)

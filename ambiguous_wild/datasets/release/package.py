@@ -24,8 +24,7 @@ from ambiguous_wild.datasets.release.card import ambiguity_line, card
 from ambiguous_wild.datasets.release.croissant import PackedFile, croissant
 from ambiguous_wild.datasets.release.info import ReleaseInfo
 from ambiguous_wild.datasets.release.metadata import strip_metadata
-from ambiguous_wild.io.atomic import atomic_dir, check_output
-from ambiguous_wild.io.foreign_files import list_names, refuse_foreign_files
+from ambiguous_wild.io.atomic import atomic_dir, check_output, list_names, refuse_foreign_files
 from ambiguous_wild.io.scene_folder import load_scene, read_scene_json, verify_files
 
 FILES = ("scene", "archive", "path", "role", "split", "sha256", "bytes")

@@ -20,6 +20,7 @@ from ambiguous_wild.io.atomic import atomic_dir, check_output
 from ambiguous_wild.io.colmap_model import read_model, write_model
 from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage
 from ambiguous_wild.io.images import read_gray, write_png
+from ambiguous_wild.io.ply import write_point_ply
 from ambiguous_wild.io.scene_folder import load_scene, model_folder
 
 Form = Literal["nerfstudio", "nerfbaselines", "colmap", "on-the-go"]
@@ -164,8 +165,7 @@ def _nerfstudio(scene: Scene, folder: Path, place: Place) -> list[str]:
             _write_mask(view, folder / mask)
             frame["mask_path"] = mask
         frames.append(frame)
-    points = _point_ply(scene)
-    (folder / "sparse_pc.ply").write_bytes(points)
+    write_point_ply(folder / "sparse_pc.ply", scene.points.xyz, scene.points.rgb)
     data = {
         "camera_model": "OPENCV",
         "ply_file_path": "sparse_pc.ply",
@@ -234,19 +234,6 @@ def _write_mask(view: View, target: Path) -> None:
     else:
         pixels = np.where(read_gray(view.keep_path) >= 128, 255, 0).astype(np.uint8)
     write_png(target, pixels)
-
-
-def _point_ply(scene: Scene) -> bytes:
-    points = scene.points
-    layout = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
-    table = np.empty(len(points), layout)
-    for index, axis in enumerate("xyz"):
-        table[axis] = points.xyz[:, index]
-    for index, colour in enumerate(("red", "green", "blue")):
-        table[colour] = points.rgb[:, index]
-    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
-    head += [f"property {'float' if t == '<f4' else 'uchar'} {n}" for n, t in layout]
-    return "\n".join([*head, "end_header\n"]).encode() + table.tobytes()
 
 
 def _write_json(path: Path, data: Mapping[str, Any]) -> None:

@@ -29,12 +29,6 @@ RANDOM_POINTS = 100_000  # as 3DGS has for Blender scenes, and gsplat for its ra
 BLENDER_SIDE = 1.3  # half the side of 3DGS's cube for Blender scenes
 CAMERA_SIDE = 3.0  # half the side of gsplat's cube, over the largest distance of a camera from their mean
 LEAST_POINTS = 100  # fewer triangulated points are no start
-_LARGEST_PLY = 2_000_000_000  # bytes
-_PLY_TYPES = {
-    "float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8", "uchar": "u1", "uint8": "u1",
-    "char": "i1", "int8": "i1", "short": "<i2", "int16": "<i2", "ushort": "<u2", "uint16": "<u2",
-    "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4",
-}  # fmt: skip
 
 
 def drop_test_only(model: Model, split: Mapping[str, Split]) -> tuple[Model, int]:
@@ -221,68 +215,3 @@ def _set_cameras(database: Path, known: Path, model: Model, used: Mapping[str, M
                 (MODELS[camera.model][0], params, camera.camera_id),
             )
     write_model(known, Model(cameras, images, points_without_tracks()))
-
-
-def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [M, 3] and colours [M, 3] uint8 of a point cloud, ASCII or binary little-endian.
-
-    Raises:
-        AwError: unreadable, damaged, or without x, y, z.
-    """
-    try:
-        if path.stat().st_size > _LARGEST_PLY:
-            raise AwError(f"{path} is larger than {_LARGEST_PLY // 10**9} GB")
-        data = path.read_bytes()
-    except OSError as error:
-        raise AwError(f"cannot read the points {path}: {error.strerror}") from error
-    end = data.find(b"end_header\n", 0, 65536)
-    if not data.startswith(b"ply") or end < 0:
-        raise AwError(f"{path} is no PLY file")
-    form, count, names, types = _ply_header(path, data[:end].decode("ascii", errors="replace"))
-    body = data[end + len(b"end_header\n") :]
-    try:
-        if form == "ascii":
-            rows = body.decode("ascii").split("\n")[:count]
-            table = np.array([[float(v) for v in row.split()[: len(names)]] for row in rows])
-            columns = {n: table[:, i] for i, n in enumerate(names)} if count else {}
-        else:
-            layout = np.dtype(list(zip(names, types)))
-            records = np.frombuffer(body, layout, count)
-            columns = {n: records[n] for n in names}
-    except (ValueError, IndexError, UnicodeDecodeError) as error:
-        raise AwError(f"{path} is cut short or damaged; copy it again") from error
-    if not all(axis in columns for axis in "xyz"):
-        raise AwError(f"{path} has no x, y and z")
-    xyz = np.stack([columns[a].astype(np.float64) for a in "xyz"], axis=1)
-    if not np.isfinite(xyz).all():
-        raise AwError(f"{path} holds positions that are not finite")
-    if all(c in columns for c in ("red", "green", "blue")):
-        rgb = np.stack([columns[c] for c in ("red", "green", "blue")], axis=1)
-        rgb = np.clip(rgb * (255.0 if rgb.dtype.kind == "f" and form != "ascii" else 1.0), 0, 255).astype(
-            np.uint8
-        )
-    else:
-        rgb = np.full(xyz.shape, 128, np.uint8)
-    return xyz, rgb
-
-
-def _ply_header(path: Path, text: str) -> tuple[str, int, list[str], list[str]]:
-    form, count, names, types, inside = "", -1, [], [], False
-    for line in text.splitlines():
-        words = line.split()
-        if words[:1] == ["format"]:
-            form = words[1] if len(words) > 1 else ""
-        elif words[:1] == ["element"]:
-            inside = words[1:2] == ["vertex"]
-            if inside and count < 0 and len(words) == 3 and words[2].isdigit():
-                count = int(words[2])
-            elif not inside and count < 0:
-                raise AwError(f"{path}: its first element is not vertex")
-        elif words[:1] == ["property"] and inside:
-            if len(words) != 3 or words[1] not in _PLY_TYPES:
-                raise AwError(f"{path}: the property {line.strip()[:60]!r} is not supported")
-            types.append(_PLY_TYPES[words[1]])
-            names.append(words[2])
-    if form not in ("ascii", "binary_little_endian") or count < 0:
-        raise AwError(f"{path}: format {form[:30]!r} is not supported: ascii and binary_little_endian are")
-    return form, count, names, types

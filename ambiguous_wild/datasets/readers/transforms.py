@@ -20,11 +20,11 @@ from ambiguous_wild.datasets.foreign import (
     quaternion_from_rotation,
     split_by_lists,
 )
-from ambiguous_wild.datasets.points import read_point_ply
 from ambiguous_wild.datasets.readers.colmap import has_lists, read_lists
 from ambiguous_wild.io.colmap_model import check_camera
 from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage, points_without_tracks
 from ambiguous_wild.io.images import header_size
+from ambiguous_wild.io.ply import read_point_ply
 from ambiguous_wild.io.scene_folder import TEST_EVERY
 
 _LARGEST = 100_000_000  # bytes

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ambiguous_wild.core.errors import AwError, shortlist
-from ambiguous_wild.datasets.release.croissant import NOT_FOR_RELEASE, VERSION
+from ambiguous_wild.datasets.release.describe import NOT_FOR_RELEASE, VERSION
 from ambiguous_wild.datasets.release.package import FILES, FIXED
 from ambiguous_wild.io.archive import extract
 from ambiguous_wild.io.atomic import list_names

@@ -18,7 +18,7 @@ import numpy as np
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import ScreenedPhoto, UndistortResult
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.io import colmap_binary
+from ambiguous_wild.io.colmap_model import write_model
 from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage
 from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
 from ambiguous_wild.io.safe_pycolmap import pycolmap
@@ -132,10 +132,8 @@ def undistort(
     with ThreadPoolExecutor(jobs) as pool:
         done = list(pool.map(one, model.images.values()))
     bar.finish()
-    sparse = folder / "sparse" / "0"
-    colmap_binary.write_cameras(sparse / "cameras.bin", {c.camera_id: c for _, c, _ in done}.values())
-    colmap_binary.write_images(sparse / "images.bin", [image for image, _, _ in done])
-    colmap_binary.write_points(sparse / "points3D.bin", model.points)
+    cameras, images = {c.camera_id: c for _, c, _ in done}, {image.image_id: image for image, _, _ in done}
+    write_model(folder / "sparse" / "0", Model(cameras, images, model.points))
     found = {part: sum(part in parts for _, _, parts in done) for part in TRUTH_PARTS}
     return {"truth": found if truth is not None else None}
 

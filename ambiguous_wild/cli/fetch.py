@@ -27,7 +27,7 @@ def command(name: str | None, output: Path, listing: bool, unpack: bool, as_json
 
     The hash of the first download is stored in OUTPUT/archives/downloads.json; later downloads must match it.
     """
-    from ambiguous_wild.datasets.catalogue import find_public, public_data
+    from ambiguous_wild.datasets.fetch import find_public, public_data
 
     if listing:
         if as_json:

@@ -51,7 +51,7 @@ def command(
 
     The same scenes give the same bytes. Without licence and consent the package says "not for release".
     """
-    from ambiguous_wild.datasets.release.info import TEMPLATE, ReleaseInfo, read_release_info
+    from ambiguous_wild.datasets.release.describe import TEMPLATE, ReleaseInfo, read_release_info
 
     if template is not None:
         if template.exists():

@@ -164,7 +164,7 @@ def make_command(
 def score_command(answers: tuple[Path, ...], key: Path, out: Path | None, seed: int, as_json: bool) -> None:
     """Score ANSWERS: files (JSON or CSV) saved by raters, or folders of them."""
     from ambiguous_wild.io.atomic import check_output
-    from ambiguous_wild.io.foreign_files import refuse_foreign_files as refuse_strangers
+    from ambiguous_wild.io.atomic import refuse_foreign_files as refuse_strangers
     from ambiguous_wild.study.answers import read_answers
     from ambiguous_wild.study.key import read_key
     from ambiguous_wild.study.report import SCORE_FILES, markdown_of, write_scores

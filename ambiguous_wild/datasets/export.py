@@ -15,12 +15,13 @@ from ambiguous_wild.core import Scene, View
 from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.datasets.foreign import without_suffix
 from ambiguous_wild.datasets.photos import link_file
-from ambiguous_wild.io import colmap_binary, motion_points
+from ambiguous_wild.io import motion_points
 from ambiguous_wild.io.atomic import atomic_dir, check_output
-from ambiguous_wild.io.colmap_model import read_model
-from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage, ModelPoints
+from ambiguous_wild.io.colmap_model import read_model, write_model
+from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage
 from ambiguous_wild.io.images import read_gray, write_png
-from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.io.ply import write_point_ply
+from ambiguous_wild.io.scene_folder import load_scene, model_folder
 
 Form = Literal["nerfstudio", "nerfbaselines", "colmap", "on-the-go"]
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -82,8 +83,6 @@ def _stored(view: View) -> str:
 
 def _sized_model(scene: Scene) -> Model:
     """The model of the split's photos at the size of the loaded files, a camera a distinct intrinsics."""
-    from ambiguous_wild.io.scene_folder import model_folder
-
     model = read_model(model_folder(scene.root))
     by_name = {view.name: view for view in scene.views}
     cameras: dict[tuple[Any, ...], ModelCamera] = {}
@@ -107,14 +106,7 @@ def _sized_model(scene: Scene) -> Model:
             image.xys * scale,
             image.point_ids,
         )
-    points = model.points
-    rows = np.isin(points.track_image_ids, sorted(images))
-    owner = np.repeat(np.arange(len(points.ids)), np.diff(points.track_offsets))
-    kept = np.bincount(owner[rows], minlength=len(points.ids))
-    offsets = np.concatenate([[0], np.cumsum(kept)]).astype(np.int64)
-    tracks = (points.track_image_ids[rows], points.track_point2d[rows])
-    trimmed = ModelPoints(points.ids, points.xyz, points.rgb, points.error_px, offsets, *tracks)
-    return Model({c.camera_id: c for c in cameras.values()}, images, trimmed)
+    return Model({c.camera_id: c for c in cameras.values()}, images, model.points.seen_in(images))
 
 
 def _write_lists(scene: Scene, folder: Path) -> None:
@@ -127,11 +119,7 @@ def _colmap(scene: Scene, folder: Path, place: Place) -> list[str]:
     """images/, sparse/0, and lists that some readers know."""
     for view in scene.views:
         place(view.image_path, folder / "images" / _stored(view))
-    model = _sized_model(scene)
-    sparse = folder / "sparse" / "0"
-    colmap_binary.write_cameras(sparse / "cameras.bin", model.cameras.values())
-    colmap_binary.write_images(sparse / "images.bin", model.images.values())
-    colmap_binary.write_points(sparse / "points3D.bin", model.points)
+    write_model(folder / "sparse" / "0", _sized_model(scene))
     _write_lists(scene, folder)
     return ["keep masks"] if any(v.keep_path for v in scene.train) else []
 
@@ -177,8 +165,7 @@ def _nerfstudio(scene: Scene, folder: Path, place: Place) -> list[str]:
             _write_mask(view, folder / mask)
             frame["mask_path"] = mask
         frames.append(frame)
-    points = _point_ply(scene)
-    (folder / "sparse_pc.ply").write_bytes(points)
+    write_point_ply(folder / "sparse_pc.ply", scene.points.xyz, scene.points.rgb)
     data = {
         "camera_model": "OPENCV",
         "ply_file_path": "sparse_pc.ply",
@@ -247,19 +234,6 @@ def _write_mask(view: View, target: Path) -> None:
     else:
         pixels = np.where(read_gray(view.keep_path) >= 128, 255, 0).astype(np.uint8)
     write_png(target, pixels)
-
-
-def _point_ply(scene: Scene) -> bytes:
-    points = scene.points
-    layout = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
-    table = np.empty(len(points), layout)
-    for index, axis in enumerate("xyz"):
-        table[axis] = points.xyz[:, index]
-    for index, colour in enumerate(("red", "green", "blue")):
-        table[colour] = points.rgb[:, index]
-    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
-    head += [f"property {'float' if t == '<f4' else 'uchar'} {n}" for n, t in layout]
-    return "\n".join([*head, "end_header\n"]).encode() + table.tobytes()
 
 
 def _write_json(path: Path, data: Mapping[str, Any]) -> None:

@@ -1,4 +1,6 @@
-"""Download an archive: resumed after a break, checked by length and hash, unpacked safely.
+"""The catalogue of public datasets (`public.yaml`), and their download.
+
+A download is resumed after a break, checked by length and hash, and unpacked safely.
 
 The server is not trusted: it may break off, lie about the length, ignore a wish to resume, or serve another
 file on another day.
@@ -15,6 +17,7 @@ import urllib.error
 import urllib.request
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from http.client import HTTPException
 from pathlib import Path
 from typing import Any, TypedDict
@@ -22,18 +25,57 @@ from urllib.parse import urlsplit
 
 from ambiguous_wild import __version__
 from ambiguous_wild.builder.workspace import build_lock
-from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.datasets.catalogue import PublicData
+from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.io.archive import extract
 from ambiguous_wild.io.atomic import check_output, write_json
 from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.io.plain_yaml import read_mapping
 
+CATALOGUE = Path(__file__).with_name("public.yaml")
 RECORD = "downloads.json"  # beside the archives: name -> what was downloaded first
 TRIES = 5
 WAIT_S = 2.0  # before the second try; doubles
 STALL_S = 60.0  # without a byte, a connection counts as broken
 _CHUNK = 1 << 20
 MOST_BYTES = 200_000_000_000
+
+
+@dataclass(frozen=True)
+class PublicData:
+    """One archive, or a page that leads to one."""
+
+    name: str
+    page: str
+    license: str
+    note: str
+    url: str = ""  # empty: only a page
+    layout: str = ""
+    size_mb: str = ""  # as stated; empty = not stated
+    sha256: str = ""  # empty = the publisher states none
+
+
+@cache
+def public_data() -> dict[str, PublicData]:
+    """By name, in the order of the file."""
+    data: dict[str, Any] = read_mapping(CATALOGUE)
+    rows = [*data["datasets"], *data["pages"]]
+    return {row["name"]: PublicData(**{k: str(v) for k, v in row.items()}) for row in rows}
+
+
+def find_public(name: str) -> PublicData:
+    """The dataset of that name.
+
+    Raises:
+        AwError: there is none, or it has no archive to download.
+    """
+    known = public_data()
+    if name not in known:
+        raise unknown("dataset", name, known, "'aw fetch --list' lists them")
+    if not known[name].url:
+        raise AwError(
+            f"{name} has no fixed archive: download it from {known[name].page}, then 'aw import' it"
+        )
+    return known[name]
 
 
 class Download(TypedDict):

@@ -11,7 +11,7 @@ import numpy as np
 
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.core.scene import Split
-from ambiguous_wild.io.colmap_records import LARGEST_COORDINATE, Model, ModelCamera, ModelPoints
+from ambiguous_wild.io.colmap_records import LARGEST_COORDINATE, Model
 
 SIDES: tuple[Split, Split] = ("train", "test")
 SUFFIXES = (".jpg", ".jpeg", ".png", ".JPG", ".JPEG", ".PNG")
@@ -175,31 +175,3 @@ def quaternion_from_rotation(rotation: np.ndarray) -> np.ndarray:
         q[1 + k] = m[k, i] + m[i, k]
     q /= np.linalg.norm(q)
     return q if q[0] >= 0 else -q
-
-
-def no_points() -> ModelPoints:
-    """A model's points where it has none."""
-    return points_without_tracks(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
-
-
-def points_without_tracks(
-    xyz: np.ndarray,  # [M, 3] world
-    rgb: np.ndarray,  # [M, 3] uint8
-) -> ModelPoints:
-    """Points that no photo is known to see."""
-    count = len(xyz)
-    empty = np.zeros(0, np.int64)
-    return ModelPoints(
-        np.arange(1, count + 1, dtype=np.int64),
-        np.asarray(xyz, np.float64).reshape(-1, 3),
-        np.asarray(rgb, np.uint8).reshape(-1, 3),
-        np.zeros(count),
-        np.zeros(count + 1, np.int64),
-        empty,
-        empty,
-    )
-
-
-def camera_size(camera: ModelCamera) -> str:
-    """ "4032x3024", for messages."""
-    return f"{camera.width}x{camera.height}"

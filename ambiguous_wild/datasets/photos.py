@@ -15,11 +15,9 @@ import numpy as np
 from ambiguous_wild.builder.downsample import downsample_mask, downsample_photo, downsampled_size
 from ambiguous_wild.builder.undistort import Lens, make_lens
 from ambiguous_wild.core.errors import AwError, shortlist
-from ambiguous_wild.datasets.foreign import ForeignScene, camera_size, find_photo, without_suffix
-from ambiguous_wild.datasets.readers.colmap import file_size
+from ambiguous_wild.datasets.foreign import ForeignScene, find_photo, without_suffix
 from ambiguous_wild.io.colmap_records import ModelCamera, ModelImage
-from ambiguous_wild.io.image_header import MAX_PIXELS
-from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
+from ambiguous_wild.io.images import MAX_PIXELS, header_size, read_gray, read_png_rgb, write_png
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
@@ -64,7 +62,7 @@ def plan_photos(scene: ForeignScene) -> list[PhotoPlan]:
             absent.append(image.name)
             continue
         camera = scene.model.cameras[image.camera_id]
-        size = file_size(source)
+        size = header_size(source)
         if size is None:
             wrong.append(f"{image.name} (no image)")
         elif size[0] * size[1] > MAX_PIXELS:
@@ -72,7 +70,7 @@ def plan_photos(scene: ForeignScene) -> list[PhotoPlan]:
                 f"{image.name} ({size[0]}x{size[1]}, more than {MAX_PIXELS // 1_000_000} megapixels)"
             )
         elif not _same_shape(size, (camera.width, camera.height)):
-            wrong.append(f"{image.name} ({size[0]}x{size[1]}, its camera {camera_size(camera)})")
+            wrong.append(f"{image.name} ({size[0]}x{size[1]}, its camera {camera.width}x{camera.height})")
         else:
             plans.append(_plan(scene, image, source, camera, size, only_small))
     _refuse_same_stems(scene)
@@ -116,7 +114,7 @@ def _plan(
     small = None
     if scene.factor > 1 and not convert and not only_small:
         small = find_photo(scene.root / f"images_{scene.factor}", image.name)
-        found = file_size(small) if small is not None else None
+        found = header_size(small) if small is not None else None
         if found is not None and not _same_shape(found, size):
             raise AwError(
                 f"{small} is {found[0]}x{found[1]}, another shape than {source} "
@@ -269,7 +267,7 @@ def place_mask(plan: PhotoPlan, placed: PlacedPhoto, scene: ForeignScene, mask: 
         return
     pixels = read_gray(mask)
     height, width = pixels.shape
-    size = file_size(plan.source) or (plan.camera.width, plan.camera.height)
+    size = header_size(plan.source) or (plan.camera.width, plan.camera.height)
     final = (placed.camera.width, placed.camera.height)
     if scene.factor > 1 and not plan.only_small:
         final = downsampled_size(*final, scene.factor)

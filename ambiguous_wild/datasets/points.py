@@ -22,21 +22,13 @@ from ambiguous_wild.builder.sfm_jobs import MotionJob, TriangulationJob
 from ambiguous_wild.builder.sfm_plans import plans
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.scene import Split
-from ambiguous_wild.datasets.foreign import no_points, points_without_tracks
-from ambiguous_wild.io import colmap_binary
-from ambiguous_wild.io.colmap_model import read_model
-from ambiguous_wild.io.colmap_records import MODELS, Model, ModelImage, ModelPoints
+from ambiguous_wild.io.colmap_model import read_model, write_model
+from ambiguous_wild.io.colmap_records import MODELS, Model, ModelImage, ModelPoints, points_without_tracks
 
 RANDOM_POINTS = 100_000  # as 3DGS has for Blender scenes, and gsplat for its random start
 BLENDER_SIDE = 1.3  # half the side of 3DGS's cube for Blender scenes
 CAMERA_SIDE = 3.0  # half the side of gsplat's cube, over the largest distance of a camera from their mean
 LEAST_POINTS = 100  # fewer triangulated points are no start
-_LARGEST_PLY = 2_000_000_000  # bytes
-_PLY_TYPES = {
-    "float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8", "uchar": "u1", "uint8": "u1",
-    "char": "i1", "int8": "i1", "short": "<i2", "int16": "<i2", "ushort": "<u2", "uint16": "<u2",
-    "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4",
-}  # fmt: skip
 
 
 def drop_test_only(model: Model, split: Mapping[str, Split]) -> tuple[Model, int]:
@@ -46,20 +38,9 @@ def drop_test_only(model: Model, split: Mapping[str, Split]) -> tuple[Model, int
     """
     points = model.points
     train = [i.image_id for i in model.images.values() if split.get(i.name) == "train"]
-    lengths = np.diff(points.track_offsets)
-    owner = np.repeat(np.arange(len(lengths)), lengths)
-    seen = np.bincount(owner, weights=np.isin(points.track_image_ids, train), minlength=len(lengths))
-    keep = (seen > 0) | (lengths == 0)
-    rows = keep[owner] if len(owner) else np.zeros(0, bool)
-    kept = ModelPoints(
-        points.ids[keep],
-        points.xyz[keep],
-        points.rgb[keep],
-        points.error_px[keep],
-        np.concatenate([[0], np.cumsum(lengths[keep])]).astype(np.int64),
-        points.track_image_ids[rows],
-        points.track_point2d[rows],
-    )
+    lengths, in_train = np.diff(points.track_offsets), np.isin(points.track_image_ids, train)
+    keep = (np.bincount(points.owners, weights=in_train, minlength=len(lengths)) > 0) | (lengths == 0)
+    kept = points.subset(keep, np.ones(len(in_train), bool))
     images = {
         number: dataclasses.replace(
             image, point_ids=np.where(np.isin(image.point_ids, kept.ids), image.point_ids, -1)
@@ -209,7 +190,6 @@ def _match_posed(
     extract_features(folder / "features", photos, facts, settings, plan, jobs, camera, None, bar)
     _set_cameras(folder / "features" / DATABASE, folder / "known", model, used)
     match(folder / "matches", folder / "features", facts, settings, plan, jobs, bar, posed=True)
-    colmap_binary.write_points(folder / "known" / "points3D.bin", no_points())
     return folder / "matches" / DATABASE
 
 
@@ -218,7 +198,7 @@ def _set_cameras(database: Path, known: Path, model: Model, used: Mapping[str, M
     with closing(sqlite3.connect(database)) as db, db:
         rows = db.execute("SELECT name, image_id, camera_id FROM images").fetchall()
         sizes = {n: (w, h) for n, w, h in db.execute("SELECT camera_id, width, height FROM cameras")}
-        cameras, images = {}, []
+        cameras, images = {}, {}
         for name, image_id, camera_id in rows:
             camera = model.cameras[used[name].camera_id]
             if sizes[camera_id] != (camera.width, camera.height):
@@ -227,77 +207,11 @@ def _set_cameras(database: Path, known: Path, model: Model, used: Mapping[str, M
                     f"{camera.height}: points cannot be triangulated; use the photos that the poses belong to"
                 )
             cameras[camera_id] = dataclasses.replace(camera, camera_id=camera_id)
-            images.append(dataclasses.replace(used[name], image_id=image_id, camera_id=camera_id))
+            images[image_id] = dataclasses.replace(used[name], image_id=image_id, camera_id=camera_id)
         for camera in cameras.values():
             params = np.array(camera.params, "<f8").tobytes()
             db.execute(
                 "UPDATE cameras SET model = ?, params = ?, prior_focal_length = 1 WHERE camera_id = ?",
                 (MODELS[camera.model][0], params, camera.camera_id),
             )
-    colmap_binary.write_cameras(known / "cameras.bin", cameras.values())
-    colmap_binary.write_images(known / "images.bin", images)
-
-
-def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [M, 3] and colours [M, 3] uint8 of a point cloud, ASCII or binary little-endian.
-
-    Raises:
-        AwError: unreadable, damaged, or without x, y, z.
-    """
-    try:
-        if path.stat().st_size > _LARGEST_PLY:
-            raise AwError(f"{path} is larger than {_LARGEST_PLY // 10**9} GB")
-        data = path.read_bytes()
-    except OSError as error:
-        raise AwError(f"cannot read the points {path}: {error.strerror}") from error
-    end = data.find(b"end_header\n", 0, 65536)
-    if not data.startswith(b"ply") or end < 0:
-        raise AwError(f"{path} is no PLY file")
-    form, count, names, types = _ply_header(path, data[:end].decode("ascii", errors="replace"))
-    body = data[end + len(b"end_header\n") :]
-    try:
-        if form == "ascii":
-            rows = body.decode("ascii").split("\n")[:count]
-            table = np.array([[float(v) for v in row.split()[: len(names)]] for row in rows])
-            columns = {n: table[:, i] for i, n in enumerate(names)} if count else {}
-        else:
-            layout = np.dtype(list(zip(names, types)))
-            records = np.frombuffer(body, layout, count)
-            columns = {n: records[n] for n in names}
-    except (ValueError, IndexError, UnicodeDecodeError) as error:
-        raise AwError(f"{path} is cut short or damaged; copy it again") from error
-    if not all(axis in columns for axis in "xyz"):
-        raise AwError(f"{path} has no x, y and z")
-    xyz = np.stack([columns[a].astype(np.float64) for a in "xyz"], axis=1)
-    if not np.isfinite(xyz).all():
-        raise AwError(f"{path} holds positions that are not finite")
-    if all(c in columns for c in ("red", "green", "blue")):
-        rgb = np.stack([columns[c] for c in ("red", "green", "blue")], axis=1)
-        rgb = np.clip(rgb * (255.0 if rgb.dtype.kind == "f" and form != "ascii" else 1.0), 0, 255).astype(
-            np.uint8
-        )
-    else:
-        rgb = np.full(xyz.shape, 128, np.uint8)
-    return xyz, rgb
-
-
-def _ply_header(path: Path, text: str) -> tuple[str, int, list[str], list[str]]:
-    form, count, names, types, inside = "", -1, [], [], False
-    for line in text.splitlines():
-        words = line.split()
-        if words[:1] == ["format"]:
-            form = words[1] if len(words) > 1 else ""
-        elif words[:1] == ["element"]:
-            inside = words[1:2] == ["vertex"]
-            if inside and count < 0 and len(words) == 3 and words[2].isdigit():
-                count = int(words[2])
-            elif not inside and count < 0:
-                raise AwError(f"{path}: its first element is not vertex")
-        elif words[:1] == ["property"] and inside:
-            if len(words) != 3 or words[1] not in _PLY_TYPES:
-                raise AwError(f"{path}: the property {line.strip()[:60]!r} is not supported")
-            types.append(_PLY_TYPES[words[1]])
-            names.append(words[2])
-    if form not in ("ascii", "binary_little_endian") or count < 0:
-        raise AwError(f"{path}: format {form[:30]!r} is not supported: ascii and binary_little_endian are")
-    return form, count, names, types
+    write_model(known, Model(cameras, images, points_without_tracks()))

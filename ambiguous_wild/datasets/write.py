@@ -24,10 +24,9 @@ from ambiguous_wild.datasets.photos import PhotoPlan, PlacedPhoto, place_mask, p
 from ambiguous_wild.datasets.points import drop_test_only, find_motion, random_points, triangulate
 from ambiguous_wild.datasets.recognise import read_foreign
 from ambiguous_wild.datasets.suites import differences, suite_of
-from ambiguous_wild.io import colmap_binary
-from ambiguous_wild.io.atomic import check_output, write_json, write_text
+from ambiguous_wild.io.atomic import check_output, refuse_foreign_files, write_json, write_text
+from ambiguous_wild.io.colmap_model import write_model
 from ambiguous_wild.io.colmap_records import Model
-from ambiguous_wild.io.foreign_files import refuse_foreign_files
 from ambiguous_wild.io.scene_folder import SCENE_SCHEMA, read_scene_json, verify_files
 
 
@@ -241,31 +240,9 @@ def _write_model(folder: Path, model: Model, placed: list[PlacedPhoto]) -> Model
             taken[same] = number
             cameras[number] = dataclasses.replace(camera, camera_id=number)
         images[photo.image.image_id] = dataclasses.replace(photo.image, camera_id=taken[same])
-    points = _without_absent(model, set(images))
-    sparse = folder / "sparse" / "0"
-    colmap_binary.write_cameras(sparse / "cameras.bin", cameras.values())
-    colmap_binary.write_images(sparse / "images.bin", images.values())
-    colmap_binary.write_points(sparse / "points3D.bin", points.points)
-    return Model(cameras, images, points.points)
-
-
-def _without_absent(model: Model, present: set[int]) -> Model:
-    """The model whose tracks name present photos alone; points stay."""
-    import numpy as np
-
-    points = model.points
-    lengths = np.diff(points.track_offsets)
-    owner = np.repeat(np.arange(len(lengths)), lengths)
-    rows = np.isin(points.track_image_ids, sorted(present))
-    kept = np.bincount(owner[rows], minlength=len(lengths))
-    offsets = np.concatenate([[0], np.cumsum(kept)]).astype(np.int64)
-    trimmed = dataclasses.replace(
-        points,
-        track_offsets=offsets,
-        track_image_ids=points.track_image_ids[rows],
-        track_point2d=points.track_point2d[rows],
-    )
-    return Model(model.cameras, model.images, trimmed)
+    written = Model(cameras, images, model.points.seen_in(images))
+    write_model(folder / "sparse" / "0", written)
+    return written
 
 
 def _record(

@@ -16,7 +16,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import IO
 
@@ -42,47 +42,6 @@ class Limits:
     bytes: int = 50_000_000_000
     ratio: float = 200.0  # unpacked to packed; photos and models stay under 20
     free: int = 64 << 20  # bytes below which the ratio is not checked: text compresses well
-
-
-@dataclass
-class _Budget:
-    """Counts the files and bytes of one archive."""
-
-    archive: Path
-    packed: int
-    limits: Limits
-    wanted: Callable[[str], bool]
-    written: int = 0
-    wrote: list[str] = field(default_factory=list)
-    names: dict[str, str] = field(default_factory=dict)  # normalised, case-folded -> as given
-
-    def add(self, count: int) -> None:
-        self.written += count
-        most = min(self.limits.bytes, max(self.limits.free, int(self.limits.ratio * self.packed)))
-        if self.written > most:
-            raise AwError(
-                f"{self.archive} unpacks to more than {most / 1e6:.0f} MB from {self.packed / 1e6:.2f} MB: "
-                "that may be an archive bomb; unpack it by hand if you trust it"
-            )
-
-    def place(self, name: str, folder: bool) -> PurePosixPath | None:
-        """The member's path below the target; None for the target itself."""
-        path = _inside(self.archive, name)
-        if not path.parts:
-            return None
-        if folder:
-            return path
-        if len(self.names) >= self.limits.files:
-            raise AwError(f"{self.archive} holds more than {self.limits.files} files; unpack a part of it")
-        # Some file systems take two such names for one file, and one would overwrite the other.
-        key = unicodedata.normalize("NFC", str(path)).casefold()
-        if key in self.names:
-            raise AwError(
-                f"{self.archive} holds {_short(name)} and {_short(self.names[key])}, the same file; "
-                "pack it again"
-            )
-        self.names[key] = name
-        return path
 
 
 def extract(archive: Path | str, target: Path | str, limits: Limits | None = None) -> list[str]:
@@ -132,15 +91,16 @@ def unpack(
     name = source if isinstance(source, Path) else Path("the archive")
     try:
         packed = source.stat().st_size if isinstance(source, Path) else len(source)
-        budget = _Budget(name, packed, limits or Limits(), wanted)
+        target = _Target(name, packed, limits or Limits(), folder, wanted)
         opened = open(source, "rb") if isinstance(source, Path) else io.BytesIO(source)  # noqa: SIM115
         with opened as raw, _named_errors(name):
-            zipped = zipfile.is_zipfile(raw)
+            members = _zip_members if zipfile.is_zipfile(raw) else _tar_members
             raw.seek(0)
-            (_unzip if zipped else _untar)(raw, folder, budget)
+            for member, data in members(raw, name):
+                target.add(member, data)
     except OSError as error:
         raise AwError(f"cannot unpack {name}: {error.strerror or error}") from error
-    return budget.wrote
+    return target.wrote
 
 
 def pack_folder(folder: Path | str, limit_mb: float) -> bytes:
@@ -190,30 +150,87 @@ def _named_errors(source: Path) -> Iterator[None]:
         raise AwError(f"{source} is a damaged or cut archive ({error}); download it again") from error
 
 
-def _unzip(raw: IO[bytes], folder: Path, budget: _Budget) -> None:
-    source = budget.archive
+class _Target:
+    """The folder that one archive is unpacked into; counts its files and bytes."""
+
+    def __init__(
+        self, archive: Path, packed: int, limits: Limits, folder: Path, wanted: Callable[[str], bool]
+    ) -> None:
+        self.archive, self.packed, self.folder, self.wanted = archive, packed, folder, wanted
+        self.files, self.left = limits.files, min(limits.bytes, max(limits.free, int(limits.ratio * packed)))
+        self.most = self.left
+        self.wrote: list[str] = []
+        self.names: dict[str, str] = {}  # normalised, case-folded -> as given
+
+    def add(self, name: str, data: IO[bytes] | None) -> None:
+        """Write a member, checked to stay below the folder; without data it is a folder.
+
+        A member that is not wanted is read all the same, since its size counts.
+        """
+        path = PurePosixPath(name)
+        # A backslash or a colon leads out of the folder on Windows.
+        if path.is_absolute() or ".." in path.parts or "\\" in name or ":" in name:
+            raise _refused(self.archive, name, "a path that leads out of the folder")
+        if not name.isprintable() or len(path.parts) > _DEEPEST:
+            raise _refused(self.archive, name, "no fit file name")
+        if any(len(part.encode("utf-8", errors="surrogateescape")) > _LONGEST for part in path.parts):
+            raise _refused(self.archive, name, "a name that is too long")
+        if data is None:
+            (self.folder / path).mkdir(parents=True, exist_ok=True)
+            return
+        if not path.parts:
+            raise _refused(self.archive, name, "without a name")
+        if len(self.names) >= self.files:
+            raise AwError(f"{self.archive} holds more than {self.files} files; unpack a part of it")
+        # Some file systems take two such names for one file, and one would overwrite the other.
+        key = unicodedata.normalize("NFC", str(path)).casefold()
+        if key in self.names:
+            raise AwError(
+                f"{self.archive} holds {_short(name)} and {_short(self.names[key])}, the same file; "
+                "pack it again"
+            )
+        self.names[key] = name
+        if self.wanted(str(path)):
+            (self.folder / path).parent.mkdir(parents=True, exist_ok=True)
+            with open(self.folder / path, "xb") as f:
+                self._copy(data, f.write)
+            self.wrote.append(str(path))
+        else:
+            self._copy(data, len)
+
+    def _copy(self, data: IO[bytes], write: Callable[[bytes], int]) -> None:
+        while chunk := data.read(_CHUNK):
+            self.left -= len(chunk)
+            if self.left < 0:
+                raise AwError(
+                    f"{self.archive} unpacks to more than {self.most / 1e6:.0f} MB from "
+                    f"{self.packed / 1e6:.2f} MB: that may be an archive bomb; unpack it by hand if "
+                    "you trust it"
+                )
+            write(chunk)
+
+
+def _zip_members(raw: IO[bytes], source: Path) -> Iterator[tuple[str, IO[bytes] | None]]:
+    """Names and contents; None for a folder."""
     with zipfile.ZipFile(raw) as archive:
         for member in archive.infolist():
             mode = member.external_attr >> 16
-            kind = stat.S_IFMT(mode)
-            if kind and not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+            if stat.S_IFMT(mode) and not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
                 raise _refused(source, member.filename, "a link or device")
             if member.flag_bits & 0x1:
                 raise NotImplementedError(f"{_short(member.filename)} is encrypted")
             if member.compress_type not in _ZIP_METHODS:
                 raise NotImplementedError(f"{_short(member.filename)} uses an unsupported compression method")
-            path = budget.place(member.filename, member.is_dir())
-            if path is None:
-                continue
             if member.is_dir():
-                (folder / path).mkdir(parents=True, exist_ok=True)
+                yield member.filename, None
             else:
                 with archive.open(member) as data:
-                    _write(data, folder, path, budget)
+                    yield member.filename, data
 
 
-def _untar(raw: IO[bytes], folder: Path, budget: _Budget) -> None:
-    source, head = budget.archive, raw.read(6)
+def _tar_members(raw: IO[bytes], source: Path) -> Iterator[tuple[str, IO[bytes] | None]]:
+    """As `_zip_members`. tarfile's data filter would rename and repair what is refused here."""
+    head = raw.read(6)
     raw.seek(0)
     stream = raw
     if head.startswith(b"\x1f\x8b"):
@@ -233,17 +250,12 @@ def _untar(raw: IO[bytes], folder: Path, budget: _Budget) -> None:
             if member is None:
                 return
             if member.isdir():
-                if (path := budget.place(member.name, True)) is not None:
-                    (folder / path).mkdir(parents=True, exist_ok=True)
+                yield member.name, None
                 continue
             if not member.isreg() or member.issparse():
                 raise _refused(source, member.name, "a link, device or sparse file")
-            path = budget.place(member.name, False)
-            data = archive.extractfile(member)
-            if path is None or data is None:
-                raise _refused(source, member.name, "without a name")
             gate.allowed = member.size + _CHUNK
-            _write(data, folder, path, budget)
+            yield member.name, archive.extractfile(member)
 
 
 class _Gate:
@@ -258,38 +270,6 @@ class _Gate:
         if self.allowed < 0:
             raise AwError(f"{self.source} has a header of more than {_HEADER >> 20} MB: damaged, or a bomb")
         return data
-
-
-def _write(data: IO[bytes], folder: Path, name: PurePosixPath, budget: _Budget) -> None:
-    """Write the member below the folder; a skipped member is read all the same, since its size counts."""
-    if not budget.wanted(str(name)):
-        while chunk := data.read(_CHUNK):
-            budget.add(len(chunk))
-        return
-    path = folder / name
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with open(path, "xb") as f:
-        while chunk := data.read(_CHUNK):
-            budget.add(len(chunk))
-            f.write(chunk)
-    budget.wrote.append(str(name))
-
-
-def _inside(archive: Path, name: str) -> PurePosixPath:
-    """The member's path, checked to stay below the target.
-
-    Raises:
-        AwError: it is absolute, has "..", a backslash or a colon, or is no valid file name.
-    """
-    path = PurePosixPath(name)
-    # A backslash or a colon leads out of the folder on Windows.
-    if path.is_absolute() or ".." in path.parts or "\\" in name or ":" in name:
-        raise _refused(archive, name, "a path that leads out of the folder")
-    if not name.isprintable() or len(path.parts) > _DEEPEST:
-        raise _refused(archive, name, "no fit file name")
-    if any(len(part.encode("utf-8", errors="surrogateescape")) > _LONGEST for part in path.parts):
-        raise _refused(archive, name, "a name that is too long")
-    return path
 
 
 def _refused(archive: Path, name: str, what: str) -> AwError:

@@ -1,4 +1,4 @@
-"""Atomic writes: files and folders appear under their name complete or not at all."""
+"""Atomic writes: files and folders appear under their name complete or not at all, and replace ours only."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -129,6 +129,22 @@ def check_output(path: Path | str) -> None:
             f"cannot write in {folder}: {error.strerror or error}; choose another -o, or change the "
             "permissions"
         ) from error
+
+
+def list_names(folder: Path) -> list[str]:
+    """Files and links below a folder, sorted, as paths relative to it with slashes."""
+    found = (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
+    return sorted(path.relative_to(folder).as_posix() for path in found)
+
+
+def refuse_foreign_files(folder: Path, ours: Collection[str]) -> None:
+    """Raise AwError where the folder holds a file that is not in `ours` and would be lost."""
+    for name in list_names(folder):
+        if name not in ours:
+            raise AwError(
+                f"{folder} also holds {name}, which this command did not write and would remove: "
+                "move it to another folder, or choose another -o"
+            )
 
 
 def write_text(path: Path | str, text: str) -> None:

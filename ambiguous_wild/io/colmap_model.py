@@ -1,25 +1,36 @@
 """COLMAP sparse models in numpy, binary and text, without pycolmap.
 
 Layouts: COLMAP documentation, "Output Format". Sizes in a binary file are checked against its length before
-memory is allocated.
+memory is allocated: pycolmap takes cut files for whole ones, and allocates whatever a damaged one announces.
 """
 
 from __future__ import annotations
 
+import struct
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.io import colmap_binary, colmap_text
+from ambiguous_wild.core.errors import AwError, unknown
+from ambiguous_wild.core.scene import Points, View
+from ambiguous_wild.io.atomic import atomic_path
 from ambiguous_wild.io.colmap_records import (
     _TWO_FOCALS,
     FOCAL_RANGE,
     LARGEST_COORDINATE,
     LARGEST_SIDE,
+    MODELS,
     Model,
     ModelCamera,
+    ModelImage,
+    ModelPoints,
+    model_of_id,
+    points_without_tracks,
 )
+
+_OBSERVATION = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
+_POINT = struct.Struct("<Q3d3BdQ")  # id, xyz, rgb, error, track length
 
 
 def read_model(folder: Path | str) -> Model:
@@ -35,18 +46,8 @@ def read_model(folder: Path | str) -> Model:
             break
     else:
         raise AwError(f"{root} holds no COLMAP model: cameras, images and points3D (.bin or .txt) are needed")
-    if suffix == ".bin":
-        model = Model(
-            cameras=colmap_binary.read_cameras(paths[0]),
-            images=colmap_binary.read_images(paths[1]),
-            points=colmap_binary.read_points(paths[2]),
-        )
-    else:
-        model = Model(
-            cameras=colmap_text.read_cameras(paths[0]),
-            images=colmap_text.read_images(paths[1]),
-            points=colmap_text.read_points(paths[2]),
-        )
+    cameras, images, points = _BINARY if suffix == ".bin" else _TEXT
+    model = Model(cameras(paths[0]), images(paths[1]), points(paths[2]))
     for camera in model.cameras.values():
         check_camera(root, camera)
     names: set[str] = set()
@@ -92,3 +93,235 @@ def check_camera(root: Path, camera: ModelCamera) -> None:
             f"{root}: camera {camera.camera_id} is {size[0]}x{size[1]} px with the parameters "
             f"{list(camera.params)}: the model is damaged; copy or build it again"
         )
+
+
+class _Reader:
+    """A cursor over a file's bytes that never reads past the end."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.data, self.at = path, path.read_bytes(), 0
+
+    def take(self, count: int) -> bytes:
+        if count < 0 or self.at + count > len(self.data):
+            raise AwError(
+                f"{self.path} is cut short or damaged: {count} bytes wanted at {self.at} of "
+                f"{len(self.data)}; copy or build the model again"
+            )
+        self.at += count
+        return self.data[self.at - count : self.at]
+
+    def unpack(self, layout: str) -> tuple:
+        return struct.unpack(layout, self.take(struct.calcsize(layout)))
+
+    def count(self, least_bytes: int) -> int:
+        """A uint64 count of records; refused where that many cannot fit in what is left."""
+        (number,) = self.unpack("<Q")
+        if number * least_bytes > len(self.data) - self.at:
+            raise AwError(
+                f"{self.path} is damaged: it announces {number} records, "
+                f"but {len(self.data) - self.at} bytes are left; copy or build the model again"
+            )
+        return number
+
+    def text(self) -> str:
+        end = self.data.find(b"\0", self.at)
+        if end < 0:
+            raise AwError(f"{self.path} is damaged: a name without an end at byte {self.at}")
+        raw, self.at = self.data[self.at : end], end + 1
+        return raw.decode("utf-8", errors="surrogateescape")
+
+
+def _binary_cameras(path: Path) -> dict[int, ModelCamera]:
+    """cameras.bin."""
+    reader, cameras = _Reader(path), {}
+    for _ in range(reader.count(24)):
+        camera_id, number, width, height = reader.unpack("<iiQQ")
+        name, count = model_of_id(number, str(path))
+        cameras[camera_id] = ModelCamera(camera_id, name, width, height, reader.unpack(f"<{count}d"))
+    return cameras
+
+
+def _binary_images(path: Path) -> dict[int, ModelImage]:
+    """images.bin."""
+    reader, images = _Reader(path), {}
+    for _ in range(reader.count(73)):
+        image_id, *pose, camera_id = reader.unpack("<i7di")
+        name = reader.text()
+        count = reader.count(_OBSERVATION.itemsize)
+        rows = np.frombuffer(reader.take(count * _OBSERVATION.itemsize), dtype=_OBSERVATION)
+        images[image_id] = ModelImage(
+            image_id,
+            np.array(pose[:4]),
+            np.array(pose[4:]),
+            camera_id,
+            name,
+            np.array(rows["xy"]).reshape(-1, 2),
+            np.array(rows["point"]),
+        )
+    return images
+
+
+def _binary_points(path: Path) -> ModelPoints:
+    """points3D.bin."""
+    reader = _Reader(path)
+    total = reader.count(_POINT.size)
+    ids, xyz = np.empty(total, np.int64), np.empty((total, 3))
+    rgb, error = np.empty((total, 3), np.uint8), np.empty(total)
+    offsets, tracks = np.zeros(total + 1, np.int64), []
+    for i in range(total):
+        row = _POINT.unpack(reader.take(_POINT.size))
+        if row[0] >= 2**63:
+            raise AwError(f"{path} is damaged: a point numbered {row[0]}; copy or build the model again")
+        ids[i], xyz[i], rgb[i], error[i] = row[0], row[1:4], row[4:7], row[7]
+        if row[8] * 8 > len(reader.data) - reader.at:
+            raise AwError(f"{path} is damaged: point {row[0]} announces a track of {row[8]}")
+        tracks.append(np.frombuffer(reader.take(row[8] * 8), dtype="<i4").reshape(-1, 2))
+        offsets[i + 1] = offsets[i] + row[8]
+    flat = np.concatenate(tracks).astype(np.int64) if tracks else np.zeros((0, 2), np.int64)
+    return ModelPoints(ids, xyz, rgb, error, offsets, flat[:, 0], flat[:, 1])
+
+
+def _text_cameras(path: Path) -> dict[int, ModelCamera]:
+    """cameras.txt."""
+    cameras = {}
+    for number, fields in _rows(path):
+        try:
+            camera_id, model = int(fields[0]), fields[1]
+            width, height = int(fields[2]), int(fields[3])
+            params = tuple(float(v) for v in fields[4:])
+        except (ValueError, IndexError) as error:
+            raise _damaged(path, number) from error
+        if model not in MODELS:
+            raise unknown(f"camera model in {path}", model, MODELS)
+        if len(params) != MODELS[model][1]:
+            raise _damaged(path, number)
+        cameras[camera_id] = ModelCamera(camera_id, model, width, height, params)
+    return cameras
+
+
+def _text_images(path: Path) -> dict[int, ModelImage]:
+    """images.txt: two lines an image; the second, of observations, may be empty."""
+    lines = [(n, text) for n, text in enumerate(_lines(path), 1) if not text.startswith("#")]
+    while lines and not lines[0][1].strip():
+        lines.pop(0)
+    images = {}
+    for i in range(0, len(lines), 2):
+        number, text = lines[i]
+        if not text.strip():  # trailing empty lines
+            continue
+        fields = text.strip().split(maxsplit=9)
+        rest = lines[i + 1][1].split() if i + 1 < len(lines) else []
+        try:
+            image_id, camera_id, name = int(fields[0]), int(fields[8]), fields[9]
+            pose = np.array([float(v) for v in fields[1:8]])
+            table = np.array([float(v) for v in rest]).reshape(-1, 3)
+            ids = np.array([int(v) for v in rest[2::3]], dtype=np.int64)
+        except (ValueError, IndexError, OverflowError) as error:
+            raise _damaged(path, number) from error
+        images[image_id] = ModelImage(image_id, pose[:4], pose[4:], camera_id, name, table[:, :2].copy(), ids)
+    return images
+
+
+def _text_points(path: Path) -> ModelPoints:
+    """points3D.txt."""
+    ids, xyz, rgb, error_px, lengths, tracks = [], [], [], [], [], []
+    for number, fields in _rows(path):
+        try:
+            ids.append(int(fields[0]))
+            xyz.append([float(v) for v in fields[1:4]])
+            rgb.append([int(v) for v in fields[4:7]])
+            error_px.append(float(fields[7]))
+            track = [int(v) for v in fields[8:]]
+        except (ValueError, IndexError) as error:
+            raise _damaged(path, number) from error
+        if len(track) % 2 or len(xyz[-1]) != 3 or len(rgb[-1]) != 3 or not all(0 <= v < 256 for v in rgb[-1]):
+            raise _damaged(path, number)
+        lengths.append(len(track) // 2)
+        tracks += track
+    flat = np.array(tracks, dtype=np.int64).reshape(-1, 2)
+    return ModelPoints(
+        np.array(ids, dtype=np.int64),
+        np.array(xyz, dtype=np.float64).reshape(-1, 3),
+        np.array(rgb, dtype=np.uint8).reshape(-1, 3),
+        np.array(error_px, dtype=np.float64),
+        np.concatenate([[0], np.cumsum(lengths, dtype=np.int64)]).astype(np.int64),
+        flat[:, 0],
+        flat[:, 1],
+    )
+
+
+def _lines(path: Path) -> list[str]:
+    return path.read_text(encoding="utf-8", errors="surrogateescape").split("\n")
+
+
+def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
+    for number, text in enumerate(_lines(path), 1):
+        if text.strip() and not text.startswith("#"):
+            yield number, text.split()
+
+
+def _damaged(path: Path, number: int) -> AwError:
+    return AwError(f"{path}, line {number}, is not what COLMAP writes; copy or build the model again")
+
+
+_BINARY = (_binary_cameras, _binary_images, _binary_points)
+_TEXT = (_text_cameras, _text_images, _text_points)
+
+
+def write_model(folder: Path, model: Model) -> None:
+    """Write cameras.bin and images.bin, ordered by id, and points3D.bin, in the order given."""
+    _write_cameras(folder / "cameras.bin", model.cameras.values())
+    _write_images(folder / "images.bin", model.images.values())
+    _write_points(folder / "points3D.bin", model.points)
+
+
+def write_views(folder: Path, views: Sequence[View], points: Points) -> None:
+    """As `write_model`, of these views, a pinhole camera each at the views' size; without tracks."""
+    from scipy.spatial.transform import Rotation
+
+    cameras, images, none = {}, {}, np.zeros(0, np.int64)
+    for number, view in enumerate(views, start=1):
+        c, pose = view.camera, view.camera.cam_from_world
+        cameras[number] = ModelCamera(number, "PINHOLE", c.width, c.height, (c.fx, c.fy, c.cx, c.cy))
+        qvec = np.roll(Rotation.from_matrix(pose[:3, :3]).as_quat(), 1)
+        images[number] = ModelImage(number, qvec, pose[:3, 3], number, view.name, np.zeros((0, 2)), none)
+    write_model(folder, Model(cameras, images, points_without_tracks(points.xyz, points.rgb)))
+
+
+def _write_cameras(path: Path, cameras: Iterable[ModelCamera]) -> None:
+    """Write cameras.bin, ordered by id."""
+    ordered = sorted(cameras, key=lambda c: c.camera_id)
+    parts = [struct.pack("<Q", len(ordered))]
+    for c in ordered:
+        parts.append(struct.pack("<iiQQ", c.camera_id, MODELS[c.model][0], c.width, c.height))
+        parts.append(struct.pack(f"<{len(c.params)}d", *c.params))
+    _write(path, parts)
+
+
+def _write_images(path: Path, images: Iterable[ModelImage]) -> None:
+    """Write images.bin, ordered by id."""
+    ordered = sorted(images, key=lambda i: i.image_id)
+    parts = [struct.pack("<Q", len(ordered))]
+    for image in ordered:
+        parts.append(struct.pack("<i7di", image.image_id, *image.qvec, *image.tvec, image.camera_id))
+        parts.append(image.name.encode("utf-8", errors="surrogateescape") + b"\0")
+        rows = np.empty(len(image.xys), _OBSERVATION)
+        rows["xy"], rows["point"] = image.xys, image.point_ids
+        parts += [struct.pack("<Q", len(rows)), rows.tobytes()]
+    _write(path, parts)
+
+
+def _write_points(path: Path, points: ModelPoints) -> None:
+    """Write points3D.bin, in the order given."""
+    tracks = np.stack([points.track_image_ids, points.track_point2d], axis=1).astype("<i4")
+    parts = [struct.pack("<Q", len(points.ids))]
+    for i in range(len(points.ids)):
+        start, end = points.track_offsets[i], points.track_offsets[i + 1]
+        head = (*points.xyz[i], *(int(v) for v in points.rgb[i]), points.error_px[i], end - start)
+        parts += [_POINT.pack(points.ids[i], *head), tracks[start:end].tobytes()]
+    _write(path, parts)
+
+
+def _write(path: Path, parts: list[bytes]) -> None:
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(b"".join(parts))

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ambiguous_wild.core.errors import AwError
 
@@ -89,6 +91,33 @@ class ModelPoints:
     track_image_ids: np.ndarray  # [L] int64
     track_point2d: np.ndarray  # [L] int64, index into ModelImage.xys
 
+    @property
+    def owners(self) -> np.ndarray:
+        """[L] int64, the point of every observation, as an index into `ids`."""
+        return np.repeat(np.arange(len(self.ids)), np.diff(self.track_offsets))
+
+    def subset(
+        self,
+        points: np.ndarray,  # [M] bool
+        observations: np.ndarray,  # [L] bool
+    ) -> ModelPoints:
+        """These points, with these of their observations."""
+        rows = points[self.owners] & observations
+        lengths = np.bincount(self.owners[rows], minlength=len(points))[points]
+        return ModelPoints(
+            self.ids[points],
+            self.xyz[points],
+            self.rgb[points],
+            self.error_px[points],
+            np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
+            self.track_image_ids[rows],
+            self.track_point2d[rows],
+        )
+
+    def seen_in(self, image_ids: Collection[int]) -> ModelPoints:
+        """All points, with their observations in these images alone."""
+        return self.subset(np.ones(len(self.ids), bool), np.isin(self.track_image_ids, sorted(image_ids)))
+
 
 @dataclass(frozen=True)
 class Model:
@@ -97,6 +126,24 @@ class Model:
     cameras: dict[int, ModelCamera]
     images: dict[int, ModelImage]
     points: ModelPoints
+
+
+def points_without_tracks(
+    xyz: ArrayLike = (),  # [M, 3] world
+    rgb: ArrayLike = (),  # [M, 3] uint8
+) -> ModelPoints:
+    """Points that no photo is known to see; without arguments none."""
+    positions, none = np.asarray(xyz, np.float64).reshape(-1, 3), np.zeros(0, np.int64)
+    count = len(positions)
+    return ModelPoints(
+        np.arange(1, count + 1, dtype=np.int64),
+        positions,
+        np.asarray(rgb, np.uint8).reshape(-1, 3),
+        np.zeros(count),
+        np.zeros(count + 1, np.int64),
+        none,
+        none,
+    )
 
 
 def rotation_from_quaternion(q: np.ndarray) -> np.ndarray:

@@ -5,14 +5,20 @@ For photos of any kind (EXIF, CMYK, damaged files) see `io/photos.py`.
 
 from __future__ import annotations
 
+import functools
+import warnings
+from io import BytesIO
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.atomic import atomic_path
-from ambiguous_wild.io.image_header import MAX_PIXELS, READ, header_size
+
+# Above the largest sensors in use (108 Mpx phones, 102 Mpx cameras).
+MAX_PIXELS = 120_000_000
+_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP")
 
 
 def read_png_rgb(
@@ -93,15 +99,33 @@ def image_size(path: Path | str) -> tuple[int, int]:
     Raises:
         AwError: the file is missing or does not decode.
     """
-    try:
-        with open(path, "rb") as f:
-            head = f.read(24)
-    except OSError as error:
-        raise AwError(f"cannot read image {path}: {error.strerror}") from error
-    if head.startswith(b"\x89PNG") and (size := header_size(head)) is not None:
+    if Path(path).suffix.lower() == ".png" and (size := header_size(path)) is not None:
         return size
     height, width = _decode(path, "grey").shape
     return width, height
+
+
+def header_size(source: Path | str | bytes) -> tuple[int, int] | None:
+    """(width, height) in px from the header of a file or its bytes; None where it is absent or no image.
+
+    A decoder allocates what the header says, so the size is checked before.
+    """
+    opened = BytesIO(source) if isinstance(source, bytes) else source
+    try:
+        with pillow().open(opened, formats=_FORMATS) as image:
+            return image.size
+    except Exception:  # Pillow's parsers raise many kinds on damaged headers
+        return None
+
+
+@functools.cache
+def pillow() -> Any:
+    """Pillow's Image, without its own limit of pixels: `MAX_PIXELS` is ours, checked before decoding."""
+    from PIL import Image
+
+    Image.MAX_IMAGE_PIXELS = None
+    warnings.filterwarnings("ignore", module=r"PIL\.")  # about damaged headers: our errors say it in one line
+    return Image
 
 
 def write_png(
@@ -186,6 +210,7 @@ def _decode(
     image = decode(data, flags[kind] | cv2.IMREAD_IGNORE_ORIENTATION, str(path))
     if image is None:
         raise AwError(
-            f"cannot read image {path}: it is empty, cut short or no {READ}; restore it and try again"
+            f"cannot read image {path}: it is empty, cut short or no PNG, JPEG, "
+            "TIFF, BMP or WebP; restore it and try again"
         )
     return image

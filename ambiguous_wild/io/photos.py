@@ -5,6 +5,9 @@ The result is upright 8-bit RGB; a photo that cannot be read is refused with the
 
 from __future__ import annotations
 
+import contextlib
+import importlib
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,15 +15,17 @@ from typing import Any
 import numpy as np
 
 from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.core.extras import install_command
 from ambiguous_wild.io.exif import Exif, exif_from_spec
-from ambiguous_wild.io.heif import UnreadableHeif, is_heif, read_heif
-from ambiguous_wild.io.image_header import MAX_PIXELS
+from ambiguous_wild.io.images import MAX_PIXELS, pillow
 
 PHOTO_SUFFIXES = (
     ".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".jp2", ".heic", ".heif", ".dng",
 )  # fmt: skip
 MIN_SIDE = 16  # px; smaller photos have no features
 
+_NO_REASON = "OpenImageIO gives no reason"
+_HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
 _FORMAT_OF_SUFFIX = {".jpg": "jpeg", ".jpeg": "jpeg", ".tif": "tiff", ".jp2": "jpeg2000", ".heif": "heic"}
 
 
@@ -62,16 +67,20 @@ def read_photo(
     _check_whole(source, form)
     reader = oiio.ImageInput.open(str(source))
     if reader is None:
-        raise UnreadablePhoto(source, f"damaged {form} ({_oiio_reason(oiio.geterror())})")
+        raise UnreadablePhoto(source, f"damaged {form} ({_one_line(oiio.geterror()) or _NO_REASON})")
     try:
         spec = reader.spec()
-        _check_size(source, spec)
+        _check_size(source, spec.width, spec.height)
+        if str(spec.format) not in ("uint8", "uint16"):
+            raise UnreadablePhoto(
+                source, f"pixels of type {spec.format} are not supported; export 8 or 16 bits"
+            )
         pixels = reader.read_image(0, 0, 0, spec.nchannels, "uint8")
         error = reader.geterror()
     finally:
         reader.close()
     if pixels is None or error:
-        raise UnreadablePhoto(source, f"damaged or cut {form} ({_oiio_reason(error)})")
+        raise UnreadablePhoto(source, f"damaged or cut {form} ({_one_line(error) or _NO_REASON})")
     rgb, notes = _to_rgb(source, np.asarray(pixels), spec)
     exif = exif_from_spec(spec)
     if exif.orientation != 1:
@@ -84,15 +93,63 @@ def read_photo(
 
 
 def _read_heic(source: Path) -> tuple[Photo, np.ndarray]:
+    """HEIC and HEIF, as phones make them, through libheif (extra [heic]) as a plugin of Pillow.
+
+    libheif applies the file's own rotation; by the standard EXIF's orientation is then not applied again.
+    """
+    if not _register_heif():
+        raise UnreadablePhoto(source, f"HEIC photos need the extra [heic]: {install_command('heic')}")
     try:
-        rgb, exif, notes = read_heif(source)
-    except UnreadableHeif as error:
-        raise UnreadablePhoto(source, str(error)) from error
-    height, width = rgb.shape[:2]
-    if min(width, height) < MIN_SIDE:
-        raise UnreadablePhoto(source, _too_small(width, height))
-    notes += _misnamed(source, "heic")
-    return Photo(source, "heic", width, height, exif, False, tuple(notes)), np.ascontiguousarray(rgb)
+        with pillow().open(source, formats=("HEIF",)) as picture:
+            width, height = picture.size
+            _check_size(source, width, height)
+            depth, others = int(picture.info.get("bit_depth") or 8), getattr(picture, "n_frames", 1) - 1
+            notes = [f"{depth} bits reduced to 8"] if depth > 8 else []
+            notes += [f"{others} more pictures in the file are left out"] if others else []
+            names = tuple(picture.getbands())
+            pixels = np.array(picture).reshape(height, width, len(names))
+            raw = picture.info.get("exif")
+    except UnreadablePhoto:
+        raise
+    except Exception as error:  # libheif's errors come as several classes
+        reason = _one_line(error) or type(error).__name__
+        raise UnreadablePhoto(source, f"damaged or cut HEIC ({reason})") from error
+    if "A" in names:
+        alpha = pixels[..., -1:].astype(np.uint16)
+        notes.append(_alpha_note(pixels[..., -1]))
+        pixels = (pixels[..., :-1] * alpha // 255).astype(np.uint8)
+    rgb, more = _three_channels(source, pixels, names, "")
+    notes += [*more, *_misnamed(source, "heic")]
+    return Photo(source, "heic", width, height, _block_exif(raw), False, tuple(notes)), rgb
+
+
+def _register_heif() -> bool:
+    # pi_heif decodes only; pillow_heif has the same calls and also an encoder under the GPL.
+    for name in ("pi_heif", "pillow_heif"):
+        with contextlib.suppress(ImportError):
+            importlib.import_module(name).register_heif_opener()
+            return True
+    return False
+
+
+def _block_exif(raw: object) -> Exif:
+    """EXIF of a block without a photo: read as that of a JPEG with one pixel; a damaged block is none."""
+    import OpenImageIO as oiio
+
+    if not isinstance(raw, bytes):
+        return Exif()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "exif.jpg"
+        try:
+            pillow().new("L", (1, 1)).save(path, exif=raw)
+        except (ValueError, OSError):  # longer than a JPEG can hold
+            return Exif()
+        reader = oiio.ImageInput.open(str(path))
+        try:
+            return exif_from_spec(reader.spec()) if reader is not None else Exif()
+        finally:
+            if reader is not None:
+                reader.close()
 
 
 def _misnamed(source: Path, form: str) -> list[str]:
@@ -100,10 +157,6 @@ def _misnamed(source: Path, form: str) -> list[str]:
     if _FORMAT_OF_SUFFIX.get(suffix, suffix.lstrip(".")) == form:
         return []
     return [f"{form} data under the name {source.suffix or 'without a suffix'}"]
-
-
-def _too_small(width: int, height: int) -> str:
-    return f"{width}x{height} px is too small to match (at least {MIN_SIDE} a side)"
 
 
 def _sniff(path: Path) -> str:
@@ -127,7 +180,7 @@ def _sniff(path: Path) -> str:
             return _raw(path) if path.suffix.lower() == ".dng" else form
     if head[:4] == b"RIFF" and head[8:12] == b"WEBP":
         return "webp"
-    if is_heif(head):
+    if head[4:8] == b"ftyp" and head[8:12] in _HEIF_BRANDS:
         return "heic"
     raise UnreadablePhoto(path, "no image (the content is of no photo format)")
 
@@ -174,8 +227,7 @@ def _first_scan(data: bytes) -> int:
     return -1
 
 
-def _check_size(path: Path, spec: Any) -> None:
-    width, height = spec.width, spec.height
+def _check_size(path: Path, width: int, height: int) -> None:
     if width * height > MAX_PIXELS:
         raise UnreadablePhoto(
             path,
@@ -183,9 +235,7 @@ def _check_size(path: Path, spec: Any) -> None:
             f"limit of {MAX_PIXELS // 1_000_000}; reduce it",
         )
     if min(width, height) < MIN_SIDE:
-        raise UnreadablePhoto(path, _too_small(width, height))
-    if str(spec.format) not in ("uint8", "uint16"):
-        raise UnreadablePhoto(path, f"pixels of type {spec.format} are not supported; export 8 or 16 bits")
+        raise UnreadablePhoto(path, f"{width}x{height} px is too small to match (at least {MIN_SIDE} a side)")
 
 
 def _to_rgb(path: Path, pixels: np.ndarray, spec: Any) -> tuple[np.ndarray, list[str]]:
@@ -197,24 +247,30 @@ def _to_rgb(path: Path, pixels: np.ndarray, spec: Any) -> tuple[np.ndarray, list
     space = next((spec.getattribute(f"{f}:ColorSpace") for f in ("jpeg", "tiff", "psd")), None)
     if spec.alpha_channel >= 0:
         # OpenImageIO returns colours multiplied by alpha: a composite over black.
-        if int(pixels[..., spec.alpha_channel].min()) < 255:
-            notes.append("transparency composited over black")
-        else:
-            notes.append("opaque alpha channel dropped")
+        notes.append(_alpha_note(pixels[..., spec.alpha_channel]))
         pixels = np.delete(pixels, spec.alpha_channel, axis=2)
+    rgb, more = _three_channels(path, pixels, names, str(space))
+    return rgb, notes + more
+
+
+def _alpha_note(alpha: np.ndarray) -> str:
+    return "transparency composited over black" if alpha.min() < 255 else "opaque alpha channel dropped"
+
+
+def _three_channels(
+    path: Path, pixels: np.ndarray, names: tuple[str, ...], space: str
+) -> tuple[np.ndarray, list[str]]:
+    """[H, W, C] without alpha to [H, W, 3]; `names` of the file's channels, `space` of its colours."""
     channels = pixels.shape[2]
     if channels == 1:
-        notes.append("grey repeated as RGB")
-        return np.repeat(pixels, 3, axis=2), notes
+        return np.repeat(pixels, 3, axis=2), ["grey repeated as RGB"]
     if channels == 4 and names[:4] in (("C", "M", "Y", "K"), ("CYAN", "MAGENTA", "YELLOW", "BLACK")):
         ink = pixels.astype(np.uint16)
-        notes.append("CMYK converted to RGB without its profile")
-        return ((255 - ink[..., :3]) * (255 - ink[..., 3:]) // 255).astype(np.uint8), notes
+        rgb = ((255 - ink[..., :3]) * (255 - ink[..., 3:]) // 255).astype(np.uint8)
+        return rgb, ["CMYK converted to RGB without its profile"]
     if channels != 3:
         raise UnreadablePhoto(path, f"{channels} channels ({', '.join(names)}) are not a photo; export RGB")
-    if space == "CMYK":
-        notes.append("CMYK converted to RGB without its profile")
-    return pixels, notes
+    return pixels, ["CMYK converted to RGB without its profile"] if space == "CMYK" else []
 
 
 def _upright(image: np.ndarray, orientation: int) -> np.ndarray:
@@ -228,6 +284,6 @@ def _upright(image: np.ndarray, orientation: int) -> np.ndarray:
     return image
 
 
-def _oiio_reason(text: str) -> str:
-    line = " ".join(str(text).split())
-    return line[-120:] or "OpenImageIO gives no reason"
+def _one_line(text: object) -> str:
+    """The end of a library's message."""
+    return " ".join(str(text).split())[-120:]

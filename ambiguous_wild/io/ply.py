@@ -1,9 +1,11 @@
-"""The splat PLY that every 3DGS viewer reads: binary little-endian, one vertex a Gaussian, raw parameters."""
+"""PLY files: point clouds, and the splat PLY that every 3DGS viewer reads, one vertex a Gaussian."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
@@ -16,6 +18,7 @@ _TYPES = {
     "ushort": "<u2", "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4",
     "float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8",
 }  # fmt: skip
+_COLOURS = ("red", "green", "blue")
 _SHAPES = {"means": (3,), "quats": (4,), "log_scales": (3,), "opacity_logits": (), "sh0": (3,)}
 
 
@@ -77,20 +80,9 @@ def read_splat_ply(path: Path | str) -> dict[str, np.ndarray]:
         AwError: no splat PLY, cut short, missing columns, or harmonics of no degree from 0 to 3.
     """
     path = Path(path)
-    try:
-        size = path.stat().st_size
-        with open(path, "rb") as f:
-            count, dtype, start = _header(path, f.read(_MAX_HEADER))
-            if count * dtype.itemsize > size - start:
-                raise AwError(
-                    f"{path} is cut short: {count} Gaussians of {dtype.itemsize} bytes announced, "
-                    f"{size - start} bytes present; copy or export it again"
-                )
-            f.seek(start)
-            table = np.frombuffer(f.read(count * dtype.itemsize), dtype, count)
-    except OSError as error:
-        raise AwError(f"cannot read {path}: {error.strerror or error}") from None
-    present = set(dtype.names or ())
+    table = _vertices(path, ("binary_little_endian",))
+    count = len(table)
+    present = set(table.dtype.names or ())
     rest = sum(name.startswith("f_rest_") for name in present)
     if rest not in (0, 9, 24, 45):
         raise AwError(f"{path} has {rest} f_rest columns; degree 0 to 3 have 0, 9, 24 or 45")
@@ -115,6 +107,40 @@ def read_splat_ply(path: Path | str) -> dict[str, np.ndarray]:
     }
 
 
+def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Positions [M, 3] float64 and colours [M, 3] uint8 of a point cloud, ASCII or binary little-endian.
+
+    Raises:
+        AwError: unreadable, damaged, or without x, y, z.
+    """
+    table = _vertices(path, ("ascii", "binary_little_endian"))
+    names = table.dtype.names or ()
+    if not all(axis in names for axis in "xyz"):
+        raise AwError(f"{path} has no x, y and z")
+    xyz = np.stack([table[a].astype(np.float64) for a in "xyz"], axis=1)
+    if not np.isfinite(xyz).all():
+        raise AwError(f"{path} holds positions that are not finite")
+    if not all(c in names for c in _COLOURS):
+        return xyz, np.full(xyz.shape, 128, np.uint8)
+    rgb = np.stack([table[c] for c in _COLOURS], axis=1)
+    return xyz, np.clip(rgb * (255.0 if rgb.dtype.kind == "f" else 1.0), 0, 255).astype(np.uint8)
+
+
+def write_point_ply(
+    path: Path,
+    xyz: np.ndarray,  # [M, 3]
+    rgb: np.ndarray,  # [M, 3] uint8
+) -> None:
+    """Write a point cloud, binary."""
+    table = np.empty(len(xyz), [*((axis, "<f4") for axis in "xyz"), *((c, "u1") for c in _COLOURS)])
+    for names, values in (("xyz", xyz), (_COLOURS, rgb)):
+        for index, name in enumerate(names):
+            table[name] = values[:, index]
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(xyz)}"]
+    head += [f"property float {axis}" for axis in "xyz"] + [f"property uchar {c}" for c in _COLOURS]
+    path.write_bytes("\n".join([*head, "end_header\n"]).encode() + table.tobytes())
+
+
 def splat_count(path: Path | str) -> int:
     """Number of Gaussians, from the file's header.
 
@@ -124,27 +150,66 @@ def splat_count(path: Path | str) -> int:
     path = Path(path)
     try:
         with open(path, "rb") as f:
-            return _header(path, f.read(_MAX_HEADER))[0]
+            return _header(path, f.read(_MAX_HEADER), ("binary_little_endian",))[0]
     except OSError as error:
         raise AwError(f"cannot read {path}: {error.strerror or error}") from None
 
 
-def _header(path: Path, head: bytes) -> tuple[int, np.dtype, int]:
-    """Number of vertices, their dtype, and the offset of the data."""
+def _vertices(path: Path, forms: tuple[str, ...]) -> np.ndarray:
+    """The first element's rows, [M] with a field a property.
+
+    Raises:
+        AwError: no PLY file of these forms, or cut short.
+    """
+    try:
+        size = path.stat().st_size
+        with open(path, "rb") as f:
+            count, dtype, start, form = _header(path, f.read(_MAX_HEADER), forms)
+            f.seek(start)
+            if form == "ascii":
+                return _ascii_rows(path, f, count, dtype)
+            if count * dtype.itemsize > size - start:
+                raise AwError(
+                    f"{path} is cut short: {count} vertices of {dtype.itemsize} bytes announced, "
+                    f"{size - start} bytes present; copy or export it again"
+                )
+            return np.frombuffer(f.read(count * dtype.itemsize), dtype, count)
+    except OSError as error:
+        raise AwError(f"cannot read {path}: {error.strerror or error}") from None
+
+
+def _ascii_rows(path: Path, lines: IO[bytes], count: int, dtype: np.dtype) -> np.ndarray:
+    width = len(dtype.names or ())
+    try:
+        rows = [[float(v) for v in line.split()[:width]] for line in itertools.islice(lines, count)]
+        values = np.array(rows).reshape(count, width)
+    except ValueError as error:
+        raise AwError(f"{path} is cut short or damaged; copy it again") from error
+    # a text may have more digits than float32
+    table = np.empty(count, [(n, "<f8" if dtype[n].kind == "f" else dtype[n]) for n in dtype.names or ()])
+    for index, name in enumerate(dtype.names or ()):
+        column = values[:, index]
+        if dtype[name].kind != "f":
+            column = np.clip(column, np.iinfo(dtype[name]).min, np.iinfo(dtype[name]).max)
+        table[name] = column
+    return table
+
+
+def _header(path: Path, head: bytes, forms: tuple[str, ...]) -> tuple[int, np.dtype, int, str]:
+    """Number of vertices, their dtype, the offset of the data, and its form."""
     if not head.startswith(b"ply"):
         raise AwError(f"{path} is no PLY file: it does not start with 'ply'")
     end = head.find(b"end_header")
     newline = head.find(b"\n", end)
     if end < 0 or newline < 0:
         raise AwError(f"{path}: no end of the PLY header within its first {_MAX_HEADER} bytes")
-    count, fields, element = -1, [], ""
-    binary = False
+    count, fields, element, form = -1, [], "", ""
     for line in head[:end].decode("latin-1").splitlines():
         words = line.split()
         if not words or words[0] in ("ply", "comment", "obj_info"):
             continue
         if words[0] == "format":
-            binary = words[1:2] == ["binary_little_endian"]
+            form = " ".join(words[1:2])
         elif words[0] == "element" and len(words) == 3:
             element = words[1] if count < 0 else "later"
             if count < 0:
@@ -157,11 +222,11 @@ def _header(path: Path, head: bytes) -> tuple[int, np.dtype, int]:
             fields.append((words[2], _TYPES[words[1]]))
         elif not (words[0] == "property" and element == "later"):
             raise AwError(f"{path}: cannot use header line {line[:60]!r}")
-    if not binary:
-        raise AwError(f"{path} is not binary little-endian; export it in that format")
+    if form not in forms:
+        raise AwError(f"{path} is {form[:30]}, not {' or '.join(forms)}; export it in that form")
     if count < 0 or not fields:
         raise AwError(f"{path}: its header names no vertices")
     names = [name for name, _ in fields]
     if len(set(names)) != len(names):
         raise AwError(f"{path}: its header names a vertex property twice")
-    return count, np.dtype(fields), newline + 1
+    return count, np.dtype(fields), newline + 1, form

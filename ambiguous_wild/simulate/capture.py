@@ -29,8 +29,7 @@ from ambiguous_wild import __version__
 from ambiguous_wild.core.camera import Camera
 from ambiguous_wild.core.config import config_hash, to_plain
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.io.atomic import atomic_dir, write_json
-from ambiguous_wild.io.foreign_files import refuse_foreign_files
+from ambiguous_wild.io.atomic import atomic_dir, refuse_foreign_files, write_json
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.simulate.camera_path import plan_cameras
 from ambiguous_wild.simulate.distractors import lay_out

@@ -1,6 +1,7 @@
 """HEIC, photos in two formats, bursts, live photos, several devices."""
 
 import sqlite3
+import sys
 from contextlib import closing
 from pathlib import Path
 
@@ -10,7 +11,6 @@ import pytest
 
 from ambiguous_wild.builder.pipeline import build_scene
 from ambiguous_wild.builder.settings import BuildSettings
-from ambiguous_wild.io import heif
 from ambiguous_wild.io.photos import UnreadablePhoto, read_photo
 from tests.builder.capture_maker import write_capture
 
@@ -45,7 +45,8 @@ def test_a_heic_photo_is_read_upright_with_its_exif():
 
 
 def test_without_the_decoder_the_extra_is_named(monkeypatch):
-    monkeypatch.setattr(heif, "_module", lambda: None)
+    for name in ("pi_heif", "pillow_heif"):
+        monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(UnreadablePhoto, match=r"\[heic\]"):
         read_photo(HEIC)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ambiguous_wild.io import colmap_binary
+from ambiguous_wild.io.colmap_model import write_model
 from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage, ModelPoints
 from ambiguous_wild.io.images import write_png
 
@@ -60,12 +60,6 @@ def make_model(names: list[str] = NAMES, *, points: int = 60, cameras: int = 1) 
     return Model(
         lenses, images, ModelPoints(ids, xyz, rgb, rng.random(points), offsets, flat[:, 0], flat[:, 1])
     )
-
-
-def write_model(folder: Path, model: Model) -> None:
-    colmap_binary.write_cameras(folder / "cameras.bin", model.cameras.values())
-    colmap_binary.write_images(folder / "images.bin", model.images.values())
-    colmap_binary.write_points(folder / "points3D.bin", model.points)
 
 
 def write_photos(folder: Path, names: list[str] = NAMES) -> None:

@@ -10,8 +10,7 @@ import pytest
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.datasets import fetch as fetching
-from ambiguous_wild.datasets.catalogue import PublicData, find_public, public_data
-from ambiguous_wild.datasets.fetch import fetch
+from ambiguous_wild.datasets.fetch import PublicData, fetch, find_public, public_data
 from ambiguous_wild.datasets.recognise import READERS
 from ambiguous_wild.io.hashing import sha256_file
 from tests.command_line import aw
@@ -206,7 +205,7 @@ def test_as_it_is_typed(server, tmp_path, monkeypatch):
     listed = aw("fetch", "--list")
     assert listed.returncode == 0 and "Apache-2.0" in listed.stdout
     assert aw("fetch").returncode == 2
-    monkeypatch.setattr("ambiguous_wild.datasets.catalogue.public_data", lambda: {"toy": data(server)})
+    monkeypatch.setattr("ambiguous_wild.datasets.fetch.public_data", lambda: {"toy": data(server)})
     done = aw("fetch", "toy", "-o", tmp_path / "sets")
     assert done.returncode == 0 and "recorded now" in done.stdout
     assert fetching.RECORD in {p.name for p in (tmp_path / "sets" / "archives").iterdir()}

@@ -16,14 +16,14 @@ import pytest
 import torch
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.core.tensor_files import read_tensors
+from ambiguous_wild.core.weight_files import read_tensors
 from ambiguous_wild.harness.planning.decide import SCHEMA
 from ambiguous_wild.harness.planning.file import read_plan
 from ambiguous_wild.harness.running.result_file import read_result
 from ambiguous_wild.harness.running.store import read_config
 from ambiguous_wild.io import plain_yaml
-from ambiguous_wild.io.image_header import header_size
-from ambiguous_wild.io.images import read_png_rgb, write_png
+from ambiguous_wild.io.colmap_model import read_model, write_model
+from ambiguous_wild.io.images import header_size, read_png_rgb, write_png
 from ambiguous_wild.io.scene_folder import load_scene, read_scene_json
 from ambiguous_wild.simulate.spec_file import parse_spec
 from ambiguous_wild.splat import checkpoint
@@ -31,6 +31,7 @@ from ambiguous_wild.study.answers import read_answers
 from ambiguous_wild.study.key import FORMAT, read_key
 from ambiguous_wild.vision.label_maps import read_labels
 from tests.harness.fake_runs import fake_result
+from tests.io.model_maker import make_model
 from tests.study.studies import METHODS, panel, panel_key
 from tests.tiny_scene import write_tiny_scene
 
@@ -72,12 +73,11 @@ def test_colmap_text_that_contradicts_itself(tmp_path, file, old, new):
 
 
 def test_colmap_binary_with_a_point_number_beyond_all_integers(tmp_path):
-    from ambiguous_wild.io.colmap_binary import read_points
-
+    write_model(tmp_path, make_model(["a.png"]))
     row = struct.pack("<QQ3d3BdQ", 1, 2**64 - 1, 0, 0, 0, 1, 2, 3, 0.5, 0)
     (tmp_path / "points3D.bin").write_bytes(row)
     with pytest.raises(AwError, match="18446744073709551615"):
-        read_points(tmp_path / "points3D.bin")
+        read_model(tmp_path)
 
 
 def test_yaml_bombs_and_brackets_without_end(tmp_path):

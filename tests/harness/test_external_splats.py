@@ -10,8 +10,7 @@ import yaml
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.running.grid import plan_cells, run_cells
 from ambiguous_wild.harness.running.result_file import read_result
-from ambiguous_wild.io.colmap_model import read_model
-from ambiguous_wild.io.colmap_write import write_model
+from ambiguous_wild.io.colmap_model import read_model, write_views
 from ambiguous_wild.io.images import read_png_rgb, to_uint8, write_png
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import registry
@@ -90,7 +89,7 @@ def test_no_splats_no_result(scene, model, tmp_path):
 
 def test_a_written_model_is_read_again(scene, tmp_path):
     loaded = load_scene(scene)
-    write_model(tmp_path / "sparse", loaded.train, loaded.points)
+    write_views(tmp_path / "sparse", loaded.train, loaded.points)
     found = read_model(tmp_path / "sparse")
     names = {image.name: image for image in found.images.values()}
     assert set(names) == set(TRAIN)

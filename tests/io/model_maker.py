@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ambiguous_wild.io import colmap_binary
+from ambiguous_wild.io.colmap_model import write_model
 from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage, ModelPoints
 from ambiguous_wild.io.images import write_png
 
@@ -38,12 +38,6 @@ def make_model(names: list[str], points: int = 20, seed: int = 0, camera: str = 
     )
 
 
-def write_binary(folder: Path, model: Model) -> None:
-    colmap_binary.write_cameras(folder / "cameras.bin", model.cameras.values())
-    colmap_binary.write_images(folder / "images.bin", model.images.values())
-    colmap_binary.write_points(folder / "points3D.bin", model.points)
-
-
 def write_text(folder: Path, model: Model) -> None:
     folder.mkdir(parents=True)
 
@@ -68,7 +62,7 @@ def write_text(folder: Path, model: Model) -> None:
 def write_scene(root: Path, names: list[str], factor: int = 2, **kwargs) -> Model:
     """A plain COLMAP scene: images/, images_<factor>/, sparse/0; no lists, no scene.json."""
     model = make_model(names, **kwargs)
-    write_binary(root / "sparse" / "0", model)
+    write_model(root / "sparse" / "0", model)
     rng = np.random.default_rng(1)
     for name in names:
         write_png(root / "images" / name, rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8))

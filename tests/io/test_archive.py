@@ -11,8 +11,9 @@ import zipfile
 import pytest
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.io.archive import Limits, extract
+from ambiguous_wild.io.archive import Limits, extract, pack_folder, unpack
 
+SMALL = Limits(bytes=1_000_000)
 FILES = {"scene/a.txt": b"one", "scene/images/é.png": bytes(range(256)), "b.txt": b""}
 
 
@@ -74,7 +75,7 @@ HOSTILE = {
     "tar hard link": (tar_of((special(tarfile.LNKTYPE, "../../x"), None)), "link"),
     "tar device": (tar_of((special(tarfile.CHRTYPE), None)), "device"),
     "tar fifo": (tar_of((special(tarfile.FIFOTYPE), None)), "device"),
-    "tar twice": (tar_of(("a.txt", b"x"), ("a.txt", b"y")), "the same file"),
+    "tar twice": (tar_of(("a", b"x"), ("a", b"y")), "the same file"),
     "tar bomb": (gzip.compress(tar_of(("zeros", ZEROS))), "bomb"),
     "deep": (zip_of(("a/" * 40 + "b", b"x")), "no fit file name"),
     "xz": (b"\xfd7zXZ\0" + bytes(40), "xz"),
@@ -136,3 +137,44 @@ def test_nothing_is_overwritten(tmp_path):
     with pytest.raises(AwError, match="exists"):
         extract(tmp_path / "a.zip", tmp_path / "out")
     assert os.listdir(tmp_path / "out") == ["mine"]
+
+
+def tree(folder):
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_a_folder_comes_back_as_it_was_without_what_is_hidden(tmp_path):
+    source, target = tmp_path / "a", tmp_path / "b"
+    for name in ("x.txt", "deep/er/y.bin", ".lock", "deep/.cache/z"):
+        path = source / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(name.encode())
+    (tmp_path / "real.txt").write_text("behind a link")
+    (source / "link.txt").symlink_to(tmp_path / "real.txt")
+    target.mkdir()
+    names = unpack(pack_folder(source, 1.0), target, SMALL)
+    assert tree(target) == {
+        "x.txt": b"x.txt",
+        "deep/er/y.bin": b"deep/er/y.bin",
+        "link.txt": b"behind a link",
+    }
+    assert sorted(names) == sorted(tree(target))
+    assert not (target / "link.txt").is_symlink()
+
+
+def test_too_much_is_refused_both_ways(tmp_path):
+    (tmp_path / "big").write_bytes(bytes(3_000_000))
+    with pytest.raises(AwError, match="3 MB, more than the 2 MB"):
+        pack_folder(tmp_path, 2.0)
+    small = tar_of(("bomb", bytes(3_000_000)), mode="w:gz")
+    assert len(small) < 10_000
+    target = tmp_path / "out"
+    target.mkdir()
+    with pytest.raises(AwError, match="more than 2 MB"):
+        unpack(small, target, Limits(bytes=2_000_000))
+    assert sum(map(len, tree(target).values())) <= 2_000_000
+
+
+def test_only_what_is_wanted_is_written(tmp_path):
+    unpack(tar_of(("color/a.png", b"1"), ("gt/a.png", b"2")), tmp_path, SMALL, wanted=lambda n: n[:2] == "co")
+    assert tree(tmp_path) == {"color/a.png": b"1"}

@@ -6,17 +6,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.io.colmap_model import read_model
+from ambiguous_wild.io.colmap_model import read_model, write_model
 from ambiguous_wild.io.colmap_records import rotation_from_quaternion
 from ambiguous_wild.io.safe_pycolmap import pycolmap
-from tests.io.model_maker import make_model, write_binary
+from tests.io.model_maker import make_model
 
 NAMES = ["a.png", "b é.png", "sub/c.png"]
 
 
 def test_binary_round_trip(tmp_path):
     model = make_model(NAMES)
-    write_binary(tmp_path, model)
+    write_model(tmp_path, model)
     again = read_model(tmp_path)
     assert again.cameras == model.cameras
     assert list(again.images) == list(model.images)
@@ -34,7 +34,7 @@ def test_binary_round_trip(tmp_path):
 def test_colmap_reads_what_we_write_and_we_read_what_it_writes(tmp_path):
     """pycolmap is the oracle for both directions, binary and text."""
     model = make_model(["a.png", "b.png", "c.png"])
-    write_binary(tmp_path / "ours", model)
+    write_model(tmp_path / "ours", model)
     theirs = pycolmap.Reconstruction(str(tmp_path / "ours"))
     assert theirs.num_reg_images() == 3
     for image in model.images.values():
@@ -68,7 +68,7 @@ def test_rotation_agrees_with_scipy(q):
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.99])
 def test_cut_file_is_named(tmp_path, name, share):
-    write_binary(tmp_path, make_model(["a.png", "b.png"]))
+    write_model(tmp_path, make_model(["a.png", "b.png"]))
     data = (tmp_path / name).read_bytes()
     (tmp_path / name).write_bytes(data[: int(share * len(data))])
     with pytest.raises(AwError, match=name.replace(".", r"\.")):
@@ -77,7 +77,7 @@ def test_cut_file_is_named(tmp_path, name, share):
 
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
 def test_an_absurd_count_is_refused_before_allocating(tmp_path, name):
-    write_binary(tmp_path, make_model(["a.png", "b.png"]))
+    write_model(tmp_path, make_model(["a.png", "b.png"]))
     data = (tmp_path / name).read_bytes()
     (tmp_path / name).write_bytes((2**60).to_bytes(8, "little") + data[8:])
     with pytest.raises(AwError, match="announces"):
@@ -147,6 +147,6 @@ def _no_lens(model):
 def test_what_no_mapper_writes_is_named_when_the_model_is_read(tmp_path, spoil, said):
     model = make_model(NAMES)
     spoil(model)
-    write_binary(tmp_path, model)
+    write_model(tmp_path, model)
     with pytest.raises(AwError, match=said):
         read_model(tmp_path)

@@ -76,7 +76,7 @@ def test_junk_is_refused_by_name(tmp_path):
         "cut short": whole[:-1],
         "cut short:": whole.replace(b"vertex 5", b"vertex 999999999999"),
         "element vertex": whole.replace(b"vertex 5", b"vertex -5"),
-        "not binary little-endian": whole.replace(b"binary_little_endian", b"ascii"),
+        "not binary_little_endian": whole.replace(b"binary_little_endian", b"ascii"),
         "lacks": whole.replace(b"float opacity", b"float weight"),
         "cannot use vertex property": whole.replace(b"property float x", b"property list uchar int x"),
         "twice": whole.replace(b"property float y", b"property float x"),

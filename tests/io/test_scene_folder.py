@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.io.colmap_model import write_model
 from ambiguous_wild.io.images import write_png
 from ambiguous_wild.io.scene_folder import load_scene, verify_files, without_keep
-from tests.io.model_maker import HEIGHT, WIDTH, make_model, write_binary, write_scene
+from tests.io.model_maker import HEIGHT, WIDTH, make_model, write_scene
 from tests.tiny_scene import write_tiny_scene
 
 NAMES = [f"p{i}.png" for i in range(10)]
@@ -128,7 +129,7 @@ def test_a_path_that_leaves_the_scene_is_refused(tmp_path):
     write_scene(tmp_path, NAMES)
     with pytest.raises(AwError, match="outside itself"):
         verify_files(tmp_path, {"files": {"../secret": {"sha256": "", "bytes": 0}}})
-    write_binary(tmp_path / "sparse" / "0", make_model(["../../evil.png"]))
+    write_model(tmp_path / "sparse" / "0", make_model(["../../evil.png"]))
     with pytest.raises(AwError, match="outside itself"):
         load_scene(tmp_path)
 
@@ -203,7 +204,7 @@ def test_photos_stripped_of_their_2d_points_lose_their_observations_only(tmp_pat
     whole = load_scene(tmp_path).points
     bare = {"xys": np.empty((0, 2)), "point_ids": np.empty(0, dtype=np.int64)}
     images = {i: replace(m, **bare) if m.name == "p3.png" else m for i, m in model.images.items()}
-    write_binary(tmp_path / "sparse" / "0", replace(model, images=images))
+    write_model(tmp_path / "sparse" / "0", replace(model, images=images))
     points = load_scene(tmp_path).points
     lost = whole.track_views == 3
     assert lost.any() and (points.track_views[lost] == -1).all()
@@ -211,7 +212,7 @@ def test_photos_stripped_of_their_2d_points_lose_their_observations_only(tmp_pat
     assert np.array_equal(points.track_xy[~lost], whole.track_xy[~lost])
     # One point too few is no stripped model but a damaged one.
     short = {i: replace(m, xys=m.xys[:1], point_ids=m.point_ids[:1]) for i, m in model.images.items()}
-    write_binary(tmp_path / "sparse" / "0", replace(model, images=short))
+    write_model(tmp_path / "sparse" / "0", replace(model, images=short))
     with pytest.raises(AwError, match="contradict each other"):
         load_scene(tmp_path)
 
@@ -246,7 +247,7 @@ def test_missing_folder_factor_and_photo(tmp_path):
 def test_copies_under_another_extension_are_found(tmp_path):
     write_scene(tmp_path, [f"p{i}.jpg.png" for i in range(3)])
     names = [f"p{i}.JPG" for i in range(3)]
-    write_binary(tmp_path / "sparse" / "0", make_model(names))
+    write_model(tmp_path / "sparse" / "0", make_model(names))
     for i in range(3):
         (tmp_path / "images" / f"p{i}.jpg.png").rename(tmp_path / "images" / f"p{i}.png")
     assert [v.image_path.name for v in load_scene(tmp_path).views] == ["p0.png", "p1.png", "p2.png"]

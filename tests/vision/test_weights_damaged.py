@@ -18,7 +18,7 @@ from ambiguous_wild.cli.weights import command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.lock import folder_lock
 from ambiguous_wild.metrics import lpips
-from ambiguous_wild.vision import convert, fetch, weights
+from ambiguous_wild.vision import fetch, weight_files, weights
 from ambiguous_wild.vision.backends import make_features
 from ambiguous_wild.vision.dino import DinoFeatures
 from ambiguous_wild.vision.pretrained import locate
@@ -35,7 +35,7 @@ def heads(own: Path, index: Path, without_pip: None) -> weights.Weight:
     fetch.get([weight], lambda line: None)
     path = weights.where(weight)
     assert path is not None
-    digest = convert.tensors_digest(convert.read_as_arrays(path))
+    digest = weight_files.tensors_digest(weight_files.read_as_arrays(path))
     shutil.rmtree(own)
     return dataclasses.replace(weight, tensors=digest)
 
@@ -53,11 +53,11 @@ def said(weight: weights.Weight, again: bool = False) -> list[str]:
 def test_a_damaged_file_is_downloaded_again(heads: weights.Weight, own: Path, damage: str) -> None:
     (path,) = fetch.get([heads], lambda line: None)
     whole = path.read_bytes()
-    arrays = convert.read_as_arrays(path)
+    arrays = weight_files.read_as_arrays(path)
     first = next(iter(arrays))
     values = {"other": arrays[first] + 1, "not finite": np.full_like(arrays[first], np.nan)}
     if damage in values:
-        convert.save(arrays | {first: values[damage]}, path)
+        weight_files.save(arrays | {first: values[damage]}, path)
     else:
         path.write_bytes({"empty": b"", "cut": whole[:-8], "longer": whole + b"12345678"}[damage])
     lines = said(heads)

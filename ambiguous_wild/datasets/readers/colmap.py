@@ -10,7 +10,6 @@ from ambiguous_wild.core.scene import Split
 from ambiguous_wild.datasets.foreign import SIDES, ForeignScene, inside, split_by_lists
 from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.colmap_records import Model
-from ambiguous_wild.io.image_header import header_size
 from ambiguous_wild.io.scene_folder import TEST_EVERY, read_list
 
 LISTS: dict[Split, str] = {"train": "train_list.txt", "test": "test_list.txt"}
@@ -191,13 +190,3 @@ def read_dualsplat(root: Path) -> ForeignScene:
     notes = (f"{', '.join(own)} are results of a method: left out",)
     factor = _published_factor(root, model)
     return ForeignScene("dualsplat", root, model, photo_folder(root), split, factor, missing, notes=notes)
-
-
-def file_size(path: Path) -> tuple[int, int] | None:
-    """(width, height) from the file's header; None where it is no image."""
-    try:
-        with open(path, "rb") as f:
-            # A JPEG may carry previews and colour profiles before its frame.
-            return header_size(f.read(1 << 20))
-    except OSError:
-        return None

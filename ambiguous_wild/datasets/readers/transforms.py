@@ -16,16 +16,15 @@ from ambiguous_wild.datasets.foreign import (
     ForeignScene,
     find_photo,
     inside,
-    no_points,
-    points_without_tracks,
     pose_from_opengl,
     quaternion_from_rotation,
     split_by_lists,
 )
-from ambiguous_wild.datasets.points import read_point_ply
-from ambiguous_wild.datasets.readers.colmap import file_size, has_lists, read_lists
+from ambiguous_wild.datasets.readers.colmap import has_lists, read_lists
 from ambiguous_wild.io.colmap_model import check_camera
-from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage
+from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage, points_without_tracks
+from ambiguous_wild.io.images import header_size
+from ambiguous_wild.io.ply import read_point_ply
 from ambiguous_wild.io.scene_folder import TEST_EVERY
 
 _LARGEST = 100_000_000  # bytes
@@ -98,7 +97,7 @@ def frame_camera(
 
     width, height = value("w"), value("h")
     if width is None or height is None:
-        size = file_size(photo)
+        size = header_size(photo)
         if size is None:
             raise AwError(f"{path} states no w and h, and {photo} is absent or no image")
         width, height = map(float, size)
@@ -165,7 +164,7 @@ def model_of_frames(frames: Sequence[tuple[str, Mapping[str, Any], ModelCamera]]
             np.zeros((0, 2)),
             np.zeros(0, np.int64),
         )
-    return Model({c.camera_id: c for c in cameras.values()}, images, no_points())
+    return Model({c.camera_id: c for c in cameras.values()}, images, points_without_tracks())
 
 
 def read_frames(

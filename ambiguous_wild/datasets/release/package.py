@@ -20,12 +20,9 @@ from typing import Any
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.names import check_name
-from ambiguous_wild.datasets.release.card import ambiguity_line, card
-from ambiguous_wild.datasets.release.croissant import PackedFile, croissant
-from ambiguous_wild.datasets.release.info import ReleaseInfo
-from ambiguous_wild.datasets.release.metadata import strip_metadata
-from ambiguous_wild.io.atomic import atomic_dir, check_output
-from ambiguous_wild.io.foreign_files import list_names, refuse_foreign_files
+from ambiguous_wild.datasets.release.describe import PackedFile, ReleaseInfo, ambiguity_line, card, croissant
+from ambiguous_wild.datasets.release.privacy import may_show_person, strip_metadata
+from ambiguous_wild.io.atomic import atomic_dir, check_output, list_names, refuse_foreign_files
 from ambiguous_wild.io.scene_folder import load_scene, read_scene_json, verify_files
 
 FILES = ("scene", "archive", "path", "role", "split", "sha256", "bytes")
@@ -130,8 +127,6 @@ def _open(root: Path) -> tuple[Path, str, dict[str, Any]]:
 
 def _people(root: Path, info: dict[str, Any], jobs: int, bar: Bar) -> dict[str, str]:
     """Photo -> what the detectors found; only photos with a find."""
-    from ambiguous_wild.datasets.release.people import may_show_person
-
     views = load_scene(root, verify=False).views
     bar.start("looking for people", len(views))
 

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from ambiguous_wild.core.errors import AwError, shortlist
-from ambiguous_wild.datasets.release.croissant import NOT_FOR_RELEASE, VERSION
+from ambiguous_wild.datasets.release.describe import NOT_FOR_RELEASE, VERSION
 from ambiguous_wild.datasets.release.package import FILES, FIXED
 from ambiguous_wild.io.archive import extract
-from ambiguous_wild.io.foreign_files import list_names
+from ambiguous_wild.io.atomic import list_names
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import image_size
 from ambiguous_wild.io.scene_folder import load_scene, read_scene_json, verify_files

@@ -22,9 +22,8 @@ from ambiguous_wild.harness.leaderboard.entry import Entry
 from ambiguous_wild.harness.leaderboard.models import ModelPages, write_model_pages
 from ambiguous_wild.harness.leaderboard.page_facts import facts
 from ambiguous_wild.harness.leaderboard.reported import SOURCE, Printed, Reported, read_reported, reported_csv
-from ambiguous_wild.io.atomic import atomic_dir, check_output, sweep_siblings, write_json
-from ambiguous_wild.io.foreign_files import list_names
-from ambiguous_wild.io.foreign_files import refuse_foreign_files as refuse_strangers
+from ambiguous_wild.io.atomic import atomic_dir, check_output, list_names, sweep_siblings, write_json
+from ambiguous_wild.io.atomic import refuse_foreign_files as refuse_strangers
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.lock import folder_lock
 

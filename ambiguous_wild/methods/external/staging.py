@@ -15,7 +15,7 @@ from pathlib import Path, PurePosixPath
 from typing import Literal
 
 from ambiguous_wild.core import AwError, Scene, View
-from ambiguous_wild.io.colmap_write import write_model
+from ambiguous_wild.io.colmap_model import write_views
 from ambiguous_wild.io.images import image_size
 
 Photos = Literal["all", "train", "nerf-w"]
@@ -68,7 +68,7 @@ def _link_views(
         target = folder / "images" / view.name
         target.parent.mkdir(parents=True, exist_ok=True)
         os.symlink(photos[view.name].resolve(), target)
-    write_model(folder / model, views, scene.points)
+    write_views(folder / model, views, scene.points)
 
 
 def _stage_nerfw(scene: Scene, folder: Path) -> None:

@@ -28,6 +28,7 @@ from ambiguous_wild.harness.leaderboard import pictures
 from ambiguous_wild.harness.leaderboard.entry import Entry, wide
 from ambiguous_wild.harness.leaderboard.sheet import board_csv
 from ambiguous_wild.io import images, ply
+from ambiguous_wild.io.colmap_model import write_model
 from ambiguous_wild.simulate import spec_file
 from ambiguous_wild.simulate.presets import preset
 from ambiguous_wild.splat import checkpoint
@@ -101,14 +102,14 @@ def with_exif() -> list[bytes]:
 @functools.cache
 def scene(use: str) -> Path:
     """A scene of two photos and eight points for one reader alone; a text model where its use is a text."""
-    from tests.io.model_maker import make_model, write_binary, write_text
+    from tests.io.model_maker import make_model, write_text
 
     root, names = workshop() / f"scene {use.replace('/', ' ')}", ["0.png", "1.png"]
     model = make_model(names, points=8)
     if use.endswith("txt"):
         write_text(root / "sparse" / "0", model)
     else:
-        write_binary(root / "sparse" / "0", model)
+        write_model(root / "sparse" / "0", model)
     for name in names:
         images.write_png(root / "images" / name, np.zeros((48, 64, 3), np.uint8))
     (root / "train_list.txt").write_text("0.png\n")

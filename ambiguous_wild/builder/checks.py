@@ -1,4 +1,6 @@
-"""Capture checks: which camera settings drifted, which photos to leave out, what to do about it.
+"""`aw screen`: which camera settings drifted, which photos to leave out, what to do about it.
+
+Reads a capture and writes nothing; one photo a thread is in memory.
 
 A check uses EXIF where the camera wrote it, else the pixels of surfaces that several photos show; where
 neither decides, its state is "unknown". Limits were set on captures that reconstruct well: docs/capture.md.
@@ -9,14 +11,28 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
+import cv2
 import numpy as np
 
-from ambiguous_wild.builder.photo_comparison import PhotoComparison
-from ambiguous_wild.builder.records import CheckedPhoto
-from ambiguous_wild.builder.screen import BLUR_RATIO, NEAR_DUPLICATE, exposure_stops
-from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.builder.collect import collect
+from ambiguous_wild.builder.photo_comparison import (
+    PhotoComparison,
+    candidate_pairs,
+    compare_photos,
+    photo_features,
+)
+from ambiguous_wild.builder.progress import Bar
+from ambiguous_wild.builder.records import CheckedPhoto, SkippedPhoto
+from ambiguous_wild.builder.screen import (
+    BLUR_RATIO,
+    NEAR_DUPLICATE,
+    exposure_stops,
+    read_capture,
+)
+from ambiguous_wild.core.errors import AwError, shortlist
 
 State = Literal["ok", "warning", "unknown"]
 EXIF_STOPS = 0.5  # stops between the darkest and the lightest setting
@@ -241,3 +257,87 @@ def _basis(values: Sequence[Any]) -> str:
 
 def _silent(facts: Sequence[CheckedPhoto], values: Sequence[Any]) -> str:
     return f"EXIF silent in {sum(v is None for v in values)} of {len(facts)} photos"
+
+
+@dataclass(frozen=True)
+class CaptureReport:
+    """Result of the checks."""
+
+    root: Path
+    photos: int  # that can be read
+    skipped: list[SkippedPhoto]  # unreadable files and copies
+    checks: list[Check]
+
+    @property
+    def warnings(self) -> list[Check]:
+        """The checks that failed."""
+        return [c for c in self.checks if c.state == "warning"]
+
+
+def check_capture(raw: Path | str, *, jobs: int = 1, bar: Bar | None = None) -> CaptureReport:
+    """Check the capture in a folder of photos.
+
+    Raises:
+        AwError: no capture, or fewer readable photos than a scene needs.
+    """
+    bar = bar or Bar(False)
+    capture = collect(raw, jobs)
+    read = read_capture(
+        capture,
+        lambda _, __, pixels: (noise(pixels), photo_features(pixels)),
+        strict=False,
+        jobs=jobs,
+        bar=bar,
+    )
+    facts: list[CheckedPhoto] = [
+        {**record, "noise": level} for record, (level, _) in zip(read.photos, read.more)
+    ]
+    features = [found for _, found in read.more]
+    bar.start("comparing photos", len(candidate_pairs(features)))
+    compared = compare_photos(features, bar.step, jobs)
+    bar.finish()
+    checks = run_checks(facts, read.thumbnails, compared)
+    if read.skipped:
+        checks.insert(0, _files_check(read.skipped, len(capture.sources)))
+    return CaptureReport(capture.root, len(facts), read.skipped, checks)
+
+
+def _files_check(skipped: list[SkippedPhoto], total: int) -> Check:
+    """The failed check of a capture with photos that are left out."""
+    first = f"{skipped[0]['source']} ({skipped[0]['skipped']})"
+    finding = f"{len(skipped)} of {total} photos are left out: {first}"
+    finding += f" and {len(skipped) - 1} more" if len(skipped) > 1 else ""
+    names = tuple(s["source"] for s in skipped)
+    return Check("files", "warning", "files", finding, "repair or remove them", names)
+
+
+def refuse_failed(report: CaptureReport) -> None:
+    """Raise AwError, in one line, with every check that failed."""
+    if report.warnings:
+        reasons = "; ".join(f"{c.name}: {c.finding} ({c.advice})" for c in report.warnings)
+        raise AwError(
+            f"{report.root} fails {len(report.warnings)} of {len(report.checks)} capture checks: {reasons}"
+        )
+
+
+def noise(
+    rgb: np.ndarray,  # [H, W, 3] uint8
+    block: int = 16,
+) -> float:
+    """Noise in the flattest tenth of the blocks, of 255; NaN where the photo is too small or clipped.
+
+    Source: Immerkaer, CVIU 1996. His mask gives 0 on planes; clipped blocks are left out.
+    """
+    gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    mask = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
+    h, w = (s // block * block for s in gray.shape)
+    if min(h, w) == 0:
+        return float("nan")
+    response = np.abs(cv2.filter2D(gray, cv2.CV_32F, mask))[:h, :w]
+
+    def means(values: np.ndarray) -> np.ndarray:
+        return values.reshape(h // block, block, w // block, block).mean(axis=(1, 3)).ravel()
+
+    level = means(gray[:h, :w])
+    sigma = np.sqrt(np.pi / 2) / 6 * means(response)[(level > 8) & (level < 247)]
+    return round(float(np.percentile(sigma, 10)), 3) if len(sigma) else float("nan")

@@ -13,7 +13,6 @@ from typing import cast
 
 from ambiguous_wild.builder import report
 from ambiguous_wild.builder.collect import collect
-from ambiguous_wild.builder.path_checks import check_paths
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import SceneRecord
 from ambiguous_wild.builder.settings import BuildSettings
@@ -79,7 +78,7 @@ def build_scene(
     else:
         name = check_name("scene name (the folder's; --name sets another)", target.name)
     settings = replace(settings, name=name)
-    check_paths(raw, target)
+    _check_paths(raw, target)
     count = jobs or os.cpu_count() or 1
     capture = collect(raw, count)
     check_output(target)
@@ -105,6 +104,32 @@ def build_scene(
     info: SceneRecord = json.loads((target / "scene.json").read_text(encoding="utf-8"))
     reused = tuple(r.name for r in work.results if r.reused)
     return BuildResult(target, info, False, time.perf_counter() - started, reused)
+
+
+def _check_paths(raw: Path | str, target: Path) -> None:
+    """Refuse a scene folder among the photos, and photos that are a scene.
+
+    Args:
+        raw: the capture folder, as given.
+        target: the scene folder, absolute.
+
+    Raises:
+        AwError: `target` holds the photos or lies among them, or `raw` is a scene already.
+    """
+    root, scene = Path(raw).resolve(), target.resolve()
+    if root.is_relative_to(scene):
+        raise AwError(f"{target} holds the photos themselves; choose another folder for -o")
+    if scene.is_relative_to(root):
+        raise AwError(
+            f"{target} lies inside {raw}, the folder of photos, which must stay as it is; "
+            "choose a folder outside it for -o"
+        )
+    found = next((n for n in ("scene.json", "sparse") if (root / n).exists()), None)
+    if found is not None:
+        raise AwError(
+            f"{raw} is a scene already (it holds {found}): run 'aw bench' on it, or give the folder of the "
+            "original photos"
+        )
 
 
 def _existing(target: Path, stages: Stages, overwrite: bool) -> SceneRecord | None:

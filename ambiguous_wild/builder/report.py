@@ -16,6 +16,7 @@ from ambiguous_wild.builder.records import (
     CameraFact,
     ExifRecord,
     FeatureResult,
+    LostPhoto,
     MappingResult,
     MaskResult,
     MatchResult,
@@ -54,10 +55,8 @@ def scene_record(
     warnings: list[str],
 ) -> BuildRecord:
     """scene.json without its files, inputs and timings."""
-    from ambiguous_wild.builder.select_model import lost_photos
-
     facts = screened["photos"]
-    lost = lost_photos(facts, mapping["left_out"], features["features"])
+    lost = _lost_photos(facts, mapping["left_out"], features["features"])
     summary = mapping["model"]
     assert summary is not None  # a build without a model has ended before
     sources = {f["work_name"]: f["source"] for f in facts}
@@ -186,6 +185,19 @@ def what_changed(
         changed = [f"{k} {before.get(k)} -> {v}" for k, v in values.items() if before.get(k) != v]
         parts += [f"{group} ({shortlist(changed)})"] if changed else []
     return ", ".join(parts) or "inputs"
+
+
+def _lost_photos(
+    facts: list[ScreenedPhoto], left_out: dict[str, str], features: dict[str, int]
+) -> list[LostPhoto]:
+    """The readable photos that are not in the scene, each with the reason."""
+    lost: list[LostPhoto] = []
+    for fact in facts:
+        count = features.get(fact["work_name"], 0)
+        if fact["work_name"] in left_out:
+            reason = left_out[fact["work_name"]] if count >= 50 else f"only {count} features"
+            lost.append({"source": fact["source"], "reason": reason})
+    return lost
 
 
 def _photo(

@@ -1,5 +1,7 @@
 """Second stage: read every photo, leave out damaged files and copies, warn of blur and changed settings.
 
+Phones add one photo in two formats, bursts, and videos of live photos.
+
 Every warning states the number behind it.
 """
 
@@ -7,16 +9,16 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import cast
+from typing import Generic, TypeVar, cast
 
 import cv2
 import numpy as np
 
 from ambiguous_wild.builder.collect import MIN_PHOTOS, Capture, Source, identical
-from ambiguous_wild.builder.phone_photos import burst_warnings, format_twins, live_photo_warnings
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import (
     ExifRecord,
@@ -32,7 +34,20 @@ BLUR_SIDE = 1024  # px, longer side: the Laplacian grows with resolution, so blu
 BLUR_RATIO = 0.2  # of the capture's median; a photo below it counts as blurred
 NEAR_DUPLICATE = 0.995  # correlation of 32 x 32 thumbnails
 EXPOSURE_STOPS = 1.0
+VIDEOS = (".mov", ".mp4")
 _THUMBNAIL = 32
+More = TypeVar("More")
+
+
+@dataclass(frozen=True)
+class ReadCapture(Generic[More]):
+    """The photos of a capture that can be used."""
+
+    photos: list[PhotoRecord]
+    thumbnails: np.ndarray  # [N, 1024], see `thumbnail`
+    more: list[More]  # of each photo
+    copies: dict[str, str]  # relative name of a copy or another format -> that of the photo that is used
+    skipped: list[SkippedPhoto]  # with the copies
 
 
 def screen(capture: Capture, folder: Path, *, strict: bool, jobs: int, bar: Bar) -> ScreenResult:
@@ -45,45 +60,82 @@ def screen(capture: Capture, folder: Path, *, strict: bool, jobs: int, bar: Bar)
     """
     photos = folder / "photos"
     photos.mkdir()
+    read = read_capture(
+        capture,
+        lambda source, photo, pixels: _lay_out(source, photo, pixels, photos),
+        strict=strict,
+        jobs=jobs,
+        bar=bar,
+    )
+    for path in photos.iterdir():
+        if path.name not in read.more:  # there in another format too
+            path.unlink()
+    facts: list[ScreenedPhoto] = [
+        {
+            **record,
+            "work_name": work_name,
+            "copies": [copy for copy, kept in read.copies.items() if kept == record["source"]],
+        }
+        for record, work_name in zip(read.photos, read.more)
+    ]
+    warnings = [
+        *_skipped_warning(read.skipped, len(capture.sources)),
+        *(f"{p['source']}: {n}" for p in facts for n in p["notes"]),
+        *(_identical_warning(group) for group in identical(capture) if capture.has_sides),
+        *_near_duplicates(facts, read.thumbnails),
+        *_burst_warnings(facts, read.thumbnails),
+        *_live_photo_warnings(capture),
+        *drift_warnings(facts),
+    ]
+    return {"photos": facts, "skipped": read.skipped, "warnings": warnings}
+
+
+def read_capture(
+    capture: Capture,
+    more: Callable[[Source, Photo, np.ndarray], More],
+    *,
+    strict: bool,
+    jobs: int,
+    bar: Bar,
+) -> ReadCapture[More]:
+    """Read every photo once; copies, and photos that are there in another format too, are left out.
+
+    Args:
+        capture: its photos.
+        more: called with each photo and its pixels [H, W, 3] uint8.
+        strict: refuse a photo that cannot be read.
+        jobs: threads; each holds one photo.
+        bar: progress.
+
+    Raises:
+        AwError: too few photos can be read, or with `strict` one cannot.
+    """
     sources, copies = without_copies(capture)
     bar.start("reading photos", len(sources))
 
-    def one(source: Source) -> tuple[ScreenedPhoto, np.ndarray] | SkippedPhoto:
+    def one(source: Source) -> tuple[PhotoRecord, np.ndarray, More] | SkippedPhoto:
         try:
             photo, pixels = read_photo(source.path)
         except UnreadablePhoto as error:
             return {"source": source.relative, "skipped": error.reason}
         finally:
             bar.step()
-        record: ScreenedPhoto = {
-            **photo_record(source, photo, pixels),
-            "work_name": _lay_out(source, photo, pixels, photos),
-            "copies": [copy for copy, kept in copies.items() if kept == source.relative],
-        }
-        return record, thumbnail(pixels)
+        return photo_record(source, photo, pixels), thumbnail(pixels), more(source, photo, pixels)
 
     with ThreadPoolExecutor(jobs) as pool:
         rows = list(pool.map(one, sources))
     bar.finish()
     unreadable = [r for r in rows if not isinstance(r, tuple)]
     good = [r for r in rows if isinstance(r, tuple)]
-    twins = format_twins([record for record, _ in good], np.stack([t for _, t in good]) if good else None)
     if not capture.has_sides:
-        good = _without_twins(good, twins, photos)
+        twins = _format_twins([record for record, _, _ in good], [small for _, small, _ in good])
+        good = [row for row in good if row[0]["source"] not in twins]
         copies = copies | twins
-    refuse_bad(capture, unreadable, copies, len(good), strict)
-    facts = [record for record, _ in good]
-    skipped = [*unreadable, *copy_rows(copies)]
-    warnings = [
-        *_skipped_warning(skipped, len(capture.sources)),
-        *(f"{p['source']}: {n}" for p in facts for n in p["notes"]),
-        *(_identical_warning(group) for group in identical(capture) if capture.has_sides),
-        *_near_duplicates(facts, np.stack([t for _, t in good])),
-        *burst_warnings(facts, np.stack([t for _, t in good])),
-        *live_photo_warnings(capture),
-        *drift_warnings(facts),
-    ]
-    return {"photos": facts, "skipped": skipped, "warnings": warnings}
+    _refuse_bad(capture, unreadable, copies, len(good), strict)
+    photos, thumbnails, found = zip(*good)
+    return ReadCapture(
+        list(photos), np.stack(thumbnails), list(found), copies, [*unreadable, *_copy_rows(copies)]
+    )
 
 
 def photo_record(source: Source, photo: Photo, pixels: np.ndarray) -> PhotoRecord:
@@ -177,20 +229,6 @@ def exposure_stops(exif: ExifRecord) -> float | None:
     return math.log2(exif["exposure_s"] * exif.get("iso", 100.0) / exif.get("f_number", 1.0) ** 2)
 
 
-def _without_twins(
-    good: list[tuple[ScreenedPhoto, np.ndarray]], twins: dict[str, str], folder: Path
-) -> list[tuple[ScreenedPhoto, np.ndarray]]:
-    """Leave out photos that are there in another format too; they become copies of those."""
-    kept = []
-    for record, small in good:
-        if record["source"] in twins:
-            (folder / record["work_name"]).unlink()
-            continue
-        record["copies"] += [copy for copy, source in twins.items() if source == record["source"]]
-        kept.append((record, small))
-    return kept
-
-
 def _near_duplicates(facts: Sequence[PhotoRecord], thumbnails: np.ndarray) -> list[str]:
     close = np.triu(thumbnails @ thumbnails.T > NEAR_DUPLICATE, k=1)
     pairs = [
@@ -204,6 +242,66 @@ def _near_duplicates(facts: Sequence[PhotoRecord], thumbnails: np.ndarray) -> li
         f"{len(pairs)} near-duplicate pairs add little (thumbnails correlate over {NEAR_DUPLICATE}): "
         f"{shortlist(pairs, 3)}"
     ]
+
+
+def _format_twins(facts: Sequence[PhotoRecord], thumbnails: Sequence[np.ndarray]) -> dict[str, str]:
+    """Photos that are there in another format too: source -> the source that is kept.
+
+    Phones save or export IMG_1.HEIC and IMG_1.JPG. The larger one is kept, of equal ones the first by name.
+
+    Args:
+        facts: photos that can be read.
+        thumbnails: [1024] each, of `thumbnail`.
+    """
+    groups: dict[str, list[int]] = {}
+    for index, fact in enumerate(facts):
+        groups.setdefault(str(PurePosixPath(fact["source"]).with_suffix("")).casefold(), []).append(index)
+    found = {}
+    for members in groups.values():
+        if len(members) < 2:
+            continue
+        first = max(members, key=lambda i: (facts[i]["width"] * facts[i]["height"], -i))
+        for other in members:
+            suffixes = {PurePosixPath(facts[i]["source"]).suffix.lower() for i in (first, other)}
+            if (
+                other != first
+                and len(suffixes) == 2
+                and float(thumbnails[first] @ thumbnails[other]) > NEAR_DUPLICATE
+            ):
+                found[facts[other]["source"]] = facts[first]["source"]
+    return found
+
+
+def _burst_warnings(facts: Sequence[PhotoRecord], thumbnails: np.ndarray) -> list[str]:
+    """Runs of near-identical photos of one camera, taken within the same second."""
+    groups: dict[tuple[str | None, str], list[int]] = {}
+    for index, fact in enumerate(facts):
+        taken = fact["exif"].get("taken_at")
+        if taken is not None:
+            groups.setdefault((fact["camera"], taken), []).append(index)
+    bursts = []
+    for members in groups.values():
+        alike = [i for i in members[1:] if float(thumbnails[members[0]] @ thumbnails[i]) > NEAR_DUPLICATE]
+        if alike:
+            bursts.append(f"{facts[members[0]]['source']} and {len(alike)} more")
+    if not bursts:
+        return []
+    return [
+        f"{len(bursts)} bursts of near-identical photos of one second: {shortlist(bursts, 3)}; keep "
+        "the sharpest "
+        "of each: where every 8th photo tests, its neighbours of the burst train"
+    ]
+
+
+def _live_photo_warnings(capture: Capture) -> list[str]:
+    """Videos that belong to photos of the same name."""
+    stems = {PurePosixPath(s.relative).stem.casefold() for s in capture.sources}
+    videos = [
+        name
+        for name in capture.ignored
+        if PurePosixPath(name).suffix.lower() in VIDEOS and PurePosixPath(name).stem.casefold() in stems
+    ]
+    return [f"{len(videos)} videos of live photos are left out: {shortlist(videos, 3)}"] if videos else []
 
 
 def _lay_out(source: Source, photo: Photo, pixels: np.ndarray, folder: Path) -> str:
@@ -252,7 +350,7 @@ def _identical_warning(group: list[str]) -> str:
     return f"identical files: {shortlist(group)}{leak}"
 
 
-def copy_rows(copies: dict[str, str]) -> list[SkippedPhoto]:
+def _copy_rows(copies: dict[str, str]) -> list[SkippedPhoto]:
     """The copies as photos that are left out."""
     return [{"source": copy, "skipped": f"{_sameness(copy, kept)} {kept}"} for copy, kept in copies.items()]
 
@@ -262,7 +360,7 @@ def _sameness(copy: str, kept: str) -> str:
     return "the same photo in another format as" if other_format else "the same file as"
 
 
-def refuse_bad(
+def _refuse_bad(
     capture: Capture, skipped: list[SkippedPhoto], copies: dict[str, str], good: int, strict: bool
 ) -> None:
     """Raise AwError where too few photos can be read, or with `strict` one cannot."""
@@ -274,7 +372,7 @@ def refuse_bad(
             "run without --strict to leave them out"
         )
     if good < MIN_PHOTOS:
-        reasons = shortlist([f"{r['source']} ({r['skipped']})" for r in [*skipped, *copy_rows(copies)]], 4)
+        reasons = shortlist([f"{r['source']} ({r['skipped']})" for r in [*skipped, *_copy_rows(copies)]], 4)
         raise AwError(
             f"only {good} of {total} photos in {capture.root} can be used, {MIN_PHOTOS} are needed: {reasons}"
         )

@@ -1,4 +1,4 @@
-"""Explain lost photos, and refuse a failed reconstruction with its cause."""
+"""Refuse a failed reconstruction with its cause."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ambiguous_wild.builder.collect import MIN_PHOTOS
-from ambiguous_wild.builder.records import LostPhoto, MatchResult, ModelSummary, ScreenedPhoto
+from ambiguous_wild.builder.records import MatchResult, ModelSummary
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
@@ -112,19 +112,6 @@ def pair_facts(database: Path, matches: MatchResult) -> PairFacts:
         forward=float(np.median(forward)) if forward else math.nan,
         angle_deg=float(np.median(angles)) if angles else math.nan,
     )
-
-
-def lost_photos(
-    facts: list[ScreenedPhoto], left_out: dict[str, str], features: dict[str, int]
-) -> list[LostPhoto]:
-    """The readable photos that are not in the scene, each with the reason."""
-    lost: list[LostPhoto] = []
-    for fact in facts:
-        count = features.get(fact["work_name"], 0)
-        if fact["work_name"] in left_out:
-            reason = left_out[fact["work_name"]] if count >= 50 else f"only {count} features"
-            lost.append({"source": fact["source"], "reason": reason})
-    return lost
 
 
 def _motion(database: Path, pair_ids: list[int]) -> tuple[list[float], list[float]]:

@@ -1,10 +1,16 @@
-"""The settings of a build, as scene.json records them."""
+"""Settings of a build, as scene.json records them, and the plans of structure from motion that follow.
+
+A model is built with little work first, then, if that leaves photos out, with more.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
+from ambiguous_wild.builder.records import PhotoRecord
+from ambiguous_wild.builder.retrieval import EXHAUSTIVE_LIMIT, FAST_EXHAUSTIVE_LIMIT, NEIGHBOURS
 from ambiguous_wild.core.errors import AwError
 
 CameraMode = Literal["auto", "single", "per-device", "per-image"]
@@ -13,6 +19,9 @@ Mapper = Literal["incremental", "global"]
 Effort = Literal["auto", "fast", "thorough"]
 
 
+WIDER = 40  # partners of a photo that was left out
+ENOUGH = 0.9  # placed: the rest has no clear place, which more pairs seldom give
+HALF = 0.5  # placed after that: where fewer are, matching everything cannot make it worse
 MOST_FEATURES = 100_000  # a photo; SIFT finds fewer in any
 
 
@@ -43,3 +52,70 @@ class BuildSettings:
             )
         if not 0 <= self.seed < 2**31:
             raise AwError(f"--seed must be between 0 and 2147483647, got {self.seed}")
+
+
+@dataclass(frozen=True)
+class SfmPlan:
+    """What an attempt does; `benchmarks/results/poses.md` compares them on real captures."""
+
+    name: str  # "fast", "wider" or "thorough"
+    sift: str  # whose: "opencv", or "colmap", which takes three to five times as long
+    matcher: str  # "exhaustive", "retrieval" or "sequential"
+    similar: int  # photos that each is matched with, for "retrieval"
+    neighbours: int  # next photos in the order of capture, for "retrieval"
+    growth: float  # all cameras are adjusted when the model has grown so many times
+    refinements: int  # rounds of such an adjustment, at most
+    local_refinements: int  # rounds of the adjustment after a photo was placed, at most
+    local_cameras: int  # cameras in that adjustment: the new one and those that share most points with it
+    continues: bool = False  # only photos left out so far look for partners, besides the pairs matched so far
+    below: float = 1.0  # the plan is for captures of which a smaller share is placed so far
+
+
+def plans(photos: Sequence[PhotoRecord], settings: BuildSettings) -> list[SfmPlan]:
+    """The attempts in order; the next is made where one leaves photos out."""
+    thorough = _thorough(len(photos), settings)
+    if settings.sfm == "thorough":
+        return [thorough]
+    fast = _fast(photos, settings)
+    if settings.sfm == "fast":
+        return [fast]
+    if fast.matcher != "retrieval":
+        return [fast, replace(thorough, below=ENOUGH)]
+    wider = replace(fast, name="wider", similar=WIDER, neighbours=NEIGHBOURS, continues=True, below=ENOUGH)
+    return [fast, wider, replace(thorough, below=HALF)]
+
+
+def _fast(photos: Sequence[PhotoRecord], settings: BuildSettings) -> SfmPlan:
+    matcher = _matcher(len(photos), settings, FAST_EXHAUSTIVE_LIMIT)
+    many = len(photos) > EXHAUSTIVE_LIMIT
+    return SfmPlan(
+        "fast",
+        sift="opencv",
+        matcher=matcher,
+        similar=16 if many else 14,
+        neighbours=5 if many else 2,
+        growth=2.0,
+        refinements=1,
+        local_refinements=1,
+        local_cameras=4,
+    )
+
+
+def _thorough(count: int, settings: BuildSettings) -> SfmPlan:
+    return SfmPlan(
+        "thorough",
+        sift="colmap",
+        matcher=_matcher(count, settings, EXHAUSTIVE_LIMIT),
+        similar=16,
+        neighbours=5,
+        growth=1.1,
+        refinements=5,
+        local_refinements=2,
+        local_cameras=6,
+    )
+
+
+def _matcher(count: int, settings: BuildSettings, limit: int) -> str:
+    if settings.matcher != "auto":
+        return settings.matcher
+    return "exhaustive" if count <= limit else "retrieval"

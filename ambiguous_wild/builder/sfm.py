@@ -1,4 +1,7 @@
-"""Structure from motion: the stages features, matches and mapping, each in a child process."""
+"""Structure from motion: the stages features, matches and mapping, each in a child process.
+
+Jobs of that process are written as JSON; `sfm_worker` reads them.
+"""
 
 from __future__ import annotations
 
@@ -12,9 +15,8 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, NotRequired, TypedDict, cast
 
-from ambiguous_wild.builder.pairs import MOTIONS, PAIRS
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import (
     FeatureResult,
@@ -23,9 +25,9 @@ from ambiguous_wild.builder.records import (
     PhotoRecord,
     ScreenedPhoto,
 )
-from ambiguous_wild.builder.settings import BuildSettings
-from ambiguous_wild.builder.sfm_jobs import FeatureJob, MappingJob, MatchJob, SfmJob
-from ambiguous_wild.builder.sfm_plans import SfmPlan
+from ambiguous_wild.builder.retrieval import MOTIONS, PAIRS
+from ambiguous_wild.builder.settings import BuildSettings, SfmPlan
+from ambiguous_wild.core.config import to_plain
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.atomic import write_json
 
@@ -33,6 +35,82 @@ LOG = "colmap.log"
 DATABASE = "database.db"
 _POLL_S = 0.25
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
+
+
+class FeatureJob(TypedDict):
+    """Extract features."""
+
+    task: Literal["features"]
+    database: str
+    photos: str  # folder
+    names: list[str]
+    camera: str
+    groups: list[list[str]]  # names that share a camera, where the camera is "per-device"
+    masks: str | None  # folder
+    settings: dict[str, Any]  # `BuildSettings`
+    plan: dict[str, Any]  # `SfmPlan`
+    seed: int
+    jobs: int
+    parent: NotRequired[int]  # process id, added when the job is written
+
+
+class MatchJob(TypedDict):
+    """Match and verify pairs."""
+
+    task: Literal["matches"]
+    database: str
+    names: list[str]
+    test_names: list[str]
+    plan: dict[str, Any]  # `SfmPlan`
+    only: list[str] | None  # names that look for partners; None: all
+    focals: dict[str, float] | None  # name -> over the longer side, by EXIF; None: poses are known
+    earlier: str | None  # file of pairs that the database holds matched
+    seed: int
+    jobs: int
+    parent: NotRequired[int]
+
+
+class MappingJob(TypedDict):
+    """Build models."""
+
+    task: Literal["mapping"]
+    database: str
+    motions: str  # file of the stage before
+    photos: str  # folder
+    output: str  # folder
+    progress: str  # file that holds the number of placed photos
+    mapper: str
+    plan: dict[str, Any]  # `SfmPlan`
+    seed: int
+    jobs: int
+    parent: NotRequired[int]
+
+
+class TriangulationJob(TypedDict):
+    """Triangulate points with known poses."""
+
+    task: Literal["triangulation"]
+    database: str
+    photos: str  # folder
+    model: str  # folder; cameras and poses, numbered as in the database
+    output: str  # folder
+    seed: int
+    parent: NotRequired[int]
+
+
+class MotionJob(TypedDict):
+    """Find the motions of matched pairs whose cameras are known."""
+
+    task: Literal["motions"]
+    database: str
+    model: str  # folder; cameras, numbered as in the database
+    output: str  # file
+    seed: int
+    jobs: int
+    parent: NotRequired[int]
+
+
+SfmJob = FeatureJob | MatchJob | MappingJob | TriangulationJob | MotionJob
 
 
 class SfmCrash(AwError):
@@ -105,9 +183,8 @@ def extract_features(
         if camera == "per-device"
         else [],
         "masks": str(masks) if masks else None,
-        "max_features": settings.max_features,
-        "max_side": settings.max_side,
-        "sift": plan.sift,
+        "settings": to_plain(settings),
+        "plan": to_plain(plan),
         "seed": settings.seed,
         "jobs": jobs,
     }
@@ -167,9 +244,7 @@ def match(
         "database": str(database),
         "names": names,
         "test_names": test_names,
-        "matcher": matcher,
-        "similar": plan.similar,
-        "neighbours": plan.neighbours,
+        "plan": to_plain(plan),
         "only": list(left_out) if left_out is not None else None,
         "focals": None if posed else {f["work_name"]: x for f in facts if (x := exif_focal(f)) is not None},
         "earlier": str(earlier / PAIRS) if earlier else None,
@@ -206,10 +281,7 @@ def map_scene(
         "output": str(folder),
         "progress": str(progress),
         "mapper": settings.mapper,
-        "growth": plan.growth,
-        "refinements": plan.refinements,
-        "local_refinements": plan.local_refinements,
-        "local_cameras": plan.local_cameras,
+        "plan": to_plain(plan),
         "seed": settings.seed,
         "jobs": jobs,
     }

@@ -20,11 +20,18 @@ from typing import Any
 import numpy as np
 
 from ambiguous_wild.builder.matched import Matched
-from ambiguous_wild.builder.pairs import MOTIONS, PAIRS, sequential_pairs
 from ambiguous_wild.builder.placing import LEAST_PHOTOS, Placement, pipeline_options, plausible
 from ambiguous_wild.builder.records import ModelSummary
-from ambiguous_wild.builder.retrieval import embed, pairs_of_tests, retrieval_pairs
-from ambiguous_wild.builder.sfm_jobs import (
+from ambiguous_wild.builder.retrieval import (
+    MOTIONS,
+    PAIRS,
+    embed,
+    pairs_of_tests,
+    retrieval_pairs,
+    sequential_pairs,
+)
+from ambiguous_wild.builder.settings import SfmPlan
+from ambiguous_wild.builder.sfm import (
     FeatureJob,
     MappingJob,
     MatchJob,
@@ -54,14 +61,14 @@ def run_features(job: FeatureJob) -> None:
         pycolmap.import_images(
             job["database"], job["photos"], camera_mode=mode, image_names=names, options=reader
         )
-    if job["sift"] == "opencv":
+    if job["plan"]["sift"] == "opencv":
         _extract_with_opencv(job)
         return
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
     options.num_threads = job["jobs"]
-    options.max_image_size = job["max_side"]
-    options.sift.max_num_features = job["max_features"]
+    options.max_image_size = job["settings"]["max_side"]
+    options.sift.max_num_features = job["settings"]["max_features"]
     pycolmap.extract_features(
         job["database"],
         job["photos"],
@@ -78,7 +85,12 @@ def _extract_with_opencv(job: FeatureJob) -> None:
         numbers = {image.name: image.image_id for image in database.read_all_images()}
         masks = Path(job["masks"]) if job["masks"] else None
         for name, points, words in features_of(
-            Path(job["photos"]), masks, job["names"], job["max_features"], job["max_side"], job["jobs"]
+            Path(job["photos"]),
+            masks,
+            job["names"],
+            job["settings"]["max_features"],
+            job["settings"]["max_side"],
+            job["jobs"],
         ):
             database.write_keypoints(numbers[name], points)
             kind = pycolmap.FeatureExtractorType.SIFT
@@ -94,7 +106,7 @@ def run_matches(job: MatchJob) -> None:
     options.num_threads = job["jobs"]
     options.skip_geometric_verification = True
     database = Path(job["database"])
-    if job["matcher"] == "exhaustive":
+    if job["plan"]["matcher"] == "exhaustive":
         pycolmap.match_exhaustive(job["database"], matching_options=options)
     else:
         listed = database.with_name(PAIRS)
@@ -119,7 +131,7 @@ def run_matches(job: MatchJob) -> None:
 def _likely_pairs(job: MatchJob) -> list[tuple[str, str]]:
     """By the order of capture, by similar features, or both."""
     tests = set(job["test_names"])
-    sequential = job["matcher"] == "sequential"
+    sequential = job["plan"]["matcher"] == "sequential"
     if sequential and not tests:
         return sequential_pairs(job["names"], tests)
     database = pycolmap.Database.open(job["database"])
@@ -137,8 +149,8 @@ def _likely_pairs(job: MatchJob) -> list[tuple[str, str]]:
             read,
             job["names"],
             tests,
-            job["similar"],
-            job["neighbours"],
+            job["plan"]["similar"],
+            job["plan"]["neighbours"],
             job["only"],
             job["seed"],
             job["jobs"],
@@ -231,10 +243,11 @@ def _map_incrementally(job: MappingJob, output: Path, distorted: bool) -> dict[i
     options = pipeline_options(job["seed"])
     options.min_model_size = LEAST_PHOTOS
     options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = distorted
-    options.ba_global_frames_ratio = options.ba_global_points_ratio = job["growth"]
-    options.ba_global_max_refinements = job["refinements"]
-    options.ba_local_max_refinements = job["local_refinements"]
-    options.mapper.ba_local_num_images = job["local_cameras"]
+    plan = SfmPlan(**job["plan"])
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = plan.growth
+    options.ba_global_max_refinements = plan.refinements
+    options.ba_local_max_refinements = plan.local_refinements
+    options.mapper.ba_local_num_images = plan.local_cameras
     counter = Path(job["progress"])
     state = {"best": 0, "now": 0}
 

@@ -9,12 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from ambiguous_wild.builder import report
-from ambiguous_wild.builder.collect import Capture
+from ambiguous_wild.builder.collect import Capture, read_test_list, split_photos
 from ambiguous_wild.builder.downsample import auto_factor, downsample
 from ambiguous_wild.builder.masks import find_masks, lay_out_masks, mask_hashes, mask_warnings
 from ambiguous_wild.builder.moving import write_motion
 from ambiguous_wild.builder.package import SceneParts, package
-from ambiguous_wild.builder.pairs import MOTIONS
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import (
     BuildInputs,
@@ -28,8 +27,9 @@ from ambiguous_wild.builder.records import (
     ScreenResult,
     UndistortResult,
 )
+from ambiguous_wild.builder.retrieval import MOTIONS
 from ambiguous_wild.builder.screen import screen, without_copies
-from ambiguous_wild.builder.settings import BuildSettings
+from ambiguous_wild.builder.settings import BuildSettings, SfmPlan, plans
 from ambiguous_wild.builder.sfm import (
     DATABASE,
     choose_camera,
@@ -37,10 +37,7 @@ from ambiguous_wild.builder.sfm import (
     map_scene,
     match,
 )
-from ambiguous_wild.builder.sfm_plans import SfmPlan, plans
-from ambiguous_wild.builder.split import read_test_list, split_photos
-from ambiguous_wild.builder.versions import versions
-from ambiguous_wild.builder.workspace import StageResult, Workspace, content_key
+from ambiguous_wild.builder.workspace import StageResult, Workspace, content_key, versions
 from ambiguous_wild.core.config import to_plain
 from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.colmap_records import Model

@@ -14,15 +14,32 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import cache
+from importlib import metadata
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
+from ambiguous_wild import __version__
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.atomic import atomic_dir, write_json
 from ambiguous_wild.io.lock import Held, file_lock, lock_path
 
+BUILDER = 11  # raised when a stage gives another result for the same input
+_LIBRARIES = ("pycolmap", "OpenImageIO", "opencv-contrib-python-headless", "pillow", "numpy")
 _RESULT = "stage.json"
 Facts = TypeVar("Facts", bound=Mapping[str, object])  # a record of `records.py`
+
+
+@cache
+def versions() -> dict[str, str]:
+    """Versions that the result depends on, by name, without libraries that have another name here."""
+    found = {"ambiguous_wild": __version__, "builder": str(BUILDER)}
+    for name in _LIBRARIES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
 
 
 def content_key(*parts: Any) -> str:

@@ -12,7 +12,7 @@ import click
 from ambiguous_wild.cli.paths import PathName
 
 if TYPE_CHECKING:
-    from ambiguous_wild.builder.capture_report import CaptureReport
+    from ambiguous_wild.builder.checks import CaptureReport
 
 _WORDS = {"ok": ("ok", "green"), "warning": ("WARNING", "red"), "unknown": ("unknown", "yellow")}
 
@@ -27,7 +27,7 @@ def command(raw: Path, strict: bool, jobs: int | None, as_json: bool) -> None:
     near-duplicates, overlap, motion. Nothing is written."""
     import os
 
-    from ambiguous_wild.builder.capture_report import check_capture, refuse_failed
+    from ambiguous_wild.builder.checks import check_capture, refuse_failed
     from ambiguous_wild.builder.progress import Bar
 
     found = check_capture(raw, jobs=jobs or os.cpu_count() or 1, bar=Bar(not as_json))

@@ -13,13 +13,11 @@ from typing import cast
 import numpy as np
 
 from ambiguous_wild.builder.moving import write_motion
-from ambiguous_wild.builder.pairs import MOTIONS
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import MotionResult, ScreenedPhoto
-from ambiguous_wild.builder.settings import BuildSettings, Effort
-from ambiguous_wild.builder.sfm import DATABASE, extract_features, match, run_job
-from ambiguous_wild.builder.sfm_jobs import MotionJob, TriangulationJob
-from ambiguous_wild.builder.sfm_plans import plans
+from ambiguous_wild.builder.retrieval import MOTIONS
+from ambiguous_wild.builder.settings import BuildSettings, Effort, plans
+from ambiguous_wild.builder.sfm import DATABASE, MotionJob, TriangulationJob, extract_features, match, run_job
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.scene import Split
 from ambiguous_wild.io.colmap_model import read_model, write_model

@@ -15,8 +15,7 @@ from typing import Any
 from ambiguous_wild.builder.package import list_files, nerfbaselines_info
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.report import point_checks
-from ambiguous_wild.builder.versions import versions
-from ambiguous_wild.builder.workspace import build_lock, content_key
+from ambiguous_wild.builder.workspace import build_lock, content_key, versions
 from ambiguous_wild.core.errors import AwError, counted, shortlist
 from ambiguous_wild.core.names import check_name
 from ambiguous_wild.datasets.foreign import SIDES, ForeignScene

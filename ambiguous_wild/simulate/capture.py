@@ -21,7 +21,7 @@ from dataclasses import asdict
 from importlib.metadata import version
 from itertools import islice
 from pathlib import Path, PurePosixPath
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -31,17 +31,18 @@ from ambiguous_wild.core.config import config_hash, to_plain
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.atomic import atomic_dir, refuse_foreign_files, write_json
 from ambiguous_wild.io.hashing import sha256_file
-from ambiguous_wild.simulate.camera_path import plan_cameras
+from ambiguous_wild.simulate.camera_path import focal_px, plan_cameras
+from ambiguous_wild.simulate.courtyard import courtyard
 from ambiguous_wild.simulate.distractors import lay_out
-from ambiguous_wild.simulate.image_effects.photo_random import PhotoRandom
-from ambiguous_wild.simulate.photo_files import write_photo, write_png
-from ambiguous_wild.simulate.places import build_world
+from ambiguous_wild.simulate.image_effects import PhotoRandom
 from ambiguous_wild.simulate.records import (
     CameraRecord,
     CaptureTruth,
+    DrawnEffects,
     PhotoTruth,
     PlacedDistractor,
     SimulatedCapture,
+    spread,
 )
 from ambiguous_wild.simulate.render import (
     PlannedPhoto,
@@ -52,12 +53,35 @@ from ambiguous_wild.simulate.render import (
     prepare_photo,
     trace_photo,
 )
-from ambiguous_wild.simulate.spec import CaptureSpec
+from ambiguous_wild.simulate.room import room
+from ambiguous_wild.simulate.spec import CaptureSpec, WorldSpec
 from ambiguous_wild.simulate.spec_file import plain_spec
 from ambiguous_wild.simulate.tracer import TracedPhoto
 from ambiguous_wild.simulate.world import World
+from ambiguous_wild.simulate.yard import yard
 
+_LENS_MM = 4.2  # focal length without zoom
+_ISO = 64
+_DATE = "2025:06:14 15:{:02d}:{:02d}"
+_PLACES = {"courtyard": courtyard, "room": room, "yard": yard}
 PhotoProgress = Callable[[list[PlannedPhoto]], Iterable[PlannedPhoto]]
+
+
+def build_world(
+    rng: np.random.Generator, detail_px_per_m: float, samples: int = 4, what: WorldSpec | None = None
+) -> World:
+    """Build the place of the spec; positions and textures vary with the generator.
+
+    Objects that are left out use their random numbers all the same: the others do not change.
+
+    Args:
+        rng: source of randomness.
+        detail_px_per_m: resolution of the textures, px per m.
+        samples: rays a pixel, a square number.
+        what: the place and its objects; None: the courtyard.
+    """
+    what = WorldSpec() if what is None else what
+    return _PLACES[what.place](rng, detail_px_per_m, samples, what)
 
 
 def plan(spec: CaptureSpec, seed: int) -> tuple[World, list[PlannedPhoto]]:
@@ -131,11 +155,11 @@ def _render(
     ) -> None:
         photo = planned[number]
         rendered = finish_photo(photo, randoms[number], prepared, traced)
-        write_photo(
+        _write_photo(
             folder / photo.split / photo.name, rendered.photo, spec, photo.camera, number, rendered.effects
         )
         for part, pixels in _truth(photo, rendered, metres):
-            write_png(folder / "truth" / part / f"{Path(photo.name).stem}.png", pixels)
+            _write_png(folder / "truth" / part / f"{Path(photo.name).stem}.png", pixels)
         if photo.split == "train":
             photos[photo.name] = _photo_facts(spec, photo, rendered)
 
@@ -157,6 +181,69 @@ def _render(
         for task in pending:
             task.result()
     return {photo.name: photos[photo.name] for photo in planned if photo.name in photos}
+
+
+def _write_png(path: Path, pixels: np.ndarray) -> None:
+    """[H, W] or [H, W, 3] uint8 or uint16."""
+    from PIL import Image
+
+    Image.fromarray(pixels).save(path, compress_level=3)
+
+
+def _write_photo(
+    path: Path, pixels: np.ndarray, spec: CaptureSpec, camera: Camera, number: int, drawn: DrawnEffects
+) -> None:
+    """JPEG at quality 95 without chroma subsampling, with the EXIF of a phone.
+
+    Args:
+        path: the file.
+        pixels: [H, W, 3] uint8.
+        spec: of the capture.
+        camera: of this photo; gives the focal length.
+        number: of the photo; gives the time, one photo every four seconds.
+        drawn: of this photo; gives exposure, ISO and white balance.
+    """
+    from PIL import Image
+
+    Image.fromarray(pixels).save(path, quality=95, subsampling=0, exif=_exif(spec, camera, number, drawn))
+
+
+def _exif(spec: CaptureSpec, camera: Camera, number: int, drawn: DrawnEffects) -> Any:
+    from PIL import Image, TiffImagePlugin
+
+    def rational(value: float) -> Any:
+        return TiffImagePlugin.IFDRational(round(value * 10000), 10000)
+
+    zoom = camera.fx / focal_px(spec)
+    taken = _DATE.format(number * 4 // 60 % 60, number * 4 % 60)
+    exif = Image.Exif()
+    exif[0x010F], exif[0x0110] = "ambiguous_wild", "simulated phone"
+    exif[0x0131], exif[0x0132] = f"ambiguous_wild {__version__}", taken
+    fields = exif.get_ifd(0x8769)
+    fields[0x829A] = _exposure(drawn, TiffImagePlugin.IFDRational)  # ExposureTime, s
+    fields[0x829D] = rational(1.6)  # FNumber
+    fields[0x8827] = round(drawn["iso_noise"]["iso"]) if "iso_noise" in drawn else _ISO
+    fields[0x9003] = fields[0x9004] = taken
+    fields[0x920A] = rational(_LENS_MM * zoom)
+    fields[0xA402] = 0 if "exposure_drift" in drawn else 1  # exposure: automatic or manual
+    fields[0xA403] = 0 if "white_balance" in drawn else 1  # white balance: automatic or manual
+    fields[0xA002], fields[0xA003] = spec.width, spec.height
+    per_inch = 25.4 * focal_px(spec) / _LENS_MM
+    fields[0xA20E] = fields[0xA20F] = rational(per_inch)  # FocalPlaneX/YResolution
+    fields[0xA210] = 2  # in inches
+    fields[0xA405] = round(spec.focal_35mm * zoom)  # FocalLengthIn35mmFilm
+    return exif
+
+
+def _exposure(drawn: DrawnEffects, rational: Any) -> Any:
+    """Exposure time, s: that of the motion blur, else 1/250; longer by the stops of the exposure drift."""
+    blur, drift = drawn.get("motion_blur"), drawn.get("exposure_drift")
+    seconds = 1 / 250 if blur is None else blur["exposure_s"]
+    seconds *= 2.0 ** (0.0 if drift is None else drift["stops"])
+    whole = round(1 / seconds)
+    if abs(1 / seconds - whole) < 1e-9 * whole:
+        return rational(1, whole)
+    return rational(round(seconds * 10**6), 10**6)
 
 
 def _truth(
@@ -201,7 +288,7 @@ def _facts(spec: CaptureSpec, seed: int, identity: str, photos: dict[str, PhotoT
         "mask": "255 where any part of a pixel shows a distractor; distractors cast no shadow on the scene",
         "clean": "same camera, same effects, no distractors and no moving shadow, before JPEG",
         "test": "no distractors; of the effects only specular and lens_distortion",
-        "occlusion": {"mean": float(np.mean(shares)), "min": min(shares), "max": max(shares)},
+        "occlusion": spread(shares),
         "photos": photos,
         "licence": "CC0; textures from photographs in scikit-image that are CC0 or in the public domain",
     }
@@ -210,8 +297,7 @@ def _facts(spec: CaptureSpec, seed: int, identity: str, photos: dict[str, PhotoT
 def _code_hash() -> str:
     """Hash of the simulator's source: a capture of another version is not reused."""
     here = Path(__file__).parent
-    sources = sorted([*here.glob("*.py"), *here.glob("image_effects/*.py")])
-    return config_hash([__version__, *(sha256_file(p) for p in sources)])
+    return config_hash([__version__, *(sha256_file(p) for p in sorted(here.glob("*.py")))])
 
 
 def _camera_json(spec: CaptureSpec, camera: Camera) -> CameraRecord:

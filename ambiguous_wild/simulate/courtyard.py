@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from ambiguous_wild.simulate import textures as tx
-from ambiguous_wild.simulate.atlas import build_atlas
-from ambiguous_wild.simulate.ground_plan import PLANS
 from ambiguous_wild.simulate.kernels import BOX, CYLINDER, ELLIPSOID
 from ambiguous_wild.simulate.shapes import Shape, between, figure, placed, vector
-from ambiguous_wild.simulate.spec import WorldSpec
+from ambiguous_wild.simulate.spec import PLANS, WorldSpec
 from ambiguous_wild.simulate.things import circle_of, shapes_of_thing
+from ambiguous_wild.simulate.tracer import build_atlas
 from ambiguous_wild.simulate.world import (
     WALL_AXES,
     World,

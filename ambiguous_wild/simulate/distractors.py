@@ -11,11 +11,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ambiguous_wild.core.camera import Camera
-from ambiguous_wild.simulate.ground_plan import GroundPlan
 from ambiguous_wild.simulate.image_effects import specular
 from ambiguous_wild.simulate.kernels import BOX, ELLIPSOID
 from ambiguous_wild.simulate.shapes import Shape, banner, barrier, figure, placed, pole, shape_table
-from ambiguous_wild.simulate.spec import STATUES, CaptureSpec, Distractor
+from ambiguous_wild.simulate.spec import STATUES, CaptureSpec, Distractor, GroundPlan
 from ambiguous_wild.simulate.things import car, placard, statue
 from ambiguous_wild.simulate.tracer import ShapeTable, trace
 from ambiguous_wild.simulate.world import World
@@ -88,7 +87,7 @@ def movers(spec: CaptureSpec, placements: tuple[Placement, ...], world: World) -
     shapes = [s for p in placements for s in shapes_of(spec.distractors[p.which], p, world.plan)]
     gloss = spec.effects.specular
     if gloss is not None:
-        shapes = specular.specular(shapes, gloss.textures, gloss.strength, gloss.sharpness)
+        shapes = specular(shapes, gloss.textures, gloss.strength, gloss.sharpness)
     return shape_table(shapes, world.atlas)
 
 

@@ -1,114 +1,18 @@
-"""Presets: those of the courtyard, and all of them by name."""
+"""Presets by name, from `presets.yaml`."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 from ambiguous_wild.core.errors import AwError, unknown
-from ambiguous_wild.simulate.preset_distractors import (
-    BLUE,
-    CRIMSON,
-    GRAVEL,
-    LEAVES,
-    PARCEL,
-    RED,
-    TWIN,
-    VISITOR,
-    designed,
-    far,
-    near,
-    thin,
-)
-from ambiguous_wild.simulate.preset_gallery import GALLERY
-from ambiguous_wild.simulate.preset_places import PLACES
+from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.simulate.spec import CaptureSpec
-from ambiguous_wild.simulate.spec_check import check_spec
-
-_THIN = (
-    thin("wooden pole", "pole", "timber"),
-    thin("pole of brick", "pole", "brick"),
-    thin("rope barrier", "barrier", "stone"),
-    thin("banner in brick", "banner", "brick"),
-    thin("pebble", "ball", "gravel", size=0.22, lift_m=1.9),
-    thin("clod of leaves", "ball", "foliage", size=0.26, lift_m=1.9),
-    replace(thin("red ball", "ball", "cloth", size=0.2, lift_m=1.9, tint=CRIMSON), ambiguity="none"),
-)
-
+from ambiguous_wild.simulate.spec_file import check_spec, spec_of
 
 PRESETS = {
     spec.name: spec
-    for spec in (
-        CaptureSpec(
-            "courtyard",
-            "a visitor dressed like the wall, a second statue, a bright parcel",
-            (VISITOR, TWIN, PARCEL),
-            designed=designed("both"),
-        ),
-        CaptureSpec(
-            "courtyard-colour",
-            "three distractors that wear the background's own texture",
-            (VISITOR, LEAVES, GRAVEL),
-            designed=designed("colour"),
-        ),
-        CaptureSpec(
-            "courtyard-twin",
-            "two copies of the static statue",
-            (TWIN, replace(TWIN, name="third statue")),
-            designed=designed("both"),
-        ),
-        CaptureSpec(
-            "courtyard-plain",
-            "a visitor, a ball and a parcel in colours that nothing else has: the easy case",
-            (RED, BLUE, PARCEL),
-            occlusion=(0.14, 0.26),
-            designed=designed("neither"),
-        ),
-        CaptureSpec(
-            "courtyard-thin",
-            "poles, a rope, a banner and small balls, most in the background's colours",
-            _THIN,
-            occlusion=(0.03, 0.09),
-            designed=designed("colour"),
-        ),
-        CaptureSpec(
-            "courtyard-sparse",
-            "the courtyard's distractors, fewer and farther: about 5 % of a photo",
-            (far(VISITOR), far(TWIN), far(PARCEL)),
-            occlusion=(0.02, 0.08),
-            designed=designed("both"),
-        ),
-        CaptureSpec(
-            "courtyard-crowd",
-            "a crowd of eight of every kind: about 45 % of a photo",
-            tuple(
-                near(d)
-                for d in (VISITOR, LEAVES, RED, replace(VISITOR, name="visitor in wood", texture="timber"))
-            )
-            + tuple(near(d) for d in (TWIN, GRAVEL, PARCEL, BLUE)),
-            occlusion=(0.37, 0.53),
-            designed=designed("both"),
-        ),
-        CaptureSpec(
-            "courtyard-clean",
-            "no distractors: the upper bound",
-            occlusion=(0.0, 0.0),
-            designed=designed("neither", distractors=False),
-        ),
-        CaptureSpec(
-            "tiny",
-            "the courtyard in small, for tests",
-            (VISITOR, TWIN, PARCEL),
-            train_views=12,
-            test_views=3,
-            width=320,
-            height=180,
-            detail_px_per_m=48.0,
-            arc_deg=70.0,
-            designed=designed("both"),
-        ),
-        *GALLERY,
-        *PLACES,
-    )
+    for spec in map(spec_of, plain_yaml.parse(plain_yaml.read_text(Path(__file__).with_suffix(".yaml"))))
 }
 
 

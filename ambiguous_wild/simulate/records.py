@@ -4,24 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NotRequired, TypedDict
 
-
-class DrawnHour(TypedDict):
-    """Time of day of a photo."""
-
-    hour: float  # -1 morning, 0 noon, 1 evening
-
-
-class DrawnShadow(TypedDict):
-    """Shadow casters of a photo."""
-
-    lobes: list[list[float]]  # x, y, radius, m
-
-
-class RadialDistortion(TypedDict):
-    """Lens distortion, as in COLMAP's RADIAL camera."""
-
-    k1: float
-    k2: float
+import numpy as np
 
 
 class DrawnShutter(TypedDict):
@@ -31,64 +14,21 @@ class DrawnShutter(TypedDict):
     readout_s: float
 
 
-class DrawnBlur(TypedDict):
-    """Motion blur of a photo."""
-
-    exposure_s: float
-    length_px: float
-
-
-class DrawnDefocus(TypedDict):
-    """Defocus of a photo."""
-
-    radius_px: float  # 0 = sharp
-
-
-class DrawnVignetting(TypedDict):
-    """Vignetting of a photo."""
-
-    falloff: float
-
-
-class DrawnExposure(TypedDict):
-    """Exposure drift of a photo."""
-
-    stops: float
-
-
-class DrawnBalance(TypedDict):
-    """White balance of a photo."""
-
-    gains: list[float]  # red, green, blue
-
-
-class DrawnIso(TypedDict):
-    """ISO of a photo."""
-
-    iso: float
-
-
-class DrawnJpeg(TypedDict):
-    """First JPEG compression of a photo."""
-
-    quality: int
-
-
 class DrawnEffects(TypedDict, total=False):
     """What the effects drew for one photo; an effect that the spec does not name is absent."""
 
-    time_of_day: DrawnHour
+    time_of_day: dict[str, float]  # hour: -1 morning, 0 noon, 1 evening
     specular: dict[str, float]  # empty: the same in all photos
-    moving_shadow: DrawnShadow
-    lens_distortion: RadialDistortion
+    moving_shadow: dict[str, list[list[float]]]  # lobes, each x, y, radius, m
+    lens_distortion: dict[str, float]  # k1, k2, as in COLMAP's RADIAL camera
     rolling_shutter: DrawnShutter
-    motion_blur: DrawnBlur
-    defocus: DrawnDefocus
-    vignetting: DrawnVignetting
-    exposure_drift: DrawnExposure
-    white_balance: DrawnBalance
-    iso_noise: DrawnIso
-    jpeg: DrawnJpeg
+    motion_blur: dict[str, float]  # exposure_s, length_px
+    defocus: dict[str, float]  # radius_px; 0 = sharp
+    vignetting: dict[str, float]  # falloff
+    exposure_drift: dict[str, float]  # stops
+    white_balance: dict[str, list[float]]  # gains: red, green, blue
+    iso_noise: dict[str, float]  # iso
+    jpeg: dict[str, int]  # quality
 
 
 class PlacedDistractor(TypedDict):
@@ -130,7 +70,12 @@ class CameraRecord(TypedDict):
     cx: float
     cy: float
     cam_from_world: list[list[float]]  # [4, 4], OpenCV axes, m
-    distortion: NotRequired[RadialDistortion]
+    distortion: NotRequired[dict[str, float]]  # k1, k2, as in COLMAP's RADIAL camera
+
+
+def spread(shares: list[float]) -> Spread:
+    """Of a share over the training photos."""
+    return {"mean": float(np.mean(shares)), "min": min(shares), "max": max(shares)}
 
 
 class CaptureTruth(TypedDict):
@@ -156,96 +101,3 @@ class SimulatedCapture(CaptureTruth):
     """`CaptureTruth`, and whether the capture existed."""
 
     reused: bool
-
-
-class PlacedCutout(TypedDict):
-    """One cut-out in one photo: `layers.CutoutPlacement` with its name."""
-
-    cutout: str
-    which: int
-    position: tuple[float, float, float]
-    turn_deg: float
-    standing: bool
-
-
-class CompositePhoto(TypedDict):
-    """One training photo of a composite."""
-
-    occlusion: float
-    distractors: list[PlacedCutout]
-
-
-class CutoutRecord(TypedDict):
-    """One cut-out of a composite."""
-
-    name: str
-    sha256: str  # of its file; empty where it was drawn
-    height: float  # scene units
-
-
-class CompositeSource(TypedDict):
-    """The scene that a composite is made from."""
-
-    name: str
-    scene_json: str | None  # sha256
-
-
-class CompositeRecord(TypedDict):
-    """truth/composite.json."""
-
-    schema: int
-    version: str
-    source: CompositeSource
-    config: dict[str, Any]  # `CompositeConfig`
-    mask: str
-    poses: str
-    cutouts: list[CutoutRecord]
-    occlusion: Spread
-    photos: dict[str, CompositePhoto]
-
-
-class PastedPiece(TypedDict):
-    """One distractor in one plain photo."""
-
-    cutout: str
-    photo: str  # that the piece was cut from; empty for cut-outs
-    mirrored: bool
-    x: float  # of its middle, over the photo's width
-    y: float  # of its middle, over the photo's height
-    height: float  # over the photo's height
-
-
-class PastedPhoto(TypedDict):
-    """One training photo of a capture with pasted distractors."""
-
-    source: str  # file name of the clean photo
-    sha256: str  # of the clean photo
-    occlusion: float
-    distractors: list[PastedPiece]
-
-
-class PhotoFolder(TypedDict):
-    """The folder of photos that a capture is made from."""
-
-    name: str
-    photos: int
-
-
-class PastedCutout(TypedDict):
-    """One cut-out of a capture with pasted distractors."""
-
-    name: str
-    sha256: str  # of its file
-
-
-class PastedRecord(TypedDict):
-    """truth/composite.json of a capture with pasted distractors."""
-
-    schema: int
-    version: str
-    source: PhotoFolder
-    config: dict[str, Any]  # `CompositeConfig` without pose and shadow
-    mask: str
-    cutouts: list[PastedCutout]
-    occlusion: Spread
-    photos: dict[str, PastedPhoto]

@@ -17,31 +17,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ambiguous_wild.core.camera import Camera
-from ambiguous_wild.simulate.atlas import linear_to_srgb
+from ambiguous_wild.simulate import image_effects as fx
 from ambiguous_wild.simulate.distractors import Placement, movers
-from ambiguous_wild.simulate.image_effects import (
-    defocus,
-    exposure_drift,
-    iso_noise,
-    jpeg,
-    lens_distortion,
-    motion_blur,
-    moving_shadow,
-    rolling_shutter,
-    specular,
-    time_of_day,
-    vignetting,
-    warp,
-    white_balance,
-)
-from ambiguous_wild.simulate.image_effects.hand_motion import hand_velocity
-from ambiguous_wild.simulate.image_effects.photo_random import PhotoRandom
-from ambiguous_wild.simulate.image_effects.settings import Effects
+from ambiguous_wild.simulate.image_effects import PhotoRandom
 from ambiguous_wild.simulate.kernels import DOME
 from ambiguous_wild.simulate.records import DrawnEffects
 from ambiguous_wild.simulate.shapes import Shape, shape_table
-from ambiguous_wild.simulate.spec import CaptureSpec
-from ambiguous_wild.simulate.tracer import Light, ShapeTable, TracedPhoto, trace
+from ambiguous_wild.simulate.spec import CaptureSpec, Effects
+from ambiguous_wild.simulate.tracer import Light, ShapeTable, TracedPhoto, linear_to_srgb, trace
 from ambiguous_wild.simulate.world import World
 
 _MAX_INSTANTS = 24  # of an exposure
@@ -135,8 +118,8 @@ def finish_photo(
     clean_pixels = _to_uint8(sensor(clean))
     pixels = clean_pixels if distracted is clean else _to_uint8(sensor(distracted))
     if effects.jpeg is not None:
-        quality = jpeg.draw(effects.jpeg, random)
-        pixels = jpeg.jpeg(pixels, quality)
+        quality = fx.draw_jpeg(effects.jpeg, random)
+        pixels = fx.jpeg(pixels, quality)
         drawn["jpeg"] = {"quality": quality}
     return RenderedPhoto(pixels, clean_pixels, owner, shadow, drawn)
 
@@ -160,17 +143,17 @@ def _lit(effects: Effects, world: World, random: PhotoRandom, drawn: DrawnEffect
     light, shadow_casters = world.light, None
     if effects.time_of_day is not None:
         day = effects.time_of_day
-        hour = time_of_day.draw(day, random)
-        light, sky = time_of_day.time_of_day(light, hour, day.strength, day.sweep_deg)
+        hour = fx.draw_time_of_day(day, random)
+        light, sky = fx.time_of_day(light, hour, day.strength, day.sweep_deg)
         shapes = [_sky(s, sky) if s.mapping == DOME else s for s in shapes]
         drawn["time_of_day"] = {"hour": hour}
     if effects.specular is not None:
         gloss = effects.specular
-        shapes = specular.specular(shapes, gloss.textures, gloss.strength, gloss.sharpness)
+        shapes = fx.specular(shapes, gloss.textures, gloss.strength, gloss.sharpness)
         drawn["specular"] = {}
     if effects.moving_shadow is not None:
-        lobes = moving_shadow.draw(effects.moving_shadow, random)
-        shadow_casters = shape_table(moving_shadow.moving_shadow(lobes, light.sun.mean(0)), world.atlas)
+        lobes = fx.draw_moving_shadow(effects.moving_shadow, random)
+        shadow_casters = shape_table(fx.moving_shadow(lobes, light.sun.mean(0)), world.atlas)
         drawn["moving_shadow"] = {"lobes": [list(lobe) for lobe in lobes]}
     return _LitScene(shape_table(shapes, world.atlas), shadow_casters, light)
 
@@ -190,15 +173,15 @@ def _optics(
     if effects.lens_distortion is not None or any(s is not None for s in shutter):
         fine = math.isqrt(len(light.sun))  # the number of rays stays: one in each finer pixel
         sources = _sources(effects, camera, fine, random, drawn)
-        traced, border = warp.enlarged(camera, sources, fine)
+        traced, border = fx.enlarged(camera, sources, fine)
         light = replace(light, sun=np.ascontiguousarray(light.sun[:1]))
-        steps.append(lambda image: warp.resample(image, sources, border, fine))
+        steps.append(lambda image: fx.resample(image, sources, border, fine))
     if effects.defocus is not None:
-        radius = defocus.draw(effects.defocus, random)
+        radius = fx.draw_defocus(effects.defocus, random)
         drawn["defocus"] = {"radius_px": radius * camera.width}
         if radius > 0:
-            kernel = defocus.disc(radius * camera.width)
-            steps.append(lambda image: defocus.defocus(image, kernel))
+            kernel = fx.disc(radius * camera.width)
+            steps.append(lambda image: fx.defocus(image, kernel))
     if not steps:
         return None, traced, light
 
@@ -214,29 +197,29 @@ def _sources(
     effects: Effects, camera: Camera, fine: int, random: PhotoRandom, drawn: DrawnEffects
 ) -> list[np.ndarray]:
     """Source of the photo's fine pixels in the pinhole camera, one array per instant of the exposure."""
-    points = warp.fine_points(camera, fine)
+    points = fx.fine_points(camera, fine)
     if effects.lens_distortion is not None:
         lens = effects.lens_distortion
-        points = lens_distortion.lens_distortion(points, lens.k1, lens.k2)
+        points = fx.lens_distortion(points, lens.k1, lens.k2)
         drawn["lens_distortion"] = {"k1": lens.k1, "k2": lens.k2}
     rows = camera.height * fine
     turns = np.zeros((rows, 3))
     instants = np.zeros((1, 3))
     if effects.rolling_shutter is not None:
         roll = effects.rolling_shutter
-        velocity = hand_velocity(random, roll.speed_deg_s)
-        turns = rolling_shutter.rolling_shutter(velocity, roll.readout_s, rows)
+        velocity = fx.hand_velocity(random, roll.speed_deg_s)
+        turns = fx.hand_turns(velocity, roll.readout_s, rows)
         drawn["rolling_shutter"] = {"deg_s": np.rad2deg(velocity).tolist(), "readout_s": roll.readout_s}
     if effects.motion_blur is not None:
         blur = effects.motion_blur
-        velocity = hand_velocity(random, blur.speed_deg_s)
+        velocity = fx.hand_velocity(random, blur.speed_deg_s)
         length = float(np.linalg.norm(velocity)) * blur.exposure_s * camera.fx
         count = min(max(2, math.ceil(length * fine)), _MAX_INSTANTS)
-        instants = motion_blur.motion_blur(velocity, blur.exposure_s, count)
+        instants = fx.hand_turns(velocity, blur.exposure_s, count)
         drawn["motion_blur"] = {"exposure_s": blur.exposure_s, "length_px": length}
     if not turns.any() and not instants.any():
-        return [warp.in_pixels(points, camera)]
-    return [warp.in_pixels(warp.turned(points, turns + now), camera) for now in instants]
+        return [fx.in_pixels(points, camera)]
+    return [fx.in_pixels(fx.turned(points, turns + now), camera) for now in instants]
 
 
 def _moved(
@@ -273,20 +256,20 @@ def _sensor(effects: Effects, camera: Camera, random: PhotoRandom, drawn: DrawnE
     if effects.vignetting is not None:
         falloff = effects.vignetting.falloff
         drawn["vignetting"] = {"falloff": falloff}
-        steps.append(lambda image: vignetting.vignetting(image, falloff))
+        steps.append(lambda image: fx.vignetting(image, falloff))
     if effects.exposure_drift is not None:
-        stops = exposure_drift.draw(effects.exposure_drift, random)
+        stops = fx.draw_exposure_drift(effects.exposure_drift, random)
         drawn["exposure_drift"] = {"stops": stops}
-        steps.append(lambda image: exposure_drift.exposure_drift(image, stops))
+        steps.append(lambda image: fx.exposure_drift(image, stops))
     if effects.white_balance is not None:
-        gains = white_balance.draw(effects.white_balance, random)
+        gains = fx.draw_white_balance(effects.white_balance, random)
         drawn["white_balance"] = {"gains": list(gains)}
-        steps.append(lambda image: white_balance.white_balance(image, gains))
+        steps.append(lambda image: fx.white_balance(image, gains))
     if effects.iso_noise is not None:
-        iso = iso_noise.draw(effects.iso_noise, random)
-        normal = iso_noise.pattern(random, camera.height, camera.width)
+        iso = fx.draw_iso_noise(effects.iso_noise, random)
+        normal = fx.pattern(random, camera.height, camera.width)
         drawn["iso_noise"] = {"iso": iso}
-        steps.append(lambda image: iso_noise.iso_noise(image, normal, iso))
+        steps.append(lambda image: fx.iso_noise(image, normal, iso))
 
     def develop(image: np.ndarray) -> np.ndarray:
         for step in steps:

@@ -8,12 +8,11 @@ import numpy as np
 
 from ambiguous_wild.simulate import built_textures as built
 from ambiguous_wild.simulate import textures as tx
-from ambiguous_wild.simulate.atlas import build_atlas
-from ambiguous_wild.simulate.ground_plan import PLANS
 from ambiguous_wild.simulate.kernels import BOX, CYLINDER, ELLIPSOID, PLANAR, QUAD
 from ambiguous_wild.simulate.shapes import Shape, between, placed, vector
-from ambiguous_wild.simulate.spec import WorldSpec
+from ambiguous_wild.simulate.spec import PLANS, WorldSpec
 from ambiguous_wild.simulate.things import circle_of, shapes_of_thing, statue
+from ambiguous_wild.simulate.tracer import build_atlas
 from ambiguous_wild.simulate.world import (
     WALL_AXES,
     World,
@@ -37,7 +36,7 @@ Circle = tuple[float, float, float]
 
 
 def room(rng: np.random.Generator, detail_px_per_m: float, samples: int, what: WorldSpec) -> World:
-    """Build the room; see `places.build_world`."""
+    """Build the room; see `capture.build_world`."""
     d = detail_px_per_m
     wide, deep = PLAN.surfaces["wall_back"][0], PLAN.surfaces["wall_left"][0]
     hub = (float(rng.uniform(-0.1, 0.1)), float(rng.uniform(0.35, 0.5)), 0.0)

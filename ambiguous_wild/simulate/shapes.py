@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ambiguous_wild.simulate.atlas import Atlas
 from ambiguous_wild.simulate.kernels import BOX, BY_FACE, CAPSULE, CYLINDER, ELLIPSOID, QUAD
-from ambiguous_wild.simulate.tracer import ShapeTable
+from ambiguous_wild.simulate.tracer import Atlas, ShapeTable
 from ambiguous_wild.simulate.volumes import grids
 
 UNSEEN = -1  # owner of an invisible shadow caster

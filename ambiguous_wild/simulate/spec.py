@@ -1,11 +1,14 @@
-"""The spec of a capture, as frozen dataclasses that a YAML file fills. Imports nothing heavy."""
+"""The spec of a capture, as frozen dataclasses that a YAML file fills, and the places by name.
+
+World axes: x right, y away from the walk, z up; metres; the ground is z = 0. Imports nothing heavy.
+"""
 
 from __future__ import annotations
 
+import typing
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
-
-from ambiguous_wild.simulate.image_effects.settings import Effects
 
 Kind = Literal[
     "visitor",
@@ -91,6 +94,123 @@ class WorldSpec:
 
 
 @dataclass(frozen=True)
+class ExposureDrift:
+    """Automatic exposure: brightness drifts during the capture."""
+
+    stops: float = 0.7  # largest deviation, in powers of two
+
+
+@dataclass(frozen=True)
+class WhiteBalance:
+    """Automatic white balance: photos turn warm and cold."""
+
+    warmth: float = 0.5  # stops between red and blue at most
+    tint: float = 0.12  # stops of green against both at most
+
+
+@dataclass(frozen=True)
+class IsoNoise:
+    """Shot and read noise of a small sensor."""
+
+    iso: tuple[float, float] = (800.0, 1600.0)  # drawn anew for every photo
+
+
+@dataclass(frozen=True)
+class Vignetting:
+    """Darker corners."""
+
+    falloff: float = 0.45  # share of the light that the corners lack
+
+
+@dataclass(frozen=True)
+class LensDistortion:
+    """Radial distortion as in COLMAP: x_d = x (1 + k1 r^2 + k2 r^4), of every photo, test photos too."""
+
+    k1: float = -0.12
+    k2: float = 0.0
+
+
+@dataclass(frozen=True)
+class MotionBlur:
+    """The hand turns while the shutter is open."""
+
+    exposure_s: float = 1 / 60
+    speed_deg_s: float = 12.0  # of the hand, at most
+
+
+@dataclass(frozen=True)
+class RollingShutter:
+    """The hand turns while the rows are read, from top to bottom."""
+
+    readout_s: float = 1 / 40
+    speed_deg_s: float = 12.0  # of the hand, at most
+
+
+@dataclass(frozen=True)
+class Defocus:
+    """Some photos are out of focus as a whole."""
+
+    share: float = 0.4  # of the train photos
+    radius: tuple[float, float] = (0.0015, 0.004)  # of the disc, in widths of the photo
+
+
+@dataclass(frozen=True)
+class Jpeg:
+    """Photos compressed once more, as by a messenger; colour at half the resolution."""
+
+    quality: tuple[int, int] = (30, 55)  # 1 to 95, drawn anew for every photo
+
+
+@dataclass(frozen=True)
+class TimeOfDay:
+    """Photos at different hours: colour and strength of sun and sky, direction of the sun."""
+
+    strength: float = 1.0  # of the change of colour and brightness
+    sweep_deg: float = 25.0  # greatest turn of the sun to either side
+
+
+@dataclass(frozen=True)
+class MovingShadow:
+    """A shadow from outside the photo, at another place in every photo."""
+
+    presence: float = 0.85  # share of the train photos with a shadow
+    size_m: float = 0.7  # radius of the shadow caster
+
+
+@dataclass(frozen=True)
+class Specular:
+    """Polished surfaces: reflections of sun and sky that move with the camera."""
+
+    textures: tuple[str, ...] = ("stone",)  # polished textures
+    strength: float = 0.6  # brightness of the highlight relative to the sun
+    sharpness: float = 60.0  # exponent: the higher the smaller
+
+
+@dataclass(frozen=True)
+class Effects:
+    """The effects of a capture; None = not computed."""
+
+    time_of_day: TimeOfDay | None = None
+    moving_shadow: MovingShadow | None = None
+    specular: Specular | None = None
+    lens_distortion: LensDistortion | None = None
+    rolling_shutter: RollingShutter | None = None
+    motion_blur: MotionBlur | None = None
+    defocus: Defocus | None = None
+    vignetting: Vignetting | None = None
+    exposure_drift: ExposureDrift | None = None
+    white_balance: WhiteBalance | None = None
+    iso_noise: IsoNoise | None = None
+    jpeg: Jpeg | None = None
+
+
+KINDS: dict[str, type] = {
+    name: next(kind for kind in typing.get_args(hint) if kind is not type(None))
+    for name, hint in typing.get_type_hints(Effects).items()
+}  # settings by name of the effect
+
+
+@dataclass(frozen=True)
 class CaptureSpec:
     """A capture. The same spec and seed give the same bytes."""
 
@@ -113,3 +233,46 @@ class CaptureSpec:
     world: WorldSpec = field(default_factory=WorldSpec)
     effects: Effects = field(default_factory=Effects)
     designed: Designed = field(default_factory=Designed)
+
+
+SURFACE_NAMES = ("ground", "wall_back", "wall_left", "wall_right", "wall_front")
+
+
+@dataclass(frozen=True)
+class GroundPlan:
+    """A rectangle with walls."""
+
+    ground_m: tuple[float, float]  # of the ground's texture, centred on the origin
+    x_m: tuple[float, float]  # of the inside
+    y_m: tuple[float, float]
+    wall_m: float  # height
+    walls: tuple[str, ...] = SURFACE_NAMES[1:]
+    ceiling: bool = False
+
+    @property
+    def surfaces(self) -> Mapping[str, tuple[float, float]]:
+        """Width and height of the ground and of each wall; a texture covers each once."""
+        across, along = self.x_m[1] - self.x_m[0], self.y_m[1] - self.y_m[0]
+        width = {"wall_back": across, "wall_front": across, "wall_left": along, "wall_right": along}
+        return {"ground": self.ground_m} | {name: (width[name], self.wall_m) for name in self.walls}
+
+    @property
+    def middle(self) -> tuple[float, float]:
+        """Centre of the inside."""
+        return (self.x_m[0] + self.x_m[1]) / 2, (self.y_m[0] + self.y_m[1]) / 2
+
+    @property
+    def highest_m(self) -> float:
+        """Of a camera."""
+        return self.wall_m - 0.3 if self.ceiling else 3.3
+
+    def gap(self, x: float, y: float) -> float:
+        """Distance to the nearest wall, m; the open side of the courtyard counts as one. Negative outside."""
+        return min(x - self.x_m[0], self.x_m[1] - x, y - self.y_m[0], self.y_m[1] - y)
+
+
+PLANS: Mapping[str, GroundPlan] = {
+    "courtyard": GroundPlan((16.0, 14.0), (-5.6, 5.6), (-6.0, 4.2), 3.4, SURFACE_NAMES[1:4]),  # open in front
+    "room": GroundPlan((7.2, 6.0), (-3.6, 3.6), (-3.0, 3.0), 2.7, ceiling=True),
+    "yard": GroundPlan((18.0, 16.0), (-9.0, 9.0), (-8.0, 8.0), 5.0),
+}

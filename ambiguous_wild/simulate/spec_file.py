@@ -1,20 +1,30 @@
-"""Specs as YAML: strict reading, lossless writing."""
+"""Specs as YAML: strict reading with a check of every number and name, lossless writing."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from ambiguous_wild.core.config import from_plain, to_plain
 from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.io import plain_yaml
-from ambiguous_wild.simulate.image_effects.settings import KINDS, Effects
-from ambiguous_wild.simulate.spec import CaptureSpec
-from ambiguous_wild.simulate.spec_check import check_spec
+from ambiguous_wild.simulate.spec import (
+    FULL_FRAME_DIAGONAL_MM,
+    KINDS,
+    PLANS,
+    CaptureSpec,
+    Distractor,
+    Effects,
+    GroundPlan,
+    LensDistortion,
+    Thing,
+)
 
 
 class _Dumper(yaml.SafeDumper):
@@ -57,16 +67,15 @@ def parse_spec(text: str) -> CaptureSpec:
     data = plain_yaml.parse(text)
     if not isinstance(data, dict):
         raise AwError("a spec is a list of 'key: value' lines; 'aw simulate NAME --print-spec' shows one")
-    for key in ("name", "summary"):
-        data.setdefault(key, {"name": "capture", "summary": ""}[key])
-    effects = _effects(data.pop("effects", {}))
+    return spec_of({"name": "capture", "summary": "", **data})
+
+
+def spec_of(data: dict[Any, Any]) -> CaptureSpec:
+    """The capture that plain data describes; raises like `parse_spec`."""
     _lists(data)
-    return check_spec(_built(data, effects))
-
-
-def _built(data: dict[Any, Any], effects: Effects) -> CaptureSpec:
-    spec = from_plain(CaptureSpec, {str(k): v for k, v in data.items()}, "spec")
-    return replace(spec, effects=effects)
+    rest = {str(key): value for key, value in data.items() if key != "effects"}
+    spec = from_plain(CaptureSpec, rest, "spec")
+    return check_spec(replace(spec, effects=_read_effects(data.get("effects", {}))))
 
 
 def _lists(data: dict[Any, Any]) -> None:
@@ -86,7 +95,7 @@ def _lists(data: dict[Any, Any]) -> None:
         raise AwError(f"designed.effects: a list that names each effect once, got {wanted!r}")
 
 
-def _effects(named: Any) -> Effects:
+def _read_effects(named: Any) -> Effects:
     if not isinstance(named, Mapping):
         raise AwError(f"effects: one 'effect: {{}}' a line, got {named!r}")
     values: dict[str, Any] = {}
@@ -110,3 +119,164 @@ def plain_spec(spec: CaptureSpec) -> dict[str, Any]:
     data: dict[str, Any] = to_plain(spec)
     data["effects"] = {name: value for name, value in data["effects"].items() if value is not None}
     return data
+
+
+# Textures that `world.py` bakes (a test compares the two lists).
+SHEET_NAMES = (
+    "stone",
+    "foliage",
+    "timber",
+    "clay",
+    "skin",
+    "brick",
+    "gravel",
+    "vivid",
+    "cloth",
+    "plaster",
+    "asphalt",
+    "enamel",
+)
+PICTURES = tuple(
+    f"poster_{name}" for name in ("coffee", "rocket", "chelsea", "hubble", "coins", "camera", "retina")
+)
+
+MOST = 255  # distractors: the ray caster stores a pixel's distractor in a byte
+
+# Least and greatest value; of a pair the smaller number comes first.
+Limits = dict[str, tuple[float, float]]
+_SPEC: Limits = {
+    "train_views": (3, 2000),
+    "test_views": (1, 2000),
+    "width": (64, 4096),
+    "height": (36, 4096),
+    "detail_px_per_m": (2, 300),
+    "focal_35mm": (10, 200),
+    "occlusion": (0, 0.9),
+    "zoom": (0.5, 4),
+}
+_WALKS: dict[str, Limits] = {
+    "around": {"arc_deg": (5, 150), "radius_m": (1.5, 7)},
+    "outward": {"arc_deg": (5, 360), "radius_m": (0.2, 7)},
+}
+_DISTRACTOR: Limits = {
+    "size": (0.02, 10),
+    "presence": (0, 1),
+    "lift_m": (0, 3),
+    "laps": (0, 100),
+    "distance_m": (0.3, 12),
+    "tint": (0, 4),
+}
+_THING: Limits = {"size_m": (0.01, 12), "yaw_deg": (-360, 360), "tint": (0, 4)}
+_EFFECTS: dict[str, Limits] = {
+    "exposure_drift": {"stops": (0, 3)},
+    "white_balance": {"warmth": (0, 2), "tint": (0, 1)},
+    "iso_noise": {"iso": (50, 25600)},
+    "vignetting": {"falloff": (0, 0.9)},
+    "lens_distortion": {"k1": (-0.3, 0.3), "k2": (-0.1, 0.1)},
+    "motion_blur": {"exposure_s": (1e-5, 0.5), "speed_deg_s": (0, 60)},
+    "rolling_shutter": {"readout_s": (0, 0.2), "speed_deg_s": (0, 60)},
+    "defocus": {"share": (0, 1), "radius": (0, 0.02)},
+    "jpeg": {"quality": (1, 95)},
+    "time_of_day": {"strength": (0, 2), "sweep_deg": (0, 90)},
+    "moving_shadow": {"presence": (0, 1), "size_m": (0.05, 3)},
+    "specular": {"strength": (0, 3), "sharpness": (1, 1000)},
+}
+
+
+def check_spec(spec: CaptureSpec) -> CaptureSpec:
+    """Return the spec, or refuse it.
+
+    Raises:
+        AwError: the first wrong value: where it is, what it is, what is allowed.
+    """
+    plan = PLANS[spec.world.place]
+    if not spec.name or not all(c.isalnum() or c in "-_" for c in spec.name):
+        raise AwError(f"name: letters, digits, - and _ only, got {spec.name!r}")
+    _within("", spec, {**_SPEC, **_WALKS[spec.walk], "eye_m": (0.2, plan.highest_m)})
+    if not 1 <= spec.samples <= 64 or math.isqrt(spec.samples) ** 2 != spec.samples:
+        raise AwError(f"samples: a square number from 1 to 64, got {spec.samples}")
+    if len(spec.distractors) > MOST:
+        raise AwError(f"distractors: at most {MOST}, got {len(spec.distractors)}")
+    for k, distractor in enumerate(spec.distractors):
+        if not distractor.name.strip():
+            raise AwError(f"distractors[{k}].name: empty; capture.json lists the placed distractors by name")
+        if distractor.name in (d.name for d in spec.distractors[:k]):
+            raise AwError(f"distractors[{k}].name: {distractor.name!a} is there twice; give each its own")
+        _distractor(f"distractors[{k}].", distractor, plan)
+    for k, thing in enumerate(spec.world.things):
+        _thing(f"world.things[{k}].", thing, plan)
+    for name, limits in _EFFECTS.items():
+        if (settings := getattr(spec.effects, name)) is not None:
+            _within(f"effects.{name}.", settings, limits)
+    if spec.effects.specular is not None:
+        if not spec.effects.specular.textures:
+            raise AwError("effects.specular.textures: name at least one, or leave the effect out")
+        for name in spec.effects.specular.textures:
+            _texture("effects.specular.textures", name, (*SHEET_NAMES, *plan.surfaces))
+    if spec.effects.lens_distortion is not None:
+        _lens(spec, spec.effects.lens_distortion)
+    return spec
+
+
+def _lens(spec: CaptureSpec, lens: LensDistortion) -> None:
+    """Refuse a distortion that is not invertible within the photo."""
+    corner = 0.5 * FULL_FRAME_DIAGONAL_MM / (spec.focal_35mm * spec.zoom[0])
+    r = np.linspace(0.0, 4.0 * corner, 4001)
+    bent = r * (1 + lens.k1 * r**2 + lens.k2 * r**4)
+    until = int(np.argmax(np.diff(bent) <= 0)) if (np.diff(bent) <= 0).any() else len(r) - 1
+    if bent[until] < 1.02 * corner:  # a moving hand looks a little further
+        raise AwError(
+            f"effects.lens_distortion: k1 {lens.k1:g}, k2 {lens.k2:g} fold the picture inside its corners at "
+            f"focal_35mm {spec.focal_35mm:g}, zoom {spec.zoom[0]:g}; raise the focal length or lower k1, k2"
+        )
+
+
+def _distractor(where: str, d: Distractor, plan: GroundPlan) -> None:
+    known = (*SHEET_NAMES, *PICTURES, *plan.surfaces) if d.kind == "placard" else SHEET_NAMES
+    _texture(f"{where}texture", d.texture, known)
+    if d.head:
+        if d.kind != "visitor":
+            raise AwError(f"{where}head: only a visitor has one, not a {d.kind}")
+        _texture(f"{where}head", d.head, SHEET_NAMES)
+    _within(where, d, _DISTRACTOR)
+    if d.path == "walk" and len(d.waypoints) < 2:
+        raise AwError(f"{where}waypoints: a walk needs two corners or more, [[x, y], [x, y]] in metres")
+    if d.path == "elsewhere" and d.waypoints:
+        raise AwError(f"{where}waypoints: only read with 'path: walk'; add that or leave them out")
+    if d.path == "elsewhere" and d.laps != Distractor.laps:
+        raise AwError(f"{where}laps: only read with 'path: walk'; add that or leave it out")
+    for x, y in d.waypoints:
+        _between(f"{where}waypoints x", x, plan.x_m[0] + 0.6, plan.x_m[1] - 0.6)
+        _between(f"{where}waypoints y", y, plan.y_m[0], plan.y_m[1] - 0.2)
+
+
+def _thing(where: str, thing: Thing, plan: GroundPlan) -> None:
+    known = (*SHEET_NAMES, *PICTURES, *plan.surfaces) if thing.kind == "board" else SHEET_NAMES
+    _texture(f"{where}texture", thing.texture, known)
+    _within(where, thing, _THING)
+    for axis, value, limits in zip("xyz", thing.at_m, (plan.x_m, plan.y_m, (0.0, 4.0))):
+        _between(f"{where}at_m {axis}", value, *limits)
+
+
+def _within(where: str, record: Any, limits: Limits) -> None:
+    """Check a record's numbers, in tuples each, and the order of pairs."""
+    for key, (low, high) in limits.items():
+        value = getattr(record, key)
+        for number in value if isinstance(value, tuple) else (value,):
+            _between(f"{where}{key}", number, low, high)
+        if isinstance(value, tuple) and len(value) == 2 and value[0] > value[1]:
+            raise AwError(f"{where}{key}: the smaller number first, got [{value[0]:g}, {value[1]:g}]")
+
+
+def _between(where: str, value: float, low: float, high: float) -> None:
+    if not low <= value <= high:
+        try:
+            text = f"{value:g}"
+        except OverflowError:  # a whole number that is too large for a float
+            text = "a huge number"
+        raise AwError(f"{where}: between {low:g} and {high:g}, got {text}")
+
+
+def _texture(where: str, name: str, known: Sequence[str]) -> None:
+    if name not in known:
+        raise unknown(f"texture in {where}", name, known)

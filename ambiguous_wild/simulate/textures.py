@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.simulate.atlas import srgb_to_linear
+from ambiguous_wild.simulate.tracer import srgb_to_linear
 
 # CC0, public domain or without known restrictions by the docstrings of skimage.data; all in its wheel.
 PHOTOGRAPHS = {

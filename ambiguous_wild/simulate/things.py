@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from ambiguous_wild.simulate.ground_plan import GroundPlan
 from ambiguous_wild.simulate.kernels import BOX, BY_FACE, CYLINDER, ELLIPSOID, VOLUME
 from ambiguous_wild.simulate.shapes import SHEET_M, Shape, between, figure, placed
-from ambiguous_wild.simulate.spec import STATUES, Thing
+from ambiguous_wild.simulate.spec import STATUES, GroundPlan, Thing
 
 
 def statue(name: str, texture: str, height_m: float) -> Shape:

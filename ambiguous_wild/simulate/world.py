@@ -11,11 +11,10 @@ import numpy as np
 
 from ambiguous_wild.simulate import built_textures as built
 from ambiguous_wild.simulate import textures as tx
-from ambiguous_wild.simulate.atlas import Atlas
-from ambiguous_wild.simulate.ground_plan import GroundPlan
 from ambiguous_wild.simulate.kernels import BOX, DOME, ELLIPSOID, PLANAR, QUAD
 from ambiguous_wild.simulate.shapes import SHEET_M, Axes, Shape, placed, shape_table, vector
-from ambiguous_wild.simulate.tracer import Light, ShapeTable
+from ambiguous_wild.simulate.spec import GroundPlan
+from ambiguous_wild.simulate.tracer import Atlas, Light, ShapeTable
 
 POSTERS = ("coffee", "rocket", "chelsea", "hubble", "coins", "camera", "retina")
 

@@ -9,12 +9,11 @@ import numpy as np
 
 from ambiguous_wild.simulate import built_textures as built
 from ambiguous_wild.simulate import textures as tx
-from ambiguous_wild.simulate.atlas import build_atlas
-from ambiguous_wild.simulate.ground_plan import PLANS
 from ambiguous_wild.simulate.kernels import BOX, CYLINDER, ELLIPSOID
 from ambiguous_wild.simulate.shapes import Shape, between, figure, placed, vector
-from ambiguous_wild.simulate.spec import WorldSpec
+from ambiguous_wild.simulate.spec import PLANS, WorldSpec
 from ambiguous_wild.simulate.things import car, circle_of, shapes_of_thing
+from ambiguous_wild.simulate.tracer import build_atlas
 from ambiguous_wild.simulate.world import (
     WALL_AXES,
     World,
@@ -50,7 +49,7 @@ Circle = tuple[float, float, float]
 
 
 def yard(rng: np.random.Generator, detail_px_per_m: float, samples: int, what: WorldSpec) -> World:
-    """Build the yard; see `places.build_world`."""
+    """Build the yard; see `capture.build_world`."""
     d = detail_px_per_m
     hub = (float(rng.uniform(-0.4, 0.4)), float(rng.uniform(-0.4, 0.4)), 0.0)
     shapes, circles = _standing(rng)

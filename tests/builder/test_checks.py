@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ambiguous_wild.builder.capture_report import check_capture, noise, refuse_failed
-from ambiguous_wild.builder.checks import Check
+from ambiguous_wild.builder.checks import Check, check_capture, noise, refuse_failed
 from ambiguous_wild.builder.photo_comparison import candidate_pairs, compare_photos, photo_features
 from ambiguous_wild.core import AwError
 from tests.builder.capture_maker import eyes, render, texture, write_capture

@@ -4,6 +4,7 @@ import errno
 import hashlib
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -157,8 +158,8 @@ def test_second_call_has_nothing_to_do(scene, raw):
 def test_other_settings_are_refused_by_name_until_overwrite(built, raw, tmp_path):
     out = copy_of(built, tmp_path / "scene")
     with pytest.raises(AwError, match=r"settings \(factor 2 -> 1\).*--overwrite"):
-        build_scene(raw, out, BuildSettings(**{**vars(SETTINGS), "factor": 1}))
-    other = BuildSettings(**{**vars(SETTINGS), "factor": 4})
+        build_scene(raw, out, replace(SETTINGS, factor=1))
+    other = replace(SETTINGS, factor=4)
     result = build_scene(raw, out, other, overwrite=True, keep_work=True)
     # Only what depends on the factor ran again.
     assert set(result.reused) == {"screen", "features", "matches", "mapping", "undistort", "motion"}
@@ -191,11 +192,14 @@ def test_a_damaged_scene_is_noticed_and_mended(scene, raw, tmp_path):
 
 
 def test_masks_are_used_and_carried_to_training_photos_only(raw, tmp_path):
+    """And similar photos are matched, not all."""
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
     mask[:, :100] = 0
     for i in range(COUNT):
         write_png(tmp_path / "masks" / f"p{i:02d}.png", mask)
-    result = build_scene(raw, tmp_path / "scene", SETTINGS, masks=tmp_path / "masks", keep_work=True)
+    settings = replace(SETTINGS, matcher="retrieval")
+    result = build_scene(raw, tmp_path / "scene", settings, masks=tmp_path / "masks", keep_work=True)
+    assert result.info["chosen"]["matcher"] == "retrieval" and 0 < result.info["counts"]["pairs"] <= 15
     carried = sorted(p.name for p in (result.scene / "masks" / "train").iterdir())
     assert carried == ["p00.png", "p02.png", "p03.png", "p05.png"]
     loaded = load_scene(result.scene)
@@ -264,7 +268,7 @@ def test_what_lies_in_a_scene_and_is_not_the_builds_is_never_removed(raw, scene,
     shutil.copytree(scene, out)
     (out / "runs").mkdir()
     (out / "runs" / "notes.txt").write_text("mine")
-    other = BuildSettings(**{**vars(SETTINGS), "factor": 4})
+    other = replace(SETTINGS, factor=4)
     before = hashes(out)
     with pytest.raises(AwError, match=r"also holds runs/notes\.txt"):
         build_scene(raw, out, other, overwrite=True)

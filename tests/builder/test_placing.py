@@ -41,15 +41,9 @@ def seen(points: np.ndarray, rotation: np.ndarray, centre: np.ndarray) -> np.nda
     return local[:, :2] / local[:, 2:]
 
 
-@pytest.mark.parametrize(
-    ("count", "size", "corners"),
-    [
-        (8, (170, 190), {0: (40, 60), 5: (50, 70), 7: (40, 90)}),
-        (10, (160, 180), {0: (60, 70), 7: (50, 80), 8: (60, 60), 9: (40, 70)}),
-    ],
-)
-def test_a_distractor_with_most_matches_does_not_place_its_photos(tmp_path, count, size, corners):
+def test_a_distractor_with_most_matches_does_not_place_its_photos(tmp_path):
     """COLMAP's mapper alone turns the first photo by more than 20 degrees here."""
+    count, size, corners = 8, (170, 190), {0: (40, 60), 5: (50, 70), 7: (40, 90)}
     paths = write_capture(tmp_path / "raw", count)
     for k, (top, left) in corners.items():
         photo = cv2.imread(str(paths[k]))

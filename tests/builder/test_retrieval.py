@@ -1,19 +1,21 @@
 """Pairs by similar features: overlapping photos are found, and their number grows with the photos alone."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from ambiguous_wild.builder.first_matches import best_partners, shared_features
 from ambiguous_wild.builder.pipeline import build_scene
 from ambiguous_wild.builder.retrieval import (
     SIMILAR,
+    best_partners,
     embed,
     most_similar,
     pairs_of_tests,
     retrieval_pairs,
+    shared_features,
 )
-from ambiguous_wild.builder.settings import BuildSettings
-from tests.builder.capture_maker import write_capture
+from tests.builder.capture_maker import COUNT, SETTINGS
 
 
 def places(count, per_place, seed=0):
@@ -61,17 +63,12 @@ def test_a_photo_without_features_has_neighbours_only():
     assert embed(lambda name: np.zeros((0, 128), np.uint8), names).shape == (8, 64 * 128)
 
 
-@pytest.mark.parametrize("matcher", ["retrieval", "sequential"])
-def test_a_scene_is_built_from_such_pairs(matcher, tmp_path):
-    """Also with a separate test set, whose partners come from retrieval."""
-    write_capture(tmp_path / "raw" / "train", 8)
-    (tmp_path / "raw" / "test").mkdir()
-    for name in ("p02.jpg", "p05.jpg"):
-        (tmp_path / "raw" / "train" / name).rename(tmp_path / "raw" / "test" / name)
-    settings = BuildSettings(factor=2, max_features=800, matcher=matcher)
-    info = build_scene(tmp_path / "raw", tmp_path / "scene", settings, jobs=2).info
-    assert info["counts"]["registered"] == 8
-    assert info["chosen"]["matcher"] == matcher and 0 < info["counts"]["pairs"] <= 28
+def test_a_scene_is_built_from_neighbours(built, tmp_path):
+    """With a separate test set, whose partners come from similar features."""
+    settings = replace(SETTINGS, matcher="sequential")
+    info = build_scene(built / "raw", tmp_path / "scene", settings, jobs=2).info
+    assert info["counts"]["registered"] == COUNT
+    assert info["chosen"]["matcher"] == "sequential" and 0 < info["counts"]["pairs"] <= 15
 
 
 @pytest.mark.parametrize("count", [6, 13])  # all pairs are looked at, or a shortlist

@@ -3,11 +3,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ambiguous_wild.builder.report import _parallax_warnings, parallax_deg
+from ambiguous_wild.builder.report import _lost_photos, _parallax_warnings, parallax_deg
 from ambiguous_wild.builder.select_model import (
     PairFacts,
     check_registered,
-    lost_photos,
 )
 from ambiguous_wild.core import AwError
 from tests.io.model_maker import make_model
@@ -25,7 +24,7 @@ def test_each_lost_photo_gets_its_reason():
     facts = [{"work_name": f"{n}.jpg", "source": f"{n}.JPG"} for n in "abc"]
     features = {"a.jpg": 900, "b.jpg": 12, "c.jpg": 900}
     left_out = {"b.jpg": "no placed photo agrees", "c.jpg": "two places"}
-    assert lost_photos(facts, left_out, features) == [
+    assert _lost_photos(facts, left_out, features) == [
         {"source": "b.JPG", "reason": "only 12 features"},
         {"source": "c.JPG", "reason": "two places"},
     ]

@@ -12,8 +12,7 @@ import pytest
 from ambiguous_wild.builder import stages
 from ambiguous_wild.builder.pipeline import build_scene
 from ambiguous_wild.builder.progress import Bar
-from ambiguous_wild.builder.settings import BuildSettings
-from ambiguous_wild.builder.sfm_plans import SfmPlan
+from ambiguous_wild.builder.settings import BuildSettings, SfmPlan
 from ambiguous_wild.builder.stages import SfmStages, Stages
 from tests.builder.capture_maker import write_capture
 

@@ -1,12 +1,11 @@
 import numpy as np
 import pytest
 
+from ambiguous_wild.builder.collect import read_test_list, split_photos
 from ambiguous_wild.builder.masks import find_masks, lay_out_masks, mask_warnings
-from ambiguous_wild.builder.pairs import sequential_pairs
-from ambiguous_wild.builder.settings import BuildSettings
+from ambiguous_wild.builder.retrieval import sequential_pairs
+from ambiguous_wild.builder.settings import BuildSettings, plans
 from ambiguous_wild.builder.sfm import camera_groups, choose_camera
-from ambiguous_wild.builder.sfm_plans import plans
-from ambiguous_wild.builder.split import read_test_list, split_photos
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.images import read_gray, write_png
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ambiguous_wild.simulate import capture, places, world
+from ambiguous_wild.simulate import capture, world
 
 _built: dict[str, world.World] = {}
 
@@ -16,11 +16,13 @@ _built: dict[str, world.World] = {}
 def worlds_are_built_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Captures of module fixtures are made before this and so from a world of their own."""
 
+    original = capture.build_world
+
     def build_world(rng: np.random.Generator, *what: Any) -> world.World:
         bits: Any = rng.bit_generator
         key = repr((bits.state, bits.seed_seq.state, what, list(world.SHEETS)))
         if key not in _built:
-            _built[key] = places.build_world(rng, *what)
+            _built[key] = original(rng, *what)
         return _built[key]
 
     monkeypatch.setattr(capture, "build_world", build_world)

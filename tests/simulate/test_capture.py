@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,11 +17,9 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.simulate import capture
 from ambiguous_wild.simulate import world as world_module
-from ambiguous_wild.simulate.distractors import Placement, movers, shapes_of
-from ambiguous_wild.simulate.ground_plan import PLANS, SURFACE_NAMES
-from ambiguous_wild.simulate.presets import PRESETS, TWIN, preset, resized
-from ambiguous_wild.simulate.spec_check import PICTURES
-from ambiguous_wild.simulate.tracer import trace
+from ambiguous_wild.simulate.distractors import Placement, shapes_of
+from ambiguous_wild.simulate.presets import PRESETS, preset, resized
+from ambiguous_wild.simulate.spec import PLANS
 
 SMALL = replace(resized(preset("tiny"), views=6, width=128), detail_px_per_m=20.0)
 COARSE = 5.0  # texels a metre where shapes matter; the same everywhere, so that worlds are built once
@@ -33,6 +32,14 @@ LITTLE = replace(
 def raw(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("capture") / "raw"
     capture.simulate(SMALL, out, seed=4, depth=True)
+    return out
+
+
+@pytest.fixture(scope="module")
+def little(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small capture, to be copied."""
+    out = tmp_path_factory.mktemp("little") / "raw"
+    capture.simulate(LITTLE, out)
     return out
 
 
@@ -145,7 +152,7 @@ def test_exif_states_the_true_focal_length(raw: Path) -> None:
 
 
 def test_test_viewpoints_are_new_and_inside_the_walk() -> None:
-    for seed in range(5):
+    for seed in range(2):
         world, shots = capture.plan(replace(SMALL, distractors=(), detail_px_per_m=COARSE), seed)
         hub = np.array([world.hub[0], world.hub[1] - 0.3])
         around = {"train": [], "test": []}
@@ -162,7 +169,8 @@ def test_test_viewpoints_are_new_and_inside_the_walk() -> None:
 
 
 def test_no_distractor_keeps_its_place_and_none_stands_in_the_scenery() -> None:
-    spec = replace(resized(preset("tiny"), views=14, width=96), detail_px_per_m=COARSE, distractors=(TWIN,))
+    twin = preset("courtyard-twin").distractors[:1]
+    spec = replace(resized(preset("tiny"), views=14, width=96), detail_px_per_m=COARSE, distractors=twin)
     world, shots = capture.plan(spec, 1)
     spots = np.array([(p.x_m, p.y_m) for s in shots for p in s.placements])
     assert len(spots) > 7
@@ -180,8 +188,12 @@ def test_an_identical_capture_is_left_alone_and_another_is_refused(raw: Path) ->
         capture.simulate(SMALL, raw, seed=9, depth=True)
 
 
-def test_overwrite_replaces_captures_only(tmp_path: Path) -> None:
-    capture.simulate(LITTLE, tmp_path / "raw")
+def test_overwrite_replaces_captures_only(little: Path, tmp_path: Path) -> None:
+    shutil.copytree(little, tmp_path / "raw")
+    (tmp_path / "raw/train/mine.jpg").write_bytes(b"x")
+    with pytest.raises(AwError, match=r"also holds train/mine\.jpg"):
+        capture.simulate(LITTLE, tmp_path / "raw", seed=1, overwrite=True)
+    (tmp_path / "raw/train/mine.jpg").unlink()
     (tmp_path / "raw/train/IMG_0001.jpg").write_bytes(b"spoilt")
     with pytest.raises(AwError, match="changed since"):
         capture.simulate(LITTLE, tmp_path / "raw")
@@ -205,7 +217,7 @@ def test_a_run_that_breaks_leaves_nothing(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("detail", [3.0, 12.0, 40.0])
+@pytest.mark.parametrize("detail", [3.0, 12.0])
 def test_textures_are_finite_and_never_flat_at_any_resolution(detail: float) -> None:
     world, _ = capture.plan(replace(SMALL, detail_px_per_m=detail, distractors=()), 0)
     atlas = world.atlas
@@ -215,42 +227,12 @@ def test_textures_are_finite_and_never_flat_at_any_resolution(detail: float) -> 
         assert atlas.texels[start : start + count].std() > 0.005, name
 
 
-def test_presets_name_what_they_use() -> None:
-    from ambiguous_wild.simulate.world import SHEETS
-
-    for spec in PRESETS.values():
-        flat = (*SURFACE_NAMES, *PICTURES)
-        for d in spec.distractors:
-            assert d.texture in SHEETS or (d.kind == "placard" and d.texture in flat)
-            assert not d.head or d.head in SHEETS
-    assert not PRESETS["courtyard-clean"].distractors
-    assert {d.ambiguity for d in PRESETS["courtyard"].distractors} == {"colour", "semantic", "none"}
-    assert {d.ambiguity for d in PRESETS["courtyard-plain"].distractors} == {"none"}
-    assert {"pole", "barrier", "banner", "ball"} == {d.kind for d in PRESETS["courtyard-thin"].distractors}
+def test_a_preset_is_found_by_name_and_resized_within_limits() -> None:
     with pytest.raises(AwError, match="did you mean 'courtyard-twin'"):
         preset("courtyard-twins")
-    with pytest.raises(AwError, match="--views 2"):
-        resized(preset("tiny"), views=2)
-    with pytest.raises(AwError, match="--width 10"):
-        resized(preset("tiny"), width=10)
-
-
-def test_thin_distractors_are_a_few_pixels_wide() -> None:
-    """Opening the mask with a square of 3.5 % of the width leaves little of thin things, most of figures."""
-    left = {}
-    for name in ("courtyard-thin", "courtyard"):
-        spec = replace(resized(preset(name), views=6, width=320), detail_px_per_m=COARSE, samples=1)
-        world, shots = capture.plan(spec, 2)
-        kernel, inside, total = np.ones((11, 11), np.uint8), 0, 0
-        for shot in (s for s in shots if s.split == "train"):
-            things = movers(spec, shot.placements, world)
-            mask = (trace(shot.camera, world.table(), things, world.atlas, world.light).owner > 0).astype(
-                np.uint8
-            )
-            inside += int(cv2.morphologyEx(mask, cv2.MORPH_OPEN, kernel).sum())
-            total += int(mask.sum())
-        left[name] = inside / total
-    assert left["courtyard-thin"] < 0.5 < 0.9 < left["courtyard"]
+    for words, message in (({"views": 2}, "--views 2"), ({"width": 10}, "--width 10")):
+        with pytest.raises(AwError, match=message):
+            resized(preset("tiny"), **words)
 
 
 def test_a_tint_colours_its_own_sheet_and_leaves_the_head() -> None:
@@ -290,11 +272,3 @@ def test_a_record_nested_without_end_is_named(tmp_path: Path) -> None:
     (tmp_path / "raw/truth/capture.json").write_text("[" * 100_000)
     with pytest.raises(AwError, match="an unreadable truth"):
         capture.simulate(SMALL, tmp_path / "raw")
-
-
-def test_overwrite_removes_nothing_of_the_users(tmp_path: Path) -> None:
-    capture.simulate(LITTLE, tmp_path / "raw")
-    (tmp_path / "raw/train/mine.jpg").write_bytes(b"x")
-    with pytest.raises(AwError, match=r"also holds train/mine\.jpg"):
-        capture.simulate(LITTLE, tmp_path / "raw", seed=1, overwrite=True)
-    assert (tmp_path / "raw/train/mine.jpg").read_bytes() == b"x"

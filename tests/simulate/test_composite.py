@@ -16,8 +16,7 @@ from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
 from ambiguous_wild.io.scene_folder import load_scene, read_scene_json
 from ambiguous_wild.simulate.composite.composite_scene import composite
-from ambiguous_wild.simulate.composite.cutouts import blobs, read_cutouts
-from ambiguous_wild.simulate.composite.layers import project
+from ambiguous_wild.simulate.composite.cutouts import blobs, project, read_cutouts
 from ambiguous_wild.simulate.composite.placement import (
     CompositeConfig,
     local_colours,

@@ -6,8 +6,15 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import Camera
-from ambiguous_wild.simulate.composite.cutouts import Cutout, premultiplied
-from ambiguous_wild.simulate.composite.layers import CutoutPlacement, composed, layer, resized, truth
+from ambiguous_wild.simulate.composite.cutouts import (
+    Cutout,
+    CutoutPlacement,
+    composed,
+    layer,
+    premultiplied,
+    resized,
+    truth,
+)
 
 
 def test_half_of_white_over_black_is_188() -> None:

@@ -19,9 +19,8 @@ from ambiguous_wild.io.exif import Exif
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.photos import read_photo
-from ambiguous_wild.simulate.composite.composite_photos import composite_photos
+from ambiguous_wild.simulate.composite.composite_photos import _write_jpeg, composite_photos
 from ambiguous_wild.simulate.composite.placement import CompositeConfig
-from ambiguous_wild.simulate.photo_files import write_jpeg
 
 NAMES = [f"p{i:02d}" for i in range(13)]
 TEST = ["p03", "p09"]
@@ -36,7 +35,7 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rows, columns = np.mgrid[:120, :168]
     for i, name in enumerate(NAMES):
         pixels = np.dstack([rows + 10 * i, columns, 250 - rows - 5 * i]).astype(np.uint8)
-        write_jpeg(folder / f"{name}.jpg", pixels, Exif(make="A", model="B", focal_mm=4.2, focal_35mm=26))
+        _write_jpeg(folder / f"{name}.jpg", pixels, Exif(make="A", model="B", focal_mm=4.2, focal_35mm=26))
     first = Image.open(folder / "p00.jpg")
     tags = first.getexif()
     tags[0x0112] = 6

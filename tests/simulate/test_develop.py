@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import replace
 from functools import cache
 
@@ -10,11 +9,11 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.simulate import capture
-from ambiguous_wild.simulate.image_effects.photo_random import PhotoRandom
-from ambiguous_wild.simulate.image_effects.settings import KINDS, Defocus, Effects
+from ambiguous_wild.simulate import image_effects as fx
+from ambiguous_wild.simulate.image_effects import PhotoRandom
 from ambiguous_wild.simulate.presets import PRESETS, preset, resized
 from ambiguous_wild.simulate.render import PlannedPhoto, RenderedPhoto, render_photo
-from ambiguous_wild.simulate.spec import CaptureSpec
+from ambiguous_wild.simulate.spec import KINDS, CaptureSpec, Defocus, Effects
 from ambiguous_wild.simulate.world import World
 
 EXACT = ("specular", "lens_distortion")  # of the place and the lens: test photos have them, too
@@ -41,41 +40,26 @@ def taken(spec: CaptureSpec, k: int, seed: int = 3) -> RenderedPhoto:
     return render_photo(spec, world, shots[k], PhotoRandom(seed, k, k / 3))
 
 
-@pytest.fixture
-def calls(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
-    """How often each effect's own function was called."""
-    counted = dict.fromkeys(KINDS, 0)
+@pytest.mark.parametrize("name", [*KINDS, "none", "all"])
+def test_what_is_named_is_computed_and_nothing_else(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    wanted = {"none": [], "all": list(KINDS)}.get(name, [name])
+    of_hand = ("motion_blur", "rolling_shutter")
+    called = set()
 
-    def count(name: str) -> None:
-        module = importlib.import_module(f"ambiguous_wild.simulate.image_effects.{name}")
-        original = getattr(module, name)
+    def watch(function: str) -> None:
+        original = getattr(fx, function)
 
-        def counting(*words: object, **more: object) -> object:
-            counted[name] += 1
-            return original(*words, **more)
+        def watched(*words: object) -> object:
+            called.add(function)
+            return original(*words)
 
-        monkeypatch.setattr(module, name, counting)
+        monkeypatch.setattr(fx, function, watched)
 
-    for name in KINDS:
-        count(name)
-    return counted
-
-
-def test_a_spec_without_effects_calls_none(calls: dict[str, int]) -> None:
-    for k in (0, 4):
-        taken(small(), k)
-    assert set(calls.values()) == {0}
-
-
-@pytest.mark.parametrize("name", KINDS)
-def test_what_is_named_is_called_and_nothing_else(name: str, calls: dict[str, int]) -> None:
-    made = taken(small(**{name: getattr(ALL, name)}), 1)
-    assert [n for n, count in calls.items() if count] == [name] == list(made.effects)
-
-
-def test_all_at_once_are_all_called(calls: dict[str, int]) -> None:
-    made = taken(replace(small(), effects=ALL), 1)
-    assert min(calls.values()) > 0 and set(made.effects) == set(KINDS)
+    for function in [*(kind for kind in KINDS if kind not in of_hand), "hand_turns"]:
+        watch(function)
+    made = taken(small(**{kind: getattr(ALL, kind) for kind in wanted}), 1)
+    assert set(made.effects) == set(wanted)
+    assert called == {"hand_turns" if kind in of_hand else kind for kind in wanted}
 
 
 @pytest.mark.parametrize("name", KINDS)

@@ -12,9 +12,8 @@ from ambiguous_wild.core.camera import Camera
 from ambiguous_wild.simulate import capture
 from ambiguous_wild.simulate.camera_path import look_at
 from ambiguous_wild.simulate.distractors import movers
-from ambiguous_wild.simulate.ground_plan import PLANS
 from ambiguous_wild.simulate.presets import PRESETS, resized
-from ambiguous_wild.simulate.spec import CaptureSpec
+from ambiguous_wild.simulate.spec import PLANS, CaptureSpec
 from ambiguous_wild.simulate.spec_file import dump_spec, parse_spec
 from ambiguous_wild.simulate.tracer import trace
 from ambiguous_wild.simulate.world import WALL_AXES, on_wall, wall

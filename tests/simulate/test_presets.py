@@ -54,9 +54,8 @@ def test_distractors_cover_the_stated_share_of_a_photo(name: str) -> None:
     assert shares.min() > spec.occlusion[0] - 0.03 and shares.max() < spec.occlusion[1] + 0.03
 
 
-@pytest.mark.parametrize("name", STATED)
-def test_a_seed_repeats_and_another_does_not(name: str) -> None:
-    spec = small(name, views=3, width=96)
+def test_a_seed_repeats_and_another_does_not() -> None:
+    spec = small("courtyard-thin", views=3, width=96)
     first, again, other = masks(spec, 2), masks(spec, 2), masks(spec, 3)
     assert np.array_equal(first, again) and not np.array_equal(first, other)
 
@@ -120,18 +119,3 @@ def test_plain_colours_are_nothing_elses() -> None:
                 share.append((pure[there].mean(), pure[seen.owner == 0].mean()))
     inside, outside = np.array(share).T
     assert len(share) > 6 and inside.mean() > 0.6 and outside.mean() < 0.05
-
-
-def test_the_crowd_is_of_the_courtyards_kinds_and_stands_together() -> None:
-    crowd = PRESETS["courtyard-crowd"]
-    assert {d.ambiguity for d in crowd.distractors} == {"colour", "semantic", "none"}
-    assert {d.kind for d in PRESETS["courtyard"].distractors} <= {d.kind for d in crowd.distractors}
-    _, shots = capture.plan(small("courtyard-crowd", views=4, width=64), 1)
-    assert np.mean([len(s.placements) for s in shots[:4]]) >= 4
-
-
-def test_presets_state_what_is_ambiguous_in_them() -> None:
-    ambiguity = {name: {d.ambiguity for d in spec.distractors} for name, spec in PRESETS.items()}
-    assert ambiguity["courtyard-plain"] == {"none"}
-    assert ambiguity["courtyard-colour"] == {"colour"}
-    assert ambiguity["courtyard-sparse"] == ambiguity["courtyard"]

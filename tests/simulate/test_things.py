@@ -10,16 +10,14 @@ from PIL import Image
 
 from ambiguous_wild.core.camera import Camera
 from ambiguous_wild.simulate import capture, volumes
-from ambiguous_wild.simulate.atlas import build_atlas
 from ambiguous_wild.simulate.camera_path import look_at
 from ambiguous_wild.simulate.distractors import lay_out
-from ambiguous_wild.simulate.ground_plan import PLANS
 from ambiguous_wild.simulate.kernels import QUAD, VOLUME
 from ambiguous_wild.simulate.presets import preset, resized
 from ambiguous_wild.simulate.shapes import UNSEEN, Shape, shape_table
-from ambiguous_wild.simulate.spec import STATUES, Distractor, Thing
+from ambiguous_wild.simulate.spec import PLANS, STATUES, Distractor, Thing
 from ambiguous_wild.simulate.things import circle_of, shapes_of_thing
-from ambiguous_wild.simulate.tracer import Light, trace
+from ambiguous_wild.simulate.tracer import Light, build_atlas, trace
 
 ATLAS = build_atlas({"stone": np.full((4, 4, 3), 0.5, np.float32)})
 LIGHT = Light(np.array([[0.0, -0.6, 0.8]]), np.ones(3), np.full(3, 0.3), np.full(3, 0.3))

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import Camera
-from ambiguous_wild.simulate.atlas import build_atlas, linear_to_srgb, srgb_to_linear
 from ambiguous_wild.simulate.camera_path import look_at
 from ambiguous_wild.simulate.kernels import BOX, CAPSULE, CYLINDER, ELLIPSOID, FAR, PLANAR, QUAD, _intersect
 from ambiguous_wild.simulate.shapes import UNSEEN, Shape, between, bounding_radius, placed, shape_table
-from ambiguous_wild.simulate.tracer import Light, trace
+from ambiguous_wild.simulate.tracer import Light, build_atlas, linear_to_srgb, srgb_to_linear, trace
 
 HALF = (0.5, 0.5, 0.8)
 

@@ -11,7 +11,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
+from typing import Any, TypedDict
 
 import numpy as np
 
@@ -25,11 +27,20 @@ from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import write_png
 from ambiguous_wild.io.photos import PHOTO_SUFFIXES, UnreadablePhoto, read_photo
 from ambiguous_wild.simulate.composite.composite_scene import check_folders
-from ambiguous_wild.simulate.composite.cutouts import SMALLEST_PX, Cutout, blobs, filled, read_cutouts
-from ambiguous_wild.simulate.composite.layers import TRUTH_COVER, CutoutPlacement, composed, layer, truth
+from ambiguous_wild.simulate.composite.cutouts import (
+    SMALLEST_PX,
+    TRUTH_COVER,
+    Cutout,
+    CutoutPlacement,
+    blobs,
+    composed,
+    filled,
+    layer,
+    read_cutouts,
+    truth,
+)
 from ambiguous_wild.simulate.composite.placement import CompositeConfig, natural_heights
-from ambiguous_wild.simulate.photo_files import write_jpeg
-from ambiguous_wild.simulate.records import PastedPhoto, PastedPiece, PastedRecord
+from ambiguous_wild.simulate.records import Spread, spread
 
 _TEST_EVERY = 6  # photos; also the fewest that make a capture
 _MOST_PIECES = 3  # of a photo
@@ -39,6 +50,53 @@ _MIDDLE = (0.15, 0.85)  # of the photo's sides: where the middle of a piece lies
 _LONGEST = 1.2  # of the photo's longer side: largest piece
 _WINDOW = 0.6  # of the photo's sides: largest piece of another photo
 _PREVIEW_PX = 160
+
+
+class PastedPiece(TypedDict):
+    """One distractor in one plain photo."""
+
+    cutout: str
+    photo: str  # that the piece was cut from; empty for cut-outs
+    mirrored: bool
+    x: float  # of its middle, over the photo's width
+    y: float  # of its middle, over the photo's height
+    height: float  # over the photo's height
+
+
+class PastedPhoto(TypedDict):
+    """One training photo of a capture with pasted distractors."""
+
+    source: str  # file name of the clean photo
+    sha256: str  # of the clean photo
+    occlusion: float
+    distractors: list[PastedPiece]
+
+
+class PhotoFolder(TypedDict):
+    """The folder of photos that a capture is made from."""
+
+    name: str
+    photos: int
+
+
+class PastedCutout(TypedDict):
+    """One cut-out of a capture with pasted distractors."""
+
+    name: str
+    sha256: str  # of its file
+
+
+class PastedRecord(TypedDict):
+    """truth/composite.json of a capture with pasted distractors."""
+
+    schema: int
+    version: str
+    source: PhotoFolder
+    config: dict[str, Any]  # `CompositeConfig` without pose and shadow
+    mask: str
+    cutouts: list[PastedCutout]
+    occlusion: Spread
+    photos: dict[str, PastedPhoto]
 
 
 def is_photo_folder(path: Path | str) -> bool:
@@ -91,7 +149,7 @@ def composite_photos(
         for path, test, seed in zip(progress(paths), is_test, seeds, strict=True):
             (clean, exif), name = _read(path), f"{path.stem}.jpg"
             if test:
-                write_jpeg(folder / "test" / name, clean, exif)
+                _write_jpeg(folder / "test" / name, clean, exif)
                 continue
             changed, mask, pieces = clean, np.zeros(clean.shape[:2], np.uint8), list[PastedPiece]()
             if path in chosen:
@@ -101,7 +159,7 @@ def composite_photos(
                 drawn = _draw(shapes, others, cover * mask.size, config.patches, rng)
                 over, pieces = _layer(drawn, clean.shape, cover, rng)
                 changed, mask = composed(clean, over), truth(over)
-            write_jpeg(folder / "train" / name, changed, exif)
+            _write_jpeg(folder / "train" / name, changed, exif)
             write_png(folder / "truth" / "clean" / f"{path.stem}.png", clean)
             write_png(folder / "truth" / "distractor" / f"{path.stem}.png", mask)
             share, sha256 = round(float((mask > 0).mean()), 6), sha256_file(path)
@@ -114,7 +172,7 @@ def composite_photos(
             "config": {k: v for k, v in to_plain(config).items() if k not in ("pose", "shadow")},
             "mask": "255 where a distractor covers at least a quarter of the pixel; no others change",
             "cutouts": [{"name": c.name, "sha256": c.source} for c in shapes],
-            "occlusion": {"mean": float(np.mean(shares)), "min": min(shares), "max": max(shares)},
+            "occlusion": spread(shares),
             "photos": photos,
         }
         write_json(folder / "truth" / "composite.json", facts)
@@ -146,6 +204,33 @@ def _read(path: Path) -> tuple[np.ndarray, Exif]:
     except UnreadablePhoto as error:
         raise AwError(f"cannot read photo {path}: {error.reason}; replace or remove it") from error
     return pixels, photo.exif
+
+
+def _write_jpeg(path: Path, pixels: np.ndarray, exif: Exif) -> None:
+    """JPEG at quality 95 without chroma subsampling, with the camera settings of a source photo.
+
+    Args:
+        path: the file.
+        pixels: [H, W, 3] uint8, upright.
+        exif: of the source photo; its orientation and position are left out.
+    """
+    from PIL import Image, TiffImagePlugin
+
+    def rational(value: float) -> Any:
+        fraction = Fraction(value).limit_denominator(100_000)
+        return TiffImagePlugin.IFDRational(fraction.numerator, fraction.denominator)
+
+    tags = Image.Exif()
+    fields = tags.get_ifd(0x8769)
+    texts = {0x010F: exif.make, 0x0110: exif.model, 0x0132: exif.taken_at}
+    tags.update({tag: value for tag, value in texts.items() if value is not None})
+    rationals = {0x829A: exif.exposure_s, 0x829D: exif.f_number, 0x920A: exif.focal_mm}
+    whole = {0x8827: exif.iso, 0xA403: exif.white_balance, 0xA405: exif.focal_35mm}
+    fields.update({tag: rational(value) for tag, value in rationals.items() if value is not None})
+    fields.update({tag: round(value) for tag, value in whole.items() if value is not None})
+    if exif.taken_at is not None:
+        fields[0x9003] = exif.taken_at
+    Image.fromarray(pixels).save(path, quality=95, subsampling=0, exif=tags)
 
 
 def _draw(

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypedDict, cast
 
 import numpy as np
 
@@ -26,11 +26,19 @@ from ambiguous_wild.io.atomic import atomic_dir, write_json
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import image_size, read_gray, read_png_rgb, write_png
 from ambiguous_wild.io.scene_folder import SCENE_SCHEMA, load_scene, read_scene_json
-from ambiguous_wild.simulate.composite.cutouts import Cutout, blobs, read_cutouts
-from ambiguous_wild.simulate.composite.layers import CutoutPlacement, composed, layer, resized, truth
-from ambiguous_wild.simulate.composite.patches import cut_patches
+from ambiguous_wild.simulate.composite.cutouts import (
+    Cutout,
+    CutoutPlacement,
+    blobs,
+    composed,
+    layer,
+    read_cutouts,
+    resized,
+    truth,
+)
 from ambiguous_wild.simulate.composite.placement import (
     CompositeConfig,
+    cut_patches,
     local_colours,
     natural_heights,
     place,
@@ -38,7 +46,54 @@ from ambiguous_wild.simulate.composite.placement import (
     solve_heights,
     visible_points,
 )
-from ambiguous_wild.simulate.records import CompositePhoto, CompositeRecord, PlacedCutout
+from ambiguous_wild.simulate.records import Spread, spread
+
+
+class PlacedCutout(TypedDict):
+    """One cut-out in one photo: `layers.CutoutPlacement` with its name."""
+
+    cutout: str
+    which: int
+    position: tuple[float, float, float]
+    turn_deg: float
+    standing: bool
+
+
+class CompositePhoto(TypedDict):
+    """One training photo of a composite."""
+
+    occlusion: float
+    distractors: list[PlacedCutout]
+
+
+class CutoutRecord(TypedDict):
+    """One cut-out of a composite."""
+
+    name: str
+    sha256: str  # of its file; empty where it was drawn
+    height: float  # scene units
+
+
+class CompositeSource(TypedDict):
+    """The scene that a composite is made from."""
+
+    name: str
+    scene_json: str | None  # sha256
+
+
+class CompositeRecord(TypedDict):
+    """truth/composite.json."""
+
+    schema: int
+    version: str
+    source: CompositeSource
+    config: dict[str, Any]  # `CompositeConfig`
+    mask: str
+    poses: str
+    cutouts: list[CutoutRecord]
+    occlusion: Spread
+    photos: dict[str, CompositePhoto]
+
 
 ViewProgress = Callable[[Sequence[View]], Iterable[View]]
 
@@ -225,7 +280,7 @@ def _facts(
             {"name": c.name, "sha256": c.source, "height": float(h)}
             for c, h in zip(plan.cutouts, plan.heights, strict=True)
         ],
-        "occlusion": {"mean": float(np.mean(shares)), "min": min(shares), "max": max(shares)},
+        "occlusion": spread(shares),
         "photos": photos,
     }
 

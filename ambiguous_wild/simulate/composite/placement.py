@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import cv2
@@ -12,8 +13,16 @@ import numpy as np
 from ambiguous_wild.core.camera import Camera
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.scene import Points, Scene, View
-from ambiguous_wild.simulate.composite.cutouts import Cutout
-from ambiguous_wild.simulate.composite.layers import TRUTH_COVER, CutoutPlacement, layer, project
+from ambiguous_wild.io.images import read_png_rgb
+from ambiguous_wild.simulate.composite.cutouts import (
+    SMALLEST_PX,
+    TRUTH_COVER,
+    Cutout,
+    CutoutPlacement,
+    filled,
+    layer,
+    project,
+)
 
 _DRAWS = 24  # positions drawn for a cut-out, of which the best is taken
 _NEARER = (0.90, 0.98)  # depth of the cut-out over that of the point behind it
@@ -21,6 +30,7 @@ _SAME_PLACE = 0.08  # of the scene's spread: closer positions count as the same 
 _SAME_PLACE_SHARE = 0.15  # of the photos: a cut-out that stays longer would be part of the scene
 _APART = 0.3  # of the photo's shorter side: distance of two cut-outs, where possible
 _PREVIEW_PX = 160
+_LARGEST = 0.6  # of the photo's sides: largest window of a patch
 _LONGEST = 1.2  # of the photo's longer side: largest cut-out
 
 
@@ -228,3 +238,49 @@ def local_colours(photo: np.ndarray) -> np.ndarray:
     small = cv2.resize(photo, (64, max(1, round(64 * h / w))), interpolation=cv2.INTER_AREA)
     lab = cv2.cvtColor(small.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)
     return cv2.blur(lab, (9, 9))
+
+
+def cut_patches(
+    shapes: Sequence[Cutout],
+    sites: Sequence[VisiblePoints],
+    pictures: Mapping[str, Path],
+    config: CompositeConfig,
+    rng: np.random.Generator,
+) -> tuple[list[Cutout], dict[int, np.ndarray], dict[int, np.ndarray]]:
+    """Fill every shape from a window of a train photo, about as large as the shape will appear.
+
+    Args:
+        shapes: cut-outs; only their alpha is used.
+        sites: from `visible_points`; windows are cut from their photos.
+        pictures: view name -> its largest image file.
+        config: coverage and presence, which give the size.
+        rng: source of randomness.
+
+    Returns:
+        The patches; by index the mean CIELAB colour [3]; by index the world position of the window [3].
+    """
+    patches, colours, origins = [], {}, {}
+    for k, shape in enumerate(shapes):
+        site = sites[int(rng.integers(len(sites)))]
+        photo = read_png_rgb(pictures[site.view.name])
+        height, width = _window(shape, photo.shape, config, len(shapes))
+        top = int(rng.integers(0, photo.shape[0] - height + 1))
+        left = int(rng.integers(0, photo.shape[1] - width + 1))
+        patches.append(filled(shape, photo, (top, left), (height, width)))
+        window = photo[top : top + height, left : left + width].astype(np.float32) / 255
+        colours[k] = cv2.cvtColor(window, cv2.COLOR_RGB2LAB).reshape(-1, 3).mean(0)
+        camera = site.view.camera
+        scale = np.array([camera.width / photo.shape[1], camera.height / photo.shape[0]])
+        middle = np.array([left + width / 2, top + height / 2]) * scale
+        origins[k] = site.xyz[np.linalg.norm(site.uv - middle, axis=1).argmin()]
+    return patches, colours, origins
+
+
+def _window(shape: Cutout, photo: tuple[int, ...], config: CompositeConfig, count: int) -> tuple[int, int]:
+    """Height and width of the window, px: the area that one of `count` patches will cover."""
+    area = config.coverage * photo[0] * photo[1] / (count * config.presence)
+    height = np.sqrt(area / (shape.aspect * shape.filled))
+    shrink = min(1.0, _LARGEST * photo[0] / height, _LARGEST * photo[1] / (height * shape.aspect))
+    height = height * shrink
+    sides = max(SMALLEST_PX, round(height)), max(SMALLEST_PX, round(height * shape.aspect))
+    return min(sides[0], photo[0]), min(sides[1], photo[1])

@@ -1,13 +1,203 @@
-"""Bradley-Terry strengths from paired comparisons, with intervals over raters."""
+"""The scores as they are written to scores.json; agreement of raters and Bradley-Terry ranking."""
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Any, TypedDict
 
 import numpy as np
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.extras import install_command
+
+
+class Counted(TypedDict):
+    """Number of answers and two 95 % intervals of a share; None = not defined."""
+
+    n: int
+    low: float | None  # Wilson's interval: answers are independent
+    high: float | None
+    raters_low: float | None  # bootstrap over raters
+    raters_high: float | None
+
+
+class Share(Counted):
+    """Share of decided answers; ties are not counted."""
+
+    share: float | None
+
+
+class MethodShare(Share):
+    """How often raters preferred a method."""
+
+    method: str
+    ties: int
+
+
+class SceneShare(MethodShare):
+    """The same on one scene."""
+
+    scene: str
+
+
+class PairShare(MethodShare):
+    """The same against one other method."""
+
+    against: str
+
+
+class Ranked(TypedDict):
+    """One method of the ranking, see `ranking.Strength`."""
+
+    method: str
+    strength: float
+    low: float | None
+    high: float | None
+    rank: int
+    rank_low: int
+    rank_high: int
+
+
+class AgreementScore(TypedDict):
+    """Agreement of raters, see `agreement.Agreement`."""
+
+    alpha: float | None
+    equal: float | None
+    questions: int
+    note: str
+
+
+class Preference(TypedDict):
+    """Scores of the questions about pairs of renders."""
+
+    questions: int
+    answers: int
+    methods: list[MethodShare]
+    scenes: list[SceneShare]
+    pairs: list[PairShare]
+    ranking: list[Ranked]
+    ranking_note: str
+    left: Share  # how often the left image was preferred
+    agreement: AgreementScore
+
+
+class Ratings(Counted):
+    """Ratings from 1 (easy to see) to 5; intervals and n are those of `hard`."""
+
+    mean: float | None
+    mean_low: float | None
+    mean_high: float | None
+    hard: float | None  # share rated `scores.HARD` or more
+    none: int  # answers "see nothing move"
+    outlined: int  # answers given after the distractor's outline was shown
+
+
+class SceneRatings(Ratings):
+    """Ratings of all photos of one scene."""
+
+    scene: str
+
+
+class PhotoRatings(SceneRatings):
+    """Ratings of one photo."""
+
+    view: str
+
+
+class Ambiguity(TypedDict):
+    """Scores of the questions about photos."""
+
+    questions: int
+    answers: int
+    scenes: list[SceneRatings]
+    photos: list[PhotoRatings]
+    agreement: AgreementScore
+
+
+class RaterSummary(TypedDict):
+    """One rater."""
+
+    rater: str
+    name: str
+    answers: int
+    asked: int
+    too_fast: int  # of the answers; left out of the scores
+    outlined: int  # answers given after the distractor's outline was shown
+    median_s: float
+    file: str
+
+
+class Scores(TypedDict):
+    """All scores of a study; None where the study has no such questions."""
+
+    study: str
+    title: str
+    seed: int
+    too_fast_s: dict[str, float]  # kind -> seconds below which an answer is left out
+    raters: list[RaterSummary]
+    preference: Preference | None
+    ambiguity: Ambiguity | None
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Agreement over all questions that two or more raters answered."""
+
+    alpha: float | None  # 1 = full agreement, 0 = chance; None = not defined
+    equal: float | None  # share of rater pairs with the same answer to a question
+    questions: int  # answered by two or more raters
+    note: str = ""  # why alpha is not defined
+
+
+def agreement(
+    answers: Iterable[tuple[str, str, Any]],  # (rater, question, answer)
+    *,
+    ordered: bool,  # answers are numbers with distances: 1 is closer to 2 than to 5
+) -> Agreement:
+    """Krippendorff's alpha, nominal or (`ordered`) interval, over questions with two or more answers.
+
+    Source: Krippendorff, Computing Krippendorff's Alpha-Reliability (2011); computed by NLTK.
+
+    Raises:
+        AwError: NLTK is not installed.
+    """
+    rows = list(answers)
+    per_question = Counter(question for _, question, _ in rows)
+    rows = [row for row in rows if per_question[row[1]] > 1]
+    questions = sum(n > 1 for n in per_question.values())
+    if not rows:
+        return Agreement(None, None, 0, "no question was answered by two raters")
+    equal = _equal(rows)
+    if len({answer for _, _, answer in rows}) == 1:
+        # alpha is 0/0 if all answers are equal
+        return Agreement(None, equal, questions, "all answers are equal, so alpha is not defined")
+    task, nominal, interval = _nltk()
+    return Agreement(
+        float(task(data=rows, distance=interval if ordered else nominal).alpha()), equal, questions
+    )
+
+
+def _equal(rows: list[tuple[str, str, Any]]) -> float:
+    by_question: dict[str, Counter[Any]] = {}
+    for _, question, answer in rows:
+        by_question.setdefault(question, Counter())[answer] += 1
+    same = sum(n * (n - 1) for counts in by_question.values() for n in counts.values())
+    pairs = sum(c.total() * (c.total() - 1) for c in by_question.values())
+    return same / pairs
+
+
+def _nltk() -> tuple[Callable[..., Any], Callable[..., float], Callable[..., float]]:
+    try:
+        from nltk.metrics.agreement import AnnotationTask
+        from nltk.metrics.distance import binary_distance, interval_distance
+    except ImportError as error:
+        raise AwError(
+            f"scoring a study needs NLTK ({error}); install it with: {install_command('study')}"
+        ) from None
+    return AnnotationTask, binary_distance, interval_distance
+
 
 # Regularisation, as if each pair had this fraction of one more answer for each side. It keeps the strength of
 # a method that won every answer finite, and changes others by less than the printed digits.

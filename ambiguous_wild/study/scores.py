@@ -12,11 +12,8 @@ from typing import Any
 import numpy as np
 
 from ambiguous_wild.metrics.ambiguity import ratio_interval
-from ambiguous_wild.study.agreement import agreement
-from ambiguous_wild.study.answers import TOO_FAST_S, Answer, Rater
-from ambiguous_wild.study.key import KIND_PAIR, KIND_PHOTO, Key
-from ambiguous_wild.study.ranking import Strength, bradley_terry
-from ambiguous_wild.study.records import (
+from ambiguous_wild.study.answers import KIND_PAIR, KIND_PHOTO, TOO_FAST_S, Answer, Key, Rater
+from ambiguous_wild.study.ranking import (
     AgreementScore,
     Ambiguity,
     MethodShare,
@@ -27,6 +24,9 @@ from ambiguous_wild.study.records import (
     Ratings,
     Scores,
     Share,
+    Strength,
+    agreement,
+    bradley_terry,
 )
 
 HARD = 4  # of 5: a photo rated this or more is hard

@@ -14,14 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from ambiguous_wild.core import AwError, Scene, View
+from ambiguous_wild.core import AwError, Camera, Scene, View
 from ambiguous_wild.io.atomic import check_output, refuse_file, write_text
+from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.motion_points import read_motion_points
+from ambiguous_wild.io.splat_formats.arrays import finite, sigmoid
 from ambiguous_wild.io.splat_formats.spz import spz_bytes
-from ambiguous_wild.viewing.model import Model
-from ambiguous_wild.viewing.photos import mask_uris, photo_uris
-from ambiguous_wild.viewing.reduce import reduced
-from ambiguous_wild.viewing.space import space_of
+from ambiguous_wild.viewing.model import Model, space_of
 
 PAGE = "index.html"
 GENERATOR = '<meta name="generator" content="aw view">'
@@ -224,3 +223,115 @@ def _fill(title: str, data: Mapping[str, Any], models: str) -> str:
 
 def _digest(text: str) -> str:
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+
+
+WIDTHS = (640, 480, 360, 240, 160, 96, 64)  # px, tried from the largest
+_QUALITY = 78
+_MASK_WIDTH = 480  # px, at most
+
+
+def photo_uris(views: Sequence[View], most_bytes: int) -> list[str]:
+    """A data: address for each photo, JPEG, as wide as lets all of them stay below `most_bytes` of text.
+
+    1000 photos or more can exceed it at the smallest width. One photo is held at a time.
+    """
+    return _as_wide_as_fits(_photo, [view.image_path for view in views], WIDTHS, most_bytes)
+
+
+def mask_uris(folder: Path, views: Sequence[View], most_bytes: int) -> dict[str, str]:
+    """A data: address for each keep map that `folder` holds, PNG with two grey levels, by view name.
+
+    As wide as lets all of them stay below `most_bytes` of text.
+    """
+    paths = {view.name: folder / Path(view.name).with_suffix(".png") for view in views}
+    found = {name: path for name, path in paths.items() if path.is_file()}
+    widths = [width for width in WIDTHS if width <= _MASK_WIDTH]
+    return dict(zip(found, _as_wide_as_fits(_mask, list(found.values()), widths, most_bytes)))
+
+
+def _as_wide_as_fits(
+    uri: Callable[[Path, int], str], paths: Sequence[Path], widths: Sequence[int], most_bytes: int
+) -> list[str]:
+    """The addresses at the first width at which they fit; else at the last one."""
+    uris: list[str] = []
+    for width in widths:
+        uris, size = [], 0
+        for path in paths:
+            uris.append(uri(path, width))
+            size += len(uris[-1])
+            if size > most_bytes and width != widths[-1]:
+                break
+        else:
+            return uris
+    return uris
+
+
+def _photo(path: Path, width: int) -> str:
+    import cv2
+
+    small = _narrowed(np.ascontiguousarray(read_png_rgb(path)[:, :, ::-1]), width)
+    return _uri("jpeg", bytes(cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]))
+
+
+def _mask(path: Path, width: int) -> str:
+    import cv2
+
+    black_and_white = ((_narrowed(read_gray(path), width) > 127) * 255).astype(np.uint8)
+    options = [cv2.IMWRITE_PNG_BILEVEL, 1]
+    return _uri("png", bytes(cv2.imencode(".png", black_and_white, options)[1]))
+
+
+def _narrowed(image: np.ndarray, width: int) -> np.ndarray:
+    import cv2
+
+    if image.shape[1] <= width:
+        return image
+    height = max(1, round(image.shape[0] * width / image.shape[1]))
+    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def _uri(kind: str, data: bytes) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
+
+
+_NEAR = 0.01  # as in training
+_MARGIN = 0.15  # of the picture on each side still counts
+
+
+def reduced(
+    gaussians: Mapping[str, np.ndarray], cameras: Sequence[Camera], most: int
+) -> dict[str, np.ndarray]:
+    """At most so many Gaussians: the ones with the largest opacity times projected area, summed over cameras.
+
+    A Gaussian's area in one camera counts up to a hundredth of the picture, so that a few large ones in the
+    background do not displace all detail. Order is kept.
+
+    Args:
+        gaussians: raw parameters.
+        cameras: of the photos.
+        most: Gaussians to keep.
+    """
+    kept = finite(gaussians)
+    if len(kept["means"]) <= most:
+        return kept
+    score = importance(kept, cameras)
+    rows = np.sort(np.argsort(-score, kind="stable")[:most])
+    return {name: value[rows] for name, value in kept.items()}
+
+
+def importance(gaussians: Mapping[str, np.ndarray], cameras: Sequence[Camera]) -> np.ndarray:
+    """Opacity times projected area in px, summed over cameras; [N] float64."""
+    means = gaussians["means"].astype(np.float64)
+    scales = np.sort(np.exp(gaussians["log_scales"].astype(np.float64)), axis=1)
+    area = np.pi * scales[:, 1] * scales[:, 2]  # of the two longest axes, world units squared
+    total = np.zeros(len(means))
+    for camera in cameras:
+        seen = means @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+        depth = np.where(seen[:, 2] > _NEAR, seen[:, 2], np.inf)
+        u, v = camera.fx * seen[:, 0] / depth + camera.cx, camera.fy * seen[:, 1] / depth + camera.cy
+        inside = (np.abs(u / camera.width - 0.5) < 0.5 + _MARGIN) & (
+            np.abs(v / camera.height - 0.5) < 0.5 + _MARGIN
+        )
+        covered = area * camera.fx * camera.fy / depth**2
+        total += np.where(inside, np.minimum(covered, 0.01 * camera.width * camera.height), 0.0)
+    return total * sigmoid(gaussians["opacity_logits"])

@@ -15,9 +15,8 @@ from click.testing import CliRunner
 
 from ambiguous_wild.cli.audit import command
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.audit.finding import Finding
-from ambiguous_wild.harness.audit.run import audit
-from ambiguous_wild.harness.audit.table import read_tables
+from ambiguous_wild.harness.audit.checks import audit
+from ambiguous_wild.harness.audit.table import Finding, read_tables
 from tests.harness.clean_tables import COLUMNS, Row, clean_tables, write
 
 ROOT = Path(__file__).resolve().parents[2]

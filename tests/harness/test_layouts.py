@@ -17,16 +17,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.ablation.report import ablation
 from ambiguous_wild.harness.measures import MEASURES
 from ambiguous_wild.harness.running.store import Runs, read_runs
 from ambiguous_wild.harness.tables import papers, plain_formats
-from ambiguous_wild.harness.tables.ablation import ablation
-from ambiguous_wild.harness.tables.fit import divided
-from ambiguous_wild.harness.tables.html_page import to_html
-from ambiguous_wild.harness.tables.latex import latex_text, to_latex
-from ambiguous_wild.harness.tables.reported import datasets_of, read_reported, with_reported
-from ambiguous_wild.harness.tables.significance import difference_interval
+from ambiguous_wild.harness.tables.papers import (
+    datasets_of,
+    difference_interval,
+    read_reported,
+    with_reported,
+)
+from ambiguous_wild.harness.tables.plain_formats import divided
 from ambiguous_wild.harness.tables.table import Cell, Column, Row, Table, ranks
+from ambiguous_wild.harness.tables.typeset import latex_text, to_html, to_latex
 from ambiguous_wild.metrics import stats
 from tests.harness.fake_runs import failed, fake_result, save
 

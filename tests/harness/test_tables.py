@@ -17,12 +17,10 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.measures import MEASURES, measure
 from ambiguous_wild.harness.running.store import read_runs
 from ambiguous_wild.harness.tables.comparison import comparison
-from ambiguous_wild.harness.tables.fit import fitted
-from ambiguous_wild.harness.tables.latex import latex_text
-from ambiguous_wild.harness.tables.latex import to_latex as latex_of
 from ambiguous_wild.harness.tables.papers import cost_at_the_end
 from ambiguous_wild.harness.tables.plain_formats import (
     display_width,
+    fitted,
     markdown_text,
     plain,
     to_markdown,
@@ -30,6 +28,8 @@ from ambiguous_wild.harness.tables.plain_formats import (
     to_wide_csv,
 )
 from ambiguous_wild.harness.tables.table import Cell, Table
+from ambiguous_wild.harness.tables.typeset import latex_text
+from ambiguous_wild.harness.tables.typeset import to_latex as latex_of
 from tests.harness.fake_runs import failed, fake_result, save, start
 
 HOSTILE = '<script>|\\input{x}$&%#_^~"*`[a](http://b)\x1b[31m\u202e'

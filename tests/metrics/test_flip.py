@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.metrics.flip import flip, flip_map
+from ambiguous_wild.metrics.image import flip, flip_map
 
 
 def picture(seed: int = 0, size: tuple[int, int] = (20, 24)) -> np.ndarray:

@@ -14,8 +14,7 @@ from torchmetrics.functional.image import (
     structural_similarity_index_measure as torchmetrics_ssim,
 )
 
-from ambiguous_wild.metrics.flip import flip, flip_map
-from ambiguous_wild.metrics.image import psnr, ssim, ssim_inria
+from ambiguous_wild.metrics.image import flip, flip_map, psnr, ssim, ssim_inria
 from ambiguous_wild.metrics.masks import psnr_valid
 from tests.metrics.pairs import Pair, pairs
 

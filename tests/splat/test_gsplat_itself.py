@@ -9,8 +9,8 @@ import torch
 
 from ambiguous_wild.splat.gpu import gsplat_seam
 from ambiguous_wild.splat.render import render
-from ambiguous_wild.stress.float64_check import agree, cloud
-from ambiguous_wild.stress.float64_check import camera as front_camera
+from ambiguous_wild.stress.case import agree, cloud
+from ambiguous_wild.stress.case import camera as front_camera
 
 from . import fake_kernels
 from .scenes import camera, cotangents, gaussians, given

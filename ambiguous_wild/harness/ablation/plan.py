@@ -7,11 +7,10 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NotRequired, TypedDict
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash, flatten, to_plain, with_options
-from ambiguous_wild.harness.ablation.records import StudyFacts
 from ambiguous_wild.harness.running.cell import Cell
 from ambiguous_wild.harness.running.grid import cell_folder, plan_cells
 from ambiguous_wild.harness.running.records import RunResult, metrics_of
@@ -20,6 +19,57 @@ from ambiguous_wild.methods.ablation import DEFAULT, Group, Variant, choose_grou
 from ambiguous_wild.methods.describe import BACK_ENDS
 from ambiguous_wild.methods.registry import MethodEntry, get_method
 from ambiguous_wild.splat.pace import TrainConfig
+
+
+class StudyFacts(TypedDict):
+    """Facts that two studies must share before one report can hold both."""
+
+    method: str
+    settings: list[str]  # on top of the defaults, in every row
+    train: dict[str, Any]  # fields of `TrainConfig`; the seed is None
+    scenes: list[str]
+    seeds: list[int]
+
+
+class GroupFacts(TypedDict):
+    """A group of variants."""
+
+    name: str
+    title: str
+    source: str  # in the paper; empty without
+
+
+class Summary(TypedDict):
+    """Mean and sample deviation over the runs of a variant; None = missing."""
+
+    mean: float | None
+    spread: float | None
+
+
+class VariantRow(TypedDict):
+    """A variant: its values, its differences to the default, its runs."""
+
+    group: str
+    variant: str
+    settings: list[str]
+    text: str
+    status: Literal["ok", "failed", "missing"]
+    reason: str  # of another status than ok
+    same_as: str
+    values: dict[str, Summary]  # by key of `plan.METRICS`
+    differences: dict[str, Summary]  # by key of `plan.DIFFERENCES`
+    runs: list[dict[str, Any]]  # scene, seed, folder, error, and every key of `plan.METRICS`
+
+
+class StudyReport(StudyFacts):
+    """ablation.json."""
+
+    schema: int
+    made_by: str  # the command
+    note: NotRequired[str]  # what the method says about itself
+    groups: list[GroupFacts]
+    rows: list[VariantRow]
+
 
 REPORT = "ablation.json"
 

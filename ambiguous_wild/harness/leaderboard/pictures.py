@@ -16,11 +16,11 @@ import numpy as np
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash
-from ambiguous_wild.harness.leaderboard.board import measured
-from ambiguous_wild.harness.leaderboard.entry import Entry
-from ambiguous_wild.harness.leaderboard.sheet import (
+from ambiguous_wild.harness.leaderboard.board import (
     CsvValue,
+    Entry,
     board_csv,
+    measured,
     number,
     read_csv,
     slug,

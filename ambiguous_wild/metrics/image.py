@@ -205,7 +205,7 @@ def flip(
     """Mean LDR-FLIP error in [0, 1] at 67 pixels per degree; 0 for identical images.
 
     Raises:
-        AwError: see `image.checked_pair`.
+        AwError: see `checked_pair`.
     """
     return float(flip_map(a, b).mean())
 
@@ -213,18 +213,15 @@ def flip(
 def flip_map(
     a: np.ndarray,  # [H, W, 3] uint8 or float in [0, 1], sRGB
     b: np.ndarray,  # [H, W, 3] the same size
-    pixels_per_degree: float = PIXELS_PER_DEGREE,
 ) -> np.ndarray:
     """The LDR-FLIP error of every pixel, [H, W] float64 in [0, 1]; symmetric in the images.
 
     Raises:
-        AwError: pixels per degree not positive, or see `image.checked_pair`.
+        AwError: see `checked_pair`.
     """
-    if not (math.isfinite(pixels_per_degree) and pixels_per_degree > 0):
-        raise AwError(f"pixels per degree must be positive, got {pixels_per_degree}")
     first, second = (_opponent(_linear(picture)) for picture in checked_pair(a, b))
-    colour = _colour_error(_perceived(first, pixels_per_degree), _perceived(second, pixels_per_degree))
-    feature = _feature_error(_luminance(first), _luminance(second), pixels_per_degree)
+    colour = _colour_error(_perceived(first), _perceived(second))
+    feature = _feature_error(_luminance(first), _luminance(second))
     return colour ** (1.0 - feature)  # equation 7
 
 
@@ -257,11 +254,11 @@ def _luminance(opponent: np.ndarray) -> np.ndarray:
     return (opponent[..., 0] + 16.0) / 116.0
 
 
-def _perceived(opponent: np.ndarray, pixels_per_degree: float) -> np.ndarray:
+def _perceived(opponent: np.ndarray) -> np.ndarray:
     """Filtered by contrast sensitivity, in L*a*b* with Hunt's adjustment, [H, W, 3]."""
     widest = max(width for gaussians in _CSF.values() for _, width in gaussians)
-    radius = math.ceil(3.0 * math.sqrt(widest / (2.0 * math.pi**2)) * pixels_per_degree)
-    degrees = np.arange(-radius, radius + 1) / pixels_per_degree
+    radius = math.ceil(3.0 * math.sqrt(widest / (2.0 * math.pi**2)) * PIXELS_PER_DEGREE)
+    degrees = np.arange(-radius, radius + 1) / PIXELS_PER_DEGREE
     filtered = [_blur_csf(opponent[..., i], gaussians, degrees) for i, gaussians in enumerate(_CSF.values())]
     rgb = (np.stack(filtered, axis=-1) - _YCC_OFFSET) @ np.linalg.inv(_YCC_FROM_RGB).T
     return _hunt(_lab(np.clip(rgb, 0.0, 1.0)))
@@ -307,9 +304,9 @@ def _colour_error(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.where(error < knee, error * (_KNEE_ERROR / knee), above)
 
 
-def _feature_error(a: np.ndarray, b: np.ndarray, pixels_per_degree: float) -> np.ndarray:
+def _feature_error(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Difference in edges and points between two luminances [H, W], equation 6."""
-    deviation = 0.5 * _FEATURE_DEGREES * pixels_per_degree
+    deviation = 0.5 * _FEATURE_DEGREES * PIXELS_PER_DEGREE
     radius = math.ceil(3.0 * deviation)
     x = np.arange(-radius, radius + 1)
     smooth = np.exp(-(x**2) / (2.0 * deviation**2))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from typing import Any, TypedDict
 
 import numpy as np
@@ -49,24 +48,24 @@ class PairShare(MethodShare):
 
 
 class Ranked(TypedDict):
-    """One method of the ranking, see `ranking.Strength`."""
+    """One method of the ranking."""
 
     method: str
-    strength: float
-    low: float | None
+    strength: float  # log odds against an average method; the mean over methods is 0
+    low: float | None  # 95 % over raters; None for a single rater
     high: float | None
-    rank: int
-    rank_low: int
-    rank_high: int
+    rank: int  # 1 = best
+    rank_low: int  # best possible rank: 1 + number of significantly better methods
+    rank_high: int  # worst possible rank
 
 
 class AgreementScore(TypedDict):
-    """Agreement of raters, see `agreement.Agreement`."""
+    """Agreement over all questions that two or more raters answered."""
 
-    alpha: float | None
-    equal: float | None
-    questions: int
-    note: str
+    alpha: float | None  # 1 = full agreement, 0 = chance; None = not defined
+    equal: float | None  # share of rater pairs with the same answer to a question
+    questions: int  # answered by two or more raters
+    note: str  # why alpha is not defined
 
 
 class Preference(TypedDict):
@@ -141,21 +140,11 @@ class Scores(TypedDict):
     ambiguity: Ambiguity | None
 
 
-@dataclass(frozen=True)
-class Agreement:
-    """Agreement over all questions that two or more raters answered."""
-
-    alpha: float | None  # 1 = full agreement, 0 = chance; None = not defined
-    equal: float | None  # share of rater pairs with the same answer to a question
-    questions: int  # answered by two or more raters
-    note: str = ""  # why alpha is not defined
-
-
 def agreement(
     answers: Iterable[tuple[str, str, Any]],  # (rater, question, answer)
     *,
     ordered: bool,  # answers are numbers with distances: 1 is closer to 2 than to 5
-) -> Agreement:
+) -> AgreementScore:
     """Krippendorff's alpha, nominal or (`ordered`) interval, over questions with two or more answers.
 
     Source: Krippendorff, Computing Krippendorff's Alpha-Reliability (2011); computed by NLTK.
@@ -168,15 +157,17 @@ def agreement(
     rows = [row for row in rows if per_question[row[1]] > 1]
     questions = sum(n > 1 for n in per_question.values())
     if not rows:
-        return Agreement(None, None, 0, "no question was answered by two raters")
+        return _score(None, None, 0, "no question was answered by two raters")
     equal = _equal(rows)
     if len({answer for _, _, answer in rows}) == 1:
         # alpha is 0/0 if all answers are equal
-        return Agreement(None, equal, questions, "all answers are equal, so alpha is not defined")
+        return _score(None, equal, questions, "all answers are equal, so alpha is not defined")
     task, nominal, interval = _nltk()
-    return Agreement(
-        float(task(data=rows, distance=interval if ordered else nominal).alpha()), equal, questions
-    )
+    return _score(float(task(data=rows, distance=interval if ordered else nominal).alpha()), equal, questions)
+
+
+def _score(alpha: float | None, equal: float | None, questions: int, note: str = "") -> AgreementScore:
+    return {"alpha": alpha, "equal": equal, "questions": questions, "note": note}
 
 
 def _equal(rows: list[tuple[str, str, Any]]) -> float:
@@ -204,23 +195,10 @@ def _nltk() -> tuple[Callable[..., Any], Callable[..., float], Callable[..., flo
 PRIOR = 0.1
 
 
-@dataclass(frozen=True)
-class Strength:
-    """One method of the ranking."""
-
-    method: str
-    strength: float  # log odds against an average method; the mean over methods is 0
-    low: float  # 95 % over raters; NaN for a single rater
-    high: float
-    rank: int  # 1 = best
-    rank_low: int  # best possible rank: 1 + number of significantly better methods
-    rank_high: int  # worst possible rank
-
-
 def bradley_terry(
     methods: list[str],
     wins: np.ndarray,  # [raters, methods, methods], wins[r, i, j]: r preferred i to j; a tie is 0.5 each
-) -> tuple[list[Strength], str]:
+) -> tuple[list[Ranked], str]:
     """Maximum-likelihood strengths (choix); intervals by leaving out one rater at a time.
 
     Raters are resampled, because answers of one rater are correlated (jackknife, Student's t with raters - 1
@@ -253,16 +231,16 @@ def bradley_terry(
         spread = factor * np.sqrt(((differences - differences.mean(axis=0)) ** 2).sum(axis=0))
     better = (theta[:, None] - theta[None, :]) > spread  # [i, j]: i is better than j; False where NaN
     order = np.argsort(-theta, kind="stable")
-    ranked = [
-        Strength(
-            methods[i],
-            float(theta[i]),
-            float(theta[i] - own[i]),
-            float(theta[i] + own[i]),
-            place,
-            1 + int(better[:, i].sum()),
-            len(methods) - int(better[i].sum()),
-        )
+    ranked: list[Ranked] = [
+        {
+            "method": methods[i],
+            "strength": float(theta[i]),
+            "low": None if count < 2 else float(theta[i] - own[i]),
+            "high": None if count < 2 else float(theta[i] + own[i]),
+            "rank": place,
+            "rank_low": 1 + int(better[:, i].sum()),
+            "rank_high": len(methods) - int(better[i].sum()),
+        }
         for place, i in enumerate(order, start=1)
     ]
     notes = []

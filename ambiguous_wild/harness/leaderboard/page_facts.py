@@ -5,15 +5,15 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.audit.checks import audit
-from ambiguous_wild.harness.audit.table import Finding, read_tables
+from ambiguous_wild.harness.audit.table import Finding, Number, read_tables
 from ambiguous_wild.harness.leaderboard.board import ALONE, CsvValue, Entry, board_csv, in_order, to_number
 from ambiguous_wild.harness.measures import PARTIAL, measure
 from ambiguous_wild.methods.registry import knows_truth
@@ -151,36 +151,20 @@ REPORTED_COLUMNS = (
 
 
 @dataclass(frozen=True)
-class Printed:
-    """One number of a paper's table."""
-
-    method: str
-    setting: str
-    dataset: str
-    scene: str
-    metric: str
-    variant: str  # "unknown" where the paper does not say
-    value: float
-    printed: str  # with the digits it has there
-    table: str
-    where: str = ""  # file and line
-
-    def plain(self) -> dict[str, Any]:
-        return asdict(self)
-
-
-@dataclass(frozen=True)
 class Reported:
     """What papers print, where it stands, and what `aw audit` found in it."""
 
-    numbers: tuple[Printed, ...] = ()
+    numbers: tuple[Number, ...] = ()
     findings: tuple[Finding, ...] = ()
     sources: dict[str, dict[str, str]] = field(default_factory=dict)  # table -> title, venue, url, caption
 
     def plain(self) -> dict[str, Any]:
         """For the page: findings are looked up by the place of a number."""
         return {
-            "reported": [n.plain() for n in self.numbers],
+            "reported": [
+                {column: _plain(n, column) for column in (*REPORTED_COLUMNS[1:], "where")}
+                for n in self.numbers
+            ],
             "findings": [{"kind": f.kind, "text": f.text, "where": list(f.where)} for f in self.findings],
             "sources": self.sources,
         }
@@ -195,13 +179,8 @@ def read_reported(folder: Path) -> Reported:
     if not folder.is_dir() or not any(folder.glob("*.csv")):
         return Reported()
     numbers = read_tables([folder])
-    found = [
-        Printed(
-            n.method, n.setting, n.dataset, n.scene, n.metric, n.variant, n.value, n.text, n.table, n.where
-        )
-        for n in numbers
-        if n.known and n.method != "dataset"  # of no method: what the text says of the photos
-    ]
+    # of no method: what the text says of the photos
+    found = [n for n in numbers if n.known and n.method != "dataset"]
     found.sort(key=lambda n: (n.dataset, n.method, n.setting, n.scene, n.table, n.metric, n.variant))
     return Reported(tuple(found), tuple(audit(numbers)), read_sources(folder / SOURCES))
 
@@ -239,10 +218,12 @@ def _link(url: object) -> str:
     return text if re.fullmatch(r"https?://[^\s\"'<>]+", text) else ""
 
 
-def reported_csv(numbers: Sequence[Printed]) -> str:
+def reported_csv(numbers: Sequence[Number]) -> str:
     """One number a row, each marked as reported; beside the value how it is printed."""
-    rows: Iterator[list[CsvValue]] = (
-        [SOURCE, n.method, n.setting, n.dataset, n.scene, n.metric, n.variant, n.value, n.printed, n.table]
-        for n in numbers
-    )
+    rows = ([SOURCE, *(_plain(n, column) for column in REPORTED_COLUMNS[1:])] for n in numbers)
     return board_csv(REPORTED_COLUMNS, rows)
+
+
+def _plain(number: Number, column: str) -> CsvValue:
+    value: CsvValue = getattr(number, "text" if column == "printed" else column)
+    return value

@@ -16,12 +16,11 @@ from typing import Any
 from urllib.parse import quote
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.audit.table import REPORTED
+from ambiguous_wild.harness.audit.table import REPORTED, Number
 from ambiguous_wild.harness.leaderboard import pictures
 from ambiguous_wild.harness.leaderboard.board import Entry, files_of, read_board, slug
 from ambiguous_wild.harness.leaderboard.page_facts import (
     SOURCE,
-    Printed,
     Reported,
     facts,
     read_reported,
@@ -155,7 +154,7 @@ def _published(out: Path) -> set[str] | None:
     return {MANIFEST, *map(str, found)} if isinstance(found, list) else None
 
 
-def _write_data(board: Path, folder: Path, entries: Sequence[Entry], printed: Sequence[Printed]) -> list[str]:
+def _write_data(board: Path, folder: Path, entries: Sequence[Entry], printed: Sequence[Number]) -> list[str]:
     folder.mkdir()
     files = {path.name: text for path, text in files_of(board, entries).items()}
     if printed:

@@ -13,7 +13,7 @@ from typing import Any
 
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError, Scene
-from ambiguous_wild.core.config import config_hash, to_plain
+from ambiguous_wild.core.config import config_hash, flatten, to_plain
 from ambiguous_wild.harness.leaderboard.board import HIDDEN, Entry
 from ambiguous_wild.harness.running.identity import scene_identity
 from ambiguous_wild.harness.running.records import RunResult
@@ -111,7 +111,7 @@ def _changed(config: Mapping[str, Any]) -> dict[str, str]:
     Of a method in a file, all of them. Of a variant only those that depend on the machine: its name says the
     others.
     """
-    options, name = _flat(config["options"]), config["method"]
+    options, name = flatten(config["options"]), config["method"]
     if "@" in name:
         kept = {f"{member}.{k}": options.get(f"{place}.{k}") for place, member, k in _chosen(name)}
         return {key: _word(value) for key, value in kept.items() if value is not None}
@@ -139,17 +139,10 @@ def _defaults(method: str) -> dict[str, Any] | None:
 
     try:
         entry = get_method(method)
-        options = _flat(to_plain(entry.options()))
+        options = flatten(to_plain(entry.options()))
     except (AwError, ImportError):
         return None
     return {k: v for k, v in options.items() if k not in entry.by_machine()}
-
-
-def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in tree.items():
-        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
-    return flat
 
 
 def _word(value: Any) -> str:

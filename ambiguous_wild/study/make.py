@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import base64
 import hashlib
-import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 from itertools import combinations
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -20,6 +17,7 @@ from ambiguous_wild.core.errors import shortlist, unknown
 from ambiguous_wild.harness.running.store import read_config, read_runs
 from ambiguous_wild.io.atomic import write_json, write_text
 from ambiguous_wild.io.images import read_gray, read_png_rgb
+from ambiguous_wild.io.page_parts import data_uri, fill_page, jpeg_bytes, narrowed
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.study.answers import KEY_FORMAT, KEY_VERSION, KIND_PAIR, KIND_PHOTO, study_id
 
@@ -174,26 +172,6 @@ def _stem(name: str) -> str:
 OUTLINE = (255, 220, 0)  # sRGB; drawn over a black edge, to be visible on any background
 
 
-def data_uri(
-    image: np.ndarray,  # [H, W, 3] uint8
-    *,
-    side: int,  # px, most of the longer side
-    quality: int,  # of JPEG
-) -> str:
-    """The image as a JPEG data URI, encoded from pixels, so without EXIF or file name."""
-    longest = max(image.shape[:2])
-    if longest > side:
-        size = tuple(max(1, round(n * side / longest)) for n in image.shape[1::-1])
-        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    # 4:4:4, since chroma subsampling would blur details that raters compare.
-    settings = [cv2.IMWRITE_JPEG_QUALITY, quality,
-                cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]  # fmt: skip
-    done, data = cv2.imencode(".jpg", image[:, :, ::-1], settings)
-    if not done:
-        raise AwError(f"OpenCV could not encode an image of {list(image.shape)} as JPEG")
-    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode("ascii")
-
-
 def outlined(photo: Path, mask: Path) -> np.ndarray:  # [H, W, 3] uint8
     """The photo with the distractor's outline."""
     image = read_png_rgb(photo).copy()
@@ -313,8 +291,14 @@ class _Album:
     def add(self, name: str, image: np.ndarray) -> str:
         if name not in self._tokens:
             token = self._tokens[name] = self.token()
-            self.images[token] = data_uri(image, side=self._settings.side, quality=self._settings.quality)
+            self.images[token] = self._encoded(image)
         return self._tokens[name]
+
+    def _encoded(self, image: np.ndarray) -> str:
+        """Encoded from pixels, so without EXIF or file name; small colour details are compared, too."""
+        width = image.shape[1] * self._settings.side // max(image.shape[:2])
+        small = narrowed(image, max(1, width))
+        return data_uri("jpeg", jpeg_bytes(small, self._settings.quality, full_colour=True))
 
     @property
     def hashes(self) -> dict[str, str]:
@@ -346,11 +330,4 @@ def _pair(
 
 def page_html(data: dict[str, Any]) -> str:
     """The HTML page with its data, escaped so that it cannot end its script element."""
-    here = files("ambiguous_wild.study")
-    text = json.dumps(data, ensure_ascii=True, allow_nan=False)
-    text = text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
-    page = (here / "page.html").read_text(encoding="utf-8")
-    parts = {"STYLE": "page.css", "SCRIPT": "page.js"}
-    for mark, name in parts.items():
-        page = page.replace(f"/*{mark}*/", (here / name).read_text(encoding="utf-8"))
-    return page.replace("/*DATA*/", text)
+    return fill_page(Path(__file__).parent, data, ("page.js",))

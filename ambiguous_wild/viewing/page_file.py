@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import base64
-import hashlib
 import html
-import json
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +15,7 @@ from ambiguous_wild.core import AwError, Camera, Scene, View
 from ambiguous_wild.io.atomic import check_output, refuse_file, write_text
 from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.motion_points import read_motion_points
+from ambiguous_wild.io.page_parts import data_uri, fill_page, jpeg_bytes, narrowed
 from ambiguous_wild.io.splat_formats.arrays import finite, sigmoid
 from ambiguous_wild.io.splat_formats.spz import spz_bytes
 from ambiguous_wild.viewing.model import Model, space_of
@@ -194,35 +192,22 @@ def _view_facts(view: View, photo: str, points: list[int]) -> dict[str, Any]:
 
 
 def _fill(title: str, data: Mapping[str, Any], models: str) -> str:
-    """The template with everything in it; texts can be anything and stay text."""
-    style = (_HERE / "page.css").read_text(encoding="utf-8")
-    script = "\n".join((_HERE / name).read_text(encoding="utf-8") for name in SCRIPTS)
-    text = json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
-    for char in "<>&\u2028\u2029":  # no text in it can end the element it stands in
-        text = text.replace(char, f"\\u{ord(char):04x}")
-    # Spark's WebAssembly is compiled from bytes, its workers come from blobs; nothing may be fetched.
-    policy = (
-        f"default-src 'none'; img-src data: blob:; style-src {_digest(style)}; worker-src blob:; "
-        f"script-src {_digest(script)} blob: 'wasm-unsafe-eval'; base-uri 'none'; form-action 'none'"
-    )
     licences = html.escape((_HERE / "licences.txt").read_text(encoding="utf-8"), quote=False)
-    parts = {
-        "POLICY": policy,
-        "TITLE": html.escape(title),
-        "STYLE": style,
-        "DATA": text,
-        "MODELS": models,
-        "RENDERER": base64.b64encode((_HERE / "renderer.js.gz").read_bytes()).decode("ascii"),
-        "LICENCES": licences.replace("--", "—"),  # they stand in a comment
-        "SCRIPT": script,
-    }
-    # In one pass: what is put in is not looked at again.
-    template = (_HERE / "page.html").read_text(encoding="utf-8")
-    return re.sub(r"/\*([A-Z]+)\*/", lambda found: parts[found[1]], template)
-
-
-def _digest(text: str) -> str:
-    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+    return fill_page(
+        _HERE,
+        data,
+        SCRIPTS,
+        title=title,
+        # Spark's WebAssembly is compiled from bytes, its workers come from blobs; nothing may be fetched.
+        images="data: blob:",
+        more_sources="worker-src blob:; ",
+        more_scripts=" blob: 'wasm-unsafe-eval'",
+        parts={
+            "MODELS": models,
+            "RENDERER": base64.b64encode((_HERE / "renderer.js.gz").read_bytes()).decode("ascii"),
+            "LICENCES": licences.replace("--", "—"),  # they stand in a comment
+        },
+    )
 
 
 WIDTHS = (640, 480, 360, 240, 160, 96, 64)  # px, tried from the largest
@@ -267,31 +252,15 @@ def _as_wide_as_fits(
 
 
 def _photo(path: Path, width: int) -> str:
-    import cv2
-
-    small = _narrowed(np.ascontiguousarray(read_png_rgb(path)[:, :, ::-1]), width)
-    return _uri("jpeg", bytes(cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]))
+    return data_uri("jpeg", jpeg_bytes(narrowed(read_png_rgb(path), width), _QUALITY))
 
 
 def _mask(path: Path, width: int) -> str:
     import cv2
 
-    black_and_white = ((_narrowed(read_gray(path), width) > 127) * 255).astype(np.uint8)
+    black_and_white = ((narrowed(read_gray(path), width) > 127) * 255).astype(np.uint8)
     options = [cv2.IMWRITE_PNG_BILEVEL, 1]
-    return _uri("png", bytes(cv2.imencode(".png", black_and_white, options)[1]))
-
-
-def _narrowed(image: np.ndarray, width: int) -> np.ndarray:
-    import cv2
-
-    if image.shape[1] <= width:
-        return image
-    height = max(1, round(image.shape[0] * width / image.shape[1]))
-    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-
-
-def _uri(kind: str, data: bytes) -> str:
-    return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
+    return data_uri("png", bytes(cv2.imencode(".png", black_and_white, options)[1]))
 
 
 _NEAR = 0.01  # as in training

@@ -315,13 +315,3 @@ def write_gif(path: Path, frames: Sequence[Frame], fps: float) -> None:
             loop=0,
             optimize=True,
         )
-
-
-def narrowed(frame: Frame, width: int) -> Frame:
-    """The frame, not wider than so many px."""
-    import cv2
-
-    if frame.shape[1] <= width:
-        return frame
-    height = max(2, round(frame.shape[0] * width / frame.shape[1]))
-    return cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA)

@@ -1,9 +1,6 @@
 """Pictures of a run: they change nothing of it, survive a kill, and show what they say."""
 
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -25,7 +22,7 @@ from ambiguous_wild.harness.pictures.training import (
 )
 from ambiguous_wild.harness.running.grid import plan_cells, run_cells
 from ambiguous_wild.io.images import read_png_rgb, write_png
-from ambiguous_wild.io.palette import ramp, tint
+from ambiguous_wild.io.palette import ramp
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import get_method
 from ambiguous_wild.splat import checkpoint
@@ -178,25 +175,9 @@ def test_the_ramp_is_monotone_from_green_to_red_and_nan_is_grey():
     assert (ramp(np.ones(3), 1.0, 1.0) == ramp(np.zeros(3), 0.0, 1.0)).all()  # no range: no division by 0
 
 
-def test_a_tint_leaves_the_rest_alone():
-    photo = np.random.default_rng(0).integers(0, 256, (4, 5, 3), dtype=np.uint8)
-    mask = np.zeros((4, 5), bool)
-    mask[1, 2] = True
-    shown = tint(photo, mask, (255, 0, 0))
-    assert (shown[~mask] == photo[~mask]).all() and (shown[mask] != photo[mask]).any()
-
-
 def test_long_captions_stay_on_their_picture():
     framed = sheets.cell(
         "a caption that is far longer than the picture below it is wide", np.zeros((9, 40, 3), np.uint8)
     )
     assert framed.shape == (9 + sheets.BAR + sheets.GAP, 40 + sheets.GAP, 3)
     assert (framed[: sheets.BAR, 40:] == 255).all() and (framed[: sheets.BAR] < 255).any()
-
-
-def test_the_command_line_can_leave_pictures_away(scene, tmp_path):
-    command = [sys.executable, "-m", "ambiguous_wild.cli.main", "bench", "--method", "3dgs", "--scene"]
-    command += [str(scene.root), "--iterations", "5", "--no-pictures", "-o", str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[2])
-    assert done.returncode == 0, done.stderr
-    assert not list(tmp_path.rglob("pictures"))

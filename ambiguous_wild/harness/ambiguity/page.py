@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import html
 import math
 from collections.abc import Iterator
@@ -19,6 +18,7 @@ from ambiguous_wild.harness.tables.plain_formats import to_csv
 from ambiguous_wild.harness.tables.table import text_table
 from ambiguous_wild.harness.tables.typeset import html_table
 from ambiguous_wild.io.atomic import atomic_dir, atomic_path, refuse_file, write_json, write_text
+from ambiguous_wild.io.page_parts import data_uri, jpeg_bytes, narrowed
 from ambiguous_wild.io.palette import ADDED, LOCAL, MASKED, NEUTRAL, faded, plot_colour, ramp, tint
 from ambiguous_wild.metrics import ambiguity as am
 from ambiguous_wild.metrics import semantic as sem
@@ -213,18 +213,7 @@ def _pictures(
         cosine = cosine_picture(look, index, photo, distractor)
         if cosine is not None:
             images.append(("similarity to the largest distractor", cosine))
-        yield view.name, [(caption, _jpeg(image)) for caption, image in images]
-
-
-def _jpeg(image: np.ndarray) -> bytes:
-    import cv2
-
-    scale = WIDTH / image.shape[1]
-    if scale < 1:
-        image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return bytes(
-        cv2.imencode(".jpg", np.ascontiguousarray(image[:, :, ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 85])[1]
-    )
+        yield view.name, [(caption, jpeg_bytes(narrowed(image, WIDTH), 85)) for caption, image in images]
 
 
 _STYLE = """
@@ -300,8 +289,7 @@ def _shown(name: str, caption: str, data: bytes) -> str:
 
 
 def _image(data: bytes, kind: str, name: str) -> str:
-    text = base64.b64encode(data).decode("ascii")
-    return f'<img alt="{html.escape(name)}" src="data:image/{kind};base64,{text}">'
+    return f'<img alt="{html.escape(name)}" src="{data_uri(kind, data)}">'
 
 
 def _cell(value: Any) -> str:

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
-import html
 import json
 import os
-import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -33,6 +29,7 @@ from ambiguous_wild.io.foreign_files import list_names
 from ambiguous_wild.io.foreign_files import refuse_foreign_files as refuse_strangers
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.lock import folder_lock
+from ambiguous_wild.io.page_parts import fill_page
 from ambiguous_wild.viewing.page_file import page_text
 
 GENERATOR = '<meta name="generator" content="aw leaderboard publish">'
@@ -176,25 +173,9 @@ def _copy_picture(source: Path, target: Path, digest: str) -> None:
 
 def page(title: str, known: Mapping[str, Any]) -> str:
     """The page; data and title can be anything and stay text."""
-    here = Path(__file__).resolve().parent
-    template = (here / "page.html").read_text(encoding="utf-8")
-    style = (here / "page.css").read_text(encoding="utf-8")
-    script = "\n".join((here / name).read_text(encoding="utf-8") for name in SCRIPTS)
-    data = json.dumps(known, ensure_ascii=False, allow_nan=False, separators=(",", ":"), sort_keys=True)
-    for char in "<>&\u2028\u2029":  # no text in it can end the element it stands in
-        data = data.replace(char, f"\\u{ord(char):04x}")
     # A picture beside a file:// page is not 'self' in every browser.
-    policy = (
-        f"default-src 'none'; img-src 'self' file: data:; style-src {_digest(style)}; "
-        f"script-src {_digest(script)}; base-uri 'none'; form-action 'none'"
-    )
-    parts = {"POLICY": policy, "TITLE": html.escape(title), "STYLE": style, "SCRIPT": script, "DATA": data}
-    # In one pass: what is put in is not looked at again.
-    return re.sub(r"/\*([A-Z]+)\*/", lambda found: parts[found[1]], template)
-
-
-def _digest(text: str) -> str:
-    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+    here = Path(__file__).resolve().parent
+    return fill_page(here, known, SCRIPTS, title=title, images="'self' file: data:", sort_keys=True)
 
 
 MODELS = "models"

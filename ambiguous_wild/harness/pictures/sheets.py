@@ -17,6 +17,7 @@ from ambiguous_wild.harness.running.store import Runs
 from ambiguous_wild.harness.showing.read import open_scene
 from ambiguous_wild.io.atomic import atomic_path
 from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
+from ambiguous_wild.io.page_parts import jpeg_bytes
 from ambiguous_wild.io.palette import ADDED, MASKED, tint
 from ambiguous_wild.metrics.image import psnr
 
@@ -80,13 +81,9 @@ def spread(items: Sequence[Item], count: int) -> list[Item]:
 
 def write_jpeg(path: Path, image: np.ndarray, quality: int = 90) -> None:
     """Write [H, W, 3] uint8 RGB atomically."""
-    done, data = cv2.imencode(
-        ".jpg", np.ascontiguousarray(image[:, :, ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality]
-    )
-    if not done:  # a side above 65500 px
-        raise AwError(f"{path}: {list(image.shape[:2])} px are too many for a JPG; write a .png")
+    data = jpeg_bytes(image, quality)
     with atomic_path(path) as temporary:
-        temporary.write_bytes(data.tobytes())
+        temporary.write_bytes(data)
 
 
 def write_capture_sheet(raw: Path, path: Path | None = None) -> Path:

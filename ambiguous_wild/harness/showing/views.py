@@ -14,6 +14,7 @@ from ambiguous_wild.harness.running.callbacks import Callbacks, outcome_line, ru
 from ambiguous_wild.harness.running.prepare import prepare_cpu
 from ambiguous_wild.harness.showing.read import find_models, open_scene, read_models
 from ambiguous_wild.io.atomic import check_output
+from ambiguous_wild.io.page_parts import narrowed
 from ambiguous_wild.viewing.live import LiveView
 from ambiguous_wild.viewing.model import Exported, export
 from ambiguous_wild.viewing.video import (
@@ -21,7 +22,6 @@ from ambiguous_wild.viewing.video import (
     Tick,
     draw_frames,
     from_file,
-    narrowed,
     orbit,
     through_views,
     write_gif,

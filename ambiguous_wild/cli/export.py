@@ -13,7 +13,7 @@ import click
 from ambiguous_wild.cli.paths import PathName
 
 if TYPE_CHECKING:
-    from ambiguous_wild.viewing.export import Exported
+    from ambiguous_wild.viewing.model import Exported
 
 FORMATS = ("compressed-ply", "spz", "sog", "gltf")
 
@@ -62,7 +62,7 @@ def command(
     aw export runs
     aw export runs/courtyard/refinesplat/seed0 --format spz -o models
     """
-    from ambiguous_wild.harness.showing.export import export_runs
+    from ambiguous_wild.harness.showing.views import export_runs
     from ambiguous_wild.methods.registry import load_plugin
 
     for plugin in plugins:

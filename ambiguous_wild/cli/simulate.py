@@ -81,7 +81,7 @@ def command(
         sweep_siblings(out)  # left by a killed call
         facts = simulate(spec, out, seed, depth, overwrite, bar)
         if sheet and not (facts["reused"] and (out / "truth" / "sheet.jpg").is_file()):
-            from ambiguous_wild.harness.pictures.capture_sheet import write_capture_sheet
+            from ambiguous_wild.harness.pictures.sheets import write_capture_sheet
 
             write_capture_sheet(out)
     outside = _outside(spec, facts["photos"])

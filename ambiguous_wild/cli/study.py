@@ -103,8 +103,7 @@ def make_command(
     from ambiguous_wild.core.errors import AwError
     from ambiguous_wild.core.names import is_text
     from ambiguous_wild.io.atomic import check_output
-    from ambiguous_wild.study.make import StudySettings, make_study
-    from ambiguous_wild.study.questions import Question, render_pairs, scene_photos
+    from ambiguous_wild.study.make import Question, StudySettings, make_study, render_pairs, scene_photos
 
     if not scenes and runs is None:
         raise AwError("nothing to ask about: give --scene SCENE (photos), --runs RUNS (renders), or both")
@@ -165,8 +164,7 @@ def score_command(answers: tuple[Path, ...], key: Path, out: Path | None, seed: 
     """Score ANSWERS: files (JSON or CSV) saved by raters, or folders of them."""
     from ambiguous_wild.io.atomic import check_output
     from ambiguous_wild.io.atomic import refuse_foreign_files as refuse_strangers
-    from ambiguous_wild.study.answers import read_answers
-    from ambiguous_wild.study.key import read_key
+    from ambiguous_wild.study.answers import read_answers, read_key
     from ambiguous_wild.study.report import SCORE_FILES, markdown_of, write_scores
     from ambiguous_wild.study.scores import score
 

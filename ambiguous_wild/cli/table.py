@@ -96,7 +96,7 @@ def command(
 
     found = None if layout == "ablation" else _read(runs)
     if sheet is not None and found is not None:
-        from ambiguous_wild.harness.tables.sheet import write_sheet
+        from ambiguous_wild.harness.pictures.sheets import write_sheet
 
         shown = write_sheet(found, sheet, scene=scenes[0] if scenes else None)
         click.echo(f"wrote {sheet}: {shown} methods side by side", err=True)
@@ -123,8 +123,8 @@ def _read(runs: Path) -> Runs:
 
 
 def _write_tidy(found: Runs, output: Path | None, metrics: Sequence[str], scenes: Sequence[str]) -> None:
+    from ambiguous_wild.harness.tables.comparison import tidy
     from ambiguous_wild.harness.tables.plain_formats import to_csv
-    from ambiguous_wild.harness.tables.tidy import tidy
     from ambiguous_wild.io.atomic import write_text
 
     frame = tidy(found, metrics=metrics, scenes=scenes)
@@ -148,9 +148,8 @@ def _blocks(
     everything: bool,
 ) -> tuple[str, str]:
     from ambiguous_wild.harness.tables.comparison import comparison
-    from ambiguous_wild.harness.tables.fit import fitted
     from ambiguous_wild.harness.tables.papers import cost_at_the_end
-    from ambiguous_wild.harness.tables.plain_formats import to_wide_csv
+    from ambiguous_wild.harness.tables.plain_formats import fitted, to_wide_csv
 
     tables = comparison(found, metrics=metrics, scenes=scenes)
     if style == "text" and not metrics and not everything:
@@ -173,9 +172,8 @@ def _echo_notes(tables: Sequence[Table], made_by: str) -> None:
 
 
 def _written(tables: Sequence[Table], style: str, color: bool) -> str:
-    from ambiguous_wild.harness.tables.html_page import to_html
-    from ambiguous_wild.harness.tables.latex import to_latex
     from ambiguous_wild.harness.tables.plain_formats import to_markdown, to_text
+    from ambiguous_wild.harness.tables.typeset import to_html, to_latex
 
     if style == "text":
         return to_text(tables, color=color)
@@ -192,11 +190,10 @@ def _layouts(
     reported: bool,
     reported_from: Path | None,
 ) -> list[Table]:
+    from ambiguous_wild.harness.ablation.report import ablation
     from ambiguous_wild.harness.tables import papers
-    from ambiguous_wild.harness.tables.ablation import ablation
     from ambiguous_wild.harness.tables.comparison import comparison
-    from ambiguous_wild.harness.tables.reported import datasets_of, read_reported, with_reported
-    from ambiguous_wild.harness.tables.significance import Ties
+    from ambiguous_wild.harness.tables.papers import Ties, datasets_of, read_reported, with_reported
 
     if found is None:
         return ablation(runs, tuple(metrics))
@@ -217,8 +214,7 @@ def _layouts(
 
 
 def _laid_out(made: list[Table], style: str, made_by: str, color: bool, everything: bool) -> tuple[str, str]:
-    from ambiguous_wild.harness.tables.fit import divided
-    from ambiguous_wild.harness.tables.plain_formats import to_long_csv
+    from ambiguous_wild.harness.tables.plain_formats import divided, to_long_csv
 
     told = f"{len(made)} table{'' if len(made) == 1 else 's'}"
     if style == "csv":

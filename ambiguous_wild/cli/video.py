@@ -57,7 +57,7 @@ def command(
     aw video runs -o video.mp4
     aw video runs --path orbit --seconds 12 --fps 30 --gif video.gif
     """
-    from ambiguous_wild.harness.showing.video import video_runs
+    from ambiguous_wild.harness.showing.views import video_runs
     from ambiguous_wild.methods.registry import load_plugin
 
     for plugin in plugins:

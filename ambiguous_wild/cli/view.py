@@ -103,7 +103,7 @@ def command(
     if live is not None:
         if runs:
             raise AwError("--live trains a run of its own: leave RUNS out, or leave --live out")
-        from ambiguous_wild.harness.showing.live import watch
+        from ambiguous_wild.harness.showing.views import watch
 
         folder = Path("runs") if chosen is click.core.ParameterSource.DEFAULT else output
         watch(
@@ -113,7 +113,7 @@ def command(
         return
     if not runs:
         raise AwError("no RUNS: give the folder that 'aw bench -o' wrote, or --live SCENE")
-    from ambiguous_wild.harness.showing.page import view_runs
+    from ambiguous_wild.harness.showing.read import view_runs
 
     page = view_runs(
         runs,

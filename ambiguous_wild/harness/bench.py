@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from ambiguous_wild.harness.running.cell import Cell, CellReport, Outcome, Overwrite, Protocol
     from ambiguous_wild.harness.running.records import RunResult
     from ambiguous_wild.harness.running.store import Runs
-    from ambiguous_wild.harness.showing.page import Viewer
+    from ambiguous_wild.harness.showing.read import Viewer
 
 Place = Literal["mask", "density", "regulariser"]
 Words = str | Path
@@ -78,7 +78,7 @@ class RunReport:
         Raises:
             AwError: the run has no model, or its scene is not where it was.
         """
-        from ambiguous_wild.harness.showing.page import Viewer
+        from ambiguous_wild.harness.showing.read import Viewer
 
         return Viewer([self.folder], height=height)
 
@@ -116,7 +116,7 @@ class BenchReport:
 
     def show(self, height: int = 640) -> Viewer:
         """The page of `aw view` with every model side by side, for a notebook; see `RunReport.show`."""
-        from ambiguous_wild.harness.showing.page import Viewer
+        from ambiguous_wild.harness.showing.read import Viewer
 
         return Viewer([run.folder for run in self.runs if run.outcome != "failed"], height=height)
 

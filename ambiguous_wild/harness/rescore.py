@@ -14,7 +14,7 @@ from typing import Literal, cast
 from ambiguous_wild import __version__
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.errors import shortlist
-from ambiguous_wild.harness.leaderboard.photos import check_photos
+from ambiguous_wild.harness.leaderboard.verify import check_photos
 from ambiguous_wild.harness.running.evaluate import Measures, measures_of
 from ambiguous_wild.harness.running.identity import config_identity, scene_identity
 from ambiguous_wild.harness.running.provenance import code_hash

@@ -92,7 +92,7 @@ def _ready(
 
 def suite_methods(suite: Suite, reported_from: Path | None = None) -> list[str]:
     """Our methods that tables of the suite's dataset report; 3DGS and RefineSplat where none does."""
-    from ambiguous_wild.harness.tables.reported import read_reported
+    from ambiguous_wild.harness.tables.papers import read_reported
     from ambiguous_wild.methods.registry import all_methods
 
     numbers = read_reported(reported_from)
@@ -112,8 +112,7 @@ def suite_tables(prepared: PreparedSuite, runs: Path, reported_from: Path | None
         AwError: no finished run.
     """
     from ambiguous_wild.harness.running.store import read_runs
-    from ambiguous_wild.harness.tables.papers import paper
-    from ambiguous_wild.harness.tables.reported import read_reported, with_reported
+    from ambiguous_wild.harness.tables.papers import paper, read_reported, with_reported
 
     suite, found = prepared.suite, read_runs(runs)
     known = set(found.runs["scene"]) if len(found.runs) else set()

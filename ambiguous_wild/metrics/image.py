@@ -1,4 +1,4 @@
-"""PSNR and SSIM of one image pair; each variant has its own name (full image, float64, range 1).
+"""PSNR, SSIM and FLIP of a render and its photo; each variant has its own name (full image, float64).
 
 Implementations differ more than methods: padding at the border alone changes SSIM by up to 0.009. So the
 variant is part of the name, and all metrics are computed from the same saved 8-bit images.
@@ -151,3 +151,186 @@ def _as_float(image: np.ndarray, which: str) -> np.ndarray:
             f"the {which} image has values outside [0, 1] or not finite; clip the render before measuring"
         )
     return values
+
+
+RANK = 1e-12  # of the largest eigenvalue: below it a channel is a copy of others, as in grey pictures
+
+
+def psnr_affine(
+    render: np.ndarray,  # [H, W, 3] uint8 or float in [0, 1]
+    photo: np.ndarray,  # [H, W, 3] uint8 or float in [0, 1]
+) -> float:
+    """PSNR in dB after the affine colour map (3x3 and an offset, least squares) from render to photo.
+
+    The map is fitted to the whole picture, its result cut to [0, 1]. Never below `psnr`, as leaving the
+    colours alone is such a map. (Nerfstudio and gsplat fit a quadratic map for `cc_psnr`: other values.)
+
+    Raises:
+        AwError: see `checked_pair`.
+    """
+    left, right = checked_pair(render, photo)
+    x, y = left.reshape(-1, 3), right.reshape(-1, 3)
+    plain = float(np.mean((x - y) ** 2))
+    # Normal equations of centred colours: exact enough for 8 bits, and no 4-column copy of a large picture.
+    x_mean, y_mean = x.mean(axis=0), y.mean(axis=0)
+    x = x - x_mean
+    matrix = np.linalg.lstsq(x.T @ x, x.T @ (y - y_mean), rcond=RANK)[0]
+    fitted = np.clip(x @ matrix + y_mean, 0.0, 1.0)
+    return psnr_from_mse(min(plain, float(np.mean((fitted - y) ** 2))))
+
+
+# The paper's default: a screen of 0.7 m and 3840 px, seen from 0.7 m: 67.02.
+PIXELS_PER_DEGREE = 0.7 * (3840 / 0.7) * math.pi / 180
+
+# Contrast sensitivity per channel: Gaussians (amplitude, width in degrees^2), table 1.
+_CSF = {
+    "achromatic": ((1.0, 0.0047),),
+    "red-green": ((1.0, 0.0053),),
+    "blue-yellow": ((34.1, 0.04), (13.5, 0.025)),
+}
+_COLOUR_EXPONENT = 0.7  # q_c
+_KNEE, _KNEE_ERROR = 0.4, 0.95  # p_c, p_t: share of the largest colour error, and the value it maps to
+_FEATURE_DEGREES = 0.082  # w, edge width of highest visibility
+_FEATURE_EXPONENT = 0.5  # q_f
+
+# CIE xy of sRGB's primaries and of its white point D65.
+_PRIMARIES = ((0.64, 0.33), (0.30, 0.60), (0.15, 0.06))
+_WHITE = (0.3127, 0.3290)
+
+
+def flip(
+    a: np.ndarray,  # [H, W, 3] uint8 or float in [0, 1], sRGB
+    b: np.ndarray,  # [H, W, 3] the same size
+) -> float:
+    """Mean LDR-FLIP error in [0, 1] at 67 pixels per degree; 0 for identical images.
+
+    Raises:
+        AwError: see `checked_pair`.
+    """
+    return float(flip_map(a, b).mean())
+
+
+def flip_map(
+    a: np.ndarray,  # [H, W, 3] uint8 or float in [0, 1], sRGB
+    b: np.ndarray,  # [H, W, 3] the same size
+) -> np.ndarray:
+    """The LDR-FLIP error of every pixel, [H, W] float64 in [0, 1]; symmetric in the images.
+
+    Raises:
+        AwError: see `checked_pair`.
+    """
+    first, second = (_opponent(_linear(picture)) for picture in checked_pair(a, b))
+    colour = _colour_error(_perceived(first), _perceived(second))
+    feature = _feature_error(_luminance(first), _luminance(second))
+    return colour ** (1.0 - feature)  # equation 7
+
+
+def _linear(image: np.ndarray) -> np.ndarray:
+    """sRGB to linear RGB."""
+    return np.where(image > 0.04045, ((image + 0.055) / 1.055) ** 2.4, image / 12.92)
+
+
+def _xyz_from_rgb() -> np.ndarray:
+    """Matrix [3, 3] from linear RGB to XYZ, from the primaries and the white point."""
+    columns = np.array([(x / y, 1.0, (1.0 - x - y) / y) for x, y in _PRIMARIES]).T
+    x, y = _WHITE
+    return columns * np.linalg.solve(columns, [x / y, 1.0, (1.0 - x - y) / y])
+
+
+_XYZ_FROM_RGB = _xyz_from_rgb()
+_XYZ_WHITE = _XYZ_FROM_RGB.sum(axis=1)
+# YCxCz, the opponent space of the contrast sensitivity functions: rows act on XYZ / white.
+_YCC_FROM_XYZ = np.array([[0.0, 116.0, 0.0], [500.0, -500.0, 0.0], [0.0, 200.0, -200.0]])
+_YCC_OFFSET = np.array([-16.0, 0.0, 0.0])
+_YCC_FROM_RGB = _YCC_FROM_XYZ @ (_XYZ_FROM_RGB / _XYZ_WHITE[:, None])
+
+
+def _opponent(linear: np.ndarray) -> np.ndarray:
+    return linear @ _YCC_FROM_RGB.T + _YCC_OFFSET
+
+
+def _luminance(opponent: np.ndarray) -> np.ndarray:
+    """Y of YCxCz scaled to [0, 1], [H, W]."""
+    return (opponent[..., 0] + 16.0) / 116.0
+
+
+def _perceived(opponent: np.ndarray) -> np.ndarray:
+    """Filtered by contrast sensitivity, in L*a*b* with Hunt's adjustment, [H, W, 3]."""
+    widest = max(width for gaussians in _CSF.values() for _, width in gaussians)
+    radius = math.ceil(3.0 * math.sqrt(widest / (2.0 * math.pi**2)) * PIXELS_PER_DEGREE)
+    degrees = np.arange(-radius, radius + 1) / PIXELS_PER_DEGREE
+    filtered = [_blur_csf(opponent[..., i], gaussians, degrees) for i, gaussians in enumerate(_CSF.values())]
+    rgb = (np.stack(filtered, axis=-1) - _YCC_OFFSET) @ np.linalg.inv(_YCC_FROM_RGB).T
+    return _hunt(_lab(np.clip(rgb, 0.0, 1.0)))
+
+
+def _blur_csf(
+    channel: np.ndarray, gaussians: tuple[tuple[float, float], ...], degrees: np.ndarray
+) -> np.ndarray:
+    """Filter a channel by its contrast sensitivity, equation 3: separable Gaussians with sum 1."""
+    kernels = [np.exp(-(math.pi**2) * degrees**2 / width) for _, width in gaussians]
+    weights = [a * math.sqrt(math.pi / width) for a, width in gaussians]
+    total = sum(w * k.sum() ** 2 for w, k in zip(weights, kernels))
+    parts = (w * _separable(channel, k, k) for w, k in zip(weights, kernels))
+    return sum(parts, np.zeros_like(channel)) / total
+
+
+def _lab(linear: np.ndarray) -> np.ndarray:
+    """Linear RGB to CIE L*a*b*."""
+    t = linear @ (_XYZ_FROM_RGB / _XYZ_WHITE[:, None]).T
+    delta = 6.0 / 29.0
+    f = np.where(t > delta**3, np.cbrt(t), t / (3.0 * delta**2) + 4.0 / 29.0)
+    x, y, z = f[..., 0], f[..., 1], f[..., 2]
+    return np.stack([116.0 * y - 16.0, 500.0 * (x - y), 200.0 * (y - z)], axis=-1)
+
+
+def _hunt(lab: np.ndarray) -> np.ndarray:
+    """Hunt effect: colour differences grow with luminance, equation 4."""
+    return np.concatenate([lab[..., :1], 0.01 * lab[..., :1] * lab[..., 1:]], axis=-1)
+
+
+def _hyab(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """HyAB distance, for large colour differences, equation 5."""
+    difference = a - b
+    return np.abs(difference[..., 0]) + np.hypot(difference[..., 1], difference[..., 2])
+
+
+def _colour_error(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Colour difference in [0, 1]; small differences take most of the range, section 4.1.3."""
+    green, blue = _hunt(_lab(np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])))
+    largest = _hyab(green, blue) ** _COLOUR_EXPONENT
+    error, knee = _hyab(a, b) ** _COLOUR_EXPONENT, _KNEE * largest
+    above = _KNEE_ERROR + (error - knee) / (largest - knee) * (1.0 - _KNEE_ERROR)
+    return np.where(error < knee, error * (_KNEE_ERROR / knee), above)
+
+
+def _feature_error(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Difference in edges and points between two luminances [H, W], equation 6."""
+    deviation = 0.5 * _FEATURE_DEGREES * PIXELS_PER_DEGREE
+    radius = math.ceil(3.0 * deviation)
+    x = np.arange(-radius, radius + 1)
+    smooth = np.exp(-(x**2) / (2.0 * deviation**2))
+    smooth /= smooth.sum()
+    edge = _balanced(-x * smooth)
+    point = _balanced((x**2 / deviation**2 - 1.0) * smooth)
+    found = [np.abs(_strength(a, kernel, smooth) - _strength(b, kernel, smooth)) for kernel in (edge, point)]
+    return np.clip(np.maximum(*found) / math.sqrt(2.0), 0.0, None) ** _FEATURE_EXPONENT
+
+
+def _balanced(kernel: np.ndarray) -> np.ndarray:
+    """Scale the positive part to sum 1 and the negative to -1: the response lies in [-1, 1]."""
+    positive, negative = kernel[kernel > 0].sum(), -kernel[kernel < 0].sum()
+    return np.where(kernel > 0, kernel / positive, kernel / negative)
+
+
+def _strength(luminance: np.ndarray, kernel: np.ndarray, smooth: np.ndarray) -> np.ndarray:
+    return np.hypot(_separable(luminance, smooth, kernel), _separable(luminance, kernel, smooth))
+
+
+def _separable(image: np.ndarray, down: np.ndarray, across: np.ndarray) -> np.ndarray:
+    """Filter along both axes; border pixels are repeated."""
+    rows = correlate1d(image, down, axis=0, mode="nearest")
+    return correlate1d(rows, across, axis=1, mode="nearest")
+
+
+FULL_IMAGE = METRICS | {"psnr_affine": psnr_affine, "flip": flip}

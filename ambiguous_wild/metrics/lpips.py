@@ -135,32 +135,6 @@ def load(name: str) -> Metric:
     return measure
 
 
-def lpips_alex(a: np.ndarray, b: np.ndarray) -> float:
-    """LPIPS with AlexNet, input scaled to [-1, 1]: the variant of NerfBaselines and most papers.
-
-    Args:
-        a: [H, W, 3] uint8 or float in [0, 1], sides of at least 31 px.
-        b: the same size.
-
-    Raises:
-        AwError: weights missing or unusable (see `available`), an image too small, or see `checked_pair`.
-    """
-    return load("lpips_alex")(a, b)
-
-
-def lpips_vgg(a: np.ndarray, b: np.ndarray) -> float:
-    """LPIPS with VGG-16, input scaled to [-1, 1]; sides of at least 16 px. See `lpips_alex`."""
-    return load("lpips_vgg")(a, b)
-
-
-def lpips_vgg_01(a: np.ndarray, b: np.ndarray) -> float:
-    """LPIPS with VGG-16 and input in [0, 1], not scaled: the LPIPS of the original 3DGS code.
-
-    The network was calibrated for twice this contrast: compare only with itself. See `lpips_alex`.
-    """
-    return load("lpips_vgg_01")(a, b)
-
-
 def _distance(
     backbone: _Backbone,
     stack: nn.Sequential,

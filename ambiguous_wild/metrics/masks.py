@@ -74,19 +74,6 @@ def confusion(
     )
 
 
-def mask_scores(
-    distractor: np.ndarray,  # [H, W] bool, predicted; True = transient
-    truth: np.ndarray,  # [H, W] bool, true; True = transient
-) -> dict[str, float]:
-    """IoU, precision and recall of the transient pixels of one photo; NaN if undefined.
-
-    Raises:
-        AwError: maps of different size, or not two-dimensional.
-    """
-    counts = confusion(~np.asarray(distractor, dtype=bool), ~np.asarray(truth, dtype=bool))
-    return {"iou": counts.iou, "precision": counts.precision, "recall": counts.recall}
-
-
 def pooled(counts: Iterable[Confusion]) -> Confusion:
     """The sum of the counts of several photos."""
     return sum(counts, Confusion())

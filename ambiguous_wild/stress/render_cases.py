@@ -14,16 +14,20 @@ from ambiguous_wild.splat.gaussians import PARAMETERS, Gaussians
 from ambiguous_wild.splat.reference import render_reference
 from ambiguous_wild.splat.render import render
 from ambiguous_wild.splat.rendered import Cotangents
-from ambiguous_wild.stress.case import UNIT, Measured, case, failed_checks, worst
-from ambiguous_wild.stress.float64_check import (
+from ambiguous_wild.stress.case import (
     FAST_MATH,
+    UNIT,
+    Measured,
     agree,
     alpha_clamp,
     camera,
+    case,
     cloud,
     device_result,
+    failed_checks,
     float64_result,
     stacked_gaussians,
+    worst,
 )
 
 BOTH = ("cpu", "cuda")
@@ -271,22 +275,3 @@ def _against_differences(g: Gaussians, cam: Camera, device: str) -> Measured:
     # 96 + 6 N roundings of float32, times the terms of a directional derivative; h^2 and 1e-16 / h vanish
     tolerance = (96 + 6 * len(g)) * terms * UNIT * (FAST_MATH if clamp else 1)
     return Measured(worst_error, tolerance, "roundings x terms of a derivative", "the same slope", None)
-
-
-CASES = (
-    near_plane,
-    in_front_of_near_plane,
-    not_finite,
-    scales,
-    aspect,
-    quaternions,
-    quaternion_denormal,
-    logits_and_colours,
-    logit_clamped,
-    stack,
-    opaque_stack,
-    sizes,
-    nothing,
-    cameras,
-    finite_differences,
-)

@@ -6,15 +6,9 @@ import fnmatch
 from collections.abc import Callable, Iterable, Sequence
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.stress import mask_cases, metric_cases, render_cases, training_cases
-from ambiguous_wild.stress.case import Case, Outcome, run
+from ambiguous_wild.stress.case import REGISTERED, Case, Outcome, run
 
-CASES: tuple[Case, ...] = tuple(
-    sorted(
-        (*render_cases.CASES, *training_cases.CASES, *mask_cases.CASES, *metric_cases.CASES),
-        key=lambda c: c.row,
-    )
-)
+CASES: tuple[Case, ...] = tuple(sorted(REGISTERED, key=lambda c: c.row))
 
 
 def chosen(only: Sequence[str]) -> list[Case]:

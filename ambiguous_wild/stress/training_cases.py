@@ -14,8 +14,7 @@ from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.rendered import Gradients
-from ambiguous_wild.stress.case import UNIT, Measured, case, failed_checks
-from ambiguous_wild.stress.float64_check import camera, cloud, stacked_gaussians
+from ambiguous_wild.stress.case import UNIT, Measured, camera, case, cloud, failed_checks, stacked_gaussians
 
 _RATES = {
     "means": 1e-3, "quats": 1e-3, "log_scales": 5e-3, "opacity_logits": 5e-2, "sh0": 2.5e-3, "sh_rest": 1e-4
@@ -185,6 +184,3 @@ def never_seen(device: str) -> Measured:
     optimiser.flush()
     checks = {name: torch.equal(t[1], getattr(before, name)[1]) for name, t in g.items()}
     return failed_checks(checks, "unchanged, bit for bit")
-
-
-CASES = (same_bits, adam_at_rest, never_seen, density_rows, all_masked, saturated_sky)

@@ -11,8 +11,8 @@ from ambiguous_wild.harness.tables import plain_formats
 from ambiguous_wild.harness.tables.plain_formats import markdown_text
 from ambiguous_wild.harness.tables.table import text_table
 from ambiguous_wild.io.atomic import atomic_dir, write_json, write_text
-from ambiguous_wild.study.key import KIND_PAIR, KIND_PHOTO
-from ambiguous_wild.study.records import (
+from ambiguous_wild.study.answers import KIND_PAIR, KIND_PHOTO
+from ambiguous_wild.study.ranking import (
     AgreementScore,
     Ambiguity,
     Counted,

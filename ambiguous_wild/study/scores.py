@@ -12,21 +12,18 @@ from typing import Any
 import numpy as np
 
 from ambiguous_wild.metrics.ambiguity import ratio_interval
-from ambiguous_wild.study.agreement import agreement
-from ambiguous_wild.study.answers import TOO_FAST_S, Answer, Rater
-from ambiguous_wild.study.key import KIND_PAIR, KIND_PHOTO, Key
-from ambiguous_wild.study.ranking import Strength, bradley_terry
-from ambiguous_wild.study.records import (
-    AgreementScore,
+from ambiguous_wild.study.answers import KIND_PAIR, KIND_PHOTO, TOO_FAST_S, Answer, Key, Rater
+from ambiguous_wild.study.ranking import (
     Ambiguity,
     MethodShare,
     PairShare,
     Preference,
-    Ranked,
     RaterSummary,
     Ratings,
     Scores,
     Share,
+    agreement,
+    bradley_terry,
 )
 
 HARD = 4  # of 5: a photo rated this or more is hard
@@ -112,30 +109,13 @@ def _preference(key: Key, raters: list[Rater], seed: int) -> Preference | None:
             for m in methods
         ],
         "pairs": [_pair(a, b, votes, seed) for a, b in combinations(methods, 2)],
-        "ranking": [_ranked(s) for s in ranking],
+        "ranking": ranking,
         "ranking_note": note,
         "left": share(_counts(mine, lambda a: a.answer == a.left, lambda a: a.answer != "tie"), seed),
-        "agreement": _agreement(
+        "agreement": agreement(
             ((r.rater, a.question, a.answer) for r, one in zip(raters, mine) for a in one), ordered=False
         ),
     }
-
-
-def _ranked(found: Strength) -> Ranked:
-    return {
-        "method": found.method,
-        "strength": found.strength,
-        "low": _number(found.low),
-        "high": _number(found.high),
-        "rank": found.rank,
-        "rank_low": found.rank_low,
-        "rank_high": found.rank_high,
-    }
-
-
-def _agreement(answers: Iterable[tuple[str, str, Any]], *, ordered: bool) -> AgreementScore:
-    found = agreement(answers, ordered=ordered)
-    return {"alpha": found.alpha, "equal": found.equal, "questions": found.questions, "note": found.note}
 
 
 # (winner, loser, scene, tie); for a tie the methods x and y
@@ -190,7 +170,7 @@ def _ambiguity(key: Key, raters: list[Rater], seed: int) -> Ambiguity | None:
              **_ratings([[a for a in one if a.question == q] for one in mine], seed)}
             for q, e in sorted(entries.items(), key=lambda item: (item[1]["scene"], item[1]["view"]))
         ],
-        "agreement": _agreement(rows, ordered=True),
+        "agreement": agreement(rows, ordered=True),
     }  # fmt: skip
 
 

@@ -17,8 +17,8 @@ import numpy as np
 from ambiguous_wild.core import AwError, Camera
 from ambiguous_wild.core.extras import install_command
 from ambiguous_wild.io.images import read_png_rgb, to_uint8
-from ambiguous_wild.viewing.space import space_of
-from ambiguous_wild.viewing.video import narrowed
+from ambiguous_wild.io.page_parts import narrowed
+from ambiguous_wild.viewing.model import space_of
 
 if TYPE_CHECKING:
     from ambiguous_wild.splat.trainer import Trainer

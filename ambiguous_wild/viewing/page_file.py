@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import base64
-import hashlib
 import html
-import json
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,14 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from ambiguous_wild.core import AwError, Scene, View
+from ambiguous_wild.core import AwError, Camera, Scene, View
 from ambiguous_wild.io.atomic import check_output, refuse_file, write_text
+from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.motion_points import read_motion_points
+from ambiguous_wild.io.page_parts import data_uri, fill_page, jpeg_bytes, narrowed
+from ambiguous_wild.io.splat_formats.arrays import finite, sigmoid
 from ambiguous_wild.io.splat_formats.spz import spz_bytes
-from ambiguous_wild.viewing.model import Model
-from ambiguous_wild.viewing.photos import mask_uris, photo_uris
-from ambiguous_wild.viewing.reduce import reduced
-from ambiguous_wild.viewing.space import space_of
+from ambiguous_wild.viewing.model import Model, space_of
 
 PAGE = "index.html"
 GENERATOR = '<meta name="generator" content="aw view">'
@@ -195,32 +192,115 @@ def _view_facts(view: View, photo: str, points: list[int]) -> dict[str, Any]:
 
 
 def _fill(title: str, data: Mapping[str, Any], models: str) -> str:
-    """The template with everything in it; texts can be anything and stay text."""
-    style = (_HERE / "page.css").read_text(encoding="utf-8")
-    script = "\n".join((_HERE / name).read_text(encoding="utf-8") for name in SCRIPTS)
-    text = json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
-    for char in "<>&\u2028\u2029":  # no text in it can end the element it stands in
-        text = text.replace(char, f"\\u{ord(char):04x}")
-    # Spark's WebAssembly is compiled from bytes, its workers come from blobs; nothing may be fetched.
-    policy = (
-        f"default-src 'none'; img-src data: blob:; style-src {_digest(style)}; worker-src blob:; "
-        f"script-src {_digest(script)} blob: 'wasm-unsafe-eval'; base-uri 'none'; form-action 'none'"
-    )
     licences = html.escape((_HERE / "licences.txt").read_text(encoding="utf-8"), quote=False)
-    parts = {
-        "POLICY": policy,
-        "TITLE": html.escape(title),
-        "STYLE": style,
-        "DATA": text,
-        "MODELS": models,
-        "RENDERER": base64.b64encode((_HERE / "renderer.js.gz").read_bytes()).decode("ascii"),
-        "LICENCES": licences.replace("--", "—"),  # they stand in a comment
-        "SCRIPT": script,
-    }
-    # In one pass: what is put in is not looked at again.
-    template = (_HERE / "page.html").read_text(encoding="utf-8")
-    return re.sub(r"/\*([A-Z]+)\*/", lambda found: parts[found[1]], template)
+    return fill_page(
+        _HERE,
+        data,
+        SCRIPTS,
+        title=title,
+        # Spark's WebAssembly is compiled from bytes, its workers come from blobs; nothing may be fetched.
+        images="data: blob:",
+        more_sources="worker-src blob:; ",
+        more_scripts=" blob: 'wasm-unsafe-eval'",
+        parts={
+            "MODELS": models,
+            "RENDERER": base64.b64encode((_HERE / "renderer.js.gz").read_bytes()).decode("ascii"),
+            "LICENCES": licences.replace("--", "—"),  # they stand in a comment
+        },
+    )
 
 
-def _digest(text: str) -> str:
-    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+WIDTHS = (640, 480, 360, 240, 160, 96, 64)  # px, tried from the largest
+_QUALITY = 78
+_MASK_WIDTH = 480  # px, at most
+
+
+def photo_uris(views: Sequence[View], most_bytes: int) -> list[str]:
+    """A data: address for each photo, JPEG, as wide as lets all of them stay below `most_bytes` of text.
+
+    1000 photos or more can exceed it at the smallest width. One photo is held at a time.
+    """
+    return _as_wide_as_fits(_photo, [view.image_path for view in views], WIDTHS, most_bytes)
+
+
+def mask_uris(folder: Path, views: Sequence[View], most_bytes: int) -> dict[str, str]:
+    """A data: address for each keep map that `folder` holds, PNG with two grey levels, by view name.
+
+    As wide as lets all of them stay below `most_bytes` of text.
+    """
+    paths = {view.name: folder / Path(view.name).with_suffix(".png") for view in views}
+    found = {name: path for name, path in paths.items() if path.is_file()}
+    widths = [width for width in WIDTHS if width <= _MASK_WIDTH]
+    return dict(zip(found, _as_wide_as_fits(_mask, list(found.values()), widths, most_bytes)))
+
+
+def _as_wide_as_fits(
+    uri: Callable[[Path, int], str], paths: Sequence[Path], widths: Sequence[int], most_bytes: int
+) -> list[str]:
+    """The addresses at the first width at which they fit; else at the last one."""
+    uris: list[str] = []
+    for width in widths:
+        uris, size = [], 0
+        for path in paths:
+            uris.append(uri(path, width))
+            size += len(uris[-1])
+            if size > most_bytes and width != widths[-1]:
+                break
+        else:
+            return uris
+    return uris
+
+
+def _photo(path: Path, width: int) -> str:
+    return data_uri("jpeg", jpeg_bytes(narrowed(read_png_rgb(path), width), _QUALITY))
+
+
+def _mask(path: Path, width: int) -> str:
+    import cv2
+
+    black_and_white = ((narrowed(read_gray(path), width) > 127) * 255).astype(np.uint8)
+    options = [cv2.IMWRITE_PNG_BILEVEL, 1]
+    return data_uri("png", bytes(cv2.imencode(".png", black_and_white, options)[1]))
+
+
+_NEAR = 0.01  # as in training
+_MARGIN = 0.15  # of the picture on each side still counts
+
+
+def reduced(
+    gaussians: Mapping[str, np.ndarray], cameras: Sequence[Camera], most: int
+) -> dict[str, np.ndarray]:
+    """At most so many Gaussians: the ones with the largest opacity times projected area, summed over cameras.
+
+    A Gaussian's area in one camera counts up to a hundredth of the picture, so that a few large ones in the
+    background do not displace all detail. Order is kept.
+
+    Args:
+        gaussians: raw parameters.
+        cameras: of the photos.
+        most: Gaussians to keep.
+    """
+    kept = finite(gaussians)
+    if len(kept["means"]) <= most:
+        return kept
+    score = importance(kept, cameras)
+    rows = np.sort(np.argsort(-score, kind="stable")[:most])
+    return {name: value[rows] for name, value in kept.items()}
+
+
+def importance(gaussians: Mapping[str, np.ndarray], cameras: Sequence[Camera]) -> np.ndarray:
+    """Opacity times projected area in px, summed over cameras; [N] float64."""
+    means = gaussians["means"].astype(np.float64)
+    scales = np.sort(np.exp(gaussians["log_scales"].astype(np.float64)), axis=1)
+    area = np.pi * scales[:, 1] * scales[:, 2]  # of the two longest axes, world units squared
+    total = np.zeros(len(means))
+    for camera in cameras:
+        seen = means @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+        depth = np.where(seen[:, 2] > _NEAR, seen[:, 2], np.inf)
+        u, v = camera.fx * seen[:, 0] / depth + camera.cx, camera.fy * seen[:, 1] / depth + camera.cy
+        inside = (np.abs(u / camera.width - 0.5) < 0.5 + _MARGIN) & (
+            np.abs(v / camera.height - 0.5) < 0.5 + _MARGIN
+        )
+        covered = area * camera.fx * camera.fy / depth**2
+        total += np.where(inside, np.minimum(covered, 0.01 * camera.width * camera.height), 0.0)
+    return total * sigmoid(gaussians["opacity_logits"])

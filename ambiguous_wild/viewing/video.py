@@ -1,7 +1,8 @@
-"""Videos of models side by side along one camera path: mp4 (VP9) and GIF."""
+"""Films of models side by side along one camera path: through cameras, an orbit, or from a file."""
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -9,9 +10,176 @@ from typing import Any
 
 import numpy as np
 
-from ambiguous_wild.core import AwError, Camera
+from ambiguous_wild.core import AwError, Camera, Scene
 from ambiguous_wild.io.atomic import atomic_path
-from ambiguous_wild.viewing.model import Model, Renderer
+from ambiguous_wild.viewing.model import Model, Renderer, space_of
+
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's camera axes to OpenCV's, and back
+_MOST_BYTES = 64 * 1024 * 1024
+_TILT_DEG = 15.0  # of an orbit's cameras above the middle
+
+
+def through_views(scene: Scene, frames: int, size: tuple[int, int]) -> list[Camera]:
+    """A smooth path through the test cameras (train cameras where there are none), each once, nearest next.
+
+    Args:
+        scene: at least one view.
+        frames: number of cameras, evenly spaced in length of the path.
+        size: width and height, px; the lens is the views' own, fitted into it.
+    """
+    views = scene.test or scene.train
+    keys = [view.camera for view in views]
+    order = _nearest_next(np.array([camera.center for camera in keys]))
+    return _smooth([keys[i] for i in order], frames, size)
+
+
+def orbit(scene: Scene, frames: int, size: tuple[int, int]) -> list[Camera]:
+    """A circle around the middle of the scene, as far away as the photos were taken."""
+    space = space_of(scene)
+    first = (scene.test or scene.views)[0].camera
+    away = first.center - space.middle
+    away -= space.up * (away @ space.up)
+    size_of = np.linalg.norm(away)
+    x = away / size_of if size_of > 1e-9 else np.cross(space.up, [1.0, 0.3, 0.2])
+    x = x / np.linalg.norm(x)
+    y = np.cross(space.up, x)
+    tilt = math.radians(_TILT_DEG)
+    cameras = []
+    for k in range(frames):
+        turn = 2 * math.pi * k / frames
+        flat = math.cos(turn) * x + math.sin(turn) * y
+        center = space.middle + space.distance * (math.cos(tilt) * flat + math.sin(tilt) * space.up)
+        cameras.append(fitted(first, size, _looking(center, space.middle, space.up)))
+    return cameras
+
+
+def from_file(path: Path, scene: Scene, frames: int, size: tuple[int, int]) -> list[Camera]:
+    """A path that a viewer saved, in the scene's own coordinates.
+
+    Read are the page of `aw view` and nerfstudio ({"camera_path": [{"camera_to_world": 16 numbers, "fov":
+    degrees}]}, OpenGL axes) and 3DGS viewers (cameras.json: [{"position", "rotation", "fx", "fy", "width",
+    "height"}], OpenCV axes). A path of other length is resampled to `frames`.
+
+    Raises:
+        AwError: another format, fewer than two cameras, or numbers that make no camera.
+    """
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise AwError(f"{path} is larger than a camera path can be")
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise AwError(f"cannot read {path}: {error.strerror or error}") from None
+    except (ValueError, RecursionError) as error:
+        raise AwError(f"{path} is no camera path: no JSON ({error})") from None
+    rows = data.get("camera_path") if isinstance(data, dict) else data
+    if not isinstance(rows, list) or len(rows) < 2:
+        raise AwError(
+            f"{path} is no camera path: it needs two cameras or more, as 'aw view' and nerfstudio save them"
+        )
+    lens = (scene.test or scene.views)[0].camera
+    cameras = []
+    for number, row in enumerate(rows):
+        try:
+            cameras.append(_camera(row, lens, size))
+        except (AwError, KeyError, TypeError, ValueError, OverflowError, np.linalg.LinAlgError) as error:
+            raise AwError(f"{path}: camera {number} is none: {error}") from None
+    return cameras if len(cameras) == frames else _smooth(cameras, frames, size)
+
+
+def _camera(row: Any, lens: Camera, size: tuple[int, int]) -> Camera:
+    if "camera_to_world" in row:
+        to_world = np.asarray(row["camera_to_world"], np.float64).reshape(4, 4) @ _FLIP
+        fov = float(row["fov"]) if row.get("fov") is not None else None
+        if fov is not None and not 0.1 <= fov <= 179:
+            raise ValueError(f"fov {fov} is no angle between 0.1 and 179 degrees")
+        if fov is not None:
+            focal = size[1] / 2 / math.tan(math.radians(fov) / 2)
+            lens = Camera(size[0], size[1], focal, focal, size[0] / 2, size[1] / 2, np.eye(4))
+    else:
+        to_world = np.eye(4)
+        to_world[:3, :3] = np.asarray(row["rotation"], np.float64).reshape(3, 3)
+        to_world[:3, 3] = np.asarray(row["position"], np.float64).reshape(3)
+        width, height = int(row["width"]), int(row["height"])
+        fx, fy = float(row["fx"]), float(row["fy"])
+        if not (math.isfinite(fx) and math.isfinite(fy)):
+            raise ValueError("fx and fy must be finite")
+        lens = Camera(width, height, fx, fy, width / 2, height / 2, np.eye(4))
+    rotation = to_world[:3, :3]
+    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if not np.isfinite(to_world).all() or off > 0.01 or np.linalg.det(rotation) < 0:
+        raise ValueError("its pose is no rotation and position")
+    to_world[3] = [0, 0, 0, 1]
+    return fitted(lens, size, np.linalg.inv(to_world))
+
+
+def fitted(lens: Camera, size: tuple[int, int], cam_from_world: np.ndarray) -> Camera:
+    """The lens for another size: the whole picture of the lens is in it."""
+    width, height = size
+    scale = min(width / lens.width, height / lens.height)
+    left, top = (width - scale * lens.width) / 2, (height - scale * lens.height) / 2
+    return Camera(
+        width,
+        height,
+        lens.fx * scale,
+        lens.fy * scale,
+        lens.cx * scale + left,
+        lens.cy * scale + top,
+        cam_from_world,
+    )
+
+
+def _nearest_next(places: np.ndarray) -> list[int]:
+    """Each place once, the nearest of those left next, from the one furthest from the middle."""
+    left = set(range(len(places)))
+    at = int(np.linalg.norm(places - places.mean(axis=0), axis=1).argmax())
+    order = []
+    while True:
+        order.append(at)
+        left.remove(at)
+        if not left:
+            return order
+        at = min(left, key=lambda i: (float(np.linalg.norm(places[i] - places[at])), i))
+
+
+def _smooth(keys: Sequence[Camera], frames: int, size: tuple[int, int]) -> list[Camera]:
+    """Cameras along a curve through the keys; the lens changes evenly from key to key."""
+    from scipy.interpolate import CubicSpline, PchipInterpolator
+    from scipy.spatial.transform import Rotation, RotationSpline
+
+    if len(keys) == 1:
+        return [fitted(keys[0], size, keys[0].cam_from_world)] * frames
+    to_world = np.linalg.inv(np.array([key.cam_from_world for key in keys]))
+    steps = np.linalg.norm(np.diff(to_world[:, :3, 3], axis=0), axis=1)
+    turns = Rotation.from_matrix(to_world[:, :3, :3])
+    angles = (turns[:-1].inv() * turns[1:]).magnitude()
+    # No step has length 0: keys may differ in direction alone, or not at all.
+    lengths = steps + angles * max(float(steps.mean()), 1e-6) + 1e-9 + 1e-3 * steps.mean()
+    at = np.concatenate([[0.0], np.cumsum(lengths)])
+    wanted = np.linspace(0.0, at[-1], frames)
+    centers = CubicSpline(at, to_world[:, :3, 3])(wanted)
+    rotations = RotationSpline(at, turns)(wanted).as_matrix()
+    # A lens changes monotonically between keys: no overshoot below zero.
+    lenses = np.array([fitted(key, size, key.cam_from_world) for key in keys], dtype=object)
+    values = np.array([[lens.fx, lens.fy, lens.cx, lens.cy] for lens in lenses])
+    values = PchipInterpolator(at, values)(wanted)
+    cameras = []
+    for center, rotation, (fx, fy, cx, cy) in zip(centers, rotations, values):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation.T, -rotation.T @ center
+        cameras.append(Camera(size[0], size[1], fx, fy, cx, cy, pose))
+    return cameras
+
+
+def _looking(center: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """cam_from_world of a camera at `center` that looks at `target`, OpenCV axes."""
+    forward = (target - center) / np.linalg.norm(target - center)
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ center
+    return pose
+
 
 _GAP = 4  # px between pictures
 _MOST_SIDE = 8192  # px of a frame
@@ -147,13 +315,3 @@ def write_gif(path: Path, frames: Sequence[Frame], fps: float) -> None:
             loop=0,
             optimize=True,
         )
-
-
-def narrowed(frame: Frame, width: int) -> Frame:
-    """The frame, not wider than so many px."""
-    import cv2
-
-    if frame.shape[1] <= width:
-        return frame
-    height = max(2, round(frame.shape[0] * width / frame.shape[1]))
-    return cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA)

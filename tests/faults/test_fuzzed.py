@@ -27,8 +27,7 @@ from ambiguous_wild.io.images import header_size, read_png_rgb, write_png
 from ambiguous_wild.io.scene_folder import load_scene, read_scene_json
 from ambiguous_wild.simulate.spec_file import parse_spec
 from ambiguous_wild.splat import checkpoint
-from ambiguous_wild.study.answers import read_answers
-from ambiguous_wild.study.key import FORMAT, read_key
+from ambiguous_wild.study.answers import KEY_FORMAT, read_answers, read_key
 from ambiguous_wild.vision.label_maps import read_labels
 from tests.harness.fake_runs import fake_result
 from tests.io.model_maker import make_model
@@ -127,7 +126,7 @@ def test_a_plan_whose_decision_is_none(tmp_path, row):
 
 
 def test_a_study_key_whose_kind_is_a_list(tmp_path):
-    data = {"format": FORMAT, "version": 1, "study": "s", "title": "t", "questions": {"q": {"kind": []}}}
+    data = {"format": KEY_FORMAT, "version": 1, "study": "s", "title": "t", "questions": {"q": {"kind": []}}}
     (tmp_path / "k.json").write_text(json.dumps(data))
     with pytest.raises(AwError, match="damaged"):
         read_key(tmp_path / "k.json")

@@ -17,16 +17,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.ablation.report import ablation
 from ambiguous_wild.harness.measures import MEASURES
 from ambiguous_wild.harness.running.store import Runs, read_runs
 from ambiguous_wild.harness.tables import papers, plain_formats
-from ambiguous_wild.harness.tables.ablation import ablation
-from ambiguous_wild.harness.tables.fit import divided
-from ambiguous_wild.harness.tables.html_page import to_html
-from ambiguous_wild.harness.tables.latex import latex_text, to_latex
-from ambiguous_wild.harness.tables.reported import datasets_of, read_reported, with_reported
-from ambiguous_wild.harness.tables.significance import difference_interval
-from ambiguous_wild.harness.tables.table import Cell, Column, Row, Table, ranks
+from ambiguous_wild.harness.tables.papers import (
+    datasets_of,
+    difference_interval,
+    read_reported,
+    with_reported,
+)
+from ambiguous_wild.harness.tables.plain_formats import divided
+from ambiguous_wild.harness.tables.table import Cell, Column, Table
+from ambiguous_wild.harness.tables.typeset import latex_text, to_html, to_latex
 from ambiguous_wild.metrics import stats
 from tests.harness.fake_runs import failed, fake_result, save
 
@@ -223,14 +226,6 @@ def test_an_ablation_is_a_table_a_group(tmp_path: Path) -> None:
         ablation(tmp_path)
 
 
-def test_ranks_are_those_of_print() -> None:
-    psnr, lpips = MEASURES["psnr"], MEASURES["lpips_alex"]
-    assert ranks([20.001, 20.004, 19.0, math.nan, 18.0, 17.0], psnr) == [1, 1, 3, None, None, None]
-    assert ranks([0.3, 0.1], lpips) == [2, 1]
-    assert ranks([20.0, 20.0], psnr) == [None, None]
-    assert ranks([1.0, 2.0], MEASURES["iterations"]) == [None, None]
-
-
 class Page(HTMLParser):
     """Tags that are open, the text, and whatever could load or run something."""
 
@@ -287,18 +282,6 @@ def test_any_name_is_ascii_or_latin_for_latex(name: str) -> None:
     assert all(c.isascii() or c == "±" or "À" <= c <= "ÿ" for c in latex_text(name))
 
 
-def test_text_markdown_and_csv_keep_names_text(tmp_path: Path) -> None:
-    layout = hostile(tmp_path)
-    text, markdown = plain_formats.to_text([layout]), plain_formats.to_markdown([layout])
-    assert "\x1b" not in text + markdown and "\u202e" not in text + markdown
-    rows = [line for line in markdown.splitlines() if line.startswith("|")]
-    assert {len(re.findall(r"(?<!\\)\|", row)) for row in rows} == {len(layout.columns) + 2}
-    assert "<script" not in markdown
-    cells = list(csv.reader(io.StringIO(plain_formats.to_long_csv([layout]))))
-    assert {len(row) for row in cells} == {len(plain_formats.LONG_HEAD)}
-    assert not any(cell.startswith(("=", "+", "@")) for row in cells for cell in row)
-
-
 def test_every_column_is_under_its_heading_in_text(tmp_path: Path) -> None:
     text = plain_formats.to_text(
         papers.paper(runs_of(tmp_path, *results("a scene with a very long name", "two")))
@@ -307,9 +290,3 @@ def test_every_column_is_under_its_heading_in_text(tmp_path: Path) -> None:
     top, head = lines[1], lines[2]
     assert top.index("two") <= head.index("PSNR", top.index("two")) < top.index("Mean")
     assert len({len(line) for line in lines[3:6]}) == 1
-
-
-def test_a_line_of_notes_says_what_a_reported_row_is() -> None:
-    row = Row("x", (Cell(printed="1.0"),), kind="reported")
-    layout = Table("t", (Column("s", MEASURES["psnr"], "s"),), (row,))
-    assert any(text.startswith("reported:") for text in layout.legend)

@@ -18,16 +18,14 @@ from ambiguous_wild.cli.leaderboard import command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.audit.table import REPORTED
 from ambiguous_wild.harness.leaderboard.board import read_board, write_board
-from ambiguous_wild.harness.leaderboard.check import check
+from ambiguous_wild.harness.leaderboard.edit import check, remove
 from ambiguous_wild.harness.leaderboard.publish import publish
-from ambiguous_wild.harness.leaderboard.remove import remove
 from ambiguous_wild.harness.leaderboard.reproduce import command as command_of
 from ambiguous_wild.harness.running.identity import config_identity
 from ambiguous_wild.harness.running.regions import find_regions
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.io.scene_folder import load_scene
-from ambiguous_wild.metrics.affine import psnr_affine
-from ambiguous_wild.metrics.flip import flip
+from ambiguous_wild.metrics.image import flip, psnr_affine
 from tests.harness.board_runs import write_run, write_scene
 
 

@@ -1,9 +1,6 @@
 """Pictures of a run: they change nothing of it, survive a kill, and show what they say."""
 
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -11,13 +8,21 @@ import pytest
 import torch
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.pictures import strips
-from ambiguous_wild.harness.pictures.density import draw_density
-from ambiguous_wild.harness.pictures.mask_sheet import write_contact
-from ambiguous_wild.harness.pictures.training import CELL, MOMENTS, ROWS, VIEWS, Recorder, draw_all, strip
+from ambiguous_wild.harness.pictures import sheets
+from ambiguous_wild.harness.pictures.sheets import write_contact
+from ambiguous_wild.harness.pictures.training import (
+    CELL,
+    MOMENTS,
+    ROWS,
+    VIEWS,
+    Recorder,
+    draw_all,
+    draw_density,
+    strip,
+)
 from ambiguous_wild.harness.running.grid import plan_cells, run_cells
 from ambiguous_wild.io.images import read_png_rgb, write_png
-from ambiguous_wild.io.palette import ramp, tint
+from ambiguous_wild.io.palette import ramp
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import get_method
 from ambiguous_wild.splat import checkpoint
@@ -77,8 +82,8 @@ def test_every_picture_is_there_a_row_a_moment(watched):
     assert all(path.is_file() and path.parent == folder / "pictures" for path in written)
     assert not (folder / ROWS).exists()
     picture = read_png_rgb(folder / "pictures" / "training_train_0.png")
-    row = strips.BAR + strips.GAP + round(HEIGHT * CELL / WIDTH)
-    assert picture.shape == (len(MOMENTS) * row, 8 * (CELL + strips.GAP), 3)
+    row = sheets.BAR + sheets.GAP + round(HEIGHT * CELL / WIDTH)
+    assert picture.shape == (len(MOMENTS) * row, 8 * (CELL + sheets.GAP), 3)
     assert VIEWS == 3
 
 
@@ -147,16 +152,16 @@ def test_a_contact_sheet_shows_named_photos_tinted(scene, tmp_path):
         write_png(tmp_path / "masks" / name, keep)
     (path,) = write_contact(scene, tmp_path / "masks", tmp_path / "p" / "masks.jpg", names=["train_3.png"])
     sheet = cv2.imread(str(path))[:, :, ::-1].astype(float)
-    assert sheet.shape[1] == 320 + strips.GAP
+    assert sheet.shape[1] == 320 + sheets.GAP
     photo = read_png_rgb(scene.root / "images" / "train_3.png").astype(float)
-    inside = sheet[strips.BAR : -strips.GAP, : -strips.GAP]
+    inside = sheet[sheets.BAR : -sheets.GAP, : -sheets.GAP]
     left, right = inside[:, :150].mean((0, 1)), inside[:, 170:].mean((0, 1))
     np.testing.assert_allclose(right, photo[:, 34:].mean((0, 1)), atol=4)
     np.testing.assert_allclose(
         left, 0.45 * photo[:, :30].mean((0, 1)) + 0.55 * np.array([255, 30, 30]), atol=4
     )
     (path,) = write_contact(scene, tmp_path / "masks", tmp_path / "all.jpg", most=4)
-    assert cv2.imread(str(path)).shape[1] == 4 * (320 + strips.GAP)
+    assert cv2.imread(str(path)).shape[1] == 4 * (320 + sheets.GAP)
     with pytest.raises(AwError, match="train photo"):
         write_contact(scene, tmp_path / "masks", path, names=["train_9.png"])
     assert write_contact(scene, tmp_path / "none", tmp_path / "none.jpg") == []
@@ -170,25 +175,9 @@ def test_the_ramp_is_monotone_from_green_to_red_and_nan_is_grey():
     assert (ramp(np.ones(3), 1.0, 1.0) == ramp(np.zeros(3), 0.0, 1.0)).all()  # no range: no division by 0
 
 
-def test_a_tint_leaves_the_rest_alone():
-    photo = np.random.default_rng(0).integers(0, 256, (4, 5, 3), dtype=np.uint8)
-    mask = np.zeros((4, 5), bool)
-    mask[1, 2] = True
-    shown = tint(photo, mask, (255, 0, 0))
-    assert (shown[~mask] == photo[~mask]).all() and (shown[mask] != photo[mask]).any()
-
-
 def test_long_captions_stay_on_their_picture():
-    framed = strips.cell(
+    framed = sheets.cell(
         "a caption that is far longer than the picture below it is wide", np.zeros((9, 40, 3), np.uint8)
     )
-    assert framed.shape == (9 + strips.BAR + strips.GAP, 40 + strips.GAP, 3)
-    assert (framed[: strips.BAR, 40:] == 255).all() and (framed[: strips.BAR] < 255).any()
-
-
-def test_the_command_line_can_leave_pictures_away(scene, tmp_path):
-    command = [sys.executable, "-m", "ambiguous_wild.cli.main", "bench", "--method", "3dgs", "--scene"]
-    command += [str(scene.root), "--iterations", "5", "--no-pictures", "-o", str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[2])
-    assert done.returncode == 0, done.stderr
-    assert not list(tmp_path.rglob("pictures"))
+    assert framed.shape == (9 + sheets.BAR + sheets.GAP, 40 + sheets.GAP, 3)
+    assert (framed[: sheets.BAR, 40:] == 255).all() and (framed[: sheets.BAR] < 255).any()

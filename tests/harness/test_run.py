@@ -17,9 +17,7 @@ from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.lock import folder_lock
 from ambiguous_wild.io.ply import read_splat_ply
 from ambiguous_wild.methods import MethodEntry, register, registry
-from ambiguous_wild.metrics.affine import psnr_affine
-from ambiguous_wild.metrics.flip import flip
-from ambiguous_wild.metrics.image import psnr
+from ambiguous_wild.metrics.image import flip, psnr, psnr_affine
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.parts import MaskPolicy, Parts
 from tests.tiny_scene import TEST, TRAIN, write_tiny_scene

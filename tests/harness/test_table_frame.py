@@ -12,8 +12,8 @@ from click.testing import CliRunner
 from ambiguous_wild.cli.table import command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.running.store import read_runs
+from ambiguous_wild.harness.tables.comparison import COLUMNS, tidy
 from ambiguous_wild.harness.tables.plain_formats import to_csv
-from ambiguous_wild.harness.tables.tidy import COLUMNS, tidy
 from tests.harness.fake_runs import failed, fake_result, save, start
 
 

@@ -10,26 +10,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.measures import MEASURES, measure
 from ambiguous_wild.harness.running.store import read_runs
 from ambiguous_wild.harness.tables.comparison import comparison
-from ambiguous_wild.harness.tables.fit import fitted
-from ambiguous_wild.harness.tables.latex import latex_text
-from ambiguous_wild.harness.tables.latex import to_latex as latex_of
 from ambiguous_wild.harness.tables.papers import cost_at_the_end
 from ambiguous_wild.harness.tables.plain_formats import (
     display_width,
-    markdown_text,
+    fitted,
     plain,
     to_markdown,
     to_text,
     to_wide_csv,
 )
 from ambiguous_wild.harness.tables.table import Cell, Table
+from ambiguous_wild.harness.tables.typeset import to_latex as latex_of
 from tests.harness.fake_runs import failed, fake_result, save, start
 
 HOSTILE = '<script>|\\input{x}$&%#_^~"*`[a](http://b)\x1b[31m\u202e'
@@ -361,38 +357,3 @@ def test_hostile_names_stay_text_in_every_format(tmp_path: Path) -> None:
     assert len(re.findall(r"(?<!\\)&", row)) == len(table[0].columns)
     rows = list(csv.reader(io.StringIO(to_wide_csv(table))))
     assert {len(r) for r in rows} == {len(rows[0])}
-
-
-@given(st.text(max_size=30))
-def test_latex_and_markdown_of_any_name_have_no_open_special(name: str) -> None:
-    assert "\n" not in latex_text(name) + markdown_text(name)
-    rest = re.sub(r"\\text\w+\{\}|\\[&%$#_{}]|\{(?:[\[*]|'')\}", "", latex_text(name))
-    assert not re.search(r"[\\&%$#_{}~^\[*]", rest)
-    assert not re.search(r"[<>]", markdown_text(name))
-
-
-def test_latex_needs_no_font_encoding(tmp_path: Path) -> None:
-    latex = to_latex(table_of(tmp_path, fake_result('6" lens')))
-    assert "6{''} lens &" in latex and "quotedbl" not in latex
-
-
-def test_latex_is_balanced_and_names_begin_no_option(tmp_path: Path) -> None:
-    table = table_of(tmp_path, *(fake_result(m, s) for m in ("[2em] x", "*b") for s in ("one", "two")))
-    latex = to_latex(table)
-    body = [line for line in latex.splitlines() if line.endswith(r"\\")]
-    assert len({line.count("&") for line in body[1:]}) == 1
-    assert not any(line.startswith(("[", "*")) for line in latex.splitlines())
-    assert latex.count("{") == latex.count("}")
-    assert latex.index("mean over 2 scenes") > latex.index("{two}")
-
-
-def test_text_columns_are_aligned(tmp_path: Path) -> None:
-    table = table_of(tmp_path, fake_result("日本", psnr=(9.0,)), fake_result("long name", psnr=(20.0,)))
-    lines = to_text(table).splitlines()
-    ruler, second, first = lines[2], lines[3], lines[4]
-    end = len(ruler) - len(ruler.lstrip("─"))
-    assert end == len("long name")
-    # Two wide characters take four columns of a terminal: two fewer characters than columns.
-    assert first.index("9.00") + len("9.00") + 2 == second.index("20.00") + len("20.00")
-    colored = to_text(table, color=True)
-    assert re.sub(r"\x1b\[[0-9;]*m", "", colored) == to_text(table) and "\x1b[" in colored

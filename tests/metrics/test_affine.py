@@ -7,8 +7,7 @@ import pytest
 from skimage.metrics import peak_signal_noise_ratio
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.metrics.affine import psnr_affine
-from ambiguous_wild.metrics.image import psnr
+from ambiguous_wild.metrics.image import psnr, psnr_affine
 
 
 def pair(seed=0, size=(23, 31), noise=0.05):

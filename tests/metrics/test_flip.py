@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.metrics.flip import flip, flip_map
+from ambiguous_wild.metrics.image import flip, flip_map
 
 
 def picture(seed: int = 0, size: tuple[int, int] = (20, 24)) -> np.ndarray:
@@ -37,5 +37,3 @@ def test_the_error_lies_where_the_pictures_differ_and_grows_with_the_difference(
 def test_unusable_input_is_named() -> None:
     with pytest.raises(AwError, match="different size"):
         flip(picture(), picture(size=(20, 25)))
-    with pytest.raises(AwError, match="pixels per degree"):
-        flip_map(picture(), picture(), 0.0)

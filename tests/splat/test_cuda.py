@@ -11,7 +11,7 @@ from ambiguous_wild.splat.gpu.render import on_device
 from ambiguous_wild.splat.reference import render_reference
 from ambiguous_wild.splat.render import render
 from ambiguous_wild.splat.rendered import Cotangents
-from ambiguous_wild.stress.float64_check import agree
+from ambiguous_wild.stress.case import agree
 
 from . import fake_gsplat
 from .scenes import camera, cotangents, doubles, gaussians, given
@@ -141,8 +141,8 @@ def test_nothing_to_draw(fake):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_adapter_passes_the_bound_that_follows_from_the_problem(fake, seed):
-    from ambiguous_wild.stress.float64_check import camera as front_camera
-    from ambiguous_wild.stress.float64_check import cloud
+    from ambiguous_wild.stress.case import camera as front_camera
+    from ambiguous_wild.stress.case import cloud
 
     measured = agree(cloud(30, seed), front_camera(), "cpu", "", sh_degree=1)
     assert measured.error <= measured.tolerance

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import yaml
 
-from ambiguous_wild.study.key import FORMAT, Key
+from ambiguous_wild.study.answers import KEY_FORMAT, Key
 from tests.harness.fake_runs import fake_result, save
 from tests.tiny_scene import TEST, write_tiny_scene
 
@@ -49,7 +49,7 @@ def panel_key(methods: tuple[str, ...] = METHODS, views: int = 8) -> Key:
 
 def write_key(key: Key, path: Path) -> Path:
     data = {
-        "format": FORMAT,
+        "format": KEY_FORMAT,
         "version": 1,
         "study": key.study,
         "title": key.title,

@@ -15,8 +15,7 @@ from click.testing import CliRunner
 
 from ambiguous_wild.cli.study import command
 from ambiguous_wild.core import AwError
-from ambiguous_wild.study.make import page_html
-from ambiguous_wild.study.questions import PairQuestion, render_pairs, sample_questions
+from ambiguous_wild.study.make import PairQuestion, page_html, render_pairs, sample_questions
 from tests.study.studies import METHODS, write_runs
 from tests.tiny_scene import TEST, TRAIN
 

@@ -12,8 +12,7 @@ import pytest
 from ambiguous_wild.io.ply import read_splat_ply, write_splat_ply
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.metrics.image import psnr
-from ambiguous_wild.viewing.export import FORMATS, export
-from ambiguous_wild.viewing.model import Look, Model, Renderer
+from ambiguous_wild.viewing.model import FORMATS, Look, Model, Renderer, export
 from tests.command_line import aw
 from tests.tiny_scene import write_tiny_scene
 from tests.viewing.wall_runs import wall_model, write_shown_run

@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 import pytest
 
-from ambiguous_wild.harness.showing.page import Viewer, view_runs
+from ambiguous_wild.harness.showing.read import Viewer, view_runs
 from ambiguous_wild.io.ply import read_splat_ply
-from ambiguous_wild.viewing.camera_path import fitted
 from ambiguous_wild.viewing.model import Look, Renderer
+from ambiguous_wild.viewing.video import fitted
 from tests.chromium import Browser, needs_chromium
 from tests.tiny_scene import TEST, TRAIN, write_tiny_scene
 from tests.viewing.wall_runs import write_shown_run
@@ -258,10 +258,10 @@ def test_a_camera_path_is_saved_for_the_video(page: Browser, runs: Path, tmp_pat
     assert page.run("$('path').textContent") == "Path (3)"
     (tmp_path / "path.json").write_text(page.run("JSON.stringify(pathFile())"))
     from ambiguous_wild.io.scene_folder import load_scene
-    from ambiguous_wild.viewing import camera_path
+    from ambiguous_wild.viewing import video
 
     scene = load_scene(runs / "porch")
-    cameras = camera_path.from_file(tmp_path / "path.json", scene, 3, (64, 48))
+    cameras = video.from_file(tmp_path / "path.json", scene, 3, (64, 48))
     names = [*TEST, *TRAIN]
     for camera, name in zip(cameras, names[1:4]):
         wanted = next(v.camera for v in scene.views if v.name == name)

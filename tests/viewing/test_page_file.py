@@ -15,15 +15,14 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.showing.page import Viewer, view_runs
-from ambiguous_wild.harness.showing.read import read_look
+from ambiguous_wild.harness.showing.read import Viewer, read_look, view_runs
 from ambiguous_wild.io.images import write_png
 from ambiguous_wild.io.motion_points import FILE, MotionPoints, write_motion_points
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.io.splat_formats.spz import read_spz
-from ambiguous_wild.viewing import page_file, photos
+from ambiguous_wild.viewing import page_file
 from ambiguous_wild.viewing.model import Look
-from ambiguous_wild.viewing.reduce import importance, reduced
+from ambiguous_wild.viewing.page_file import importance, reduced
 from tests.command_line import aw
 from tests.tiny_scene import TEST, TRAIN, write_tiny_scene
 from tests.viewing.wall_runs import wall_model, write_shown_run
@@ -158,7 +157,7 @@ def test_what_cannot_be_shown_is_one_line(runs: Path, tmp_path: Path) -> None:
         ([tmp_path / "none"], "no folder of runs"),
         ([tmp_path], "no finished run with a point_cloud.ply"),
         ([runs, "--scene", "hall"], "unknown scene 'hall'"),
-        ([runs, "--scene-folder", tmp_path / "gone"], "say where it lies with --scene-folder"),
+        ([runs, "--scene-folder", tmp_path / "gone"], "name its folder (--scene-folder)"),
         ([], "no RUNS"),
         ([runs, "--live", runs.parent / "porch"], "leave RUNS out"),
     ):
@@ -215,15 +214,15 @@ def test_photos_and_masks_stay_below_their_share_of_the_page(runs: Path, tmp_pat
         mask.parent.mkdir(exist_ok=True)
         write_png(mask, rng.integers(0, 2, (270, 480), np.uint8) * 255)
         views.append(dataclasses.replace(view, image_path=photo))
-    pictures = photos.photo_uris(views, 200_000)
-    masks = photos.mask_uris(tmp_path / "masks", views, 60_000)
+    pictures = page_file.photo_uris(views, 200_000)
+    masks = page_file.mask_uris(tmp_path / "masks", views, 60_000)
     for uris, most in ((pictures, 200_000), (list(masks.values()), 60_000)):
         assert len(uris) == len(views) and most / 4 < sum(map(len, uris)) <= most
         assert len({image_of(uri).shape for uri in uris}) == 1  # all of one width
-    wide = photos.photo_uris(views, 10**9)
+    wide = page_file.photo_uris(views, 10**9)
     assert {image_of(uri).shape[:2] for uri in wide} == {(270, 480)}  # never enlarged
-    least = photos.photo_uris(views, 1)  # too little for any: the smallest
-    assert {image_of(uri).shape[1] for uri in least} == {photos.WIDTHS[-1]}
+    least = page_file.photo_uris(views, 1)  # too little for any: the smallest
+    assert {image_of(uri).shape[1] for uri in least} == {page_file.WIDTHS[-1]}
 
 
 def image_of(uri: str) -> np.ndarray:

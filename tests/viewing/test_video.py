@@ -12,8 +12,8 @@ import pytest
 
 from ambiguous_wild.core import AwError, Camera, Scene
 from ambiguous_wild.io.scene_folder import load_scene
-from ambiguous_wild.viewing import camera_path
-from ambiguous_wild.viewing.space import space_of
+from ambiguous_wild.viewing import video
+from ambiguous_wild.viewing.model import space_of
 from ambiguous_wild.viewing.video import labelled, write_gif, write_mp4
 from tests.command_line import aw
 from tests.tiny_scene import write_tiny_scene
@@ -46,7 +46,7 @@ def frames_of(path: Path) -> list[np.ndarray]:
 
 
 def test_the_path_goes_through_the_test_cameras(scene: Scene) -> None:
-    path = camera_path.through_views(scene, 41, SIZE)
+    path = video.through_views(scene, 41, SIZE)
     assert len(path) == 41 and {(c.width, c.height) for c in path} == {SIZE}
     centers = np.array([c.center for c in path])
     for view in scene.test:
@@ -59,7 +59,7 @@ def test_the_path_goes_through_the_test_cameras(scene: Scene) -> None:
 def test_an_orbit_keeps_distance_and_looks_at_the_middle(scene: Scene) -> None:
     space = space_of(scene)
     assert space.up @ [0, -1, 0] > 0.99 and abs(space.middle[2] - 4) < 0.2
-    path = camera_path.orbit(scene, 12, SIZE)
+    path = video.orbit(scene, 12, SIZE)
     for camera in path:
         assert np.linalg.norm(camera.center - space.middle) == pytest.approx(space.distance)
         seen = camera.cam_from_world[:3, :3] @ space.middle + camera.cam_from_world[:3, 3]
@@ -85,15 +85,15 @@ def inria(position: list[float], rotation: np.ndarray, fx: float = 60.0) -> dict
 def test_paths_of_viewers_are_read(scene: Scene, tmp_path: Path) -> None:
     given = [view.camera for view in scene.train[:4]]
     (tmp_path / "a.json").write_text(json.dumps(nerfstudio(given, 60.0)))
-    path = camera_path.from_file(tmp_path / "a.json", scene, 4, (100, 80))
+    path = video.from_file(tmp_path / "a.json", scene, 4, (100, 80))
     for camera, wanted in zip(path, given):
         assert np.allclose(camera.cam_from_world, wanted.cam_from_world, atol=1e-9)
         assert camera.fy == pytest.approx(40 / math.tan(math.radians(30))) and camera.fx == camera.fy
     rows = [inria(c.center.tolist(), c.cam_from_world[:3, :3].T) for c in given]
     (tmp_path / "b.json").write_text(json.dumps(rows))
-    path = camera_path.from_file(tmp_path / "b.json", scene, 4, (128, 96))
+    path = video.from_file(tmp_path / "b.json", scene, 4, (128, 96))
     assert all(np.allclose(c.cam_from_world, w.cam_from_world, atol=1e-9) for c, w in zip(path, given))
-    assert path[0].fx == 120 and len(camera_path.from_file(tmp_path / "b.json", scene, 30, SIZE)) == 30
+    assert path[0].fx == 120 and len(video.from_file(tmp_path / "b.json", scene, 30, SIZE)) == 30
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_paths_of_viewers_are_read(scene: Scene, tmp_path: Path) -> None:
 def test_what_is_no_path_is_one_line(scene: Scene, tmp_path: Path, text: str) -> None:
     (tmp_path / "p.json").write_text(text)
     with pytest.raises(AwError, match=r"p\.json") as error:
-        camera_path.from_file(tmp_path / "p.json", scene, 5, SIZE)
+        video.from_file(tmp_path / "p.json", scene, 5, SIZE)
     assert "\n" not in str(error.value)
 
 

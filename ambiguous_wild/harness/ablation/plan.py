@@ -7,11 +7,11 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NotRequired, TypedDict
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash, flatten, to_plain, with_options
-from ambiguous_wild.harness.ablation.records import StudyFacts
+from ambiguous_wild.harness.measures import Measure, measure
 from ambiguous_wild.harness.running.cell import Cell
 from ambiguous_wild.harness.running.grid import cell_folder, plan_cells
 from ambiguous_wild.harness.running.records import RunResult, metrics_of
@@ -21,7 +21,59 @@ from ambiguous_wild.methods.describe import BACK_ENDS
 from ambiguous_wild.methods.registry import MethodEntry, get_method
 from ambiguous_wild.splat.pace import TrainConfig
 
+
+class StudyFacts(TypedDict):
+    """Facts that two studies must share before one report can hold both."""
+
+    method: str
+    settings: list[str]  # on top of the defaults, in every row
+    train: dict[str, Any]  # fields of `TrainConfig`; the seed is None
+    scenes: list[str]
+    seeds: list[int]
+
+
+class GroupFacts(TypedDict):
+    """A group of variants."""
+
+    name: str
+    title: str
+    source: str  # in the paper; empty without
+
+
+class Summary(TypedDict):
+    """Mean and sample deviation over the runs of a variant; None = missing."""
+
+    mean: float | None
+    spread: float | None
+
+
+class VariantRow(TypedDict):
+    """A variant: its values, its differences to the default, its runs."""
+
+    group: str
+    variant: str
+    settings: list[str]
+    text: str
+    status: Literal["ok", "failed", "missing"]
+    reason: str  # of another status than ok
+    same_as: str
+    values: dict[str, Summary]  # by key of `plan.METRICS`
+    differences: dict[str, Summary]  # by key of `plan.DIFFERENCES`
+    runs: list[dict[str, Any]]  # scene, seed, folder, error, and every key of `plan.METRICS`
+
+
+class StudyReport(StudyFacts):
+    """ablation.json."""
+
+    schema: int
+    made_by: str  # the command
+    note: NotRequired[str]  # what the method says about itself
+    groups: list[GroupFacts]
+    rows: list[VariantRow]
+
+
 REPORT = "ablation.json"
+MASK_LABELS = {"iou": "IoU", "precision": "precision", "recall": "recall"}
 
 
 @dataclass(frozen=True)
@@ -224,7 +276,7 @@ class Outcome:
             return None
         cost: Mapping[str, Any] = self.result["cost"]
         masks: Mapping[str, Any] = self.result["masks"] or {}
-        if metric in ("iou", "precision", "recall"):
+        if metric in MASK_LABELS:
             return masks.get(metric)
         if metric == "total_s":
             parts = (cost.get("train_s"), cost.get("setup_s"))
@@ -237,21 +289,14 @@ class Outcome:
         return sum(known) / len(known) if known and len(known) == len(values) else None
 
 
-# key, label, digits: what is tabulated of every variant
+# What is tabulated of every variant; keys as in ablation.json.
 METRICS = (
-    ("psnr", "PSNR dB", 2),
-    ("ssim", "SSIM", 3),
-    ("lpips_alex", "LPIPS alex", 3),
-    ("iou", "IoU", 3),
-    ("precision", "precision", 3),
-    ("recall", "recall", 3),
-    ("gaussians", "Gaussians", 0),
-    ("model_mb", "MB", 1),
-    ("ms_per_iteration", "ms/it", 1),
-    ("setup_s", "setup s", 1),
-    ("total_s", "total s", 1),
+    *map(measure, ("psnr", "ssim", "lpips_alex")),
+    *(Measure(key, f"mask {label}", "higher", 3) for key, label in MASK_LABELS.items()),
+    *map(measure, ("gaussians", "model_mb", "ms_per_iteration", "setup_s")),
+    Measure("total_s", "total s", "lower", 1, per_image=False, timed=True),
 )
-DIFFERENCES = (("psnr", "d dB", 2), ("iou", "d IoU", 3), ("ms_per_iteration", "d ms/it", 1))
+DIFFERENCES = tuple(m for m in METRICS if m.key in ("psnr", "iou", "ms_per_iteration"))
 
 
 def read_outcomes(cells: Sequence[Cell], output: Path) -> list[Outcome]:

@@ -7,19 +7,37 @@ same scene with the same seed, so that the spread of a difference is not the spr
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
+from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import to_plain
-from ambiguous_wild.harness.ablation.plan import DIFFERENCES, METRICS, Outcome, Planned, Study, read_outcomes
-from ambiguous_wild.harness.ablation.records import GroupFacts, StudyReport, Summary, VariantRow
+from ambiguous_wild.harness.ablation.plan import (
+    DIFFERENCES,
+    METRICS,
+    REPORT,
+    GroupFacts,
+    Outcome,
+    Planned,
+    Study,
+    StudyReport,
+    Summary,
+    VariantRow,
+    read_outcomes,
+)
+from ambiguous_wild.harness.measures import Measure, measure
 from ambiguous_wild.harness.tables.plain_formats import to_csv, to_markdown
-from ambiguous_wild.harness.tables.table import BLANK, Cell, Table, text_table
+from ambiguous_wild.harness.tables.table import BLANK, Cell, Column, Row, Table, ranks
 from ambiguous_wild.io.atomic import atomic_path, write_json, write_text
+from ambiguous_wild.methods.ablation import DEFAULT
 from ambiguous_wild.methods.describe import BACK_ENDS
 from ambiguous_wild.metrics import stats
+
+KEYS = tuple(m.key for m in METRICS)
 
 
 def report(study: Study, output: Path, made_by: str = "") -> StudyReport:
@@ -46,9 +64,9 @@ def _row(row: Planned, outcomes: list[Outcome], default: list[Outcome]) -> Varia
     failed = [o for o in outcomes if o.result is None]
     status: Literal["ok", "failed", "missing"] = "missing" if row.missing else "failed" if failed else "ok"
     reason = row.missing or "; ".join(dict.fromkeys(f"{o.scene}, seed {o.seed}: {o.error}" for o in failed))
-    values = {key: _summary([o.value(key) for o in outcomes]) for key, _, _ in METRICS}
+    values = {key: _summary([o.value(key) for o in outcomes]) for key in KEYS}
     differences = {}
-    for key, _, _ in DIFFERENCES:
+    for key in (m.key for m in DIFFERENCES):
         pairs = [(o.value(key), d.value(key)) for o, d in zip(outcomes, default, strict=False)]
         differences[key] = _summary([None if a is None or b is None else a - b for a, b in pairs])
     return {
@@ -63,7 +81,7 @@ def _row(row: Planned, outcomes: list[Outcome], default: list[Outcome]) -> Varia
         "differences": differences,
         "runs": [
             {"scene": o.scene, "seed": o.seed, "folder": str(o.folder), "error": o.error or None}
-            | {key: o.value(key) for key, _, _ in METRICS}
+            | {key: o.value(key) for key in KEYS}
             for o in outcomes
         ],
     }
@@ -121,37 +139,11 @@ def csv_of(data: StudyReport) -> str:
 
 
 def markdown_of(data: StudyReport, picture: str = "") -> str:
-    """One table a group: quality and cost of each variant."""
-    shown = [m for m in METRICS if any(r["values"][m[0]]["mean"] is not None for r in data["rows"])]
+    """One table a group: differences to the default, quality and cost of each variant, and what it is."""
     lines = [f"# Ablations of {data['method']}", "", _subtitle(data), ""]
-    if data.get("note"):
-        lines += [f"{data['method']}: {data['note']}", ""]
-    if picture:
-        lines += [f"![quality against cost]({picture})", ""]
-    for group in data["groups"]:
-        rows = [row for row in data["rows"] if row["group"] == group["name"]]
-        lines += [f"## {group['name']}: {group['title']}", ""]
-        if group["source"]:
-            lines += [f"Paper: {group['source']}.", ""]
-        lines += [*to_markdown([_table(rows, shown)]).splitlines(), ""]
-        lines += [f"- {r['variant']} {r['status']}: {r['reason']}" for r in rows if r["status"] != "ok"]
-        lines += [""] if lines[-1] else []
-    if data["made_by"]:
-        lines += [f"command: `{data['made_by']}`", ""]
-    return "\n".join(lines)
-
-
-def _table(rows: Sequence[VariantRow], shown: Sequence[tuple[str, str, int]]) -> Table:
-    head = ["variant", *(label for _, label, _ in DIFFERENCES), *(label for _, label, _ in shown), "what"]
-    lines: list[list[str | Cell]] = []
-    for row in rows:
-        if row["status"] == "ok":
-            cells = [_cell(row, "differences", key, digits, sign=True) for key, _, digits in DIFFERENCES]
-            cells += [_cell(row, "values", key, digits) for key, _, digits in shown]
-        else:  # the reason stands below the table
-            cells = [row["status"], *[""] * (len(head) - 3)]
-        lines.append([row["variant"], *cells, _what(row)])
-    return text_table("", head, lines, words=("what",))
+    lines += [f"![quality against cost]({picture})", ""] if picture else []
+    shown = [m for m in METRICS if any(row["values"][m.key]["mean"] is not None for row in data["rows"])]
+    return "\n".join(lines) + "\n" + to_markdown(_tables(data, shown, differences=True))
 
 
 def _subtitle(data: StudyReport) -> str:
@@ -161,7 +153,7 @@ def _subtitle(data: StudyReport) -> str:
     base = f"; in every row of the method: {' '.join(data['settings'])}" if data["settings"] else ""
     return (
         f"{', '.join(data['scenes'])}; seeds {', '.join(map(str, data['seeds']))}; {length}{base}. "
-        "Differences are to the default, on the same scene with the same seed; +- is the sample deviation "
+        "Differences are to the default, on the same scene with the same seed; ± is the sample deviation "
         "over runs."
     )
 
@@ -171,18 +163,6 @@ def _what(row: VariantRow) -> Cell:
     parts.append(f"same runs as {row['same_as']}" if row["same_as"] else "")
     text = "; ".join(part for part in parts if part)
     return Cell(printed=text, markdown=text) if text else BLANK
-
-
-def _cell(
-    row: VariantRow, kind: Literal["values", "differences"], key: str, digits: int, sign: bool = False
-) -> str:
-    entry = row[kind][key]
-    if row["variant"] == "default" and kind == "differences":
-        return ""
-    if entry["mean"] is None:
-        return "missing"
-    text = f"{entry['mean']:{'+' if sign else ''},.{digits}f}"
-    return text if entry["spread"] is None else f"{text} +- {entry['spread']:,.{digits}f}"
 
 
 def draw(data: StudyReport, path: Path) -> bool:
@@ -258,3 +238,84 @@ def _labels(axes: Any, points: list[tuple[str, float, float, float]]) -> None:
             va="center",
             arrowprops={"arrowstyle": "-", "lw": 0.4, "color": "0.6"},
         )
+
+
+SHOWN = ("psnr", "ssim", "lpips_alex", "iou", "ms_per_iteration", "gaussians", "model_mb")
+
+
+def ablation(folder: Path, metrics: tuple[str, ...] = ()) -> list[Table]:
+    """The tables of a study: a table a group, a row a variant.
+
+    Args:
+        folder: the output of `aw ablate`.
+        metrics: columns; empty = those of `SHOWN` that any row has.
+
+    Raises:
+        AwError: no study there, a damaged one, or a metric that it does not have.
+    """
+    path = folder / REPORT
+    try:
+        data: StudyReport = json.loads(path.read_text(encoding="utf-8"))
+        known = list(dict.fromkeys(key for row in data["rows"] for key in row["values"]))
+        for name in metrics:
+            if name not in known:
+                raise AwError(f"{path} has no {name!r}: it has {', '.join(known)}")
+        has = {key for row in data["rows"] for key in known if not math.isnan(_mean(row, "values", key))}
+        ours = {m.key: m for m in METRICS}
+        keys = metrics or [key for key in SHOWN if key in has]
+        return _tables(data, [ours.get(key, measure(key)) for key in keys])
+    except FileNotFoundError:
+        raise AwError(f"no {REPORT} in {folder}: 'aw ablate -o {folder}' writes it") from None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise AwError(f"{path} is damaged ({error!r}): run 'aw ablate' again") from None
+
+
+def _tables(data: StudyReport, columns: Sequence[Measure], *, differences: bool = False) -> list[Table]:
+    """A table a group; with `differences` those to the default stand first, and what a variant is last."""
+    tables = []
+    for group in data["groups"]:
+        members = [row for row in data["rows"] if row["group"] == group["name"]]
+        by_column = [ranks([_mean(row, "values", c.key) for row in members], c) for c in columns]
+        lines = []
+        for k, row in enumerate(members):
+            cells = [_cell(row, c, rank[k]) for c, rank in zip(columns, by_column)]
+            if differences:
+                cells = [*(_difference(row, c) for c in DIFFERENCES), *cells, _what(row)]
+            lines.append(Row(str(row["variant"]), tuple(cells), note=str(row["text"])))
+        notes = [f"{r['variant']} {r['status']}: {r['reason']}" for r in members if r["status"] != "ok"]
+        heads = [Column("", c) for c in columns]
+        if differences:
+            first = (Column("", replace(c, label=f"d {c.label}", better=None)) for c in DIFFERENCES)
+            heads = [*first, *heads, Column("", Measure("what", "what", None, 0), words=True)]
+        source = f" (paper: {group['source']})" if group["source"] else ""
+        title = f"{data['method']}, {group['name']}: {group['title']}{source}"
+        over = "seeds" if len(data["scenes"]) == 1 else "scenes and seeds"
+        tables.append(Table(title, tuple(heads), tuple(lines), tuple(notes), over))
+    common = [f"{', '.join(data['scenes'])}; seeds {', '.join(map(str, data['seeds']))}"]
+    common += [f"{data['method']}: {data['note']}"] if data.get("note") else []
+    common += [f"command of the runs: {data['made_by']}"] if data["made_by"] else []
+    return [*tables[:-1], tables[-1].with_notes(*common)]
+
+
+def _cell(row: VariantRow, column: Measure, rank: int | None) -> Cell:
+    if row["status"] == "failed":
+        return Cell(state="failed")
+    value = _mean(row, "values", column.key)
+    if math.isnan(value):
+        return Cell(state="missing")
+    spread = row["values"][column.key]["spread"]
+    return Cell(value, math.nan if spread is None else float(spread), rank=rank)
+
+
+def _difference(row: VariantRow, column: Measure) -> Cell:
+    value, spread = _mean(row, "differences", column.key), row["differences"][column.key]["spread"]
+    if row["variant"] == DEFAULT or math.isnan(value):
+        return BLANK
+    text = f"{value:+.{column.digits}f}"
+    return Cell(printed=text if spread is None else f"{text} ± {spread:.{column.digits}f}")
+
+
+def _mean(row: VariantRow, kind: Literal["values", "differences"], key: str) -> float:
+    """NaN where it is missing."""
+    value = row[kind][key]["mean"] if key in row[kind] else None
+    return math.nan if value is None else float(value)

@@ -7,8 +7,7 @@ import re
 from typing import Any, TypedDict
 
 from ambiguous_wild.core import Scene
-from ambiguous_wild.harness.ambiguity.evidence import KINDS
-from ambiguous_wild.harness.ambiguity.measure import Look, Measured, feature_family, weight_free
+from ambiguous_wild.harness.ambiguity.measure import KINDS, Look, Measured, feature_family, weight_free
 from ambiguous_wild.metrics import ambiguity as am
 from ambiguous_wild.metrics import semantic as sem
 from ambiguous_wild.metrics.stats import Interval

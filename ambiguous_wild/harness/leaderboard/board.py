@@ -1,20 +1,255 @@
-"""The files of a leaderboard: one CSV a dataset, one row a run; all.csv is the same, tidy.
-
-BOARD/reported/*.csv              numbers that others printed, see docs/audit.md
-BOARD/measured/<dataset>.csv      what `aw leaderboard add` took in
-BOARD/measured/all.csv            the same, one number a row; made from the others
-BOARD/measured/images/            small pictures, and index.csv that says what they show
-"""
+"""CSV that spreadsheets take for text, and that reads back as what was written."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import csv
+import hashlib
+import math
+import re
+import unicodedata
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.leaderboard.entry import FIRST, LAST, TIDY, Entry, from_wide, tidy, wide
-from ambiguous_wild.harness.leaderboard.sheet import board_csv, read_csv, slug
+from ambiguous_wild.core.config import config_hash
+from ambiguous_wild.harness.measures import MEASURES
+from ambiguous_wild.harness.tables import plain_formats
+from ambiguous_wild.harness.tables.plain_formats import shortest
 from ambiguous_wild.io.atomic import write_text
+
+FORMULA = ("=", "+", "-", "@")
+LARGEST = 200_000_000  # bytes
+LONGEST = 200  # characters of a name
+HIDDEN = ("Cc", "Cf", "Cs", "Zl", "Zp")  # Unicode categories of invisible characters
+CsvValue = str | int | float | None
+
+
+def guard(text: str) -> str:
+    """The text with an apostrophe in front where a spreadsheet would calculate it.
+
+    A text that begins with an apostrophe gets one too, so that `unguard` knows ours from its own.
+    """
+    begins = text.lstrip()[:1]
+    return "'" + text if begins in FORMULA or text[:1] in ("'", "\t", "\r", "\n") else text
+
+
+def unguard(cell: str) -> str:
+    """What `guard` was given."""
+    return cell[1:] if cell.startswith("'") else cell
+
+
+def number(value: float | None) -> str:
+    """Shortest digits that read back as the same number; empty where it is missing."""
+    if value is None or math.isnan(value):
+        return ""
+    return str(value) if isinstance(value, int) else shortest(value)
+
+
+def board_csv(head: Sequence[str], rows: Iterable[Sequence[CsvValue]]) -> str:
+    """Text is guarded, numbers stay numbers, None is an empty cell."""
+    return plain_formats.to_csv(head, rows, text=guard, number=shortest)
+
+
+def read_csv(path: Path, required: Sequence[str]) -> tuple[list[str], list[dict[str, str]]]:
+    """(columns, rows) of a file that `board_csv` wrote; cells as they stand, see `unguard` and `to_number`.
+
+    Raises:
+        AwError: unreadable, malformed, or without a column that must be there.
+    """
+    try:
+        if path.stat().st_size > LARGEST:
+            raise AwError(f"{path} is larger than {LARGEST // 1_000_000} MB: no file of a leaderboard")
+        with open(path, newline="", encoding="utf-8") as f:
+            lines = list(csv.reader(f, strict=True))
+    except UnicodeDecodeError:
+        raise AwError(f"{path} is no text in UTF-8: restore it from your version control") from None
+    except csv.Error as error:
+        raise AwError(f"{path} is malformed CSV ({error}): restore it from your version control") from None
+    except OSError as error:
+        raise AwError(f"cannot read {path}: {error.strerror}") from None
+    head = lines[0] if lines else []
+    lacking = [c for c in required if c not in head]
+    if lacking or len(set(head)) != len(head):
+        what = f"lacks the column {lacking[0]!r}" if lacking else "names a column twice"
+        raise AwError(f"{path} {what}: it is no file of a leaderboard, or was changed by hand; restore it")
+    for at, line in enumerate(lines[1:], 2):
+        if len(line) != len(head):
+            raise AwError(f"{path} row {at} has {len(line)} cells, not {len(head)}: restore the file")
+    return head, [dict(zip(head, line)) for line in lines[1:]]
+
+
+def to_count(text: str, where: str) -> int:
+    """The whole number from 0 on of a cell.
+
+    Raises:
+        AwError: it holds none, or one of more than 18 digits.
+    """
+    if not (text.isascii() and text.isdigit()) or len(text) > 18:
+        raise AwError(f"{where} {text[:40]!a} is no count; restore the file")
+    return int(text)
+
+
+def to_number(cell: str, where: str) -> float:
+    """The number in a cell; NaN for an empty one.
+
+    Raises:
+        AwError: it is no number.
+    """
+    if not cell:
+        return math.nan
+    if not re.fullmatch(r"-?(inf|\d+(\.\d+)?([eE][+-]?\d+)?)", cell):
+        raise AwError(f"{where}: {cell[:40]!a} is no number; restore the file")
+    return float(cell)
+
+
+def check_text(kind: str, text: str) -> str:
+    """The text, where it is fit to stand in a table: others' names may hold anything that can be printed.
+
+    Raises:
+        AwError: empty, too long, or with control characters or text-direction marks.
+    """
+    hidden = next((c for c in text if unicodedata.category(c) in HIDDEN), None)
+    if not text.strip() or len(text) > LONGEST or hidden is not None:
+        shown = text if len(text) <= 40 else text[:37] + "..."
+        why = "is empty" if not text.strip() else f"holds {hidden!a}" if hidden else "is too long"
+        raise AwError(f"the {kind} {shown!a} {why}; give it 1 to {LONGEST} characters that can be printed")
+    return text
+
+
+def slug(text: str) -> str:
+    """A file name for any text: lower case, digits and '-', and never a path."""
+    ascii_text = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode().lower()
+    return re.sub(r"[^a-z0-9]+", "-", ascii_text).strip("-")[:48].strip("-")
+
+
+def unique_slug(*texts: str) -> str:
+    """A file name of its own for every tuple of texts."""
+    digest = hashlib.sha256("\0".join(texts).encode("utf-8", "surrogatepass")).hexdigest()[:8]
+    return "-".join(filter(None, (slug(texts[0]), digest)))
+
+
+FIRST = ("dataset", "scene", "method", "setting", "options", "seed", "images")
+LAST = (
+    "missing", "device", "hardware", "version", "source", "code_hash", "config_hash", "scene_hash",
+    "result_hash", "checked", "reproduce", "row_hash",
+)  # fmt: skip
+NO_TEXT = ("seed", "images", "missing", "checked", "row_hash")  # columns of others than plain text
+COST = "cost_"  # begins the column of a cost; every other column of numbers is a quality
+ALONE = "alone"  # the cost that says whether the run had the machine alone: 1 or 0
+TIDY = (
+    "dataset", "scene", "method", "setting", "options", "seed", "kind", "metric", "value", "device",
+    "version", "source", "config_hash", "scene_hash", "checked",
+)  # fmt: skip
+# What was computed again from renders and photos: every metric of pictures, PSNR alone, or nothing.
+Checked = Literal["photos", "psnr", "files"]
+CHECKED: tuple[Checked, ...] = ("files", "psnr", "photos")  # the stronger last
+Key = tuple[str, str, str, str, str, int]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A run on the board; its values are means over the test images."""
+
+    dataset: str
+    scene: str
+    method: str
+    setting: str  # what sets it apart, for people: "2000 iterations, effects exposure"
+    options: str  # first 8 hex digits of the hash of the method's options; empty where it has none
+    seed: int
+    images: int  # test images behind the values
+    quality: Mapping[str, float]  # metric variant -> value
+    cost: Mapping[str, float]  # as in the result file, numbers only
+    missing: tuple[str, ...]  # metrics that were asked for and are not there
+    device: str
+    hardware: str  # what times depend on
+    version: str  # of this package
+    source: str  # sha256 of the method's own file; empty for the methods of this package
+    code_hash: str  # sha256 over this package's files; empty in results of before it was kept
+    config_hash: str
+    scene_hash: str
+    result_hash: str  # sha256 of metrics.json
+    checked: Checked
+    reproduce: str  # the command
+
+    @property
+    def key(self) -> Key:
+        """The cell it fills."""
+        return (self.dataset, self.scene, self.method, self.setting, self.options, self.seed)
+
+    @property
+    def name(self) -> str:
+        return f"{self.method} on {self.scene} with seed {self.seed} ({self.setting})"
+
+    @property
+    def row_hash(self) -> str:
+        """sha256 over the cells of its row: what a hand or a spreadsheet changes there shows."""
+        plain = {k: getattr(self, k) for k in (*FIRST, *LAST) if k != "row_hash"}
+        values = {k: {m: number(v) for m, v in getattr(self, k).items()} for k in ("quality", "cost")}
+        return config_hash(plain | values)
+
+
+def in_order(names: Iterable[str]) -> list[str]:
+    """Metrics in the order tables have them, then by name."""
+    known = list(MEASURES)
+    return sorted(names, key=lambda n: (known.index(n) if n in known else len(known), n))
+
+
+def wide(entries: Sequence[Entry]) -> tuple[list[str], list[list[CsvValue]]]:
+    """Head and rows, one row a run."""
+    quality = in_order({k for e in entries for k in e.quality})
+    cost = in_order({k for e in entries for k in e.cost})
+    head = [*FIRST, *quality, *(COST + k for k in cost), *LAST]
+    rows: list[list[CsvValue]] = []
+    for e in sorted(entries, key=lambda e: e.key):
+        row: list[CsvValue] = [*e.key, e.images]
+        row += [e.quality.get(k) for k in quality]
+        row += [e.cost.get(k) for k in cost]
+        row += [" ".join(e.missing), e.device, e.hardware, e.version, e.source, e.code_hash]
+        rows.append([*row, e.config_hash, e.scene_hash, e.result_hash, e.checked, e.reproduce, e.row_hash])
+    return head, rows
+
+
+def from_wide(head: Sequence[str], row: Mapping[str, str], where: str) -> Entry:
+    """The entry of a row.
+
+    Raises:
+        AwError: a cell that cannot be.
+    """
+    text = {k: unguard(row[k]) for k in (*FIRST, *LAST)}
+    numbers = {
+        k: value
+        for k in head
+        if k not in FIRST and k not in LAST and not math.isnan(value := to_number(row[k], f"{where}, {k}"))
+    }
+    counts = {column: to_count(text[column], f"{where}: {column}") for column in ("seed", "images")}
+    checked = next((c for c in CHECKED if c == text["checked"]), None)
+    if checked is None:
+        raise AwError(
+            f"{where}: checked is {text['checked'][:40]!a}, none of {', '.join(CHECKED)}; restore it"
+        )
+    names = {k: text[k] for k in (*FIRST, *LAST) if k not in NO_TEXT}
+    return Entry(
+        **names,
+        seed=counts["seed"],
+        images=counts["images"],
+        quality={k: v for k, v in numbers.items() if not k.startswith(COST)},
+        cost={k.removeprefix(COST): v for k, v in numbers.items() if k.startswith(COST)},
+        missing=tuple(text["missing"].split()),
+        checked=checked,
+    )
+
+
+def tidy(entries: Iterable[Entry]) -> Iterator[list[CsvValue]]:
+    """Rows under `TIDY`, one a run and metric; what is missing has a row without a value."""
+    for e in sorted(entries, key=lambda e: e.key):
+        last = [e.device, e.version, e.source, e.config_hash, e.scene_hash, e.checked]
+        qualities = {**dict.fromkeys(e.missing, math.nan), **e.quality}
+        for kind, values in (("quality", qualities), ("cost", e.cost)):
+            for metric in in_order(values):
+                yield [*e.key, kind, metric, values[metric], *last]
+
 
 ALL = "all"
 

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from ambiguous_wild.harness.leaderboard.entry import ALONE, Entry, in_order
-from ambiguous_wild.harness.leaderboard.reported import Reported
-from ambiguous_wild.harness.leaderboard.sheet import to_number
+from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.audit.checks import audit
+from ambiguous_wild.harness.audit.table import Finding, Number, read_tables
+from ambiguous_wild.harness.leaderboard.board import ALONE, CsvValue, Entry, board_csv, in_order, to_number
 from ambiguous_wild.harness.measures import PARTIAL, measure
 from ambiguous_wild.methods.registry import knows_truth
 
@@ -128,3 +132,98 @@ def _number(value: float) -> float | str | None:
     if math.isfinite(value):
         return value
     return None if math.isnan(value) else str(value)
+
+
+SOURCE = "reported"
+SOURCES = "sources.json"
+REPORTED_COLUMNS = (
+    "source",
+    "method",
+    "setting",
+    "dataset",
+    "scene",
+    "metric",
+    "variant",
+    "value",
+    "printed",
+    "table",
+)
+
+
+@dataclass(frozen=True)
+class Reported:
+    """What papers print, where it stands, and what `aw audit` found in it."""
+
+    numbers: tuple[Number, ...] = ()
+    findings: tuple[Finding, ...] = ()
+    sources: dict[str, dict[str, str]] = field(default_factory=dict)  # table -> title, venue, url, caption
+
+    def plain(self) -> dict[str, Any]:
+        """For the page: findings are looked up by the place of a number."""
+        return {
+            "reported": [
+                {column: _plain(n, column) for column in (*REPORTED_COLUMNS[1:], "where")}
+                for n in self.numbers
+            ],
+            "findings": [{"kind": f.kind, "text": f.text, "where": list(f.where)} for f in self.findings],
+            "sources": self.sources,
+        }
+
+
+def read_reported(folder: Path) -> Reported:
+    """Every number of FOLDER/*.csv that says method and scene, in order; none without the folder.
+
+    Raises:
+        AwError: a file that is unreadable or malformed.
+    """
+    if not folder.is_dir() or not any(folder.glob("*.csv")):
+        return Reported()
+    numbers = read_tables([folder])
+    # of no method: what the text says of the photos
+    found = [n for n in numbers if n.known and n.method != "dataset"]
+    found.sort(key=lambda n: (n.dataset, n.method, n.setting, n.scene, n.table, n.metric, n.variant))
+    return Reported(tuple(found), tuple(audit(numbers)), read_sources(folder / SOURCES))
+
+
+def read_sources(path: Path) -> dict[str, dict[str, str]]:
+    """Table -> title of its paper, link and caption, from the sources.json beside reported tables.
+
+    Raises:
+        AwError: it is there and not of that form.
+    """
+    if not path.is_file():
+        return {}
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        papers, tables = found["papers"], found["tables"]
+        return {
+            str(name): {
+                "caption": str(about.get("caption", "")),
+                "title": str(papers[about["paper"]].get("title", "")),
+                "venue": str(papers[about["paper"]].get("venue", "")),
+                "url": _link(papers[about["paper"]].get("url", "")),
+            }
+            for name, about in tables.items()
+        }
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        raise AwError(
+            f'{path} is malformed: write {{"papers": {{ID: {{"title", "venue", "url"}}}}, '
+            '"tables": {TABLE: {"paper": ID, "caption"}}}'
+        ) from None
+
+
+def _link(url: object) -> str:
+    """An address that a page may link to; empty for anything else, such as javascript:."""
+    text = str(url or "")
+    return text if re.fullmatch(r"https?://[^\s\"'<>]+", text) else ""
+
+
+def reported_csv(numbers: Sequence[Number]) -> str:
+    """One number a row, each marked as reported; beside the value how it is printed."""
+    rows = ([SOURCE, *(_plain(n, column) for column in REPORTED_COLUMNS[1:])] for n in numbers)
+    return board_csv(REPORTED_COLUMNS, rows)
+
+
+def _plain(number: Number, column: str) -> CsvValue:
+    value: CsvValue = getattr(number, "text" if column == "printed" else column)
+    return value

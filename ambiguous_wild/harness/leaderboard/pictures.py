@@ -16,11 +16,11 @@ import numpy as np
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash
-from ambiguous_wild.harness.leaderboard.board import measured
-from ambiguous_wild.harness.leaderboard.entry import Entry
-from ambiguous_wild.harness.leaderboard.sheet import (
+from ambiguous_wild.harness.leaderboard.board import (
     CsvValue,
+    Entry,
     board_csv,
+    measured,
     number,
     read_csv,
     slug,
@@ -33,6 +33,7 @@ from ambiguous_wild.harness.leaderboard.verify import RENDERS, Verified
 from ambiguous_wild.io.atomic import atomic_path, write_text
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import read_gray, read_png_rgb
+from ambiguous_wild.io.page_parts import jpeg_bytes
 
 INDEX = "index.csv"
 OLD = (  # columns of an index of before masks were kept: every picture is of kind "test"
@@ -244,7 +245,7 @@ def _overlay(
     red, green, blue, alpha = colour
     image = np.zeros((*shown.shape, 4), np.uint8)
     image[shown] = (blue, green, red, alpha)
-    return _encoded(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    return bytes(cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 9])[1])
 
 
 def _jpeg(path: Path) -> bytes:
@@ -252,12 +253,4 @@ def _jpeg(path: Path) -> bytes:
     scale = SIDE / max(image.shape[:2])
     if scale < 1:  # never enlarged: the browser does that
         image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    flags = [cv2.IMWRITE_JPEG_QUALITY, QUALITY, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111]
-    return _encoded(".jpg", np.ascontiguousarray(image[:, :, ::-1]), flags)
-
-
-def _encoded(suffix: str, image: np.ndarray, flags: list[int]) -> bytes:
-    done, data = cv2.imencode(suffix, image, flags)
-    if not done:
-        raise AwError(f"OpenCV could not write a picture of {image.shape[1]}x{image.shape[0]} as {suffix}")
-    return data.tobytes()
+    return jpeg_bytes(image, QUALITY, full_colour=True)

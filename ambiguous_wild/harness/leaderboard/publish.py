@@ -2,30 +2,34 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
-import html
 import json
 import os
-import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.audit.table import REPORTED
+from ambiguous_wild.harness.audit.table import REPORTED, Number
 from ambiguous_wild.harness.leaderboard import pictures
-from ambiguous_wild.harness.leaderboard.board import files_of, read_board
-from ambiguous_wild.harness.leaderboard.entry import Entry
-from ambiguous_wild.harness.leaderboard.models import ModelPages, write_model_pages
-from ambiguous_wild.harness.leaderboard.page_facts import facts
-from ambiguous_wild.harness.leaderboard.reported import SOURCE, Printed, Reported, read_reported, reported_csv
+from ambiguous_wild.harness.leaderboard.board import Entry, files_of, read_board, slug
+from ambiguous_wild.harness.leaderboard.page_facts import (
+    SOURCE,
+    Reported,
+    facts,
+    read_reported,
+    reported_csv,
+)
+from ambiguous_wild.harness.running.result_file import RESULT
+from ambiguous_wild.harness.showing.read import Found, find_models, open_scene
 from ambiguous_wild.io.atomic import atomic_dir, check_output, list_names, sweep_siblings, write_json
 from ambiguous_wild.io.atomic import refuse_foreign_files as refuse_strangers
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.lock import folder_lock
+from ambiguous_wild.io.page_parts import fill_page
+from ambiguous_wild.viewing.page_file import page_text
 
 GENERATOR = '<meta name="generator" content="aw leaderboard publish">'
 OURS = {"index.html", "data", "images", "models"}
@@ -146,7 +150,7 @@ def _published(out: Path) -> set[str] | None:
     return {MANIFEST, *map(str, found)} if isinstance(found, list) else None
 
 
-def _write_data(board: Path, folder: Path, entries: Sequence[Entry], printed: Sequence[Printed]) -> list[str]:
+def _write_data(board: Path, folder: Path, entries: Sequence[Entry], printed: Sequence[Number]) -> list[str]:
     folder.mkdir()
     files = {path.name: text for path, text in files_of(board, entries).items()}
     if printed:
@@ -168,22 +172,77 @@ def _copy_picture(source: Path, target: Path, digest: str) -> None:
 
 def page(title: str, known: Mapping[str, Any]) -> str:
     """The page; data and title can be anything and stay text."""
-    here = Path(__file__).resolve().parent
-    template = (here / "page.html").read_text(encoding="utf-8")
-    style = (here / "page.css").read_text(encoding="utf-8")
-    script = "\n".join((here / name).read_text(encoding="utf-8") for name in SCRIPTS)
-    data = json.dumps(known, ensure_ascii=False, allow_nan=False, separators=(",", ":"), sort_keys=True)
-    for char in "<>&\u2028\u2029":  # no text in it can end the element it stands in
-        data = data.replace(char, f"\\u{ord(char):04x}")
     # A picture beside a file:// page is not 'self' in every browser.
-    policy = (
-        f"default-src 'none'; img-src 'self' file: data:; style-src {_digest(style)}; "
-        f"script-src {_digest(script)}; base-uri 'none'; form-action 'none'"
-    )
-    parts = {"POLICY": policy, "TITLE": html.escape(title), "STYLE": style, "SCRIPT": script, "DATA": data}
-    # In one pass: what is put in is not looked at again.
-    return re.sub(r"/\*([A-Z]+)\*/", lambda found: parts[found[1]], template)
+    here = Path(__file__).resolve().parent
+    return fill_page(here, known, SCRIPTS, title=title, images="'self' file: data:", sort_keys=True)
 
 
-def _digest(text: str) -> str:
-    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+MODELS = "models"
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class ModelPages:
+    """What was written."""
+
+    links: dict[str, str]  # by the result hash of a run: where its entry is shown, relative to index.html
+    pages: int
+
+
+def write_model_pages(entries: Sequence[Entry], runs: Sequence[Path], out: Path, say: Say) -> ModelPages:
+    """Write OUT/models/*.html from run folders whose results are on the board.
+
+    Of an entry (a method with its setting) the lowest seed that is at hand is shown.
+
+    Args:
+        entries: of the board.
+        runs: run folders, or folders of them.
+        out: folder of the published page.
+        say: told which entries have no model at hand.
+
+    Raises:
+        AwError: no run with a model below `runs`, or a scene that is not where its run says.
+    """
+    found, notes = find_models(runs)
+    for note in notes:
+        say(note)
+    by_hash = {sha256_file(f.run / RESULT): f for f in found}
+    scenes: dict[tuple[str, str], dict[str, list[Entry]]] = {}
+    for entry in sorted(entries, key=lambda e: e.key):
+        label = f"{entry.method} ({entry.setting})" + (f" {entry.options}" if entry.options else "")
+        scenes.setdefault((entry.dataset, entry.scene), {}).setdefault(label, []).append(entry)
+    links: dict[str, str] = {}
+    names: set[str] = set()
+    for (dataset, scene), groups in scenes.items():
+        shown: list[tuple[str, Found]] = []
+        for label, of_group in groups.items():
+            at_hand = [e for e in of_group if e.result_hash in by_hash]
+            if not at_hand:
+                say(f"no model of {label} on {scene}: its run is not below the folders given")
+                continue
+            chosen = at_hand[0]
+            shown.append((label, by_hash[chosen.result_hash]))
+        if not shown:
+            continue
+        if len({f.scene_hash for _, f in shown}) > 1:
+            raise AwError(f"runs on scene {scene!r} of {dataset!r} saw different photos: publish them apart")
+        name = _page_name(dataset, scene, names)
+        models = [replace(f.model, label=label) for label, f in shown]
+        text, _, _ = page_text(open_scene(shown[0][1].run), models, title=f"{dataset}: {scene}")
+        (out / MODELS).mkdir(exist_ok=True)
+        (out / MODELS / name).write_text(text, encoding="utf-8")
+        for label, _ in shown:
+            for entry in groups[label]:
+                links[entry.result_hash] = f"{MODELS}/{name}#left={quote(label, safe='')}"
+    return ModelPages(links, len(names))
+
+
+def _page_name(dataset: str, scene: str, taken: set[str]) -> str:
+    """A file name nobody has yet; names of scenes can be anything."""
+    stem = f"{slug(dataset)}-{slug(scene)}".strip("-") or "scene"
+    name, number = f"{stem}.html", 1
+    while name in taken:
+        number += 1
+        name = f"{stem}-{number}.html"
+    taken.add(name)
+    return name

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 import unicodedata
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from functools import cache
 from pathlib import Path
@@ -13,9 +13,11 @@ from typing import Any
 
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError, Scene
-from ambiguous_wild.core.config import config_hash, to_plain
-from ambiguous_wild.harness.leaderboard.sheet import HIDDEN
+from ambiguous_wild.core.config import config_hash, flatten, to_plain
+from ambiguous_wild.harness.leaderboard.board import HIDDEN, Entry
+from ambiguous_wild.harness.running.identity import scene_identity
 from ambiguous_wild.harness.running.records import RunResult
+from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.simulate.presets import PRESETS, resized
 from ambiguous_wild.simulate.spec_file import plain_spec
 
@@ -109,7 +111,7 @@ def _changed(config: Mapping[str, Any]) -> dict[str, str]:
     Of a method in a file, all of them. Of a variant only those that depend on the machine: its name says the
     others.
     """
-    options, name = _flat(config["options"]), config["method"]
+    options, name = flatten(config["options"]), config["method"]
     if "@" in name:
         kept = {f"{member}.{k}": options.get(f"{place}.{k}") for place, member, k in _chosen(name)}
         return {key: _word(value) for key, value in kept.items() if value is not None}
@@ -137,17 +139,10 @@ def _defaults(method: str) -> dict[str, Any] | None:
 
     try:
         entry = get_method(method)
-        options = _flat(to_plain(entry.options()))
+        options = flatten(to_plain(entry.options()))
     except (AwError, ImportError):
         return None
     return {k: v for k, v in options.items() if k not in entry.by_machine()}
-
-
-def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in tree.items():
-        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
-    return flat
 
 
 def _word(value: Any) -> str:
@@ -235,3 +230,84 @@ def _build(raw: str, name: str, settings: Mapping[str, Any]) -> list[str]:
         if key in settings and settings[key] != usual[key]:
             words += [f"--{key.replace('_', '-')}", str(settings[key])]
     return words + (["--strict"] if settings.get("strict") else [])
+
+
+SIMULATED = "simulated"
+
+
+class Scenes:
+    """Finds scenes, each opened once."""
+
+    def __init__(
+        self, folder: Path | None = None, dataset: str | None = None, board: Iterable[Entry] = ()
+    ) -> None:
+        """Args:
+        folder: of scenes, or one scene; instead of where the runs say they lie.
+        dataset: of every scene, whatever it says itself.
+        board: what is known of scenes that are not at hand.
+        """
+        self._folder, self._dataset = folder, dataset
+        self._known = {e.scene_hash: e.dataset for e in board}
+        self._opened: dict[tuple[Path, int | None], tuple[Scene, str]] = {}
+
+    def find(self, run: Path, config: Mapping[str, Any]) -> Scene | None:
+        """The scene of a run; None where it is not on this machine.
+
+        Raises:
+            AwError: what lies there is another scene, or damaged.
+        """
+        asked = config["scene"]
+        path = self._path(asked)
+        if path is None:
+            return None
+        factor = asked.get("factor")
+        key = (path, factor if isinstance(factor, int) else None)
+        if key not in self._opened:
+            scene = load_scene(path, factor=key[1], verify=True)
+            self._opened[key] = scene, scene_identity(scene)
+        scene, identity = self._opened[key]
+        if identity != asked.get("sha256"):
+            raise AwError(
+                f"{run} is of another scene than {path}: the run's has hash {str(asked.get('sha256'))[:12]}, "
+                f"this one {identity[:12]}; name the right one with --scenes, or run again on this one"
+            )
+        return scene
+
+    def _path(self, asked: Mapping[str, Any]) -> Path | None:
+        name = str(asked.get("name"))
+        if self._folder is not None:
+            if (self._folder / "sparse").is_dir():
+                return self._folder
+            # The name is a stranger's: it must not lead elsewhere.
+            inside = Path(name).name == name and (self._folder / name).is_dir()
+            return self._folder / name if inside else None
+        path = asked.get("path")
+        return Path(path) if isinstance(path, str) and path and Path(path).is_dir() else None
+
+    def dataset(self, run: Path, scene: Scene | None, scene_hash: str) -> str:
+        """The dataset: as asked for, as scene.json says, "simulated", or as the board knows it.
+
+        Raises:
+            AwError: nothing says it.
+        """
+        if self._dataset is not None:
+            return self._dataset
+        if scene is not None:
+            said = scene.info.get("dataset")
+            if isinstance(said, str) and said.strip():
+                return said
+            if _simulated(scene.root):
+                return SIMULATED
+        if scene_hash in self._known:
+            return self._known[scene_hash]
+        why = "its scene is not on this machine" if scene is None else f"{scene.root} names none"
+        raise AwError(f"{run}: no dataset known, {why}; say it with --dataset NAME")
+
+
+def _simulated(root: Path) -> bool:
+    """Whether `aw simulate` made the photos."""
+    try:
+        facts = json.loads((root / "truth" / "capture.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(facts, dict) and isinstance(facts.get("preset"), str)

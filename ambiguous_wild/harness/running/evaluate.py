@@ -20,7 +20,7 @@ from ambiguous_wild.io.images import read_png_rgb, to_uint8, write_png
 from ambiguous_wild.metrics import image as image_metrics
 from ambiguous_wild.metrics import lpips
 from ambiguous_wild.metrics import masks as mask_metrics
-from ambiguous_wild.metrics.full_image import FULL_IMAGE
+from ambiguous_wild.metrics.image import FULL_IMAGE
 from ambiguous_wild.splat import device
 from ambiguous_wild.splat.cpu.compile import threads
 from ambiguous_wild.splat.trainer import Trainer

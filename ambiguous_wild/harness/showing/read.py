@@ -1,9 +1,10 @@
-"""The models of finished runs, with their scene, ready to be shown together."""
+"""The models of finished runs, with their scene, ready to be shown together; and the page of `aw view`."""
 
 from __future__ import annotations
 
+import html
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.references import is_reference
 from ambiguous_wild.methods.registry import get_method
 from ambiguous_wild.viewing.model import Look, Model
+from ambiguous_wild.viewing.page_file import MOST_GAUSSIANS, Page, check_page_folder, page_text, write_page
 
 PLY = "point_cloud.ply"
 MASKS = "masks"
@@ -119,10 +121,12 @@ def open_scene(run: Path, folder: Path | None = None) -> Scene:
     """
     asked = read_config(run).get("scene")
     if not isinstance(asked, dict):
-        raise AwError(f"{run / CONFIG} names no scene; run 'aw bench' again to replace it")
+        raise AwError(f"{run} has no {CONFIG} that names its scene: restore it, or run 'aw bench' again")
     path = Path(str(asked.get("path"))) if folder is None else folder
     if not path.is_dir():
-        raise AwError(f"the scene of {run} is not at {path}: say where it lies with --scene-folder")
+        raise AwError(
+            f"the scene of {run} is not at {path}: move the scene back, or name its folder (--scene-folder)"
+        )
     factor = asked.get("factor")
     return load_scene(path, factor=factor if isinstance(factor, int) else None)
 
@@ -179,3 +183,70 @@ def _with_labels(found: list[Found]) -> list[Found]:
     twice = {label for label, count in Counter(labels).items() if count > 1}
     labels = [str(f.run) if label in twice else label for f, label in zip(found, labels)]
     return [replace(f, model=replace(f.model, label=label)) for f, label in zip(found, labels)]
+
+
+def view_runs(
+    paths: Sequence[Path],
+    output: Path,
+    *,
+    scene: str | None = None,
+    scene_folder: Path | None = None,
+    most_gaussians: int = MOST_GAUSSIANS,
+    title: str | None = None,
+    say: Callable[[str], None] = lambda text: None,
+) -> Page:
+    """Write OUTPUT/index.html with the models of runs.
+
+    Args:
+        paths: run folders, or folders of runs, all of one scene.
+        output: folder of the page.
+        scene: name of the scene, where the runs are of several.
+        scene_folder: where it lies; None = where the runs say.
+        most_gaussians: a larger model is reduced to so many, with a note on the page.
+        title: of the page; None = the scene's name.
+        say: told what is done.
+
+    Raises:
+        AwError: no run with a model, several scenes, no scene, or another page in the folder.
+    """
+    check_page_folder(output)
+    shown = read_models(paths, scene=scene, scene_folder=scene_folder)
+    return write_page(
+        output,
+        shown.scene,
+        shown.models,
+        title=shown.scene.name if title is None else title,
+        most_gaussians=most_gaussians,
+        notes=shown.notes,
+        say=say,
+    )
+
+
+class Viewer:
+    """The page of one or more runs, shown by a notebook in a frame of its own."""
+
+    def __init__(self, paths: Sequence[Path], *, height: int = 640, scene_folder: Path | None = None) -> None:
+        """
+        Args:
+            paths: run folders, or folders of runs, all of one scene.
+            height: of the frame, px.
+            scene_folder: where the scene lies; None = where the runs say.
+
+        Raises:
+            AwError: as `view_runs`.
+        """
+        shown = read_models(paths, scene_folder=scene_folder)
+        self.labels = tuple(model.label for model in shown.models)
+        self.height = height
+        self.page, _, _ = page_text(shown.scene, shown.models, title=shown.scene.name, notes=shown.notes)
+
+    def __repr__(self) -> str:
+        return f"Viewer of {', '.join(self.labels)}; a notebook shows it, 'aw view' writes it to a file"
+
+    def _repr_html_(self) -> str:
+        """A frame without access to the notebook's page; its scripts run."""
+        page = html.escape(self.page, quote=True)
+        return (
+            f'<iframe sandbox="allow-scripts" srcdoc="{page}" '
+            f'style="width:100%;height:{self.height}px;border:0"></iframe>'
+        )

@@ -29,8 +29,7 @@ from ambiguous_wild.io.photos import read_photo
 from ambiguous_wild.simulate import capture, spec_file
 from ambiguous_wild.simulate.composite.cutouts import read_cutouts
 from ambiguous_wild.splat import checkpoint
-from ambiguous_wild.study.answers import read_answers
-from ambiguous_wild.study.key import read_key
+from ambiguous_wild.study.answers import read_answers, read_key
 from ambiguous_wild.vision.label_maps import read_labels
 from ambiguous_wild.vision.precompute import cached
 from tests.faults.fuzzing import mutate as damages

@@ -25,8 +25,7 @@ import torch
 import yaml
 
 from ambiguous_wild.harness.leaderboard import pictures
-from ambiguous_wild.harness.leaderboard.entry import Entry, wide
-from ambiguous_wild.harness.leaderboard.sheet import board_csv
+from ambiguous_wild.harness.leaderboard.board import Entry, board_csv, wide
 from ambiguous_wild.io import images, ply
 from ambiguous_wild.io.colmap_model import write_model
 from ambiguous_wild.simulate import spec_file

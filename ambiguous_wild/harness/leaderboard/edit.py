@@ -1,21 +1,31 @@
-"""Add runs to the board: each is checked, and only those that pass are added."""
+"""Add runs to the board, where each is checked first; remove runs; check a board."""
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.harness.leaderboard import pictures
-from ambiguous_wild.harness.leaderboard.board import measured, read_board, write_board
-from ambiguous_wild.harness.leaderboard.entry import CHECKED, Entry, Key
-from ambiguous_wild.harness.leaderboard.scenes import Scenes
+from ambiguous_wild.harness.leaderboard.board import (
+    ALL,
+    CHECKED,
+    Entry,
+    Key,
+    examine,
+    measured,
+    read_board,
+    write_board,
+)
+from ambiguous_wild.harness.leaderboard.reproduce import Scenes
 from ambiguous_wild.harness.leaderboard.verify import Unfinished, Verified, verify
 from ambiguous_wild.harness.running.store import run_folders
 from ambiguous_wild.io.atomic import sweep
+from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.lock import folder_lock
 
 Outcome = Literal["added", "there already", "replaced", "refused", "unfinished"]
@@ -182,3 +192,96 @@ def _conflicts(there: list[Entry], passed: list[Verified]) -> list[tuple[str, Ve
             continue
         found.append((reason, v))
     return found
+
+
+def remove(
+    board: Path,
+    *,
+    method: str,
+    dataset: str | None = None,
+    scene: str | None = None,
+    setting: str | None = None,
+    seed: int | None = None,
+    dry: bool = False,
+) -> list[Entry]:
+    """Remove the runs of a method, or those of them that the other words choose.
+
+    Returns:
+        What was removed; with `dry` what would be.
+
+    Raises:
+        AwError: a name that is not on the board, no run that all words fit, or the board is in use.
+    """
+    if not board.is_dir():
+        raise AwError(f"no leaderboard {board}: name its folder with --board")
+    asked = {"method": method, "dataset": dataset, "scene": scene, "setting": setting, "seed": seed}
+    with folder_lock(board, "aw leaderboard remove"):
+        entries = read_board(board)
+        for what, value in asked.items():
+            there = {str(getattr(e, what)) for e in entries}
+            if value is not None and str(value) not in there:
+                raise unknown(f"{what} on the board {board}", str(value), there)
+        gone = [e for e in entries if all(v is None or getattr(e, k) == v for k, v in asked.items())]
+        if not gone:
+            raise AwError(f"no run on {board} is all of this; leave out one of the choices")
+        if not dry:
+            kept = [e for e in entries if e not in gone]
+            pictures.drop(board, kept)  # before its run: no picture without one
+            write_board(board, kept)
+    return gone
+
+
+@dataclass(frozen=True)
+class Checked:
+    """What a check found."""
+
+    runs: int
+    problems: tuple[str, ...]  # one line each
+
+
+def check(board: Path) -> Checked:
+    """Read everything again and compare.
+
+    Raises:
+        AwError: no board.
+    """
+    if not measured(board).is_dir():
+        raise AwError(
+            f"no leaderboard {board}, it has no folder 'measured': 'aw leaderboard add RUNS --board {board}' "
+            "makes one"
+        )
+    try:
+        entries, wrong = examine(board)
+    except AwError as error:
+        return Checked(0, (str(error),))
+    everything = measured(board) / f"{ALL}.csv"
+    if entries and not everything.is_file():
+        wrong.append(f"{everything} is missing: 'aw leaderboard add' of any run writes it again")
+    return Checked(len(entries), (*wrong, *_copies(entries), *_pictures(board)))
+
+
+def _copies(entries: Iterable[Entry]) -> Iterator[str]:
+    """Runs that are there twice: under one configuration, or as two seeds with the same numbers."""
+    by_config: dict[str, Entry] = {}
+    by_values: dict[object, Entry] = {}
+    for e in entries:
+        first = by_config.setdefault(e.config_hash, e)
+        if first is not e:
+            yield f"{e.name} and {first.name} have the same configuration hash: one is the other's copy"
+        # Whole runs of noise-free reference rows may agree between methods; between seeds nothing does.
+        values = tuple(sorted((k, v) for k, v in e.quality.items() if not k.startswith("mask_")))
+        other = by_values.setdefault((*e.key[:-1], values), e)
+        if values and other is not e:
+            yield f"{e.name} and seed {other.seed} have the same numbers in all digits: is it the same run?"
+
+
+def _pictures(board: Path) -> Iterator[str]:
+    try:
+        index = pictures.read_index(board)
+    except AwError as error:
+        yield str(error)
+        return
+    for row in index:
+        path = pictures.folder_of(board) / row["file"]
+        if not path.is_file() or sha256_file(path) != row["sha256"]:
+            yield f"picture {path} is missing or changed: restore it, or add its runs again"

@@ -1,4 +1,4 @@
-"""Contradictions, exchanged numbers, means, ranks, digits and units."""
+"""Contradictions, exchanged numbers, means, ranks, digits and units; and what `aw audit` prints."""
 
 from __future__ import annotations
 
@@ -8,8 +8,19 @@ from itertools import combinations
 
 import numpy as np
 
-from ambiguous_wild.harness.audit.finding import Finding, finding, method_name, place_name
-from ambiguous_wild.harness.audit.table import ALL, MEAN, UNKNOWN, Number
+from ambiguous_wild.harness.audit import odd_numbers
+from ambiguous_wild.harness.audit.table import (
+    ALL,
+    KINDS,
+    MEAN,
+    UNKNOWN,
+    Finding,
+    Number,
+    finding,
+    method_name,
+    place_name,
+)
+from ambiguous_wild.harness.tables.plain_formats import markdown_text, plain, to_csv
 
 LOWER = ("lpips", "flip", "memory", "gpu_hours", "train_s", "ms", "model_mb", "peak", "gaussians")
 HIGHER = ("psnr", "ssim", "fps", "mask_", "iou")
@@ -178,3 +189,42 @@ def units(numbers: list[Number]) -> list[Finding]:
             text = f"{len(bare)} values of {metric} carry no unit, nor what was counted ({tables})"
             found.append(finding("unit", text, bare))
     return found
+
+
+CHECKS = (
+    odd_numbers.repeated, contradictions, odd_numbers.exchanged, means,
+    odd_numbers.out_of_place, odd_numbers.unlike, ranks, digits, units,
+)  # fmt: skip
+
+
+def audit(numbers: list[Number]) -> list[Finding]:
+    """Everything that cannot be right, by kind; the same numbers give the same findings."""
+    found = [f for check in CHECKS for f in check(numbers)]
+    order = list(KINDS)
+    return sorted(found, key=lambda f: order.index(f.kind))
+
+
+def text_of(findings: list[Finding]) -> str:
+    """Grouped by kind, for a terminal."""
+    lines = []
+    for kind, meaning in KINDS.items():
+        of_kind = [f for f in findings if f.kind == kind]
+        if of_kind:
+            lines += [f"{kind}: {meaning} ({len(of_kind)})", *(f"  {plain(f.text)}" for f in of_kind), ""]
+    return "\n".join(lines)
+
+
+def markdown_of(findings: list[Finding]) -> str:
+    """A list by kind."""
+    lines = []
+    for kind, meaning in KINDS.items():
+        of_kind = [f for f in findings if f.kind == kind]
+        if of_kind:
+            lines += [f"**{kind}** ({meaning}):", "", *(f"- {markdown_text(f.text)}" for f in of_kind), ""]
+    return "\n".join(lines)
+
+
+def csv_of(findings: list[Finding]) -> str:
+    """One finding a row."""
+    rows = ((f.kind, f.text, "; ".join(f.tables), "; ".join(f.where)) for f in findings)
+    return to_csv(("kind", "finding", "tables", "where"), rows)

@@ -1,0 +1,95 @@
+"""Parts of pages that are one file: a template with everything put in, JPEGs, data: addresses."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import json
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ambiguous_wild.core.errors import AwError
+
+
+def fill_page(
+    folder: Path,
+    data: Mapping[str, Any],
+    scripts: Sequence[str],
+    *,
+    title: str = "",
+    images: str = "data:",
+    more_sources: str = "",
+    more_scripts: str = "",
+    parts: Mapping[str, str] | None = None,
+    sort_keys: bool = False,
+) -> str:
+    """The template FOLDER/page.html with style, scripts and data in it; texts can be anything and stay text.
+
+    Its policy allows this style, these scripts and what is named here; the page loads nothing else.
+
+    Args:
+        folder: of the template, its style and its scripts.
+        data: for the scripts, as JSON.
+        scripts: names of files, in order.
+        title: of the page.
+        images: where pictures may come from.
+        more_sources: further directives of the policy.
+        more_scripts: other sources of scripts.
+        parts: what else the template asks for, by its /*NAME*/.
+        sort_keys: of the JSON.
+    """
+    style = (folder / "page.css").read_text(encoding="utf-8")
+    script = "\n".join((folder / name).read_text(encoding="utf-8") for name in scripts)
+    text = json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":"), sort_keys=sort_keys)
+    for char in "<>&\u2028\u2029":  # no text in it can end the element it stands in
+        text = text.replace(char, f"\\u{ord(char):04x}")
+    policy = (
+        f"default-src 'none'; img-src {images}; style-src {_digest(style)}; {more_sources}"
+        f"script-src {_digest(script)}{more_scripts}; base-uri 'none'; form-action 'none'"
+    )
+    known = {"POLICY": policy, "TITLE": html.escape(title), "STYLE": style, "SCRIPT": script, "DATA": text}
+    known |= parts or {}
+    # In one pass: what is put in is not looked at again.
+    template = (folder / "page.html").read_text(encoding="utf-8")
+    return re.sub(r"/\*([A-Z]+)\*/", lambda found: known[found[1]], template)
+
+
+def _digest(text: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+
+
+def jpeg_bytes(image: np.ndarray, quality: int, *, full_colour: bool = False) -> bytes:
+    """[H, W, 3] uint8 RGB as JPEG without metadata; `full_colour` halves no resolution of colours.
+
+    Raises:
+        AwError: too large for a JPEG.
+    """
+    import cv2
+
+    flags = [cv2.IMWRITE_JPEG_QUALITY, quality]
+    if full_colour:
+        flags += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+    done, data = cv2.imencode(".jpg", np.ascontiguousarray(image[:, :, ::-1]), flags)
+    if not done:  # a side above 65500 px
+        raise AwError(f"a picture of {image.shape[1]}x{image.shape[0]} px is too large for a JPEG")
+    return data.tobytes()
+
+
+def narrowed(image: np.ndarray, width: int) -> np.ndarray:
+    """The image [H, W] or [H, W, C], not wider than so many px."""
+    import cv2
+
+    if image.shape[1] <= width:
+        return image
+    height = max(1, round(image.shape[0] * width / image.shape[1]))
+    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def data_uri(kind: str, data: bytes) -> str:
+    """A data: address of a picture; `kind` is "jpeg" or "png"."""
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"

@@ -24,15 +24,14 @@ from captures_report import facts_of, missing_runs, rows_of, summarise, tabulate
 from job_queue import Run, exit_code, find_scenes, parser_of, run_all
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.running.cell import Cell
-from ambiguous_wild.harness.running.choosing import PLANNED, Probing, chosen_by
-from ambiguous_wild.harness.running.environment import environment
-from ambiguous_wild.harness.running.grid import cell_folder, plan_cells
-from ambiguous_wild.harness.running.prepare import prepare_cpu
-from ambiguous_wild.harness.running.run_folder import planned_effects, refuse_other_config
+from ambiguous_wild.harness.running.cell import Cell, environment
+from ambiguous_wild.harness.running.choosing import PLANNED, chosen_by
+from ambiguous_wild.harness.running.grid import Probing, cell_folder, plan_cells
+from ambiguous_wild.harness.running.run import planned_effects, refuse_other_config
 from ambiguous_wild.harness.running.store import read_runs
 from ambiguous_wild.io.atomic import write_text
 from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.splat.cpu.warmup import prepare_cpu
 from ambiguous_wild.splat.pace import TrainConfig
 
 RESULTS = Path(__file__).parent / "results" / "captures.md"

@@ -20,7 +20,7 @@ from job_queue import exit_code
 
 from ambiguous_wild.harness.cost.read import CostRun, read_cost_runs
 from ambiguous_wild.harness.cost.recommend import CLOSE_DB, leave_out
-from ambiguous_wild.harness.running.environment import environment
+from ambiguous_wild.harness.running.cell import environment
 from ambiguous_wild.io.atomic import write_json
 
 RESULTS = Path(__file__).parent / "results" / "recommend.json"

@@ -11,9 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ambiguous_wild.cli.engines import engine_options
-from ambiguous_wild.cli.options import training_options
-from ambiguous_wild.cli.paths import PathName
+from ambiguous_wild.cli.options import PathName, engine_options, training_options
 from ambiguous_wild.cli.progress import Progress, finish, say
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.harness.bench import Engine, bench

@@ -3,15 +3,60 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from ambiguous_wild.cli.paths import PathName
+from ambiguous_wild.cli.options import PathName
 
 if TYPE_CHECKING:
     from ambiguous_wild.builder.pipeline import BuildResult
+
+_CODE = (
+    "import os\n"
+    "if hasattr(os, 'nice'): os.nice(19)\n"
+    "from ambiguous_wild.splat.cpu.warmup import warm_up\n"
+    "warm_up()\n"
+)
+
+
+@contextmanager
+def kernels_meanwhile() -> Iterator[None]:
+    """Compile at the lowest priority meanwhile; what is not finished at the end is left for later.
+
+    Each kernel is kept as soon as it is compiled. Nothing is said and nothing fails: the command that needs
+    the kernels compiles what is missing, and reports what went wrong.
+    """
+    if _compiled():
+        yield
+        return
+    quiet = subprocess.DEVNULL
+    one = {**os.environ, "NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    try:
+        process = subprocess.Popen(
+            [sys.executable, "-c", _CODE], stdin=quiet, stdout=quiet, stderr=quiet, env=one
+        )
+    except OSError:
+        yield
+        return
+    try:
+        yield
+    finally:
+        process.kill()
+        process.wait()
+
+
+def _compiled() -> bool:
+    """Whether the kernel that is compiled last is on disk for this state of the source."""
+    from ambiguous_wild.splat.cpu.cache import kernel_cache
+
+    return any(kernel_cache().rglob("*catch_up_all*.nbi"))
 
 
 @click.command("build-scene")
@@ -100,7 +145,6 @@ def command(
     from ambiguous_wild.builder import report
     from ambiguous_wild.builder.pipeline import build_scene
     from ambiguous_wild.builder.settings import BuildSettings
-    from ambiguous_wild.cli.kernels import kernels_meanwhile
     from ambiguous_wild.core.config import from_plain
     from ambiguous_wild.core.names import check_name
     from ambiguous_wild.io.images import image_size

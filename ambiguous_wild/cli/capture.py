@@ -9,7 +9,7 @@ from pathlib import Path
 
 import click
 
-from ambiguous_wild.cli.paths import PathName
+from ambiguous_wild.cli.options import PathName
 
 BROKEN_BELOW = 0.9  # of the frames in a video's header, which is often wrong by a few
 

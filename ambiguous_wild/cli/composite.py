@@ -10,7 +10,7 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from ambiguous_wild.cli.paths import PathName
+from ambiguous_wild.cli.options import PathName
 
 
 @click.command("composite")

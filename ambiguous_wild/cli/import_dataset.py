@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from ambiguous_wild.cli.paths import PathName
+from ambiguous_wild.cli.options import PathName
 
 KINDS = (
     "on-the-go", "robustnerf", "photo-tourism", "drone", "dualsplat", "nerfbaselines", "nerfstudio",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ambiguous_wild.cli.paths import PathName
+from ambiguous_wild.cli.options import PathName
 
 if TYPE_CHECKING:
     from ambiguous_wild.builder.capture_report import CaptureReport

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from ambiguous_wild.cli.paths import PathName
+from ambiguous_wild.cli.options import PathName
 
 
 @click.command(name="video")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from ambiguous_wild.cli.paths import PathName
+from ambiguous_wild.cli.options import PathName
 from ambiguous_wild.core.errors import AwError
 
 MOST_GAUSSIANS = 150_000

@@ -11,8 +11,8 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import with_options
 from ambiguous_wild.harness.ablation.plan import plan_study, read_outcomes
 from ambiguous_wild.harness.ablation.report import markdown_of, report, write_report
+from ambiguous_wild.harness.running.cell import reproduce
 from ambiguous_wild.harness.running.grid import cell_folder, run_cells
-from ambiguous_wild.harness.running.provenance import reproduce
 from ambiguous_wild.harness.running.result_file import write_result
 from ambiguous_wild.harness.running.store import read_runs
 from ambiguous_wild.methods import MethodEntry, get_method, register, registry

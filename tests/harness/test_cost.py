@@ -14,15 +14,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.cost.curves import Curve, Summary, curves_of, summary, timeline
-from ambiguous_wild.harness.cost.front import Point, pareto, points
+from ambiguous_wild.harness.cost.curves import (
+    Curve,
+    Point,
+    Summary,
+    curves_of,
+    pareto,
+    points,
+    summary,
+    timeline,
+)
 from ambiguous_wild.harness.cost.pairs import changes
-from ambiguous_wild.harness.cost.plot_style import spread_out
-from ambiguous_wild.harness.cost.plots import draw_all
+from ambiguous_wild.harness.cost.plots import draw_all, spread_out
 from ambiguous_wild.harness.cost.reach import first_time, times_to_reach
 from ambiguous_wild.harness.cost.read import CostRun, Found, read_cost_runs
-from ambiguous_wild.harness.cost.report import cost_report, write_report
-from ambiguous_wild.harness.cost.text import to_text
+from ambiguous_wild.harness.cost.report import cost_report, to_text, write_report
 from tests.harness.fake_cost import cost_run
 from tests.harness.fake_runs import failed
 

@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from ambiguous_wild.harness.cost.read import Found, read_cost_runs
-from ambiguous_wild.harness.cost.report import cost_report
-from ambiguous_wild.harness.cost.text import to_text
+from ambiguous_wild.harness.cost.report import cost_report, to_text
 from tests.harness.fake_cost import cost_run
 
 RISING = [(10.0, 10.0), (20.0, 18.0), (40.0, 20.0)]

@@ -14,13 +14,12 @@ from click.testing import CliRunner
 from ambiguous_wild.cli.cost import command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.cost import recommend as advice
-from ambiguous_wild.harness.cost.answer import answers
 from ambiguous_wild.harness.cost.curves import curves_of
 from ambiguous_wild.harness.cost.pairs import changes
+from ambiguous_wild.harness.cost.reach import answers
 from ambiguous_wild.harness.cost.read import Found, read_cost_runs
 from ambiguous_wild.harness.cost.recommend import additive, in_words, leave_out, recommend, value_at, words_of
-from ambiguous_wild.harness.cost.report import cost_report, plain_data
-from ambiguous_wild.harness.cost.text import to_text
+from ambiguous_wild.harness.cost.report import cost_report, plain_data, to_text
 from tests.harness.fake_cost import cost_run
 from tests.tiny_scene import write_tiny_scene
 

@@ -5,8 +5,8 @@ import sys
 import numpy as np
 import pytest
 
-from ambiguous_wild.harness.running.environment import environment, installed
-from ambiguous_wild.harness.running.memory import peak_rss_mb, reset_peak
+from ambiguous_wild.harness.running.cell import environment, installed
+from ambiguous_wild.harness.running.training import peak_rss_mb, reset_peak
 
 
 def test_the_environment_names_what_is_there_and_what_is_not():

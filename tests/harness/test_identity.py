@@ -3,7 +3,7 @@
 import shutil
 from dataclasses import replace
 
-from ambiguous_wild.harness.running.identity import scene_identity
+from ambiguous_wild.harness.running.cell import scene_identity
 from ambiguous_wild.io.scene_folder import load_scene
 from tests.tiny_scene import write_tiny_scene
 

@@ -18,7 +18,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.leaderboard.board import read_board
 from ambiguous_wild.harness.leaderboard.check import check
 from ambiguous_wild.harness.leaderboard.sheet import board_csv, guard, read_csv, unguard, unique_slug
-from ambiguous_wild.harness.running.identity import config_identity
+from ambiguous_wild.harness.running.cell import config_identity
 from ambiguous_wild.io.images import read_png_rgb, write_png
 from tests.harness.board_runs import write_run, write_scene
 

@@ -9,9 +9,8 @@ from pathlib import Path
 import pytest
 
 from ambiguous_wild.cli.bench import command, parse_budget
-from ambiguous_wild.harness.running.cell import Cell
+from ambiguous_wild.harness.running.cell import Cell, code_hash, provenance, reproduce
 from ambiguous_wild.harness.running.grid import plan_cells
-from ambiguous_wild.harness.running.provenance import code_hash, provenance, reproduce
 from ambiguous_wild.methods import registry
 from ambiguous_wild.methods.registry import load_plugin
 from ambiguous_wild.splat.pace import TrainConfig

@@ -8,8 +8,8 @@ import torch
 
 from ambiguous_wild import bench
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.harness.running import passes
-from ambiguous_wild.harness.running.costs import both_passes
+from ambiguous_wild.harness.running import training as passes
+from ambiguous_wild.harness.running.training import both_passes
 from ambiguous_wild.io.images import read_keep_map
 from ambiguous_wild.methods import get_method
 from ambiguous_wild.methods.fixed_masks import FixedMasks

@@ -277,9 +277,9 @@ def speed_here(found: Found, say: Callable[[str], None] = lambda text: None) -> 
     """
     import torch
 
-    from ambiguous_wild.harness.running.prepare import prepare_cpu
-    from ambiguous_wild.harness.running.step_time import slowness
+    from ambiguous_wild.harness.running.timing import slowness
     from ambiguous_wild.splat.calibration import KERNELS
+    from ambiguous_wild.splat.cpu.warmup import prepare_cpu
     from ambiguous_wild.splat.readiness import choose
 
     kernels = {run.timing.kernel for run in found.runs if not run.error}

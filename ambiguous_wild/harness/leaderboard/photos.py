@@ -11,8 +11,8 @@ import numpy as np
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.harness.measures import PARTIAL
-from ambiguous_wild.harness.running.records import ImageRow, metrics_of
 from ambiguous_wild.harness.running.regions import find_regions
+from ambiguous_wild.harness.running.result_file import ImageRow, metrics_of
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.metrics.full_image import FULL_IMAGE
 

@@ -15,7 +15,7 @@ from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import config_hash, to_plain
 from ambiguous_wild.harness.leaderboard.sheet import HIDDEN
-from ambiguous_wild.harness.running.records import RunResult
+from ambiguous_wild.harness.running.result_file import RunResult
 from ambiguous_wild.simulate.presets import PRESETS, resized
 from ambiguous_wild.simulate.spec_file import plain_spec
 

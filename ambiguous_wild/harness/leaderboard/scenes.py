@@ -9,7 +9,7 @@ from typing import Any
 
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.harness.leaderboard.entry import Entry
-from ambiguous_wild.harness.running.identity import scene_identity
+from ambiguous_wild.harness.running.cell import scene_identity
 from ambiguous_wild.io.scene_folder import load_scene
 
 SIMULATED = "simulated"

@@ -23,9 +23,15 @@ from ambiguous_wild.harness.leaderboard.reproduce import (
 from ambiguous_wild.harness.leaderboard.scenes import Scenes
 from ambiguous_wild.harness.leaderboard.sheet import check_text
 from ambiguous_wild.harness.measures import PARTIAL
-from ambiguous_wild.harness.running.identity import config_identity
-from ambiguous_wild.harness.running.records import RunConfig, RunResult, metrics_of
-from ambiguous_wild.harness.running.result_file import FAILED, RESULT, read_result
+from ambiguous_wild.harness.running.cell import config_identity
+from ambiguous_wild.harness.running.result_file import (
+    FAILED,
+    RESULT,
+    RunConfig,
+    RunResult,
+    metrics_of,
+    read_result,
+)
 from ambiguous_wild.harness.running.store import MASK_SCORES, read_config
 from ambiguous_wild.harness.running.timing import timing_of
 from ambiguous_wild.io.hashing import sha256_file

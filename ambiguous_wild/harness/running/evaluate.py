@@ -13,8 +13,8 @@ import numpy as np
 import torch
 
 from ambiguous_wild.core import Camera, Scene, View
-from ambiguous_wild.harness.running.records import Cost, ImageRow, MaskScores, image_row
 from ambiguous_wild.harness.running.regions import Regions, find_regions, true_distractor
+from ambiguous_wild.harness.running.result_file import Cost, ImageRow, MaskScores, image_row
 from ambiguous_wild.io.atomic import atomic_dir
 from ambiguous_wild.io.images import read_png_rgb, to_uint8, write_png
 from ambiguous_wild.metrics import image as image_metrics

@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from ambiguous_wild.core import AwError, View
-from ambiguous_wild.harness.running.prepare import prepare_cpu
 from ambiguous_wild.harness.showing.read import find_models, open_scene
 from ambiguous_wild.io.atomic import check_output
+from ambiguous_wild.splat.cpu.warmup import prepare_cpu
 from ambiguous_wild.viewing.export import Exported, export
 
 FOLDER = "export"  # in a run folder

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ambiguous_wild.core import AwError, Camera, Scene
-from ambiguous_wild.harness.running.prepare import prepare_cpu
 from ambiguous_wild.harness.showing.read import read_models
 from ambiguous_wild.io.atomic import check_output
+from ambiguous_wild.splat.cpu.warmup import prepare_cpu
 from ambiguous_wild.viewing import camera_path
 from ambiguous_wild.viewing.video import Frame, Tick, draw_frames, narrowed, write_gif, write_mp4
 

@@ -13,7 +13,9 @@ makes no plan of effects, but reads the one in a run folder of the scene; withou
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
+import json
 import re
 import sys
 from collections.abc import Iterable, Sequence
@@ -27,7 +29,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.running.cell import Cell, environment
 from ambiguous_wild.harness.running.choosing import PLANNED, chosen_by
 from ambiguous_wild.harness.running.grid import Probing, cell_folder, plan_cells
-from ambiguous_wild.harness.running.run import planned_effects, refuse_other_config
+from ambiguous_wild.harness.running.run import EFFECTS, refuse_other_config
 from ambiguous_wild.harness.running.store import read_runs
 from ambiguous_wild.io.atomic import write_text
 from ambiguous_wild.io.scene_folder import load_scene
@@ -65,6 +67,14 @@ def with_recorded_effects(cells: Sequence[Cell], wanted: str, out: Path) -> list
             plans.setdefault(cell.scene.name, planned)
     chosen = [chosen_by(plans.get(c.scene.name), wanted, c.scene, c.method) for c in cells]
     return [dataclasses.replace(c, chosen=own) for c, own in zip(cells, chosen) if own is not None]
+
+
+def planned_effects(folder: Path) -> tuple[str, ...] | None:
+    """All effects that the plan of the run called for; None where no plan is recorded."""
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError, RecursionError):
+        plan = json.loads((folder / EFFECTS).read_text(encoding="utf-8"))["plan"]
+        return tuple(str(name) for name in plan["effects"])
+    return None
 
 
 def refuse_other_configs(cells: Sequence[Cell], out: Path) -> None:

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ambiguous_wild.cli.options import PathName, engine_options, training_options
-from ambiguous_wild.cli.progress import Progress, finish, say
+from ambiguous_wild.cli.options import PathName, engine_options, say, training_options
+from ambiguous_wild.cli.progress import Progress, finish
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.harness.bench import Engine, bench
 

@@ -132,11 +132,16 @@ def choose_device(device: str) -> str:
         return "cpu"
     from ambiguous_wild.splat.readiness import choose
 
-    return choose(device, lambda text: click.echo(text, err=True))
+    return choose(device, say)
 
 
 def prepare_cpu(threads: int | None) -> None:
     """Set the number of threads and compile the CPU kernels, once per machine."""
     from ambiguous_wild.splat.cpu import warmup
 
-    warmup.prepare_cpu(threads, lambda text: click.echo(text, err=True))
+    warmup.prepare_cpu(threads, say)
+
+
+def say(text: str) -> None:
+    """Write a line on stderr, so that stdout stays clean for results."""
+    click.echo(text, err=True)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import json
 import os
 import shutil
 import traceback
@@ -48,14 +46,6 @@ def is_finished(folder: Path) -> bool:
     except AwError:
         return False
     return True
-
-
-def planned_effects(folder: Path) -> tuple[str, ...] | None:
-    """All effects that the plan of the run called for; None where no plan is recorded."""
-    with contextlib.suppress(OSError, ValueError, KeyError, TypeError, RecursionError):
-        plan = json.loads((folder / EFFECTS).read_text(encoding="utf-8"))["plan"]
-        return tuple(str(name) for name in plan["effects"])
-    return None
 
 
 def record_failure(cell: Cell, folder: Path, error: Exception) -> None:

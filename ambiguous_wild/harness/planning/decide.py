@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
+
+import msgspec
 
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.harness.planning.evidence import Evidence, has_tracks, measure, uncovered
@@ -218,10 +220,6 @@ def plan_without_training(scene: Scene) -> Plan:
     return decide(scene.name, measure(scene, [load_image_float(v.image_path) for v in scene.train]))
 
 
-_NUMBERS = ("cost_ms", "gain_db", "error_db")
-_TEXTS = ("effect", "evidence", "unit", "why", "how")
-
-
 def read_plan(path: Path) -> Plan:
     """A plan that `aw plan` wrote.
 
@@ -232,34 +230,13 @@ def read_plan(path: Path) -> Plan:
         data = json.loads(path.read_text(encoding="utf-8"))
         if data["schema"] != SCHEMA:
             raise ValueError(f"schema {data['schema']!r}, not {SCHEMA}")
-        lines = tuple(_decision(row) for row in data["decisions"])
-        cost = None if data.get("cost") is None else _cost(data["cost"])
-        if not isinstance(data["scene"], str):
-            raise ValueError("scene is no text")
+        rows = [
+            row | {"value": math.nan if row["value"] is None else row["value"]} for row in data["decisions"]
+        ]
+        decisions = msgspec.convert(rows, tuple[Decision, ...])
+        cost = msgspec.convert(data.get("cost"), Cost | None)
+        return Plan(msgspec.convert(data["scene"], str), decisions, bool(data.get("probed")), cost)
     except FileNotFoundError:
         raise AwError(f"there is no plan {path}; 'aw plan SCENE' makes one") from None
-    except (OSError, ValueError, KeyError, TypeError, RecursionError, OverflowError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, msgspec.ValidationError) as error:
         raise AwError(f"{path} is no plan of 'aw plan' ({error}); make it again") from None
-    return Plan(data["scene"], lines, bool(data.get("probed")), cost)
-
-
-def _decision(row: object) -> Decision:
-    if not isinstance(row, dict):
-        raise ValueError("a decision is no object")
-    values = {f.name: row.get(f.name) for f in fields(Decision)}
-    if row.get("decision") not in ("on", "off", "unknown"):
-        raise ValueError(f"decision {row.get('decision')!r}")
-    for name in _TEXTS:
-        if not isinstance(values[name], str):
-            raise ValueError(f"{name} is no text")
-    for name in _NUMBERS:
-        values[name] = None if values[name] is None else float(values[name])  # type: ignore[arg-type]
-    values["value"] = math.nan if values["value"] is None else float(values["value"])
-    values["threshold"] = float(values["threshold"])  # type: ignore[arg-type]
-    return Decision(**values)  # type: ignore[arg-type]
-
-
-def _cost(row: object) -> Cost:
-    if not isinstance(row, dict):
-        raise ValueError("cost is no object")
-    return Cost(int(row["iterations"]), float(row["seconds"]), float(row["share"]))

@@ -12,15 +12,18 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, NoReturn, NotRequired, Required, TypedDict, cast
+from typing import Annotated, Any, Literal, NoReturn, NotRequired, Required, TypedDict, cast
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.running.timing import VERDICTS
 from ambiguous_wild.io.atomic import write_json
 
 Status = Literal["ok", "failed"]
+NotNegative = Annotated[float, Meta(ge=0.0)]
+Name = Annotated[str, Meta(pattern=r"\S")]
 
 
 class ImageRow(TypedDict, total=False):
@@ -51,7 +54,7 @@ def metrics_of(row: ImageRow) -> dict[str, float | None]:
     return {key: cast("float | None", value) for key, value in row.items() if key != "name"}
 
 
-class MaskScores(TypedDict):
+class MaskScores(TypedDict, total=False):
     """Predicted distractor pixels against the exact ones, over all train photos together."""
 
     iou: float | None
@@ -60,17 +63,21 @@ class MaskScores(TypedDict):
     images: int
 
 
+# (seconds of training so far, seconds of the kernel)
+Sample = Annotated[list[NotNegative], Meta(min_length=2, max_length=2)]
+
+
 class TimeRecord(TypedDict, total=False):
     """How far the time of a run can be trusted, see `timing.py`."""
 
     verdict: Required[Literal["alone", "contended", "unknown"]]
     reason: Required[str]  # empty for "alone"
     kernel: str  # of the calibration
-    kernel_reference_s: float  # its seconds on the reference machine
-    samples: list[list[float]]  # (seconds of training so far, seconds of the kernel)
+    kernel_reference_s: NotNegative  # its seconds on the reference machine
+    samples: list[Sample]
     parallel_share: float  # of the time in which several threads worked; the samples allow for it
     runs: int  # most runs of ours at once on this machine or GPU, this one included
-    others: float  # processors that other programs used, mean over the run
+    others: NotNegative  # processors that other programs used, mean over the run
 
 
 class Cost(TypedDict, total=False):
@@ -97,7 +104,7 @@ class Cost(TypedDict, total=False):
     model_mb: float  # of point_cloud.ply, 10^6 bytes
 
 
-class Environment(TypedDict):
+class Environment(TypedDict, total=False):
     """Versions and hardware, as in env.json."""
 
     ambiguous_wild: str
@@ -107,8 +114,8 @@ class Environment(TypedDict):
     cores: int | None
     device: str
     packages: dict[str, str | None]  # None = not installed
-    gpu: NotRequired[str]
-    gsplat_max_alpha: NotRequired[float]  # differs between sources of gsplat
+    gpu: str
+    gsplat_max_alpha: float  # differs between sources of gsplat
 
 
 class Provenance(TypedDict):
@@ -131,8 +138,8 @@ class RunResult(TypedDict):
     """A result file: metrics.json, or failed.json of a run that failed."""
 
     schema: int
-    method: str
-    scene: str
+    method: Name
+    scene: Name
     seed: int
     status: Status
     error: str | None
@@ -184,27 +191,6 @@ class RunConfig(UnusualConfig):
 SCHEMA = 1
 RESULT = "metrics.json"
 FAILED = "failed.json"  # same schema, status "failed"; counts where there is no metrics.json
-# key -> type of a result file; a number may also be an int, "inf" or null
-FIELDS: dict[str, type | tuple[type, ...]] = {
-    "method": str,
-    "scene": str,
-    "seed": int,
-    "status": str,
-    "error": (str, type(None)),
-    "options": dict,
-    "per_image": list,
-    "missing": dict,
-    "masks": (dict, type(None)),
-    "facts": dict,
-    "cost": dict,
-    "config_hash": str,
-    "scene_hash": str,
-    "version": str,
-}
-# Fields that results of earlier versions lack.
-OPTIONAL: dict[str, type | tuple[type, ...]] = {
-    "environment": dict, "code_hash": str, "reproduce": str, "rescored": list,
-}  # fmt: skip
 
 
 def write_result(path: Path | str, result: Mapping[str, Any]) -> None:
@@ -218,7 +204,7 @@ def write_result(path: Path | str, result: Mapping[str, Any]) -> None:
         AwError: the result does not follow the schema.
     """
     encoded = _encode(result)
-    _check(encoded, str(path))
+    _checked(encoded, str(path))
     write_json(path, encoded)
 
 
@@ -239,97 +225,35 @@ def read_result(path: Path | str) -> RunResult:
         raise AwError(f"no result file {path}") from None
     except (OSError, ValueError, RecursionError) as error:
         raise AwError(f"{path} is damaged ({error}); run 'aw bench' again to replace it") from None
-    _check(data, str(path))
-    data["per_image"] = [
-        {k: v if k == "name" else _decode(v) for k, v in row.items()} for row in data["per_image"]
-    ]
-    data["cost"] = {k: _decode(v) for k, v in data["cost"].items()}
-    if data["masks"] is not None:
-        data["masks"] = {k: _decode(v) for k, v in data["masks"].items()}
-    return cast(RunResult, data)
+    return _checked(data, str(path))
 
 
-def _check(data: Any, where: str) -> None:
-    if not isinstance(data, dict):
-        _wrong(where, "it must hold one JSON object")
-    if data.get("schema") != SCHEMA:
-        _wrong(where, f"schema version {data.get('schema')!r}, this version reads {SCHEMA}")
-    for name, kind in FIELDS.items():
-        if name not in data:
-            _wrong(where, f"{name!r} is absent")
-        if not isinstance(data[name], kind) or (kind is int and isinstance(data[name], bool)):
-            _wrong(where, f"{name!r} has the wrong type: {_short(data[name])}")
-    for name, kind in OPTIONAL.items():
-        if name in data and not isinstance(data[name], kind):
-            _wrong(where, f"{name!r} has the wrong type: {_short(data[name])}")
-    for name in ("method", "scene"):
-        if not data[name].strip():
-            _wrong(where, f"{name!r} is empty")
-    if data["status"] not in ("ok", "failed"):
-        _wrong(where, f"'status' must be 'ok' or 'failed', not {_short(data['status'])}")
-    if data["status"] == "failed" and not data["error"]:
-        _wrong(where, "a failed run must say its error")
-    if not all(isinstance(reason, str) for reason in data["missing"].values()):
-        _wrong(where, "'missing' must map a metric to a reason")
-    _check_images(data["per_image"], where)
-    for name, value in (data["masks"] or {}).items():
-        _check_number(value, f"masks.{name}", where)
-    for name, value in data["cost"].items():
-        if name == "timing":
-            _check_timing(value, where)
-        elif name not in ("device", "ms_parts"):
-            _check_number(value, f"cost.{name}", where)
-
-
-def _check_timing(value: Any, where: str) -> None:
-    if not isinstance(value, dict) or value.get("verdict") not in VERDICTS:
-        _wrong(where, f"cost.timing has no verdict of {', '.join(VERDICTS)}: {_short(value)}")
-    if not isinstance(value.get("reason"), str) or not isinstance(value.get("kernel", ""), str):
-        _wrong(where, f"cost.timing has no reason or kernel in words: {_short(value)}")
-    samples = value.get("samples", [])
-    if not isinstance(samples, list) or not all(isinstance(s, list) and len(s) == 2 for s in samples):
-        _wrong(where, f"cost.timing.samples are no pairs of numbers: {_short(samples)}")
-    numbers = [n for pair in samples for n in pair]
-    numbers += [value[name] for name in ("kernel_reference_s", "runs", "others", "load") if name in value]
-    for number in numbers:
-        _check_number(number, "a number of cost.timing", where)
-        if not isinstance(number, (int, float)) or not number >= 0.0:
-            _wrong(where, f"cost.timing holds {_short(number)}, which is no time")
-    if any(not pair[1] > 0.0 for pair in samples):
-        _wrong(where, "cost.timing.samples hold a kernel that took no time")
-
-
-def _check_images(rows: list[Any], where: str) -> None:
-    names = set()
-    for row in rows:
-        if not isinstance(row, dict) or not isinstance(row.get("name"), str):
-            _wrong(where, f"an entry of 'per_image' has no name: {_short(row)}")
-        if row["name"] in names:
-            _wrong(where, f"image {row['name']!r} is there twice")
-        names.add(row["name"])
-        for metric, value in row.items():
-            if metric != "name":
-                _check_number(value, f"{metric} of {row['name']}", where)
-
-
-def _check_number(value: Any, what: str, where: str) -> None:
-    number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    # JSON's whole numbers have no end, floats have
-    number = number and (isinstance(value, float) or abs(value) < 2**1000)
-    if not number and value is not None and value not in ("inf", "-inf"):
-        _wrong(where, f"{what} is no number: {_short(value)}")
-
-
-def _wrong(where: str, what: str) -> NoReturn:
-    raise AwError(f"{where} is no result file of ours: {what}; run 'aw bench' again to replace it")
-
-
-def _short(value: Any) -> str:
+def _checked(data: Any, where: str) -> RunResult:
+    """The result with numbers decoded; AwError where it does not follow `RunResult`."""
     try:
-        text = repr(value)
-    except ValueError:  # a whole number of thousands of digits
-        text = "a number without end"
-    return text if len(text) <= 60 else text[:57] + "..."
+        if not isinstance(data, dict):
+            raise msgspec.ValidationError("it must hold one JSON object")
+        if data.get("schema") != SCHEMA:
+            raise msgspec.ValidationError(
+                f"schema version {data.get('schema')!r}, this version reads {SCHEMA}"
+            )
+        data = data | {name: _decode(data[name]) for name in ("per_image", "cost", "masks") if name in data}
+        known = data
+        if isinstance(data.get("cost"), dict):  # a cost that was not a number is null
+            known = data | {"cost": {k: v for k, v in data["cost"].items() if v is not None}}
+        msgspec.convert(known, RunResult)
+        rows = {row["name"]: metrics_of(row) for row in data["per_image"]}
+        if len(rows) < len(data["per_image"]):
+            raise msgspec.ValidationError("an image is there twice - at `$.per_image`")
+        msgspec.convert(rows, dict[str, dict[str, float | None]])  # metrics of plugins and later versions too
+        if any(kernel <= 0.0 for _, kernel in data["cost"].get("timing", {}).get("samples", ())):
+            raise msgspec.ValidationError("a calibration took no time - at `$.cost.timing.samples`")
+        if data["status"] == "failed" and not data["error"]:
+            raise msgspec.ValidationError("a failed run must say its error")
+    except (msgspec.ValidationError, RecursionError) as error:
+        text = f"{where} is no result file of ours: {error}; run 'aw bench' again to replace it"
+        raise AwError(text) from None
+    return cast(RunResult, data)
 
 
 def _no_constant(name: str) -> NoReturn:
@@ -349,4 +273,8 @@ def _encode(value: Any) -> Any:
 
 
 def _decode(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: v if k == "name" else _decode(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [_decode(v) for v in value]
     return float(value) if value in ("inf", "-inf") else value

@@ -239,4 +239,4 @@ def read_plan(path: Path) -> Plan:
     except FileNotFoundError:
         raise AwError(f"there is no plan {path}; 'aw plan SCENE' makes one") from None
     except (OSError, ValueError, KeyError, TypeError, RecursionError, msgspec.ValidationError) as error:
-        raise AwError(f"{path} is no plan of 'aw plan' ({error}); make it again") from None
+        raise AwError(f"{path} is no plan of 'aw plan' ({str(error)[:200]!a}); make it again") from None

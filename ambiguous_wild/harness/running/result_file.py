@@ -251,8 +251,12 @@ def _checked(data: Any, where: str) -> RunResult:
         if data["status"] == "failed" and not data["error"]:
             raise msgspec.ValidationError("a failed run must say its error")
     except (msgspec.ValidationError, RecursionError) as error:
-        text = f"{where} is no result file of ours: {error}; run 'aw bench' again to replace it"
-        raise AwError(text) from None
+        why = (
+            str(error)[:300].encode("ascii", "backslashreplace").decode()
+        )  # a value may be long or unprintable
+        raise AwError(
+            f"{where} is no result file of ours: {why}; run 'aw bench' again to replace it"
+        ) from None
     return cast(RunResult, data)
 
 

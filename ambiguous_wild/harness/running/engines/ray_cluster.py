@@ -55,8 +55,9 @@ class RayCluster:
         if not address:
             slots = None if engine.jobs is None else max(1, round(engine.jobs * cpus))
             where = {"address": "local", "num_cpus": slots, "include_dashboard": False}
+        quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
         try:
-            ray.init(log_to_driver=False, logging_level="ERROR", **where)
+            ray.init(**where, **quiet)
         except (ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
             text = " ".join(str(error).split())[:300]
             raise AwError(
@@ -143,7 +144,7 @@ class RayCluster:
                     say(f"{len(reports)} of {len(jobs)} cells done, the others run or wait for a node")
                 for reference in ready:
                     index = pending.pop(reference)
-                    ended(index, self._report(reference, jobs[index], lambda why, i=index: lost(i, why)))
+                    ended(index, self._report(reference, jobs[index], index, lost))
         except BaseException:
             for reference in pending:
                 ray.cancel(reference, force=True)
@@ -164,7 +165,9 @@ class RayCluster:
             )
         say(f"no node has {', '.join(words)} now: waiting for one to come (Ctrl-C to give up)")
 
-    def _report(self, reference: Any, job: Job, lost: Callable[[str], CellReport]) -> CellReport:
+    def _report(
+        self, reference: Any, job: Job, index: int, lost: Callable[[int, str], CellReport]
+    ) -> CellReport:
         errors = self.ray.exceptions
         try:
             value = self.ray.get(reference)
@@ -175,7 +178,7 @@ class RayCluster:
             return CellReport(Path(job.folder), "failed", error=error_line(cause))
         except errors.RayError as error:
             again = f", {self.engine.retries + 1} times" if self.engine.retries else ""
-            return lost(f"its worker or node was lost{again} ({type(error).__name__})")
+            return lost(index, f"its worker or node was lost{again} ({type(error).__name__})")
         except AwError as error:
             return CellReport(Path(job.folder), "failed", error=str(error))
 

@@ -21,7 +21,6 @@ from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.parts import Parts
 from tests.harness.fake_runs import fake_result
-from tests.tiny_scene import write_tiny_scene
 
 SHORT = TrainConfig(iterations=30, probes=0)
 GROUPS = (
@@ -53,11 +52,6 @@ def _methods(monkeypatch):
             ablations=GROUPS,
         )
     )
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 def study(scene, **kw):

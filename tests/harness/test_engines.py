@@ -46,11 +46,6 @@ def _methods(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
-
-
-@pytest.fixture(scope="module")
 def frail(tmp_path_factory):
     """A method's reference, and the file that says how often it kills its worker."""
     folder = tmp_path_factory.mktemp("method")

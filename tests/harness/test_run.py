@@ -49,11 +49,6 @@ def _methods(monkeypatch):
     register(MethodEntry("broken", "fails", explode))
 
 
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
-
-
 def bench(scene, output, *methods, train=SHORT, overwrite="missing", **kw):
     cells = plan_cells(methods, [scene], kw.pop("seeds", [0]), train, **kw)
     return cells, run_cells(cells, output, overwrite=overwrite)

@@ -266,7 +266,7 @@ def draw_front(report: CostReport) -> Any | None:
         for p in known:
             hollow = bool(p.unranked) and key != "model_mb"
             _dot(panel, _x(p, key, unit), p.psnr, look[p.curve]["color"], hollow=hollow)
-        for name in {p.curve for p in known}:  # trainings of several lengths
+        for name in dict.fromkeys(p.curve for p in known):  # trainings of several lengths
             line = [(_x(p, key, unit).mean, p.psnr.mean) for p in known if p.curve == name]
             panel.plot([x for x, _ in line], [y for _, y in line], **look[name], linewidth=1.0, alpha=0.6)
         last = {p.curve: p for p in known}  # of a curve of several lengths, the longest has the name

@@ -112,30 +112,21 @@ def _compiled() -> bool:
 @click.option("--jobs", type=click.IntRange(min=1), help="Threads; the result does not depend on it.")
 @click.option("--seed", type=int, default=0, show_default=True, help="Seed of COLMAP's random choices.")
 @click.option("--name", help="Name of the scene.  [default: the name of the output folder]")
-@click.option("--license", "license_", default="", help="Licence of the photos, recorded in scene.json.")
+@click.option("--license", default="", help="Licence of the photos, recorded in scene.json.")
 @click.option("--overwrite", is_flag=True, help="Replace a scene built from other photos or settings.")
 @click.option("--keep-work", is_flag=True, help="Keep the work folder with every stage and COLMAP's log.")
 @click.option("--json", "as_json", is_flag=True, help="Print the same facts as JSON.")
 def command(
     raw: Path,
     output: Path,
-    factor: int | None,
-    camera: str,
-    sfm: str,
-    matcher: str,
-    mapper: str,
-    max_features: int,
     masks: Path | None,
-    masks_missing: str,
     test_list: Path | None,
-    strict: bool,
     jobs: int | None,
-    seed: int,
     name: str | None,
-    license_: str,
     overwrite: bool,
     keep_work: bool,
     as_json: bool,
+    **settings: Any,  # fields of `BuildSettings`
 ) -> None:
     """Build a scene from the photos in RAW: check, COLMAP, undistort, downsample, split.
 
@@ -149,28 +140,13 @@ def command(
     from ambiguous_wild.core.names import check_name
     from ambiguous_wild.io.images import image_size
 
-    settings = from_plain(
-        BuildSettings,
-        {
-            "factor": factor,
-            "camera": camera,
-            "sfm": sfm,
-            "matcher": matcher,
-            "mapper": mapper,
-            "max_features": max_features,
-            "seed": seed,
-            "masks_missing": masks_missing,
-            "strict": strict,
-            "name": "" if name is None else check_name("scene name", name),
-            "license": license_,
-        },
-    )
+    settings["name"] = "" if name is None else check_name("scene name", name)
     # One of the two cores is idle while photos are placed; training needs the kernels next.
     with kernels_meanwhile():
         result = build_scene(
             raw,
             output,
-            settings,
+            from_plain(BuildSettings, settings),
             masks=masks,
             test_list=test_list,
             overwrite=overwrite,

@@ -185,13 +185,8 @@ def composite_command(
     source: Path,
     output: Path,
     cutouts: Path | None,
-    patches: bool,
-    coverage: float,
-    presence: float,
-    pose: str,
-    shadow: float,
-    seed: int,
     as_json: bool,
+    **settings: Any,  # fields of `CompositeConfig`
 ) -> None:
     """Add distractors to the train photos of SOURCE, in each photo at other places. Test photos do not change.
 
@@ -211,18 +206,7 @@ def composite_command(
     from ambiguous_wild.simulate.composite.composite_scene import composite
     from ambiguous_wild.simulate.composite.placement import CompositeConfig
 
-    config = from_plain(
-        CompositeConfig,
-        {
-            "coverage": coverage,
-            "presence": presence,
-            "pose": pose,
-            "shadow": shadow,
-            "patches": patches,
-            "seed": seed,
-        },
-    )
-
+    config = from_plain(CompositeConfig, settings)
     plain = is_photo_folder(source)
     given = [n for n in ("pose", "shadow") if context.get_parameter_source(n) is not ParameterSource.DEFAULT]
     if plain and given:

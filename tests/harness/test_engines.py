@@ -14,10 +14,11 @@ from ambiguous_wild.cli.bench import command as bench
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.running.cell import RunOptions
 from ambiguous_wild.harness.running.engines import job as jobs
-from ambiguous_wild.harness.running.engines.ray_cluster import receive, run_sent, send_scene, stays
+from ambiguous_wild.harness.running.engines.ray_cluster import receive, run_sent, send_scene
 from ambiguous_wild.harness.running.engines.session import run_in_processes
 from ambiguous_wild.harness.running.grid import cell_folder, plan_cells
 from ambiguous_wild.harness.running.result_file import read_result
+from ambiguous_wild.harness.running.run import left_alone
 from ambiguous_wild.methods import registry
 from ambiguous_wild.splat.pace import TrainConfig
 from tests.tiny_scene import write_tiny_scene
@@ -172,7 +173,7 @@ def test_a_scene_travels_and_a_run_folder_comes_back(scene, tmp_path, monkeypatc
     (cell,) = plan_cells([f"external:{method}"], [scene], [0], SHORT)
     sources = jobs.read_sources([], [f"external:{method}"])
     job = jobs.make_job(cell, cell_folder(tmp_path / "runs", cell), RunOptions(tmp_path / "c"), sources)
-    assert stays(job) is None
+    assert left_alone(Path(job.folder), "missing") is None
     key, content = send_scene(scene, 10.0)
     for _ in range(2):  # the second finds the scene unpacked
         report = receive(run_sent(job, key, content, 10.0), job, 10.0)
@@ -180,9 +181,7 @@ def test_a_scene_travels_and_a_run_folder_comes_back(scene, tmp_path, monkeypatc
     assert report.folder == Path(job.folder)
     assert read_result(report.folder / "metrics.json")["config_hash"] == cell.identity
     assert (report.folder / "renders/test/test_0.png").is_file()
-    assert (
-        stays(job).outcome == "kept" and stays(replace(job, options=RunOptions(tmp_path, "always"))) is None
-    )
+    assert left_alone(report.folder, "missing") == "kept" and left_alone(report.folder, "always") is None
     assert [p.name for p in (tmp_path / "node").rglob("scene")] == ["scene"]
     assert list((tmp_path / "node").rglob("run-*")) == []
     with pytest.raises(AwError, match="--transfer-limit"):

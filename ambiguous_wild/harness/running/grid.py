@@ -28,7 +28,7 @@ from ambiguous_wild.harness.running.choosing import (
     scene_protocol,
 )
 from ambiguous_wild.harness.running.run import (
-    is_finished,
+    left_alone,
     refuse_other_config,
     refuse_strange_folder,
     run_cell,
@@ -242,13 +242,7 @@ def _moved(cell: Cell, seconds: float | None, group: str) -> Cell:
 
 def unfinished(cells: Sequence[Cell], output: Path, overwrite: Overwrite) -> list[Cell]:
     """The cells that will be run: not those that are kept."""
-    return [cell for cell in cells if not _kept(cell_folder(output, cell), overwrite)]
-
-
-def _kept(folder: Path, overwrite: Overwrite) -> bool:
-    if overwrite == "never":
-        return folder.exists()
-    return overwrite == "missing" and is_finished(folder)
+    return [cell for cell in cells if left_alone(cell_folder(output, cell), overwrite) is None]
 
 
 def expected_line(cells: Sequence[Cell]) -> str:

@@ -7,7 +7,7 @@ import shutil
 import traceback
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import yaml
 
@@ -17,6 +17,7 @@ from ambiguous_wild.harness.running.cell import (
     IGNORED,
     Cell,
     CellReport,
+    Overwrite,
     RunOptions,
     environment,
     provenance,
@@ -46,6 +47,13 @@ def is_finished(folder: Path) -> bool:
     except AwError:
         return False
     return True
+
+
+def left_alone(folder: Path, overwrite: Overwrite) -> Literal["kept", "skipped"] | None:
+    """What a run becomes that need not be made: finished before, or to be left as it is; else None."""
+    if overwrite == "never":
+        return "skipped" if folder.exists() else None
+    return "kept" if overwrite == "missing" and is_finished(folder) else None
 
 
 def record_failure(cell: Cell, folder: Path, error: Exception) -> None:

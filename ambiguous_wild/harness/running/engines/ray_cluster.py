@@ -19,7 +19,7 @@ from ambiguous_wild.harness.running.callbacks import Engine
 from ambiguous_wild.harness.running.cell import CellReport, RunOptions
 from ambiguous_wild.harness.running.engines.job import LOCK_WAIT_S, Job, run_job
 from ambiguous_wild.harness.running.result_file import RESULT, read_result
-from ambiguous_wild.harness.running.run import error_line, is_finished
+from ambiguous_wild.harness.running.run import error_line, is_finished, left_alone
 from ambiguous_wild.io.archive import Limits, pack_folder, unpack
 from ambiguous_wild.io.atomic import atomic_dir
 from ambiguous_wild.io.lock import folder_lock, patient_lock
@@ -129,8 +129,9 @@ class RayCluster:
                 token.parent.mkdir(parents=True, exist_ok=True)
                 token.touch()
             for index, job in enumerate(jobs):
-                if (here := stays(job)) is not None:
-                    ended(index, here)
+                folder = Path(job.folder)
+                if (outcome := left_alone(folder, job.options.overwrite)) is not None:
+                    ended(index, CellReport(folder, outcome))
                 elif store:
                     if job.scene not in scenes:
                         key, content = send_scene(Path(job.scene), engine.transfer_limit)
@@ -232,11 +233,3 @@ def receive(sent: Sent, job: Job, limit_mb: float) -> CellReport:
         with folder_lock(folder, "aw bench"), atomic_dir(folder) as temporary:
             unpack(sent.content, temporary, Limits(bytes=int(limit_mb * 1e6)))
     return sent.report
-
-
-def stays(job: Job) -> CellReport | None:
-    """The report of a run that need not be made: finished here before, or to be left alone; else None."""
-    folder, overwrite = Path(job.folder), job.options.overwrite
-    if folder.exists() and overwrite == "never":
-        return CellReport(folder, "skipped")
-    return CellReport(folder, "kept") if overwrite != "always" and is_finished(folder) else None

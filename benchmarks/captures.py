@@ -13,7 +13,9 @@ makes no plan of effects, but reads the one in a run folder of the scene; withou
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
+import json
 import re
 import sys
 from collections.abc import Iterable, Sequence
@@ -24,15 +26,14 @@ from captures_report import facts_of, missing_runs, rows_of, summarise, tabulate
 from job_queue import Run, exit_code, find_scenes, parser_of, run_all
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.running.cell import Cell
-from ambiguous_wild.harness.running.choosing import PLANNED, Probing, chosen_by
-from ambiguous_wild.harness.running.environment import environment
-from ambiguous_wild.harness.running.grid import cell_folder, plan_cells
-from ambiguous_wild.harness.running.prepare import prepare_cpu
-from ambiguous_wild.harness.running.run_folder import planned_effects, refuse_other_config
+from ambiguous_wild.harness.running.cell import Cell, environment
+from ambiguous_wild.harness.running.choosing import PLANNED, chosen_by
+from ambiguous_wild.harness.running.grid import Probing, cell_folder, plan_cells
+from ambiguous_wild.harness.running.run import EFFECTS, refuse_other_config
 from ambiguous_wild.harness.running.store import read_runs
 from ambiguous_wild.io.atomic import write_text
 from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.splat.calibration import prepare_cpu
 from ambiguous_wild.splat.pace import TrainConfig
 
 RESULTS = Path(__file__).parent / "results" / "captures.md"
@@ -66,6 +67,14 @@ def with_recorded_effects(cells: Sequence[Cell], wanted: str, out: Path) -> list
             plans.setdefault(cell.scene.name, planned)
     chosen = [chosen_by(plans.get(c.scene.name), wanted, c.scene, c.method) for c in cells]
     return [dataclasses.replace(c, chosen=own) for c, own in zip(cells, chosen) if own is not None]
+
+
+def planned_effects(folder: Path) -> tuple[str, ...] | None:
+    """All effects that the plan of the run called for; None where no plan is recorded."""
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError, RecursionError):
+        plan = json.loads((folder / EFFECTS).read_text(encoding="utf-8"))["plan"]
+        return tuple(str(name) for name in plan["effects"])
+    return None
 
 
 def refuse_other_configs(cells: Sequence[Cell], out: Path) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from ambiguous_wild.core import Scene
-from ambiguous_wild.harness.running.identity import scene_identity
+from ambiguous_wild.harness.running.cell import scene_identity
 from ambiguous_wild.harness.running.regions import true_distractor
 from ambiguous_wild.harness.running.store import Runs
 from ambiguous_wild.io.images import read_gray

@@ -22,7 +22,7 @@ import numpy as np
 from job_queue import aw, exit_code
 
 from ambiguous_wild.core import AwError, Scene
-from ambiguous_wild.harness.running.covered import train_looks
+from ambiguous_wild.harness.running.regions import train_looks
 from ambiguous_wild.io.atomic import write_text
 from ambiguous_wild.io.scene_folder import load_scene
 

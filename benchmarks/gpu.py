@@ -28,9 +28,9 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.running.environment import environment
+from ambiguous_wild.harness.running.cell import environment
 from ambiguous_wild.harness.running.evaluate import frames_per_second, load_test_photos, mean_psnr
-from ambiguous_wild.harness.running.memory import peak_memory, reset_peak
+from ambiguous_wild.harness.running.training import peak_memory, reset_peak
 from ambiguous_wild.io.atomic import write_json
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.registry import get_method

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.running.environment import environment
+from ambiguous_wild.harness.running.cell import environment
 from ambiguous_wild.io.atomic import write_json, write_text
 from ambiguous_wild.io.colmap_model import read_model
 

@@ -18,12 +18,45 @@ from typing import Any
 
 from job_queue import exit_code
 
+from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.cost.read import CostRun, read_cost_runs
-from ambiguous_wild.harness.cost.recommend import CLOSE_DB, leave_out
-from ambiguous_wild.harness.running.environment import environment
+from ambiguous_wild.harness.cost.recommend import CLOSE_DB, additive, values_within
+from ambiguous_wild.harness.running.cell import environment
 from ambiguous_wild.io.atomic import write_json
+from ambiguous_wild.methods.registry import knows_truth
 
 RESULTS = Path(__file__).parent / "results" / "recommend.json"
+
+
+def leave_out(
+    runs: Sequence[CostRun], scenes: Sequence[str], budget_s: float
+) -> dict[str, tuple[str, float]]:
+    """How good the recommendation is on scenes that it has not seen.
+
+    Returns:
+        By scene: the setting that the other scenes recommend, and how many dB it is behind the scene's best.
+
+    Args:
+        runs: of all scenes, those held back included.
+        scenes: held back, all at once.
+        budget_s: in the seconds of the runs.
+    """
+    rivals = [run for run in runs if not run.error and not knows_truth(run.method)]
+    # of all runs at once: a setting is named after what varies among them
+    values = values_within(rivals, budget_s)
+    kept = {key: value for key, value in values.items() if key[1] not in scenes}
+    if not kept:
+        raise AwError("no scene is left to learn from: hold fewer back, or give a longer budget")
+    parts, _ = additive(kept)
+    found = {}
+    for scene in scenes:
+        here = {name: value for (name, where), value in values.items() if where == scene}
+        known = [name for name in parts if name in here]
+        if not known:
+            raise AwError(f"{scene} was trained with none of the settings of the other scenes")
+        chosen = max(known, key=lambda name: parts[name])
+        found[scene] = chosen, max(here.values()) - here[chosen]
+    return found
 
 
 def judge(runs: Sequence[CostRun], held_back: Sequence[str], budget_s: float) -> dict[str, Any]:

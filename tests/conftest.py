@@ -29,6 +29,18 @@ def machine_weights(monkeypatch):
 
 
 @pytest.fixture(scope="session")
+def scene(tmp_path_factory):
+    """The folder of a tiny scene that is trained on within seconds; nobody changes it."""
+    from tests.faults.compare import state
+    from tests.tiny_scene import write_tiny_scene
+
+    folder = write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
+    before = state(folder)
+    yield folder
+    assert state(folder) == before, "a test changed the scene that all share"
+
+
+@pytest.fixture(scope="session")
 def built(tmp_path_factory):
     """A folder with a capture of two walls, `raw`, its `scene`, and the finished stages of the build.
 

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import click
 
-from ambiguous_wild.cli.options import training_options
-from ambiguous_wild.cli.paths import PathName
+from ambiguous_wild.cli.options import PathName, training_options
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.methods.ablation import Group
 
@@ -74,7 +73,7 @@ def command(
         raise AwError("--iterations and --budget exclude each other: a run is as long as one of them says")
 
     from ambiguous_wild.cli.bench import parse_budget
-    from ambiguous_wild.cli.devices import choose_device, prepare_cpu
+    from ambiguous_wild.cli.options import choose_device, prepare_cpu
     from ambiguous_wild.cli.progress import ProgressBar
     from ambiguous_wild.harness.ablation.plan import earlier_groups, plan_study
     from ambiguous_wild.harness.ablation.report import markdown_of, report, write_report

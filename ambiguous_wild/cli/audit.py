@@ -9,7 +9,7 @@ from pathlib import Path
 
 import click
 
-from ambiguous_wild.cli.paths import PathName
+from ambiguous_wild.cli.options import PathName
 
 
 @click.command("audit")

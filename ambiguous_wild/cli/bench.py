@@ -11,12 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ambiguous_wild.cli.engines import engine_options
-from ambiguous_wild.cli.options import training_options
-from ambiguous_wild.cli.paths import PathName
-from ambiguous_wild.cli.progress import Progress, finish, say
+from ambiguous_wild.cli.options import PathName, engine_options, say, training_options
+from ambiguous_wild.cli.progress import Progress, finish
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.harness.bench import Engine, bench
+from ambiguous_wild.harness.bench import bench
 
 if TYPE_CHECKING:
     from ambiguous_wild.harness.suite import PreparedSuite
@@ -100,7 +98,7 @@ def parse_budget(text: str) -> float:
 )
 @click.option(
     "--plan",
-    "plan_file",
+    "plan",
     type=PathName(dir_okay=False),
     help="Use this plan of 'aw plan' instead of making a new one.",
 )
@@ -141,36 +139,24 @@ def parse_budget(text: str) -> float:
 @engine_options
 @click.option("--json", "as_json", is_flag=True, help="Print the outcome of every run as JSON.")
 def command(
-    engine: Engine,
     methods: tuple[str, ...],
     scenes: tuple[Path, ...],
     suite_name: str | None,
     root: Path | None,
-    seeds: tuple[int, ...],
     iterations: int | None,
     budgets: tuple[str, ...],
-    device: str,
-    threads: int | None,
-    factor: int | None,
     resolution: str,
     max_gaussians: int | None,
     mask: str | None,
     density: str | None,
     regulariser: str | None,
-    passes: int,
-    settings: tuple[str, ...],
-    plugins: tuple[Path, ...],
-    effects: tuple[str, ...],
-    plan_file: Path | None,
     protocol: str | None,
     output: Path,
     probes: int,
-    overwrite: str,
-    cache: Path | None,
     checkpoint_every: float,
     on_nonfinite: str,
-    pictures: bool,
     as_json: bool,
+    **given: Any,  # the other arguments of `bench`, by their names
 ) -> None:
     """Train METHODs on SCENEs and measure them on the test views.
 
@@ -217,25 +203,13 @@ def command(
         methods,
         scenes,
         output=output,
-        seeds=seeds,
         iterations=iterations,
         budgets_s=seconds,
-        effects=effects,
-        plan=plan_file,
-        settings=settings,
         parts={place: donor for place, donor in parts.items() if donor},  # type: ignore[misc]
-        passes=passes,
         train=train,  # type: ignore[arg-type]
-        plugins=plugins,
-        device=device,  # type: ignore[arg-type]
-        threads=threads,
-        engine=engine,
-        factor=factor,
         protocol=protocol,  # type: ignore[arg-type]
-        overwrite=overwrite,  # type: ignore[arg-type]
-        cache=cache,
-        pictures=pictures,
         callbacks=Progress(),
+        **given,
     )
     if prepared is not None and not as_json:
         for folder in report.folders:

@@ -3,15 +3,60 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from ambiguous_wild.cli.paths import PathName
+from ambiguous_wild.cli.options import PathName
 
 if TYPE_CHECKING:
     from ambiguous_wild.builder.pipeline import BuildResult
+
+_CODE = (
+    "import os\n"
+    "if hasattr(os, 'nice'): os.nice(19)\n"
+    "from ambiguous_wild.splat.cpu.warmup import warm_up\n"
+    "warm_up()\n"
+)
+
+
+@contextmanager
+def kernels_meanwhile() -> Iterator[None]:
+    """Compile at the lowest priority meanwhile; what is not finished at the end is left for later.
+
+    Each kernel is kept as soon as it is compiled. Nothing is said and nothing fails: the command that needs
+    the kernels compiles what is missing, and reports what went wrong.
+    """
+    if _compiled():
+        yield
+        return
+    quiet = subprocess.DEVNULL
+    one = {**os.environ, "NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    try:
+        process = subprocess.Popen(
+            [sys.executable, "-c", _CODE], stdin=quiet, stdout=quiet, stderr=quiet, env=one
+        )
+    except OSError:
+        yield
+        return
+    try:
+        yield
+    finally:
+        process.kill()
+        process.wait()
+
+
+def _compiled() -> bool:
+    """Whether the kernel that is compiled last is on disk for this state of the source."""
+    from ambiguous_wild.splat.cpu.compile import kernel_cache
+
+    return any(kernel_cache().rglob("*catch_up_all*.nbi"))
 
 
 @click.command("build-scene")
@@ -67,30 +112,21 @@ if TYPE_CHECKING:
 @click.option("--jobs", type=click.IntRange(min=1), help="Threads; the result does not depend on it.")
 @click.option("--seed", type=int, default=0, show_default=True, help="Seed of COLMAP's random choices.")
 @click.option("--name", help="Name of the scene.  [default: the name of the output folder]")
-@click.option("--license", "license_", default="", help="Licence of the photos, recorded in scene.json.")
+@click.option("--license", default="", help="Licence of the photos, recorded in scene.json.")
 @click.option("--overwrite", is_flag=True, help="Replace a scene built from other photos or settings.")
 @click.option("--keep-work", is_flag=True, help="Keep the work folder with every stage and COLMAP's log.")
 @click.option("--json", "as_json", is_flag=True, help="Print the same facts as JSON.")
 def command(
     raw: Path,
     output: Path,
-    factor: int | None,
-    camera: str,
-    sfm: str,
-    matcher: str,
-    mapper: str,
-    max_features: int,
     masks: Path | None,
-    masks_missing: str,
     test_list: Path | None,
-    strict: bool,
     jobs: int | None,
-    seed: int,
     name: str | None,
-    license_: str,
     overwrite: bool,
     keep_work: bool,
     as_json: bool,
+    **settings: Any,  # fields of `BuildSettings`
 ) -> None:
     """Build a scene from the photos in RAW: check, COLMAP, undistort, downsample, split.
 
@@ -100,33 +136,17 @@ def command(
     from ambiguous_wild.builder import report
     from ambiguous_wild.builder.pipeline import build_scene
     from ambiguous_wild.builder.settings import BuildSettings
-    from ambiguous_wild.cli.kernels import kernels_meanwhile
     from ambiguous_wild.core.config import from_plain
     from ambiguous_wild.core.names import check_name
     from ambiguous_wild.io.images import image_size
 
-    settings = from_plain(
-        BuildSettings,
-        {
-            "factor": factor,
-            "camera": camera,
-            "sfm": sfm,
-            "matcher": matcher,
-            "mapper": mapper,
-            "max_features": max_features,
-            "seed": seed,
-            "masks_missing": masks_missing,
-            "strict": strict,
-            "name": "" if name is None else check_name("scene name", name),
-            "license": license_,
-        },
-    )
+    settings["name"] = "" if name is None else check_name("scene name", name)
     # One of the two cores is idle while photos are placed; training needs the kernels next.
     with kernels_meanwhile():
         result = build_scene(
             raw,
             output,
-            settings,
+            from_plain(BuildSettings, settings),
             masks=masks,
             test_list=test_list,
             overwrite=overwrite,

@@ -1,15 +1,20 @@
-"""`aw capture`: take photos from a video, a folder or a camera."""
+"""`aw capture` takes photos from a video, a folder or a camera; `aw screen` checks them."""
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 import shlex
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
-from ambiguous_wild.cli.paths import PathName
+from ambiguous_wild.cli.options import PathName
+
+if TYPE_CHECKING:
+    from ambiguous_wild.builder.checks import CaptureReport
 
 BROKEN_BELOW = 0.9  # of the frames in a video's header, which is often wrong by a few
 
@@ -33,7 +38,9 @@ BROKEN_BELOW = 0.9  # of the frames in a video's header, which is often wrong by
 )
 @click.option("--jobs", type=click.IntRange(min=1), help="Threads; the result does not depend on it.")
 @click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
-def command(source: str, output: Path, frames: int, every: float, jobs: int | None, as_json: bool) -> None:
+def capture_command(
+    source: str, output: Path, frames: int, every: float, jobs: int | None, as_json: bool
+) -> None:
     """Take photos from SOURCE: a video (sharp, evenly spaced frames), a folder of photos (copies with
     EXIF), or 'camera' ('camera:1' is the second one)."""
     import os
@@ -77,3 +84,49 @@ def command(source: str, output: Path, frames: int, every: float, jobs: int | No
         names = ", ".join(f"{x['source']} ({x['why']})" for x in left[:3]) + (" ..." if len(left) > 3 else "")
         click.echo("left out: " + "".join(c if c.isprintable() else "?" for c in names))
     click.echo(f"{len(facts['photos'])} photos in {output}; next: aw screen {shlex.quote(str(output))}")
+
+
+_WORDS = {"ok": ("ok", "green"), "warning": ("WARNING", "red"), "unknown": ("unknown", "yellow")}
+
+
+@click.command("screen")
+@click.argument("raw", type=PathName())
+@click.option("--strict", is_flag=True, help="Refuse the capture (exit code 2) if a check fails.")
+@click.option("--jobs", type=click.IntRange(min=1), help="Threads; the result does not depend on it.")
+@click.option("--json", "as_json", is_flag=True, help="Print the same facts as JSON.")
+def screen_command(raw: Path, strict: bool, jobs: int | None, as_json: bool) -> None:
+    """Check the photos in RAW before building: exposure, white balance, ISO, focus, focal length, blur,
+    near-duplicates, overlap, motion. Nothing is written."""
+    import os
+
+    from ambiguous_wild.builder.checks import check_capture, refuse_failed
+    from ambiguous_wild.builder.progress import Bar
+
+    found = check_capture(raw, jobs=jobs or os.cpu_count() or 1, bar=Bar(not as_json))
+    if as_json:
+        facts = {
+            "capture": str(found.root),
+            "photos": found.photos,
+            "skipped": found.skipped,
+            "checks": [dataclasses.asdict(c) for c in found.checks],
+        }
+        click.echo(json.dumps(facts, indent=2, ensure_ascii=False))
+    else:
+        _print(found)
+    if strict:
+        refuse_failed(found)
+
+
+def _print(found: CaptureReport) -> None:
+    width = max(len(c.name) for c in found.checks)
+    for check in found.checks:
+        word, colour = _WORDS[check.state]
+        # File names may hold control characters of the terminal.
+        text = "".join(c if c.isprintable() else "?" for c in f"{check.finding}  [{check.basis}]")
+        click.echo(f"{check.name:<{width}}  {click.style(f'{word:<7}', fg=colour)}  {text}")
+        if check.advice:
+            click.echo(f"{'':<{width}}           -> {check.advice}")
+    bad = len(found.warnings)
+    verdict = "all checks passed" if not bad else f"{bad} of {len(found.checks)} checks failed"
+    unknown = sum(c.state == "unknown" for c in found.checks)
+    click.echo(f"{found.photos} photos: {verdict}" + (f", {unknown} unknown" if unknown else ""))

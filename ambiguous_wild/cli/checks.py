@@ -1,28 +1,88 @@
 """The checks of `aw doctor`: what was found and, if something is missing, a command to install it.
 
-This module imports nothing heavy: imports that may crash or hang are tested by `probes`, in parallel.
+This module imports nothing heavy: imports that may crash or hang are tested in other processes, in parallel.
 """
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 import importlib.util
+import json
 import os
 import platform
 import shlex
 import shutil
+import subprocess
 import sys
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-from ambiguous_wild.cli.probes import PROBES, Probe, probe
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.extras import install_command
-from ambiguous_wild.harness.running.environment import installed
+from ambiguous_wild.harness.running.cell import installed
 from ambiguous_wild.splat import readiness
+
+TIMEOUT_S = 60
+
+# Each prints one line of JSON.
+PROBES = {
+    "torch": """
+from ambiguous_wild.splat.readiness import torch_facts
+print(json.dumps(torch_facts()))
+""",
+    "torchvision": "import torchvision; print(json.dumps({'version': torchvision.__version__}))",
+    "numba": """
+import numba
+threads = numba.get_num_threads()  # starts the threading layer
+print(json.dumps({"threads": threads, "layer": numba.threading_layer()}))
+""",
+    "OpenImageIO": "import OpenImageIO; print(json.dumps({'version': OpenImageIO.VERSION_STRING}))",
+    "pycolmap": """
+import tempfile, pathlib
+from ambiguous_wild.io.safe_pycolmap import pycolmap
+import numpy as np
+from ambiguous_wild.io.images import read_png_rgb, write_png
+image = np.arange(48 * 64 * 3, dtype=np.uint8).reshape(48, 64, 3)
+with tempfile.TemporaryDirectory() as folder:
+    path = pathlib.Path(folder) / "probe.png"
+    write_png(path, image)
+    assert (read_png_rgb(path) == image).all(), "the PNG read back differs from the one written"
+print(json.dumps({"version": pycolmap.__version__}))
+""",
+}
+
+
+@dataclass(frozen=True)
+class Probe:
+    """The facts a process printed, or the error."""
+
+    facts: dict[str, Any] | None
+    error: str = ""
+
+
+def probe(name: str) -> Probe:
+    """Run one of `PROBES` in its own process."""
+    code = "import json\n" + PROBES[name]
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, timeout=TIMEOUT_S, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return Probe(None, f"no answer within {TIMEOUT_S} s")
+    if done.returncode < 0:
+        return Probe(None, f"the process crashed (signal {-done.returncode})")
+    lines = done.stderr.strip().splitlines()
+    if done.returncode:
+        return Probe(None, lines[-1] if lines else f"exit code {done.returncode}")
+    try:
+        return Probe(json.loads(done.stdout.strip().splitlines()[-1]))
+    except (IndexError, ValueError):
+        return Probe(None, f"unexpected output {done.stdout[-200:]!r}")
+
 
 PACKAGE = Path(__file__).resolve().parent.parent
 DISTRIBUTION = "ambiguous-wild"
@@ -44,6 +104,14 @@ class Check:
     fix: str = ""  # shell command to paste, or a # comment where no command can do it; "" if nothing is to do
 
 
+def _core(name: str, ok: bool, detail: str, fix: str = "") -> Check:
+    return Check("core", name, ok, detail, "" if ok else fix)
+
+
+def _optional(name: str, ok: bool, detail: str, fix: str = "") -> Check:
+    return Check("optional", name, ok, detail, "" if ok else fix)
+
+
 def all_checks() -> list[Check]:
     """Every check, core first."""
     names = [n for n in PROBES if n != "torchvision" or importlib.util.find_spec(n) is not None]
@@ -51,7 +119,7 @@ def all_checks() -> list[Check]:
         found = dict(zip(names, pool.map(probe, names)))
     return [
         *_machine(),
-        *_packages(),
+        _packages(),
         _library("torch", found["torch"], "training and LPIPS"),
         _library("OpenImageIO", found["OpenImageIO"], "reading photos"),
         _library(
@@ -69,31 +137,18 @@ def all_checks() -> list[Check]:
 
 def _machine() -> list[Check]:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    python = sys.version_info >= (3, 11)
+    python = _system_install("python3.11", "https://www.python.org/downloads")
     checks = [
-        Check(
-            "core",
-            "python",
-            python,
-            platform.python_version(),
-            "" if python else _system_install("python3.11", "https://www.python.org/downloads"),
-        ),
-        Check("core", "cpu", True, f"{cores} cores usable of {os.cpu_count()}, {platform.machine()}"),
+        _core("python", sys.version_info >= (3, 11), platform.python_version(), python),
+        _core("cpu", True, f"{cores} cores usable of {os.cpu_count()}, {platform.machine()}"),
     ]
-    memory = _memory_gb()
-    if memory is not None:
-        fine = memory >= SMALL_MEMORY_GB
-        fix = (
-            ""
-            if fine
-            else f"# use {SMALL_MEMORY_GB:.0f} GB or more, or train with aw bench --max-gaussians 50000"
-        )
-        checks.append(Check("core", "memory", fine, f"{memory:.1f} GB", fix))
+    with contextlib.suppress(AttributeError, ValueError, OSError):  # a system that does not report it
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
+        fix = f"# use {SMALL_MEMORY_GB:.0f} GB or more, or train with aw bench --max-gaussians 50000"
+        checks.append(_core("memory", memory >= SMALL_MEMORY_GB, f"{memory:.1f} GB", fix))
     free = shutil.disk_usage(Path.cwd()).free / 1e9
-    fine = free >= SMALL_DISK_GB
-    fix = "" if fine else f"df -h .  # free at least {SMALL_DISK_GB:.0f} GB, or use a folder on another disk"
-    checks.append(Check("core", "disk", fine, f"{free:.0f} GB free in {Path.cwd()}", fix))
-    return checks
+    fix = f"df -h .  # free at least {SMALL_DISK_GB:.0f} GB, or use a folder on another disk"
+    return [*checks, _core("disk", free >= SMALL_DISK_GB, f"{free:.0f} GB free in {Path.cwd()}", fix)]
 
 
 def _system_install(package: str, page: str) -> str:
@@ -105,35 +160,23 @@ def _system_install(package: str, page: str) -> str:
     return f"# install {package} from {page}"
 
 
-def _memory_gb() -> float | None:
-    """Physical memory; None if the system does not report it."""
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
-    except (AttributeError, ValueError, OSError):
-        return None
-
-
-def _packages() -> list[Check]:
+def _packages() -> Check:
     """The required packages: allowed ranges, and the tested versions."""
-    root = shlex.quote(str(PACKAGE.parent))
     try:
-        required = importlib.metadata.requires(DISTRIBUTION) or []
+        required = [r for r in importlib.metadata.requires(DISTRIBUTION) or [] if "extra ==" not in r]
     except importlib.metadata.PackageNotFoundError:
-        return [
-            Check("core", "packages", False, f"{DISTRIBUTION} is not installed", f"{_PIP} install -e {root}")
-        ]
-    wrong = unmet(r for r in required if "extra ==" not in r)
-    if wrong:
+        fix = f"{_PIP} install -e {shlex.quote(str(PACKAGE.parent))}"
+        return _core("packages", False, f"{DISTRIBUTION} is not installed", fix)
+    if wrong := unmet(required):
         fix = f"{_PIP} install " + " ".join(f"'{w}'" for w in wrong)
-        return [Check("core", "packages", False, "missing or wrong version: " + ", ".join(wrong), fix)]
+        return _core("packages", False, "missing or wrong version: " + ", ".join(wrong), fix)
     other = other_versions(PACKAGE.parent / "constraints.txt")
-    detail = f"all {sum('extra ==' not in r for r in required)} required packages"
-    if other is None:
-        return [Check("core", "packages", True, detail)]
-    detail += (
-        ", in the tested versions" if not other else "; other than the tested version: " + ", ".join(other)
-    )
-    return [Check("core", "packages", True, detail)]
+    detail = f"all {len(required)} required packages"
+    if other is not None:
+        detail += (
+            f"; other than the tested version: {', '.join(other)}" if other else ", in the tested versions"
+        )
+    return _core("packages", True, detail)
 
 
 def unmet(requirements: Iterable[str]) -> list[str]:
@@ -163,55 +206,49 @@ def other_versions(constraints: Path) -> list[str] | None:
     return lines
 
 
-def _constraints() -> str:
-    """The option of pip that installs the tested versions, in a checkout."""
+def _install_again(words: str) -> str:
+    """The command of pip that installs the tested versions, in a checkout."""
     path = PACKAGE.parent / "constraints.txt"
-    return f" -c {shlex.quote(str(path))}" if path.is_file() else ""
+    tested = f" -c {shlex.quote(str(path))}" if path.is_file() else ""
+    return f"{_PIP} install{tested} --force-reinstall {words}"
 
 
 def _library(name: str, found: Probe, use: str) -> Check:
-    if found.facts is not None:
-        return Check("core", name, True, f"{found.facts['version']} ({use})")
-    fix = f"{_PIP} install{_constraints()} --force-reinstall --no-deps {name}"
-    return Check("core", name, False, f"{found.error} ({use})", fix)
+    detail = found.error if found.facts is None else str(found.facts["version"])
+    return _core(name, found.facts is not None, f"{detail} ({use})", _install_again(f"--no-deps {name}"))
 
 
 def _numba(found: Probe) -> list[Check]:
     if found.facts is None:
-        fix = f"{_PIP} install{_constraints()} --force-reinstall numba llvmlite"
-        return [Check("core", "numba", False, found.error, fix)]
-    layer = f"{found.facts['threads']} threads, threading layer {found.facts['layer']}"
-    checks = [Check("core", "numba", True, layer)]
+        return [_core("numba", False, found.error, _install_again("numba llvmlite"))]
     from ambiguous_wild.splat.cpu.compile import kernel_cache
 
     folder = kernel_cache()
     existing = next(p for p in (folder, *folder.parents) if p.exists())
     compiled = len(list(folder.rglob("*.nbi"))) if folder.is_dir() else 0
-    state = (
-        f"{compiled} kernels compiled"
-        if compiled
-        else "not compiled yet: the first run takes 1 minute longer"
-    )
+    wait = "not compiled yet: the first run takes 1 minute longer"
+    state = f"{compiled} kernels compiled" if compiled else wait
     writable = os.access(existing, os.W_OK)
     where = f"in {folder}" if writable else f"{folder} is not writable"
-    fix = "" if writable else "export NUMBA_CACHE_DIR=$HOME/.cache/numba"
-    checks.append(Check("core", "kernel cache", writable, f"{state}, {where}", fix))
-    return checks
+    return [
+        _core("numba", True, f"{found.facts['threads']} threads, threading layer {found.facts['layer']}"),
+        _core("kernel cache", writable, f"{state}, {where}", "export NUMBA_CACHE_DIR=$HOME/.cache/numba"),
+    ]
 
 
 def _gpu(torch: Probe) -> list[Check]:
     """The same messages as those of `--device`."""
     if torch.facts is None:
-        fix = _library("torch", torch, "").fix
-        return [Check("optional", "torch cuda", False, torch.error, fix)]
+        return [_optional("torch cuda", False, torch.error, _install_again("--no-deps torch"))]
     facts = readiness.look(torch.facts)
     driver = facts.driver
     checks = [
-        Check("optional", "nvidia driver", driver is not None, driver or "no nvidia-smi; the CPU is used",
-              "" if driver else _driver_install()),
+        _optional(
+            "nvidia driver", driver is not None, driver or "no nvidia-smi; the CPU is used", _driver_install()
+        ),
         _part("torch cuda", ", ".join(torch.facts["names"]), readiness.no_cuda(facts)),
         _part("gsplat", facts.gsplat or "", readiness.no_gsplat(facts)),
-    ]  # fmt: skip
+    ]
     if facts.gsplat and facts.torch["cuda"]:
         state = "in the wheel" if facts.prebuilt else "compiled by the first run, which takes minutes longer"
         checks.append(_part("gsplat kernels", state, readiness.no_compiler(facts)))
@@ -225,13 +262,9 @@ def _driver_install() -> str:
 
 
 def _part(name: str, fine: str, lack: readiness.Lack | None) -> Check:
-    return Check(
-        "optional",
-        name,
-        lack is None,
-        fine if lack is None else lack.what,
-        pastable(lack.fix) if lack else "",
-    )
+    if lack is None:
+        return _optional(name, True, fine)
+    return _optional(name, False, lack.what, pastable(lack.fix))
 
 
 def pastable(fix: str) -> str:
@@ -242,59 +275,53 @@ def pastable(fix: str) -> str:
     return fix if fix.startswith(COMMANDS) else f"# {fix}"
 
 
+def _installed(name: str, extra: str, use: str) -> Check:
+    version = installed(name)
+    detail = f"{version or 'not installed'} ({use})"
+    return _optional(name, version is not None, detail, install_command(extra))
+
+
 def _extras() -> list[Check]:
     """Packages for single commands, and nerfbaselines, which has its own environment."""
     from ambiguous_wild.methods.external.nerfbaselines import find_program
 
-    packages = {
-        "ray": ("ray", "aw bench --engine ray"),
-        "pi-heif": ("heic", "HEIC photos of phones"),
-        "viser": ("view", "aw view --live"),
-        "choix": ("study", "aw study score: ranking"),
-        "nltk": ("study", "aw study score: agreement"),
-    }
-    checks = []
-    for name, (extra, use) in packages.items():
-        version = installed(name)
-        fix = "" if version else install_command(extra)
-        checks.append(
-            Check("optional", name, version is not None, f"{version or 'not installed'} ({use})", fix)
-        )
+    checks = [
+        _installed("ray", "ray", "aw bench --engine ray"),
+        _installed("pi-heif", "heic", "HEIC photos of phones"),
+        _installed("viser", "view", "aw view --live"),
+        _installed("choix", "study", "aw study score: ranking"),
+        _installed("nltk", "study", "aw study score: agreement"),
+    ]
     try:
-        checks.append(Check("optional", "nerfbaselines", True, f"{find_program()} (its methods)"))
+        return [*checks, _optional("nerfbaselines", True, f"{find_program()} (its methods)")]
     except AwError as error:
         what, _, fix = str(error).partition(": ")
-        checks.append(Check("optional", "nerfbaselines", False, what, fix))
-    return checks
+        return [*checks, _optional("nerfbaselines", False, what, fix)]
 
 
 def _vision() -> list[Check]:
     """Foundation models: transformers and the weights."""
     from ambiguous_wild.vision import weights
 
-    version = installed("transformers")
-    detail = f"{version or 'not installed'} (DINO features, SAM masks)"
-    fix = "" if version else install_command("masks")
-    checks = [Check("optional", "transformers", version is not None, detail, fix)]
     # those of LPIPS are listed by metric
     listed = {w.name: w for w in weights.KNOWN if "LPIPS" not in w.used_for}
-    checks += [
-        Check(
-            "optional", line.name, line.present, f"{listed[line.name].used_for}: {line.where}", line.command
-        )
-        for line in weights.status(listed.values())
+    return [
+        _installed("transformers", "masks", "DINO features, SAM masks"),
+        *(
+            _optional(w.name, w.present, f"{listed[w.name].used_for}: {w.where}", w.command)
+            for w in weights.status(listed.values())
+        ),
     ]
-    return checks
 
 
 def _torchvision(found: Probe | None) -> Check:
     """Not needed; but if it is installed and broken, transformers cannot be imported."""
     if found is None:
-        return Check("optional", "torchvision", True, "not installed, not needed")
+        return _optional("torchvision", True, "not installed, not needed")
     if found.facts is not None:
-        return Check("optional", "torchvision", True, f"{found.facts['version']}, not needed")
-    return Check("optional", "torchvision", False, f"broken, and breaks transformers: {found.error}",
-                 f"{_PIP} uninstall -y torchvision")  # fmt: skip
+        return _optional("torchvision", True, f"{found.facts['version']}, not needed")
+    why = f"broken, and breaks transformers: {found.error}"
+    return _optional("torchvision", False, why, f"{_PIP} uninstall -y torchvision")
 
 
 def _metrics() -> list[Check]:
@@ -306,17 +333,11 @@ def _metrics() -> list[Check]:
     for metric in lpips.VARIANTS:
         missing = lpips.missing_weights(metric)
         detail = f"weights missing: {', '.join(missing)}" if missing else "weights found"
-        fix = weights.fix(*missing) if missing else ""
-        checks.append(Check("optional", metric, not missing, detail, fix))
+        checks.append(_optional(metric, not missing, detail, weights.fix(*missing) if missing else ""))
     return checks
 
 
 def _git() -> Check:
     version = readiness.first_line("git", "--version")
-    return Check(
-        "optional",
-        "git",
-        version is not None,
-        version or "not installed",
-        "" if version else _system_install("git", "https://git-scm.com/downloads"),
-    )
+    fix = _system_install("git", "https://git-scm.com/downloads")
+    return _optional("git", version is not None, version or "not installed", fix)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ambiguous_wild.cli.paths import PathName
+from ambiguous_wild.cli.options import PathName
 from ambiguous_wild.core.errors import AwError
 
 if TYPE_CHECKING:
@@ -65,8 +65,7 @@ def command(
     if any(not math.isfinite(t) for t in targets):
         raise AwError("--target must be a number of dB, e.g. 25")
     from ambiguous_wild.harness.cost.read import read_cost_runs
-    from ambiguous_wild.harness.cost.report import cost_report, plain_data, write_report
-    from ambiguous_wild.harness.cost.text import to_text
+    from ambiguous_wild.harness.cost.report import cost_report, plain_data, to_text, write_report
     from ambiguous_wild.io.atomic import check_output
 
     if (recommended is None) != (budget is None):
@@ -93,7 +92,7 @@ def _recommend(found: Found, scene: Path, budget: str, as_json: bool) -> None:
     from ambiguous_wild.cli.bench import parse_budget
     from ambiguous_wild.harness.cost.recommend import in_words, recommend, speed_here
     from ambiguous_wild.harness.cost.report import finite
-    from ambiguous_wild.harness.running.identity import scene_identity
+    from ambiguous_wild.harness.running.cell import scene_identity
     from ambiguous_wild.io.scene_folder import load_scene
 
     seconds = parse_budget(budget)

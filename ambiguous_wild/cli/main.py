@@ -19,31 +19,31 @@ COMMANDS = {
         "Simulate a capture with exact truth: poses, distractor masks, clean photos.",
     ),
     "composite": (
-        "composite",
+        "simulate",
         "Add distractors with exact masks to a scene of real photos, or to plain photos.",
     ),
     "capture": ("capture", "Select sharp, evenly spaced photos from a video, a folder or a camera."),
-    "screen": ("screen", "Check a capture: exposure, white balance, focus, blur, overlap; with advice."),
+    "screen": ("capture", "Check a capture: exposure, white balance, focus, blur, overlap; with advice."),
     "build-scene": (
         "build_scene",
         "Build a scene from a folder of photos: check, COLMAP, downsample, split.",
     ),
-    "import": ("import_dataset", "Import a scene of a public dataset: On-the-go, RobustNeRF, COLMAP, ..."),
-    "fetch": ("fetch", "Download a public dataset, resumed and checked by its hash."),
-    "export-scene": ("export_scene", "Write a scene for nerfstudio, NerfBaselines, COLMAP, or as On-the-go."),
-    "package": ("package", "Pack scenes for release: archives, checksums, Croissant, data card."),
-    "verify": ("verify", "Check a package, its archives and their scenes."),
+    "import": ("datasets", "Import a scene of a public dataset: On-the-go, RobustNeRF, COLMAP, ..."),
+    "fetch": ("datasets", "Download a public dataset, resumed and checked by its hash."),
+    "export-scene": ("datasets", "Write a scene for nerfstudio, NerfBaselines, COLMAP, or as On-the-go."),
+    "package": ("datasets", "Pack scenes for release: archives, checksums, Croissant, data card."),
+    "verify": ("datasets", "Check a package, its archives and their scenes."),
     "ambiguity-report": ("ambiguity_report", "Measure how similar the distractors are to the scene."),
     "plan": ("plan", "Recommend optional effects for a scene, with their cost."),
     "bench": ("bench", "Train methods on scenes and evaluate them."),
     "ablate": ("ablate", "Measure the gain and cost of each part of a method."),
     "table": ("table", "Compare runs in tables: terminal, Markdown, CSV, LaTeX, HTML."),
-    "rescore": ("rescore", "Add metrics that were missing when runs ended, from their saved renders."),
+    "rescore": ("table", "Add metrics that were missing when runs ended, from their saved renders."),
     "cost": ("cost", "Accuracy against training time: tables and plots."),
     "audit": ("audit", "Find errors in tables of results."),
     "view": ("view", "Write a page to fly through models and compare them; or watch a training."),
-    "video": ("video", "Film models side by side along one camera path: mp4, GIF."),
-    "export": ("export", "Write models as compressed PLY, SPZ, SOG and glTF, with the loss in dB."),
+    "video": ("view", "Film models side by side along one camera path: mp4, GIF."),
+    "export": ("view", "Write models as compressed PLY, SPZ, SOG and glTF, with the loss in dB."),
     "leaderboard": ("leaderboard", "Check runs, collect them in CSV files and publish them as a page."),
     "study": ("study", "Blind user study: which distractor is hard to see, which render is better."),
     "stress": ("stress", "Numerical stress tests against float64; replay of a training that met a NaN."),
@@ -59,7 +59,9 @@ class _LazyGroup(click.Group):
     def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
         if name not in COMMANDS:
             return None
-        return importlib.import_module(f"ambiguous_wild.cli.{COMMANDS[name][0]}").command
+        module = importlib.import_module(f"ambiguous_wild.cli.{COMMANDS[name][0]}")
+        # a module of several commands names them
+        return getattr(module, f"{name.replace('-', '_')}_command", None) or module.command
 
     def resolve_command(self, ctx: click.Context, args: list[str]):
         if args and args[0] not in COMMANDS:

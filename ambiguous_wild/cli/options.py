@@ -1,15 +1,29 @@
-"""Options shared by all commands that train."""
+"""Types and options that several commands share, and the choice of the device."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import click
 
-from ambiguous_wild.cli.paths import PathName
+from ambiguous_wild.harness.running.callbacks import Engine
 
-_OPTIONS = (
+
+class PathName(click.Path):
+    """A path; an empty name is an error (an unset variable in a script), not the current folder."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(path_type=Path, **kwargs)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        if value == "":
+            self.fail("the name is empty; write . for the current folder", param, ctx)
+        return super().convert(value, param, ctx)
+
+
+_TRAINING = (
     click.option(
         "--seed",
         "seeds",
@@ -63,6 +77,71 @@ _OPTIONS = (
 def training_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add these options to a click command: seeds, iterations, device, threads, factor, max_gaussians,
     plugins, overwrite, cache."""
-    for option in reversed(_OPTIONS):
+    for option in reversed(_TRAINING):
         command = option(command)
     return command
+
+
+_ENGINE = (
+    click.option("--engine", type=click.Choice(["local", "ray"]), default="local", show_default=True,
+                 help="local: this machine; ray: Ray, also on a cluster (docs/cluster.md)."),
+    click.option("--jobs", type=click.IntRange(1),
+                 help="Runs at a time on this machine; they share cores.  [default: 1; on cuda one per GPU]"),
+    click.option("--address",
+                 help="Ray: auto, HOST:PORT, ray://HOST:10001.  [default: $RAY_ADDRESS, else this machine]"),
+    click.option("--cpus-per-cell", type=click.FloatRange(min=0, min_open=True),
+                 help="Ray: CPUs per run, also its threads.  [default: --threads, else 1]"),
+    click.option("--gpus-per-cell", type=click.FloatRange(min=0),
+                 help="Ray: GPUs per run; with 0.5 two runs share one.  [default: 1 on cuda]"),
+    click.option("--memory-per-cell", type=click.FloatRange(min=0), metavar="GB",
+                 help="Ray: memory per run."),
+    click.option("--retries", type=click.IntRange(0), default=3, show_default=True,
+                 help="How often to repeat a run whose process or node was lost."),
+    click.option("--transfer", type=click.Choice(["shared", "store"]), default="shared", show_default=True,
+                 help="Ray: shared: -o and scenes are on shared storage; store: they are sent through Ray."),
+    click.option("--transfer-limit", type=click.FloatRange(min=0, min_open=True), default=4000.0,
+                 show_default=True, metavar="MB", help="Ray: largest scene or run that is sent through Ray."),
+)  # fmt: skip
+
+
+def engine_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add them to a click command, as one argument `engine`: an `Engine`."""
+
+    def with_engine(**values: Any) -> Any:
+        names = [f for f in Engine.__dataclass_fields__ if f in values]
+        return command(engine=Engine(**{name: values.pop(name) for name in names}), **values)
+
+    with_engine.__doc__, with_engine.__name__ = command.__doc__, command.__name__
+    # Options added below this one are on the function already.
+    with_engine.__dict__.update(command.__dict__)
+    wrapped: Callable[..., Any] = with_engine
+    for option in reversed(_ENGINE):
+        wrapped = option(wrapped)
+    return wrapped
+
+
+def choose_device(device: str) -> str:
+    """The device for "cpu", "cuda" or "auto": auto is the GPU if torch and gsplat can use one.
+
+    Compiles gsplat's kernels if needed; reports a GPU that cannot be used on stderr.
+
+    Raises:
+        AwError: cuda was requested but is not usable; names what is missing.
+    """
+    if device == "cpu":
+        return "cpu"
+    from ambiguous_wild.splat.readiness import choose
+
+    return choose(device, say)
+
+
+def prepare_cpu(threads: int | None) -> None:
+    """Set the number of threads and compile the CPU kernels, once per machine."""
+    from ambiguous_wild.splat import calibration
+
+    calibration.prepare_cpu(threads, say)
+
+
+def say(text: str) -> None:
+    """Write a line on stderr, so that stdout stays clean for results."""
+    click.echo(text, err=True)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ambiguous_wild.cli.paths import PathName
+from ambiguous_wild.cli.options import PathName
 
 if TYPE_CHECKING:
     from ambiguous_wild.core import Scene
@@ -78,7 +78,7 @@ def command(
     check_output(path)
     _check_overwrite(path, probe)
     if probe or costs:
-        from ambiguous_wild.cli.devices import prepare_cpu
+        from ambiguous_wild.cli.options import prepare_cpu
 
         prepare_cpu(None)
     if probe:
@@ -124,7 +124,7 @@ def _probed(scene: Scene, iterations: int, path: Path, quiet: bool) -> Plan:
 def _check_overwrite(path: Path, probe: bool) -> None:
     """Only an earlier plan may be replaced, and not one with a probe by one without."""
     from ambiguous_wild.core.errors import AwError
-    from ambiguous_wild.harness.planning.file import read_plan
+    from ambiguous_wild.harness.planning.decide import read_plan
 
     if not path.exists():
         return

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ambiguous_wild.cli.options import say
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.harness.running.callbacks import Callbacks, Lines, outcome_line, run_name
 
@@ -18,11 +19,6 @@ if TYPE_CHECKING:
     from ambiguous_wild.harness.bench import BenchReport
     from ambiguous_wild.harness.running.cell import Cell, CellReport
     from ambiguous_wild.splat.trainer import Trainer
-
-
-def say(text: str) -> None:
-    """Write a line on stderr, so that stdout stays clean for results."""
-    click.echo(text, err=True)
 
 
 class ProgressBar(Callbacks):

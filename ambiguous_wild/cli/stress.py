@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from ambiguous_wild.cli.paths import PathName
+from ambiguous_wild.cli.options import PathName
 
 
 @click.command("stress")
@@ -93,7 +93,7 @@ def command(
 
 
 def _devices(wanted: str) -> list[str]:
-    from ambiguous_wild.cli.devices import choose_device, prepare_cpu
+    from ambiguous_wild.cli.options import choose_device, prepare_cpu
 
     found = choose_device(wanted)  # its error names what is missing for a GPU
     devices = ["cuda"] if wanted == "cuda" else ["cpu"] if found == "cpu" else ["cpu", "cuda"]
@@ -103,7 +103,7 @@ def _devices(wanted: str) -> list[str]:
 
 
 def _replay(run: Path) -> None:
-    from ambiguous_wild.cli.devices import prepare_cpu
+    from ambiguous_wild.cli.options import prepare_cpu
     from ambiguous_wild.harness.running.replay import replay
 
     prepare_cpu(None)

@@ -1,13 +1,21 @@
-"""`aw view`: a page to fly through models; `--live`: watch a training."""
+"""`aw view`, `aw video` and `aw export`: models as people see them, and as other programs read them."""
 
 from __future__ import annotations
 
+import dataclasses
+import json
+import math
+import sys
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from ambiguous_wild.cli.paths import PathName
+from ambiguous_wild.cli.options import PathName, say
 from ambiguous_wild.core.errors import AwError
+
+if TYPE_CHECKING:
+    from ambiguous_wild.viewing.model import Exported
 
 MOST_GAUSSIANS = 150_000
 
@@ -66,7 +74,7 @@ MOST_GAUSSIANS = 150_000
 )
 @click.option("--paused", is_flag=True, help="With --live: pause after the first step.")
 @click.pass_context
-def command(
+def view_command(
     ctx: click.Context,
     runs: tuple[Path, ...],
     output: Path,
@@ -108,7 +116,7 @@ def command(
         folder = Path("runs") if chosen is click.core.ParameterSource.DEFAULT else output
         watch(
             live, method, folder, iterations=iterations, max_gaussians=max_train_gaussians, seed=seed,
-            threads=threads, device=device, host=host, port=port, paused=paused, say=_say,
+            threads=threads, device=device, host=host, port=port, paused=paused, say=say,
         )  # fmt: skip
         return
     if not runs:
@@ -122,11 +130,171 @@ def command(
         scene_folder=scene_folder,
         most_gaussians=max_gaussians,
         title=title,
-        say=_say,
+        say=say,
     )
     told = f"{page.bytes / 1e6:.1f} MB, of which models {page.models_bytes / 1e6:.1f} MB"
-    _say(f"wrote {page.path}: {told}; open it in a browser")
+    say(f"wrote {page.path}: {told}; open it in a browser")
 
 
-def _say(text: str) -> None:
-    click.echo(text, err=True)
+@click.command(name="video")
+@click.argument("runs", nargs=-1, required=True, type=PathName())
+@click.option(
+    "-o",
+    "--output",
+    type=PathName(dir_okay=False),
+    default=Path("video.mp4"),
+    show_default=True,
+    help="mp4 file (VP9).",
+)
+@click.option(
+    "--path", "path", default="test", show_default=True, metavar="test|orbit|FILE",
+    help="Along the test cameras, around the scene, or FILE saved by 'aw view', nerfstudio or a 3DGS viewer.",
+)  # fmt: skip
+@click.option("--seconds", type=click.FloatRange(0.1, 600), default=8.0, show_default=True)
+@click.option(
+    "--fps", type=click.FloatRange(1, 120), default=24.0, show_default=True, help="Frames per second."
+)
+@click.option(
+    "--width", type=click.IntRange(16, 4096), help="Width of each render, px.  [default: as the photos]"
+)
+@click.option("--columns", type=click.IntRange(1), help="Renders in a row.  [default: up to three]")
+@click.option("--gif", type=PathName(dir_okay=False), help="Also write this GIF of the whole path.")
+@click.option("--gif-seconds", type=click.FloatRange(0.5, 30), default=4.0, show_default=True)
+@click.option("--gif-width", type=click.IntRange(16, 2048), default=640, show_default=True, help="Width, px.")
+@click.option("--scene", help="Name of the scene, if the runs have several.")
+@click.option(
+    "--scene-folder", type=PathName(file_okay=False), help="The scene folder.  [default: as the runs say]"
+)
+@click.option(
+    "--plugin",
+    "plugins",
+    multiple=True,
+    type=PathName(),
+    help="A Python file that registers your methods; repeatable.",
+)
+@click.option("--threads", type=click.IntRange(1), help="CPU threads.")
+def video_command(
+    runs: tuple[Path, ...], output: Path, path: str, plugins: tuple[Path, ...], **options: Any
+) -> None:
+    """Film the models of RUNS (run folders, or folders of them) side by side along one camera path.
+
+    \b
+    aw video runs -o video.mp4
+    aw video runs --path orbit --seconds 12 --fps 30 --gif video.gif
+    """
+    from ambiguous_wild.harness.showing.views import video_runs
+    from ambiguous_wild.methods.registry import load_plugin
+
+    for plugin in plugins:
+        load_plugin(plugin)
+
+    with _Bar() as bar:
+        done = video_runs(runs, output, path=path, **options, say=say, tick=bar.tick)
+    say(f"wrote {done.path}: {done.frames} frames, {done.seconds:.1f} s, {', '.join(done.labels)}")
+    if done.gif is not None:
+        say(f"wrote {done.gif}: {done.gif.stat().st_size / 1e6:.1f} MB")
+
+
+class _Bar:
+    """A bar over the frames, where somebody looks."""
+
+    def __init__(self) -> None:
+        self.bar: Any = None
+
+    def __enter__(self) -> _Bar:
+        return self
+
+    def tick(self, done: int, total: int) -> None:
+        from tqdm import tqdm
+
+        if self.bar is None:
+            self.bar = tqdm(total=total, unit="frame", disable=not sys.stderr.isatty(), file=sys.stderr)
+        self.bar.update(done - self.bar.n)
+
+    def __exit__(self, *_: object) -> None:
+        if self.bar is not None:
+            self.bar.close()
+
+
+FORMATS = ("compressed-ply", "spz", "sog", "gltf")
+
+
+@click.command(name="export")
+@click.argument("runs", nargs=-1, required=True, type=PathName())
+@click.option(
+    "--format", "formats", multiple=True, type=click.Choice(FORMATS), default=FORMATS, show_default="all",
+    help="Repeatable.",
+)  # fmt: skip
+@click.option(
+    "-o", "--output", type=PathName(file_okay=False),
+    help="Folder for the files, as LABEL.spz and so on.  [default: RUN/export]",
+)  # fmt: skip
+@click.option(
+    "--loss/--no-loss", default=True, show_default=True, help="Render the test views to measure the loss."
+)
+@click.option(
+    "--scene-folder", type=PathName(file_okay=False), help="The scene folder.  [default: as the runs say]"
+)
+@click.option(
+    "--plugin",
+    "plugins",
+    multiple=True,
+    type=PathName(),
+    help="A Python file that registers your methods; repeatable.",
+)
+@click.option("--threads", type=click.IntRange(1), help="CPU threads.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
+def export_command(
+    runs: tuple[Path, ...],
+    formats: tuple[str, ...],
+    output: Path | None,
+    loss: bool,
+    scene_folder: Path | None,
+    plugins: tuple[Path, ...],
+    threads: int | None,
+    as_json: bool,
+) -> None:
+    """Write the models of RUNS (run folders, or folders of them) as compressed PLY, SPZ, SOG and glTF.
+
+    Prints the size of each file and the loss from its rounding: PSNR against the renders of the model, and dB
+    lost against the test photos. The plain point_cloud.ply stays.
+
+    \b
+    aw export runs
+    aw export runs/courtyard/refinesplat/seed0 --format spz -o models
+    """
+    from ambiguous_wild.harness.showing.views import export_runs
+    from ambiguous_wild.methods.registry import load_plugin
+
+    for plugin in plugins:
+        load_plugin(plugin)
+
+    reports = export_runs(
+        runs, formats, output, loss=loss, scene_folder=scene_folder, threads=threads, say=say
+    )
+    if as_json:
+        rows = [
+            {k: _plain(v) for k, v in {"label": label, **dataclasses.asdict(e)}.items()}
+            for label, files in reports
+            for e in files
+        ]
+        click.echo(json.dumps(rows, indent=2, ensure_ascii=False))
+        return
+    for label, files in reports:
+        click.echo(f"{label}: {files[0].gaussians:,} Gaussians")
+        for e in files:
+            click.echo(f"  {_line(e)}")
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, Path):
+        return str(value)
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _line(e: Exported) -> str:
+    told = f"{e.format:<14} {e.bytes / 1e6:8.2f} MB  {100 * e.share:5.1f} % of the PLY"
+    if e.psnr_to_model is not None and e.lost_db is not None:
+        same = "renders the same" if math.isinf(e.psnr_to_model) else f"{e.psnr_to_model:.1f} dB to the model"
+        told += f"  {same}, {e.lost_db:+.3f} dB lost"
+    return f"{told}  {e.path}"

@@ -21,14 +21,14 @@ from typing import TYPE_CHECKING, Literal, TypedDict
 
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.harness.running.callbacks import Callbacks as Callbacks
+from ambiguous_wild.harness.running.callbacks import Engine as Engine
 from ambiguous_wild.harness.running.callbacks import Lines as Lines
-from ambiguous_wild.harness.running.engines.session import Engine as Engine
-from ambiguous_wild.harness.running.engines.session import Grid, Session
+from ambiguous_wild.harness.running.engines.session import Session
 
 if TYPE_CHECKING:
     from ambiguous_wild.harness.planning.decide import Plan
     from ambiguous_wild.harness.running.cell import Cell, CellReport, Outcome, Overwrite, Protocol
-    from ambiguous_wild.harness.running.records import RunResult
+    from ambiguous_wild.harness.running.result_file import RunResult
     from ambiguous_wild.harness.running.store import Runs
     from ambiguous_wild.harness.showing.read import Viewer
 
@@ -62,7 +62,7 @@ class RunReport:
 
     def mean(self, metric: str) -> float | None:
         """Mean of an image metric over the test views; None where any value is missing."""
-        from ambiguous_wild.harness.running.records import metrics_of
+        from ambiguous_wild.harness.running.result_file import metrics_of
 
         rows = [] if self.result is None else self.result["per_image"]
         values = [metrics_of(row).get(metric) for row in rows]
@@ -196,14 +196,21 @@ def bench(
         raise AwError("iterations and budgets_s exclude each other: a run is as long as one of them says")
     out = Path(output)
     with Session(where, threads, told) as session:
-        from ambiguous_wild.harness.running.choosing import Probing
-        from ambiguous_wild.harness.running.expected import expected_line, unfinished
+        from ambiguous_wild.harness.running.cell import RunOptions
         from ambiguous_wild.harness.running.external import check_program
-        from ambiguous_wild.harness.running.grid import plan_cells, run_cells
-        from ambiguous_wild.harness.running.groups import grouped
-        from ambiguous_wild.harness.running.passes import check_passes
-        from ambiguous_wild.harness.running.prepare import check_grafts, prepare_cpu, try_recipes
+        from ambiguous_wild.harness.running.grid import (
+            Probing,
+            check_grafts,
+            expected_line,
+            grouped,
+            plan_cells,
+            run_cells,
+            try_recipes,
+            unfinished,
+        )
+        from ambiguous_wild.harness.running.training import check_passes
         from ambiguous_wild.io.atomic import check_output
+        from ambiguous_wild.splat.calibration import prepare_cpu
         from ambiguous_wild.splat.pace import TrainConfig
 
         chosen = session.device(device)
@@ -263,7 +270,7 @@ def bench(
             )
         else:
             files = [Path(plugin) for plugin in plugins]
-            reports = session.run(Grid(cells, out, overwrite, place, pictures, files, names))
+            reports = session.run(cells, out, RunOptions(place, overwrite, pictures), files, names)
     made = BenchReport(out, tuple(_run_report(cell, report) for cell, report in zip(cells, reports)))
     if said := _rescorable(made):
         told.say(said)
@@ -313,7 +320,7 @@ def _check_effects(
 def _read_plan(plan: Plan | Words | None) -> Plan | None:
     if not isinstance(plan, str | Path):
         return plan
-    from ambiguous_wild.harness.planning.file import read_plan
+    from ambiguous_wild.harness.planning.decide import read_plan
 
     return read_plan(Path(plan))
 
@@ -345,7 +352,7 @@ def _rescorable(made: BenchReport) -> str:
 
 def _run_report(cell: Cell, report: CellReport) -> RunReport:
     from ambiguous_wild.harness.running.result_file import RESULT, read_result
-    from ambiguous_wild.harness.running.run_folder import is_finished
+    from ambiguous_wild.harness.running.run import is_finished
 
     result = report.result
     if result is None and report.outcome != "failed" and is_finished(report.folder):

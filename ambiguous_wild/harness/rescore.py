@@ -15,11 +15,16 @@ from ambiguous_wild import __version__
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.harness.leaderboard.verify import check_photos
+from ambiguous_wild.harness.running.cell import code_hash, config_identity, scene_identity
 from ambiguous_wild.harness.running.evaluate import Measures, measures_of
-from ambiguous_wild.harness.running.identity import config_identity, scene_identity
-from ambiguous_wild.harness.running.provenance import code_hash
-from ambiguous_wild.harness.running.records import ImageRow, RunResult, metrics_of
-from ambiguous_wild.harness.running.result_file import RESULT, read_result, write_result
+from ambiguous_wild.harness.running.result_file import (
+    RESULT,
+    ImageRow,
+    RunResult,
+    metrics_of,
+    read_result,
+    write_result,
+)
 from ambiguous_wild.harness.running.store import read_config, run_folders
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.io.lock import folder_lock

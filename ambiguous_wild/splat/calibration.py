@@ -177,3 +177,17 @@ def warm_up(announce: Callable[[str], None] = lambda text: None) -> float:
     optimiser.flush()
     optimiser.step(gradients, rendered.visible)
     return time.perf_counter() - begin
+
+
+def prepare_cpu(threads: int | None, say: Callable[[str], None] = lambda text: None) -> None:
+    """Set the threads of the kernels and compile them, once per machine.
+
+    Args:
+        threads: of the kernels; None = as many as there are.
+        say: told when something is compiled.
+    """
+    from ambiguous_wild.splat.cpu import set_threads
+
+    if threads is not None:
+        set_threads(threads)
+    warm_up(say)

@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 
 from ambiguous_wild.builder import capture_photos
-from ambiguous_wild.cli.capture import command
+from ambiguous_wild.cli.capture import capture_command as command
 from ambiguous_wild.core import AwError
 from tests.builder.capture_maker import texture, write_capture
 

@@ -8,7 +8,6 @@ import sys
 import pytest
 
 from tests.command_line import aw
-from tests.tiny_scene import write_tiny_scene
 
 PLUGIN = """
 from ambiguous_wild.methods.ablation import Group, Variant
@@ -27,11 +26,6 @@ register(MethodEntry(
 
 def ablate(*arguments) -> subprocess.CompletedProcess:
     return aw("ablate", *arguments)
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 @pytest.fixture(scope="module")

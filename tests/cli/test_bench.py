@@ -15,11 +15,6 @@ from tests.command_line import ROOT, aw
 from tests.tiny_scene import write_tiny_scene
 
 
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
-
-
 @pytest.mark.parametrize(("text", "seconds"), [("90s", 90), ("10m", 600), ("1.5h", 5400), (" 2 min ", 120)])
 def test_budgets(text, seconds):
     assert parse_budget(text) == seconds

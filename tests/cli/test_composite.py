@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from ambiguous_wild.cli.composite import command
+from ambiguous_wild.cli.simulate import composite_command as command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.lock import folder_lock
 from ambiguous_wild.io.scene_folder import load_scene

@@ -5,9 +5,10 @@ import sys
 import pytest
 from click.testing import CliRunner
 
-from ambiguous_wild.cli import checks, devices, main
+from ambiguous_wild.cli import checks, main
+from ambiguous_wild.cli import options as devices
 from ambiguous_wild.cli.bench import command as bench
-from ambiguous_wild.cli.probes import Probe
+from ambiguous_wild.cli.checks import Probe
 from ambiguous_wild.core import AwError
 from ambiguous_wild.splat import readiness
 from tests.splat.test_readiness import CASES, TORCH, found
@@ -51,7 +52,7 @@ def test_cuda_is_refused_with_exit_code_2_before_anything_is_made(here, tmp_path
 
 def test_a_grid_falls_back_and_runs(here, tmp_path, monkeypatch):
     # it compiles all kernels
-    monkeypatch.setattr("ambiguous_wild.harness.running.prepare.prepare_cpu", lambda *_: None)
+    monkeypatch.setattr("ambiguous_wild.splat.calibration.prepare_cpu", lambda *_: None)
     here(CASES["other gsplat"][0])
     scene = write_tiny_scene(tmp_path / "scene")
     words = [

@@ -12,9 +12,8 @@ import pytest
 from click.testing import CliRunner
 
 from ambiguous_wild.cli import checks
-from ambiguous_wild.cli.checks import Check, all_checks, other_versions, unmet
+from ambiguous_wild.cli.checks import PROBES, Check, Probe, all_checks, other_versions, probe, unmet
 from ambiguous_wild.cli.doctor import command
-from ambiguous_wild.cli.probes import PROBES, Probe, probe
 from ambiguous_wild.core import AwError
 
 

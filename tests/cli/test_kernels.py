@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import pytest
 
-from ambiguous_wild.cli import kernels
+from ambiguous_wild.cli import build_scene as kernels
 
 
 class Process:

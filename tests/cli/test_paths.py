@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from ambiguous_wild.cli.main import cli
-from ambiguous_wild.cli.paths import PathName
+from ambiguous_wild.cli.options import PathName
 
 
 def _paths(group: click.Command, ctx: click.Context) -> list[tuple[str, click.Parameter]]:

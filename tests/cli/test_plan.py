@@ -5,12 +5,6 @@ import json
 import pytest
 
 from tests.command_line import aw
-from tests.tiny_scene import write_tiny_scene
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 def files(folder):

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from ambiguous_wild.cli.screen import command
+from ambiguous_wild.cli.capture import screen_command as command
 from ambiguous_wild.core import AwError
 from tests.builder.capture_maker import write_capture
 

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 from click.testing import CliRunner
 
-from ambiguous_wild.cli.table import command
+from ambiguous_wild.cli.table import table_command as command
 from ambiguous_wild.core import AwError
 from tests.harness.fake_runs import failed, fake_result, save
 

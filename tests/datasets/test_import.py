@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.builder.downsample import downsample_photo
-from ambiguous_wild.cli import bench, import_dataset
+from ambiguous_wild.cli import bench
+from ambiguous_wild.cli import datasets as import_dataset
 from ambiguous_wild.core import AwError
 from ambiguous_wild.datasets.recognise import READERS, recognise
 from ambiguous_wild.datasets.suites import suites

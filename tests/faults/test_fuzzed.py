@@ -17,8 +17,7 @@ import torch
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.weight_files import read_tensors
-from ambiguous_wild.harness.planning.decide import SCHEMA
-from ambiguous_wild.harness.planning.file import read_plan
+from ambiguous_wild.harness.planning.decide import SCHEMA, read_plan
 from ambiguous_wild.harness.running.result_file import read_result
 from ambiguous_wild.harness.running.store import read_config
 from ambiguous_wild.io import plain_yaml

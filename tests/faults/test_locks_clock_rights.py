@@ -15,7 +15,6 @@ from ambiguous_wild.cli import main
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.lock import folder_lock
 from tests.faults.small_disks import read_only, small_disk, writable
-from tests.tiny_scene import write_tiny_scene
 
 LOCKS = {
     "bench": (
@@ -79,11 +78,6 @@ def aw(capsys, *words):
     finally:
         sys.argv = before
     return code, [line for line in capsys.readouterr().err.splitlines() if "error:" in line]
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 def bench_words(scene, out):

@@ -14,14 +14,8 @@ from ambiguous_wild.io.images import write_png
 from ambiguous_wild.splat.pace import TrainConfig
 from tests.faults.compare import half_written, state
 from tests.faults.small_disks import grow, small_disk
-from tests.tiny_scene import write_tiny_scene
 
 SHORT = TrainConfig(iterations=40, probes=0, checkpoint_every_s=0.1)
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 def bench(scene, output):

@@ -11,8 +11,8 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import with_options
 from ambiguous_wild.harness.ablation.plan import plan_study, read_outcomes
 from ambiguous_wild.harness.ablation.report import markdown_of, report, write_report
+from ambiguous_wild.harness.running.cell import reproduce
 from ambiguous_wild.harness.running.grid import cell_folder, run_cells
-from ambiguous_wild.harness.running.provenance import reproduce
 from ambiguous_wild.harness.running.result_file import write_result
 from ambiguous_wild.harness.running.store import read_runs
 from ambiguous_wild.methods import MethodEntry, get_method, register, registry
@@ -21,7 +21,6 @@ from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.parts import Parts
 from tests.harness.fake_runs import fake_result
-from tests.tiny_scene import write_tiny_scene
 
 SHORT = TrainConfig(iterations=30, probes=0)
 GROUPS = (
@@ -53,11 +52,6 @@ def _methods(monkeypatch):
             ablations=GROUPS,
         )
     )
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 def study(scene, **kw):

@@ -10,12 +10,6 @@ from ambiguous_wild import bench
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.bench import Callbacks, Engine, Lines
 from ambiguous_wild.splat.trainer import Trainer
-from tests.tiny_scene import write_tiny_scene
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 def small(scene, output, **options):

@@ -14,13 +14,12 @@ from click.testing import CliRunner
 from ambiguous_wild.cli.cost import command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.cost import recommend as advice
-from ambiguous_wild.harness.cost.answer import answers
 from ambiguous_wild.harness.cost.curves import curves_of
 from ambiguous_wild.harness.cost.pairs import changes
+from ambiguous_wild.harness.cost.reach import answers
 from ambiguous_wild.harness.cost.read import Found, read_cost_runs
-from ambiguous_wild.harness.cost.recommend import additive, in_words, leave_out, recommend, value_at, words_of
-from ambiguous_wild.harness.cost.report import cost_report, plain_data
-from ambiguous_wild.harness.cost.text import to_text
+from ambiguous_wild.harness.cost.recommend import additive, in_words, recommend, value_at, words_of
+from ambiguous_wild.harness.cost.report import cost_report, plain_data, to_text
 from tests.harness.fake_cost import cost_run
 from tests.tiny_scene import write_tiny_scene
 
@@ -211,17 +210,6 @@ def test_parts_of_settings_and_scenes_are_found_again() -> None:
     parts, rest = additive(values)
     np.testing.assert_allclose(np.diff([parts[str(i)] for i in range(4)]), np.diff(setting), atol=1e-9)
     assert all(abs(value) < 1e-9 for value in rest.values())
-
-
-def test_held_back_scenes_say_how_good_a_recommendation_is(tmp_path: Path) -> None:
-    grid(tmp_path, {"one": 0.0, "two": 5.0, "held": 1.0, "back": 2.0})
-    found = leave_out(read(tmp_path).runs, ["held", "back"], 300.0)
-    assert found == {
-        "held": ("good max_gaussians=20000", 0.0),
-        "back": ("good max_gaussians=20000", 0.0),
-    }
-    with pytest.raises(AwError, match="left to learn from"):
-        leave_out(read(tmp_path).runs, ["one", "two", "held", "back"], 300.0)
 
 
 def test_the_words_of_a_setting_are_not_those_of_a_stranger(tmp_path: Path) -> None:

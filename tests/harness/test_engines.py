@@ -12,12 +12,13 @@ from click.testing import CliRunner
 
 from ambiguous_wild.cli.bench import command as bench
 from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.running.cell import RunOptions
 from ambiguous_wild.harness.running.engines import job as jobs
-from ambiguous_wild.harness.running.engines.processes import run_in_processes
-from ambiguous_wild.harness.running.engines.ray_cluster import RayOptions
-from ambiguous_wild.harness.running.engines.transfer import receive, run_sent, send_scene, stays
+from ambiguous_wild.harness.running.engines.ray_cluster import receive, run_sent, send_scene
+from ambiguous_wild.harness.running.engines.session import run_in_processes
 from ambiguous_wild.harness.running.grid import cell_folder, plan_cells
 from ambiguous_wild.harness.running.result_file import read_result
+from ambiguous_wild.harness.running.run import left_alone
 from ambiguous_wild.methods import registry
 from ambiguous_wild.splat.pace import TrainConfig
 from tests.tiny_scene import write_tiny_scene
@@ -43,11 +44,6 @@ shutil.copy(photos[seed + 1], output / "1.png")
 @pytest.fixture(autouse=True)
 def _methods(monkeypatch):
     monkeypatch.setattr(registry, "_registered", {})
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +123,7 @@ def cell(scene, frail, tmp_path):
     (cell,) = plan_cells([frail[0]], [scene], [0], SHORT)
     sources = jobs.read_sources([], [frail[0]])
     return cell, jobs.make_job(
-        cell, cell_folder(tmp_path / "runs", cell), jobs.JobSettings(tmp_path / "c", sources=sources)
+        cell, cell_folder(tmp_path / "runs", cell), RunOptions(tmp_path / "c"), sources
     )
 
 
@@ -137,8 +133,7 @@ def test_a_cell_that_kills_every_process_is_a_failure(cell, tmp_path):
     folder = Path(job.folder)
     folder.mkdir(parents=True)
     (report,) = run_in_processes(
-        [replace(job, sources=(killer,))], 2, retries=0,
-        lost=lambda index, reason: jobs.record_lost(cell, folder, reason),
+        [replace(job, sources=(killer,))], 2, 0, lambda index, reason: jobs.record_lost(cell, folder, reason)
     )  # fmt: skip
     assert (report.outcome, report.error) == ("failed", "its process was killed by signal 9, 1 times")
     assert read_result(folder / "failed.json")["error"] == report.error
@@ -157,11 +152,11 @@ def test_what_differs_where_it_runs_is_refused(cell, tmp_path):
     _, job = cell
     other = write_tiny_scene(tmp_path / "other", distractors=False)
     (other / "test_list.txt").write_text("test_0.png\n")
-    assert "runs another state of ambiguous_wild" in jobs.run_job(replace(job, code="x")).error
-    assert "makes another run of it" in jobs.run_job(replace(job, scene=str(other))).error
+    assert "another state of ambiguous_wild" in jobs.run_job(replace(job, code="x")).error
+    assert "would be another run" in jobs.run_job(replace(job, scene=str(other))).error
     changed = [replace(s, content=s.content + b"\nenvironment: {A: b}\n") for s in job.sources]
     registry._registered.clear()
-    assert "makes another run of it" in jobs.run_job(replace(job, sources=tuple(changed))).error
+    assert "would be another run" in jobs.run_job(replace(job, sources=tuple(changed))).error
     with pytest.raises(AwError, match=r"does not see .*--transfer store"):
         jobs.check_storage(replace(job, token=str(tmp_path / "absent")), wait_s=0.0)
 
@@ -176,9 +171,9 @@ def test_a_scene_travels_and_a_run_folder_comes_back(scene, tmp_path, monkeypatc
         yaml.safe_dump({"name": "copy", "renders": "{output}/{index}.png", "train": ["sh", "-c", copy]})
     )
     (cell,) = plan_cells([f"external:{method}"], [scene], [0], SHORT)
-    shared = jobs.JobSettings(tmp_path / "c", sources=jobs.read_sources([], [f"external:{method}"]))
-    job = jobs.make_job(cell, cell_folder(tmp_path / "runs", cell), shared)
-    assert stays(job) is None
+    sources = jobs.read_sources([], [f"external:{method}"])
+    job = jobs.make_job(cell, cell_folder(tmp_path / "runs", cell), RunOptions(tmp_path / "c"), sources)
+    assert left_alone(Path(job.folder), "missing") is None
     key, content = send_scene(scene, 10.0)
     for _ in range(2):  # the second finds the scene unpacked
         report = receive(run_sent(job, key, content, 10.0), job, 10.0)
@@ -186,7 +181,7 @@ def test_a_scene_travels_and_a_run_folder_comes_back(scene, tmp_path, monkeypatc
     assert report.folder == Path(job.folder)
     assert read_result(report.folder / "metrics.json")["config_hash"] == cell.identity
     assert (report.folder / "renders/test/test_0.png").is_file()
-    assert stays(job).outcome == "kept" and stays(replace(job, overwrite="always")) is None
+    assert left_alone(report.folder, "missing") == "kept" and left_alone(report.folder, "always") is None
     assert [p.name for p in (tmp_path / "node").rglob("scene")] == ["scene"]
     assert list((tmp_path / "node").rglob("run-*")) == []
     with pytest.raises(AwError, match="--transfer-limit"):
@@ -220,8 +215,3 @@ def test_without_ray_the_command_that_brings_it_is_said(scene, tmp_path, monkeyp
     done = aw_bench(tmp_path / "runs", scene, "3dgs", "--engine", "ray")
     assert isinstance(done.exception, AwError) and "pip install" in str(done.exception)
     assert "[ray]" in str(done.exception)
-
-
-def test_what_a_cell_needs_of_a_node():
-    assert RayOptions(cpus=2, gpus=0.5, memory_gb=8).needs == {"CPU": 2, "GPU": 0.5, "memory": 8e9}
-    assert RayOptions().needs == {"CPU": 1}

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from ambiguous_wild.harness.bench import Callbacks, bench
-from ambiguous_wild.harness.running import expected
+from ambiguous_wild.harness.running import grid as expected
 from ambiguous_wild.splat import calibration
 from tests.tiny_scene import write_tiny_scene
 

@@ -45,11 +45,6 @@ def _methods(monkeypatch):
     monkeypatch.setattr(registry, "_registered", {})
 
 
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
-
-
 def describe(folder, **changes):
     path = folder / "nearest.yaml"
     path.write_text(yaml.safe_dump(BASE | changes))

@@ -18,7 +18,7 @@ from ambiguous_wild.methods.external.description import PACKAGED, load_descripti
 from ambiguous_wild.methods.external.staging import stage
 from ambiguous_wild.splat.pace import TrainConfig
 from tests.methods.baselines import parts_of, trained
-from tests.tiny_scene import TEST, TRAIN, write_tiny_scene
+from tests.tiny_scene import TEST, TRAIN
 
 TRAINER = """
 import json, pathlib, shutil, sys
@@ -32,11 +32,6 @@ shutil.copyfile(splats, output / "splats.ply")
 @pytest.fixture(autouse=True)
 def _methods(monkeypatch):
     monkeypatch.setattr(registry, "_registered", {})
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 @pytest.fixture(scope="module")

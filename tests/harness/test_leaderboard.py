@@ -24,7 +24,7 @@ from ambiguous_wild.harness.leaderboard.board import (
     unique_slug,
 )
 from ambiguous_wild.harness.leaderboard.edit import check
-from ambiguous_wild.harness.running.identity import config_identity
+from ambiguous_wild.harness.running.cell import config_identity
 from ambiguous_wild.io.images import read_png_rgb, write_png
 from tests.harness.board_runs import write_run, write_scene
 

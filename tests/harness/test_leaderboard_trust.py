@@ -21,7 +21,7 @@ from ambiguous_wild.harness.leaderboard.board import read_board, write_board
 from ambiguous_wild.harness.leaderboard.edit import check, remove
 from ambiguous_wild.harness.leaderboard.publish import publish
 from ambiguous_wild.harness.leaderboard.reproduce import command as command_of
-from ambiguous_wild.harness.running.identity import config_identity
+from ambiguous_wild.harness.running.cell import config_identity
 from ambiguous_wild.harness.running.regions import find_regions
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.io.scene_folder import load_scene

@@ -62,11 +62,6 @@ def _methods(monkeypatch):
     monkeypatch.setattr(registry, "_registered", {})
 
 
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
-
-
 @pytest.fixture
 def calls(tmp_path, monkeypatch):
     """Installs the stand-in; returns a function that reads what it was called with."""

@@ -13,12 +13,18 @@ from ambiguous_wild.core import AwError, Camera, Points, Scene, View
 from ambiguous_wild.harness.planning import decide as decide_module
 from ambiguous_wild.harness.planning import evidence as evidence_module
 from ambiguous_wild.harness.planning import probe
-from ambiguous_wild.harness.planning.decide import FEW_PHOTOS, OUTWARD, Plan, decide, plan_without_training
+from ambiguous_wild.harness.planning.decide import (
+    FEW_PHOTOS,
+    OUTWARD,
+    Plan,
+    decide,
+    plan_without_training,
+    read_plan,
+)
 from ambiguous_wild.harness.planning.evidence import measure
-from ambiguous_wild.harness.planning.file import read_plan
 from ambiguous_wild.harness.planning.probe import Occlusion, summarise, unexplained, with_occlusion
-from ambiguous_wild.harness.running.choosing import check_wanted, choose
-from ambiguous_wild.harness.running.grid import cell_folder, plan_cells, run_cells
+from ambiguous_wild.harness.running.choosing import check_wanted
+from ambiguous_wild.harness.running.grid import cell_folder, choose, plan_cells, run_cells
 from ambiguous_wild.io.atomic import write_json
 from ambiguous_wild.methods.registry import get_method
 from ambiguous_wild.splat.pace import TrainConfig

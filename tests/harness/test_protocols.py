@@ -12,14 +12,8 @@ from ambiguous_wild.harness.running.store import Runs, read_runs
 from ambiguous_wild.harness.tables.comparison import comparison
 from ambiguous_wild.harness.tables.notes import _fitted
 from ambiguous_wild.splat.pace import TrainConfig
-from tests.tiny_scene import write_tiny_scene
 
 SMALL = ("gs-w.side=16", "gs-w.width=2", "wildgaussians.width=8")
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from ambiguous_wild.cli.rescore import command
+from ambiguous_wild.cli.table import rescore_command as command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness import bench as bench_module
 from ambiguous_wild.harness.bench import Callbacks, bench

@@ -12,7 +12,7 @@ import yaml
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.running.grid import cell_folder, plan_cells, run_cells
 from ambiguous_wild.harness.running.result_file import read_result
-from ambiguous_wild.harness.running.run_folder import refuse_other_config
+from ambiguous_wild.harness.running.run import refuse_other_config
 from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.lock import folder_lock
 from ambiguous_wild.io.ply import read_splat_ply
@@ -45,11 +45,6 @@ def _methods(monkeypatch):
     monkeypatch.setattr(registry, "_registered", {})
     register(MethodEntry("truth", "exact masks", lambda options: Parts(mask=TruthMask())))
     register(MethodEntry("broken", "fails", explode))
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 def bench(scene, output, *methods, train=SHORT, overwrite="missing", **kw):

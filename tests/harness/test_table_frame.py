@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 from click.testing import CliRunner
 
-from ambiguous_wild.cli.table import command
+from ambiguous_wild.cli.table import table_command as command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.running.store import read_runs
 from ambiguous_wild.harness.tables.comparison import COLUMNS, tidy

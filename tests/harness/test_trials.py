@@ -12,13 +12,12 @@ import torch
 
 from ambiguous_wild.harness.bench import Callbacks, bench
 from ambiguous_wild.harness.planning import probed, tried
-from ambiguous_wild.harness.planning.allowance import LONGEST_ARM, SHARE, SHORTEST_ARM, TIMED, allowance
-from ambiguous_wild.harness.planning.decide import Decision, Plan, decide
+from ambiguous_wild.harness.planning.decide import Decision, Plan, decide, read_plan
 from ambiguous_wild.harness.planning.evidence import Evidence
-from ambiguous_wild.harness.planning.file import read_plan
-from ambiguous_wild.harness.planning.gain import LEAST_DB_MASKS, LEAST_PHOTOS, Arm, Gain, compare
 from ambiguous_wild.harness.planning.probe import Occlusion, with_occlusion
+from ambiguous_wild.harness.planning.probed import LONGEST_ARM, SHARE, SHORTEST_ARM, TIMED, allowance
 from ambiguous_wild.harness.planning.trials import HELD_BACK, Trials, held_back, sampled, without_blocks
+from ambiguous_wild.harness.planning.tried import LEAST_DB_MASKS, LEAST_PHOTOS, Arm, Gain, compare
 from ambiguous_wild.io.atomic import write_json
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.pace import TrainConfig
@@ -332,7 +331,7 @@ def test_a_run_under_a_budget_goes_on_with_the_probes_it_began(scene, tmp_path, 
     monkeypatch.setattr(probed, "step_costs", lambda data, names, folder: dict.fromkeys(names, 2.0))
 
     def make(slower):
-        monkeypatch.setattr("ambiguous_wild.harness.planning.allowance.slowness", lambda: slower)
+        monkeypatch.setattr("ambiguous_wild.harness.planning.probed.slowness", lambda: slower)
         config = TrainConfig(budget_s=60.0)
         return probed.plan_with_probes(scene, config, tmp_path, masks=False, prepare=lambda: None)
 

@@ -8,7 +8,7 @@ import yaml
 from click.testing import CliRunner
 
 from ambiguous_wild.cli.bench import command as bench
-from ambiguous_wild.cli.table import command as table
+from ambiguous_wild.cli.table import table_command as table
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import with_options
 from ambiguous_wild.harness.running.grid import plan_cells

@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from PIL import Image
 
 from ambiguous_wild.builder.collect import collect
-from ambiguous_wild.cli.composite import command
+from ambiguous_wild.cli.simulate import composite_command as command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.exif import Exif
 from ambiguous_wild.io.hashing import sha256_file

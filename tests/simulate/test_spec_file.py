@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner, Result
 
-from ambiguous_wild.cli.simulate import command
+from ambiguous_wild.cli.simulate import simulate_command as command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.simulate.capture import plan
 from ambiguous_wild.simulate.presets import PRESETS

@@ -256,7 +256,7 @@ def check_run(scene: Scene, run: Path) -> None:
     Raises:
         AwError: what is wrong, and what to do.
     """
-    from ambiguous_wild.harness.running.identity import scene_identity
+    from ambiguous_wild.harness.running.cell import scene_identity
 
     path = run / "config.yaml"
     if not path.is_file() or not (run / "point_cloud.ply").is_file():

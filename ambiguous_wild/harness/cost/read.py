@@ -18,8 +18,7 @@ import numpy as np
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash, flatten
-from ambiguous_wild.harness.running.records import Cost, RunResult
-from ambiguous_wild.harness.running.result_file import FAILED, RESULT, read_result
+from ambiguous_wild.harness.running.result_file import FAILED, RESULT, Cost, RunResult, read_result
 from ambiguous_wild.harness.running.store import read_config, run_folders
 from ambiguous_wild.harness.running.timing import Timing, in_reference_seconds, timing_of
 from ambiguous_wild.metrics import stats

@@ -89,7 +89,7 @@ def recommend(
     usable = alone or usable
     own = [run for run in usable if (run.scene_hash == scene_hash if scene_hash else run.scene == scene)]
     reference = budget_s * speed
-    values = _values(own or usable, reference)
+    values = values_within(own or usable, reference)
     if not values:
         shortest = min((run.train_s for run in usable), default=math.nan)
         raise AwError(
@@ -146,7 +146,7 @@ def additive(values: dict[tuple[str, str], float]) -> tuple[dict[str, float], di
     return dict(zip(names, map(float, found))), rest
 
 
-def _values(runs: Sequence[CostRun], seconds: float) -> dict[tuple[str, str], float]:
+def values_within(runs: Sequence[CostRun], seconds: float) -> dict[tuple[str, str], float]:
     """PSNR within so many seconds, by (name of the setting, scene)."""
     found = {}
     for name, curves in _curves_by_name(runs).items():
@@ -208,37 +208,6 @@ def words_of(run: CostRun) -> tuple[str, ...]:
     return tuple(kept)
 
 
-def leave_out(
-    runs: Sequence[CostRun], scenes: Sequence[str], budget_s: float
-) -> dict[str, tuple[str, float]]:
-    """How good the recommendation is on scenes that it has not seen.
-
-    Returns:
-        By scene: the setting that the other scenes recommend, and how many dB it is behind the scene's best.
-
-    Args:
-        runs: of all scenes, those held back included.
-        scenes: held back, all at once.
-        budget_s: in the seconds of the runs.
-    """
-    rivals = [run for run in runs if not run.error and not knows_truth(run.method)]
-    # of all runs at once: a setting is named after what varies among them
-    values = _values(rivals, budget_s)
-    kept = {key: value for key, value in values.items() if key[1] not in scenes}
-    if not kept:
-        raise AwError("no scene is left to learn from: hold fewer back, or give a longer budget")
-    parts, _ = additive(kept)
-    found = {}
-    for scene in scenes:
-        here = {name: value for (name, where), value in values.items() if where == scene}
-        known = [name for name in parts if name in here]
-        if not known:
-            raise AwError(f"{scene} was trained with none of the settings of the other scenes")
-        chosen = max(known, key=lambda name: parts[name])
-        found[scene] = chosen, max(here.values()) - here[chosen]
-    return found
-
-
 def in_words(found: Recommendation, scene: str) -> str:
     """The recommendation for a terminal."""
     best = found.choices[0]
@@ -277,9 +246,8 @@ def speed_here(found: Found, say: Callable[[str], None] = lambda text: None) -> 
     """
     import torch
 
-    from ambiguous_wild.harness.running.prepare import prepare_cpu
-    from ambiguous_wild.harness.running.step_time import slowness
-    from ambiguous_wild.splat.calibration import KERNELS
+    from ambiguous_wild.harness.running.timing import slowness
+    from ambiguous_wild.splat.calibration import KERNELS, prepare_cpu
     from ambiguous_wild.splat.readiness import choose
 
     kernels = {run.timing.kernel for run in found.runs if not run.error}

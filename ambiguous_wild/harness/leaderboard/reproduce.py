@@ -15,8 +15,8 @@ from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import config_hash, flatten, to_plain
 from ambiguous_wild.harness.leaderboard.board import HIDDEN, Entry
-from ambiguous_wild.harness.running.identity import scene_identity
-from ambiguous_wild.harness.running.records import RunResult
+from ambiguous_wild.harness.running.cell import scene_identity
+from ambiguous_wild.harness.running.result_file import RunResult
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.simulate.presets import PRESETS, resized
 from ambiguous_wild.simulate.spec_file import plain_spec

@@ -23,10 +23,17 @@ from ambiguous_wild.harness.leaderboard.reproduce import (
     setting,
 )
 from ambiguous_wild.harness.measures import PARTIAL
-from ambiguous_wild.harness.running.identity import config_identity
-from ambiguous_wild.harness.running.records import ImageRow, RunConfig, RunResult, metrics_of
+from ambiguous_wild.harness.running.cell import config_identity
 from ambiguous_wild.harness.running.regions import find_regions
-from ambiguous_wild.harness.running.result_file import FAILED, RESULT, read_result
+from ambiguous_wild.harness.running.result_file import (
+    FAILED,
+    RESULT,
+    ImageRow,
+    RunConfig,
+    RunResult,
+    metrics_of,
+    read_result,
+)
 from ambiguous_wild.harness.running.store import MASK_SCORES, read_config
 from ambiguous_wild.harness.running.timing import timing_of
 from ambiguous_wild.io.hashing import sha256_file

@@ -1,13 +1,17 @@
-"""Decide which effects a scene needs: evidence against thresholds."""
+"""Decide which effects a scene needs: evidence against thresholds; plans as JSON files."""
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any, Literal
 
-from ambiguous_wild.core import Scene
+import msgspec
+
+from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.harness.planning.evidence import Evidence, has_tracks, measure, uncovered
 
 Answer = Literal["on", "off", "unknown"]
@@ -214,3 +218,25 @@ def plan_without_training(scene: Scene) -> Plan:
     from ambiguous_wild.io.images import load_image_float
 
     return decide(scene.name, measure(scene, [load_image_float(v.image_path) for v in scene.train]))
+
+
+def read_plan(path: Path) -> Plan:
+    """A plan that `aw plan` wrote.
+
+    Raises:
+        AwError: no such file, or it is none.
+    """
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        if data["schema"] != SCHEMA:
+            raise ValueError(f"schema {data['schema']!r}, not {SCHEMA}")
+        rows = [
+            row | {"value": math.nan if row["value"] is None else row["value"]} for row in data["decisions"]
+        ]
+        decisions = msgspec.convert(rows, tuple[Decision, ...])
+        cost = msgspec.convert(data.get("cost"), Cost | None)
+        return Plan(msgspec.convert(data["scene"], str), decisions, bool(data.get("probed")), cost)
+    except FileNotFoundError:
+        raise AwError(f"there is no plan {path}; 'aw plan SCENE' makes one") from None
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, msgspec.ValidationError) as error:
+        raise AwError(f"{path} is no plan of 'aw plan' ({str(error)[:200]!a}); make it again") from None

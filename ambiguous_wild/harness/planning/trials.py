@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import Camera, Points, Scene
-from ambiguous_wild.harness.planning.gain import Arm
 from ambiguous_wild.harness.planning.probe import small_data
+from ambiguous_wild.harness.planning.tried import Arm
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.pace import TrainConfig

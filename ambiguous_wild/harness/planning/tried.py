@@ -1,10 +1,12 @@
-"""Decisions from paired probes: which effects are tried, in which order, and what follows."""
+"""Decisions from paired probes: what two of them say, which are tried, what follows. Imports no torch."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from ambiguous_wild.harness.planning.decide import (
     APPEARANCE,
@@ -14,8 +16,43 @@ from ambiguous_wild.harness.planning.decide import (
     Decision,
     Plan,
 )
-from ambiguous_wild.harness.planning.gain import LEAST_DB, LEAST_DB_MASKS, Arm, Gain, compare
 from ambiguous_wild.splat.effects import check_effects
+
+LEAST_PHOTOS = 4  # fewer give no standard error worth the name
+LEAST_DB = 0.05  # below, an effect is not worth its time
+# Probes grow no Gaussians and understate what masks give: static captures -0.02 to +0.01 dB, captures with
+# distractors from 0.05 dB (docs/effects.md)
+LEAST_DB_MASKS = 0.02
+
+
+@dataclass(frozen=True)
+class Arm:
+    """One probe: its PSNR on the held-back pixels of every photo that was measured."""
+
+    psnr: Mapping[str, float]  # dB, mean over visits, by the photo's name
+
+
+@dataclass(frozen=True)
+class Gain:
+    """What an effect gives on the held-back pixels of the same photos."""
+
+    db: float  # mean over photos
+    error_db: float  # standard error of that mean
+
+    def pays(self, least_db: float = LEAST_DB) -> bool:
+        """Whether it is more than its standard error, and enough to be worth its time."""
+        return self.db >= least_db and self.db > self.error_db
+
+
+def compare(arm: Arm, base: Arm) -> Gain | None:
+    """`arm` against `base`, photo by photo; None where they share too few photos."""
+    names = [name for name in base.psnr if name in arm.psnr]
+    if len(names) < LEAST_PHOTOS:
+        return None
+    difference = np.array([arm.psnr[name] - base.psnr[name] for name in names])
+    error = float(difference.std(ddof=1) / np.sqrt(len(difference)))
+    return Gain(float(difference.mean()), error)
+
 
 # The limits are the first guess: an effect is tried from there on. What appearance is compared with depends
 # on the size of the photos (`time-of-day`: 0.027 at 256 px, above 0.043 at 480 px): it is tried earlier.

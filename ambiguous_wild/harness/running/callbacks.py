@@ -1,14 +1,55 @@
-"""What a caller can be told while runs are made. Imports nothing heavy."""
+"""Where runs are made, and what a caller is told meanwhile. Imports nothing heavy."""
 
 from __future__ import annotations
 
+import importlib.util
+import os
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
+
+from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.core.extras import install_command
 
 if TYPE_CHECKING:
     from ambiguous_wild.harness.running.cell import Cell, CellReport
     from ambiguous_wild.splat.trainer import Trainer
+
+_RAY_ONLY = ("address", "cpus_per_cell", "gpus_per_cell", "memory_per_cell")
+
+
+@dataclass(frozen=True)
+class Engine:
+    """Where cells run, and how many at a time."""
+
+    engine: Literal["local", "ray"] = "local"
+    jobs: int | None = None  # cells at a time on this machine; None = 1, on cuda one a GPU
+    address: str | None = None  # of a Ray cluster; None = $RAY_ADDRESS, else a Ray of our own
+    cpus_per_cell: float | None = None  # Ray; None = the threads, else 1
+    gpus_per_cell: float | None = None  # Ray; None = 1 on cuda
+    memory_per_cell: float | None = None  # Ray; GB
+    retries: int = 3  # of a cell whose process or node was lost
+    transfer: Literal["shared", "store"] = "shared"  # Ray; "store": scenes and runs travel
+    transfer_limit: float = 4000.0  # Ray; MB of the largest scene or run that travels
+
+    def check(self) -> None:
+        """Raise AwError for settings that exclude each other, before anything heavy is loaded."""
+        stray = [f"--{name.replace('_', '-')}" for name in _RAY_ONLY if getattr(self, name) is not None]
+        if self.engine == "local" and (stray or self.transfer != "shared"):
+            raise AwError(
+                f"{', '.join(stray) or '--transfer'} is for a cluster: add --engine ray, or leave it out"
+            )
+        if self.engine == "ray":
+            if importlib.util.find_spec("ray") is None:
+                raise AwError(f"--engine ray needs Ray: {install_command('ray')}")
+            if self.jobs is not None and self.address is not None:
+                raise AwError("--jobs is for this machine: a cluster at --address runs as many cells as fit")
+
+    @property
+    def remote(self) -> bool:
+        """Whether it is a running cluster, not a Ray that this process starts."""
+        return self.engine == "ray" and bool(self.address or os.environ.get("RAY_ADDRESS"))
 
 
 class Callbacks:

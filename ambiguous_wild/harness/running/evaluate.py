@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,8 +13,8 @@ import numpy as np
 import torch
 
 from ambiguous_wild.core import Camera, Scene, View
-from ambiguous_wild.harness.running.records import Cost, ImageRow, MaskScores, image_row
 from ambiguous_wild.harness.running.regions import Regions, find_regions, true_distractor
+from ambiguous_wild.harness.running.result_file import Cost, ImageRow, MaskScores, image_row
 from ambiguous_wild.io.atomic import atomic_dir
 from ambiguous_wild.io.images import read_png_rgb, to_uint8, write_png
 from ambiguous_wild.metrics import image as image_metrics
@@ -77,7 +77,7 @@ def load_test_photos(scene: Scene) -> list[TestPhoto]:
     return [TestPhoto(view, read_png_rgb(view.image_path)) for view in scene.test]
 
 
-def mean_psnr(truth: list[TestPhoto], draw: Callable[[Camera], np.ndarray]) -> float:
+def mean_psnr(truth: Sequence[TestPhoto], draw: Callable[[Camera], np.ndarray]) -> float:
     """Mean PSNR in dB over the test views, from 8-bit images."""
     return float(np.mean([image_metrics.psnr(to_uint8(draw(t.view.camera)), t.photo) for t in truth]))
 

@@ -14,11 +14,10 @@ import numpy as np
 import torch
 
 from ambiguous_wild.core import AwError, Camera, Scene, View
-from ambiguous_wild.harness.running import evaluate, machine
+from ambiguous_wild.harness.running import evaluate
 from ambiguous_wild.harness.running.cell import Cell
-from ambiguous_wild.harness.running.meter import Meter
-from ambiguous_wild.harness.running.records import Cost, MaskScores, RunResult
-from ambiguous_wild.harness.running.result import finished_result
+from ambiguous_wild.harness.running.meter import Meter, cores, own_s
+from ambiguous_wild.harness.running.result_file import Cost, MaskScores, RunResult
 from ambiguous_wild.io.atomic import atomic_path
 from ambiguous_wild.io.images import image_size, read_gray, read_png_rgb
 from ambiguous_wild.io.ply import read_splat_ply, splat_count
@@ -62,8 +61,7 @@ def run_program(cell: Cell, folder: Path) -> RunResult:
     per_image, missing = evaluate.render_and_measure(
         drawn, truth, folder / "renders" / "test", half=cell.protocol == "half", scene=cell.scene
     )
-    return finished_result(
-        cell,
+    return cell.result(
         per_image=per_image,
         missing=missing,
         masks=_masks(cell.scene, produced.masks, folder / "masks"),
@@ -90,7 +88,7 @@ def _timed(program: Program, task: Task) -> tuple[Produced, Cost]:
     Nothing is known where its training ended before this call, or where the kernel cannot run here: a program
     has packages of its own.
     """
-    meter, begin, before = Meter(task.device, machine.cores()), time.perf_counter(), machine.own_s()
+    meter, begin, before = Meter(task.device, cores()), time.perf_counter(), own_s()
     try:
         meter.begin(0.0)
     except AwError:
@@ -104,7 +102,7 @@ def _timed(program: Program, task: Task) -> tuple[Produced, Cost]:
         meter.look(trained)
     finally:
         meter.end(0.0)
-    return produced, {**meter.cost(trained), "cpu_s": machine.own_s() - before}
+    return produced, {**meter.cost(trained), "cpu_s": own_s() - before}
 
 
 @dataclass(frozen=True)

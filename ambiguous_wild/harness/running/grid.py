@@ -1,26 +1,80 @@
-"""Plan a grid of cells and run them one after the other; one that fails does not stop the others."""
+"""Plan a grid of cells, check it before anything is trained, and run it; a failure stops no other cell."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-from ambiguous_wild.core import AwError
+from ambiguous_wild.core import Scene
 from ambiguous_wild.core.config import with_options
-from ambiguous_wild.core.errors import unknown
+from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.harness.planning.decide import Plan
-from ambiguous_wild.harness.running.cell import Cell, CellReport, Overwrite, Protocol
-from ambiguous_wild.harness.running.choosing import Probing, choose
-from ambiguous_wild.harness.running.identity import scene_identity
-from ambiguous_wild.harness.running.published import scene_protocol
-from ambiguous_wild.harness.running.run import run_isolated
-from ambiguous_wild.harness.running.run_folder import refuse_other_config, refuse_strange_folder
+from ambiguous_wild.harness.running.cell import (
+    Cell,
+    CellReport,
+    Overwrite,
+    Protocol,
+    RunOptions,
+    scene_identity,
+)
+from ambiguous_wild.harness.running.choosing import (
+    PLANNED,
+    Chosen,
+    check_wanted,
+    chosen_by,
+    reads_plan,
+    scene_protocol,
+)
+from ambiguous_wild.harness.running.run import (
+    left_alone,
+    refuse_other_config,
+    refuse_strange_folder,
+    run_cell,
+)
+from ambiguous_wild.harness.running.timing import LEAST, MOST, expected_s, slowness
 from ambiguous_wild.harness.running.training import Tick
 from ambiguous_wild.io.atomic import check_output
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.registry import MethodEntry, get_method
+from ambiguous_wild.splat.effects import ALL
 from ambiguous_wild.splat.pace import TrainConfig
+
+
+def try_recipes(cells: Sequence[Cell]) -> None:
+    """Put every method's parts together once: the last method's fault is found before the first is trained.
+
+    Raises:
+        AwError: an option or the weights that a recipe refuses. Other errors are a run's own.
+    """
+    from ambiguous_wild.splat.effects import with_effects
+
+    different = {(cell.method.name, repr(cell.options), cell.chosen.effects): cell for cell in cells}
+    for cell in different.values():
+        try:
+            with_effects(cell.method.build(cell.options), cell.chosen.effects)
+        except AwError as error:
+            raise AwError(f"{cell.method.name}: {error}") from error
+        except Exception:
+            continue  # a plug-in's bug: its runs fail with their traceback, the others are trained
+
+
+def check_grafts(cells: Sequence[Cell]) -> list[str]:
+    """Warnings of grafts, each once.
+
+    Raises:
+        AwError: a graft that could not train, or would change nothing.
+    """
+    from ambiguous_wild.methods.graft import check_graft
+
+    lines = []
+    for name, cell in {cell.method.name: cell for cell in cells}.items():
+        try:
+            lines += [f"warning: {name}: {line}" for line in check_graft(cell.method, cell.options)]
+        except AwError as error:
+            raise AwError(f"{name}: {error}") from error
+    return lines
 
 
 def plan_cells(
@@ -133,21 +187,19 @@ def run_cells(
     Raises:
         AwError: a run folder holds another configuration (found before anything is trained).
     """
-    cache_dir = cache_dir or output / ".cache"
+    options = RunOptions(cache_dir or output / ".cache", overwrite, pictures)
     reports = []
-    for cell, folder in zip(cells, checked_folders(cells, output, overwrite, cache_dir)):
+    for cell, folder in zip(cells, checked_folders(cells, output, options)):
         if on_start is not None:
             on_start(cell, folder)
-        report = run_isolated(
-            cell, folder, cache_dir=cache_dir, overwrite=overwrite, tick=tick, pictures=pictures
-        )
+        report = run_cell(cell, folder, options, tick)
         if on_end is not None:
             on_end(cell, report)
         reports.append(report)
     return reports
 
 
-def checked_folders(cells: Sequence[Cell], output: Path, overwrite: Overwrite, cache_dir: Path) -> list[Path]:
+def checked_folders(cells: Sequence[Cell], output: Path, options: RunOptions) -> list[Path]:
     """The run folder of every cell; all are checked first.
 
     Raises:
@@ -155,10 +207,119 @@ def checked_folders(cells: Sequence[Cell], output: Path, overwrite: Overwrite, c
     """
     folders = [cell_folder(output, cell) for cell in cells]
     for cell, folder in zip(cells, folders):
-        if folder.exists() and overwrite != "never":
+        if folder.exists() and options.overwrite != "never":
             refuse_strange_folder(folder)
-            if overwrite == "missing":
+            if options.overwrite == "missing":
                 refuse_other_config(folder, cell)
-    for needed in (output, cache_dir):
+    for needed in (output, options.cache_dir):
         check_output(needed / "run")  # what cannot be written is found before it is needed
     return folders
+
+
+def grouped(planned: Mapping[str, Sequence[Cell]], budgets_s: Sequence[float] = ()) -> list[Cell]:
+    """Every cell with every budget, the shortest budget first, with the name of its group.
+
+    A single budget or choice of effects gets no folder of its own.
+
+    Args:
+        planned: cells by the effects they were asked for.
+        budgets_s: seconds of training; empty = as the cells have it.
+    """
+    cells = []
+    lengths: list[float | None] = [*sorted(set(budgets_s))]
+    for seconds in lengths or [None]:
+        for effects, members in planned.items():
+            group = [f"budget-{seconds:g}s"] if len(lengths) > 1 else []
+            group += [f"effects-{effects.replace(' ', '').replace(',', '+')}"] if len(planned) > 1 else []
+            cells += [_moved(cell, seconds, "/".join(group)) for cell in members]
+    return cells
+
+
+def _moved(cell: Cell, seconds: float | None, group: str) -> Cell:
+    train = cell.train if seconds is None else dataclasses.replace(cell.train, budget_s=seconds)
+    return dataclasses.replace(cell, train=train, group=group)
+
+
+def unfinished(cells: Sequence[Cell], output: Path, overwrite: Overwrite) -> list[Cell]:
+    """The cells that will be run: not those that are kept."""
+    return [cell for cell in cells if left_alone(cell_folder(output, cell), overwrite) is None]
+
+
+def expected_line(cells: Sequence[Cell]) -> str:
+    """What runs whose length nobody chose take on this machine's CPU; kernels must be compiled."""
+    total, slower = 0.0, slowness()
+    for cell in cells:
+        camera = cell.scene.train[0].camera
+        pixels = camera.width * camera.height
+        most = min(cell.train.max_gaussians or pixels, pixels)
+        total += expected_s(cell.train.iterations, pixels, most) * slower
+    runs = "1 run" if len(cells) == 1 else f"{len(cells)} runs"
+    return (
+        f"no --iterations and no --budget: {runs} of {cells[0].train.iterations} iterations, "
+        f"{_words(LEAST * total)} to {_words(MOST * total)} for 3dgs here, other methods up to 3 times that; "
+        "--budget 10m ends each after ten minutes"
+    )
+
+
+def _words(seconds: float) -> str:
+    if seconds < 5400:
+        return f"{max(round(seconds / 60), 1)} min"
+    return f"{seconds / 3600:.1f} h"
+
+
+@dataclass(frozen=True)
+class Probing:
+    """How a plan is made from probes: for which run, and where they are kept."""
+
+    train: TrainConfig  # length of the runs
+    folder: Path
+    prepare: Callable[[], None]  # makes the CPU kernels ready
+    say: Callable[[str], None]  # told every decision
+
+
+def choose(
+    wanted: str,
+    scene: Scene,
+    methods: Sequence[MethodEntry],
+    plan: Plan | None = None,
+    probing: Probing | None = None,
+) -> dict[str, Chosen]:
+    """What every method trains with on this scene, by its name.
+
+    Args:
+        wanted: as `--effects` takes it; "default" is auto for the methods that allow effects, of those alone.
+        scene: the scene.
+        methods: the methods.
+        plan: made before; None = made now if any method needs it.
+        probing: for a plan that is made now; None = the limits decide alone.
+
+    Raises:
+        AwError: unknown effect, or a plan of another scene.
+    """
+    named = check_wanted(wanted)
+    if plan is not None and plan.scene != scene.name:
+        raise AwError(f"the plan is of scene {plan.scene}, not of {scene.name}: run 'aw plan {scene.root}'")
+    if wanted not in PLANNED:
+        effects = ALL if wanted == "all" else named
+        return {m.name: Chosen(effects, "" if wanted == "none" else wanted) for m in methods}
+    if plan is None and any(reads_plan(wanted, method) for method in methods):
+        plan = _make_plan(scene, probing)
+    found = None if plan is None else plan.effects()
+    chosen = {m.name: chosen_by(found, wanted, scene, m) or Chosen() for m in methods}
+    return {name: dataclasses.replace(c, plan=plan if c.asked else None) for name, c in chosen.items()}
+
+
+def _make_plan(scene: Scene, probing: Probing | None) -> Plan:
+    if probing is None:
+        from ambiguous_wild.harness.planning.decide import plan_without_training
+        from ambiguous_wild.harness.planning.tried import untried
+
+        return untried(plan_without_training(scene), "no probes were asked for")
+    from ambiguous_wild.harness.planning.probed import plan_with_probes
+
+    plan = plan_with_probes(
+        scene, probing.train, probing.folder, masks=False, prepare=probing.prepare, say=probing.say
+    )
+    if plan.cost is not None:
+        probing.say(f"{scene.name}: {plan.cost.line()}")
+    return plan

@@ -6,19 +6,141 @@ Each time a calibration kernel is timed. Its work and the record's are no part o
 
 from __future__ import annotations
 
+import contextlib
+import getpass
 import math
+import os
+import tempfile
 import time
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+import uuid
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from filelock import FileLock, Timeout
 
-from ambiguous_wild.harness.running import machine
-from ambiguous_wild.harness.running.records import Cost, TimeRecord
+from ambiguous_wild.harness.running.result_file import Cost, TimeRecord
 from ambiguous_wild.harness.running.timing import Verdict, in_reference_seconds
 from ambiguous_wild.splat.calibration import KERNELS, Reading, calibration
+
+_STAT = Path("/proc/stat")
+_IDLE = (3, 4)  # fields of a line of /proc/stat: idle, waiting for a disk
+_GUEST = (8, 9)  # counted in user and nice already
+
+
+def cores() -> int:
+    """Processors that this process may use."""
+    return len(_allowed()) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def busy_s() -> float | None:
+    """Seconds that these processors have worked since the machine started, for anybody; None = not known.
+
+    What a hypervisor gave to other machines counts as work of others.
+    """
+    allowed = {f"cpu{k}" for k in _allowed()}
+    try:
+        lines = [line.split() for line in _STAT.read_text(encoding="ascii").splitlines()]
+        rows = [[int(n) for n in line[1:]] for line in lines if line and line[0] in allowed]
+    except (OSError, ValueError):
+        return None
+    if not rows:
+        return None
+    ticks = sum(n for row in rows for k, n in enumerate(row) if k not in _IDLE and k not in _GUEST)
+    return ticks / float(os.sysconf("SC_CLK_TCK"))
+
+
+def own_s() -> float:
+    """Processor seconds of this process and of its children that have ended."""
+    times = os.times()
+    return time.process_time() + times.children_user + times.children_system
+
+
+def unit(device: str) -> str:
+    """What runs on this device share: the processors, or one GPU by its identity."""
+    return _gpu_name(device) if device.startswith("cuda") else "cpu"
+
+
+class Presence:
+    """Says that a run of ours works here, and counts the others that say so."""
+
+    def __init__(self, unit: str, folder: Path | None = None) -> None:
+        """
+        Args:
+            unit: runs with the same one share it, see `unit`.
+            folder: where runs leave a locked file each; None = one of this user on this machine.
+        """
+        safe = "".join(c if c.isalnum() or c == "-" else "-" for c in unit)
+        self.folder = (_own_folder() if folder is None else folder) / safe
+
+    @contextmanager
+    def here(self) -> Iterator[None]:
+        """Be counted meanwhile; the system frees the file even of a process that was killed."""
+        lock = None
+        with contextlib.suppress(OSError):  # a temporary folder that cannot be written: nobody is counted
+            self.folder.mkdir(parents=True, exist_ok=True)
+            path = self.folder / f"{os.getpid()}-{uuid.uuid4().hex[:8]}.lock"
+            lock = FileLock(path, timeout=1.0, thread_local=False)
+            with contextlib.suppress(Timeout):
+                lock.acquire()
+        try:
+            yield
+        finally:
+            if lock is not None:
+                with contextlib.suppress(OSError):
+                    lock.release()
+                    Path(lock.lock_file).unlink(missing_ok=True)
+
+    def count(self) -> int:
+        """Runs here now, this one included; files of processes that are gone are removed."""
+        try:
+            paths = sorted(self.folder.glob("*.lock"))
+        except OSError:
+            return 1
+        return max(1, sum(_is_held(path) for path in paths))
+
+
+def _is_held(path: Path) -> bool:
+    lock = FileLock(path, timeout=0.0, thread_local=False)
+    try:
+        lock.acquire()
+    except Timeout:
+        return True
+    except OSError:
+        return False
+    with contextlib.suppress(OSError):
+        path.unlink(missing_ok=True)
+        lock.release()
+    return False
+
+
+def _allowed() -> set[int]:
+    if hasattr(os, "sched_getaffinity"):
+        return set(os.sched_getaffinity(0))
+    return set(range(os.cpu_count() or 1))
+
+
+def _gpu_name(device: str) -> str:
+    import torch
+
+    index = torch.device(device).index or 0
+    try:
+        name = getattr(torch.cuda.get_device_properties(index), "uuid", None)
+    except (RuntimeError, AssertionError):  # a torch without CUDA
+        name = None
+    return f"GPU-{name}" if name is not None else str(index)
+
+
+def _own_folder() -> Path:
+    try:
+        user = getpass.getuser()
+    except (OSError, KeyError, ImportError):
+        user = "user"
+    return Path(tempfile.gettempdir()) / f"ambiguous_wild-runs-{user}"
+
 
 # One calibration is off by a tenth, on a busy machine by a fifth: a run needs about 20 of them.
 LEAST_S = 1.0  # of training between two calibrations
@@ -41,7 +163,7 @@ class Meter:
         threads: int,
         *,
         read: Callable[[], Reading] | None = None,
-        presence: machine.Presence | None = None,
+        presence: Presence | None = None,
     ) -> None:
         """
         Args:
@@ -53,7 +175,7 @@ class Meter:
         self.device, self.threads = device, threads
         self.kernel = KERNELS["cuda" if device.startswith("cuda") else "cpu"]
         self._read = read or (lambda: calibration(torch.device(device)).read())
-        self.presence = presence or machine.Presence(machine.unit(device))
+        self.presence = presence or Presence(unit(device))
         self._stack = ExitStack()
         self.samples: list[list[float]] = []  # trained seconds and the numbers of a Reading; NaN = none
         self.runs = 1
@@ -172,7 +294,7 @@ class Meter:
             where = "this GPU" if self.device.startswith("cuda") else "the machine"
             return "contended", f"{self.runs} runs shared {where}"
         others = self.others_s / self.wall_s if self.wall_s > 0.0 else 0.0
-        total = machine.cores()
+        total = cores()
         needed = min(self.threads, total)
         if others - (total - needed) > OTHERS * needed:
             return "contended", f"other programs used {others:.1f} of {total} processors"
@@ -198,7 +320,7 @@ class Meter:
         self.runs = max(self.runs, self.presence.count())
 
     def _now(self) -> tuple[float, float | None, float]:
-        return time.monotonic(), machine.busy_s(), machine.own_s()
+        return time.monotonic(), busy_s(), own_s()
 
     def _interval(self) -> tuple[float, float, float, bool]:
         """Since the last calibration: seconds, processor seconds of this run and of others, and whether

@@ -1,5 +1,6 @@
-"""One result file: `metrics.json` of a run, or `failed.json`; checked when written and when read.
+"""Records that cross files, and one of them: the result of a run, `metrics.json` or `failed.json`.
 
+All are plain dicts, with the keys that the files have. A result is checked when written and when read.
 Per-image values are kept, never only their mean. JSON has no infinity: it is written as the string
 "inf" and read back as a number. A missing value is ``null`` in the file, and its reason stands under
 "missing".
@@ -11,39 +12,185 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NoReturn, cast
+from typing import Annotated, Any, Literal, NoReturn, NotRequired, Required, TypedDict, cast
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.running.records import RunResult
-from ambiguous_wild.harness.running.timing import VERDICTS
 from ambiguous_wild.io.atomic import write_json
+
+Status = Literal["ok", "failed"]
+NotNegative = Annotated[float, Meta(ge=0.0)]
+Name = Annotated[str, Meta(pattern=r"\S")]
+
+
+class ImageRow(TypedDict, total=False):
+    """Metrics of one test image; None = undefined there. A plugin or later version may add others."""
+
+    name: Required[str]  # of the test view
+    psnr: float | None
+    ssim: float | None
+    ssim_inria: float | None
+    flip: float | None
+    psnr_affine: float | None
+    lpips_alex: float | None
+    lpips_vgg: float | None
+    lpips_vgg_01: float | None
+    psnr_valid: float | None  # this and the next three: absent where the image has no such pixel
+    psnr_covered: float | None
+    psnr_uncovered: float | None
+    psnr_supported: float | None
+
+
+def image_row(name: str, metrics: dict[str, float]) -> ImageRow:
+    """The row of one test image."""
+    return cast(ImageRow, {"name": name, **metrics})
+
+
+def metrics_of(row: ImageRow) -> dict[str, float | None]:
+    """Every metric of the row, by name."""
+    return {key: cast("float | None", value) for key, value in row.items() if key != "name"}
+
+
+class MaskScores(TypedDict, total=False):
+    """Predicted distractor pixels against the exact ones, over all train photos together."""
+
+    iou: float | None
+    precision: float | None
+    recall: float | None
+    images: int
+
+
+# (seconds of training so far, seconds of the kernel)
+Sample = Annotated[list[NotNegative], Meta(min_length=2, max_length=2)]
+
+
+class TimeRecord(TypedDict, total=False):
+    """How far the time of a run can be trusted, see `timing.py`."""
+
+    verdict: Required[Literal["alone", "contended", "unknown"]]
+    reason: Required[str]  # empty for "alone"
+    kernel: str  # of the calibration
+    kernel_reference_s: NotNegative  # its seconds on the reference machine
+    samples: list[Sample]
+    parallel_share: float  # of the time in which several threads worked; the samples allow for it
+    runs: int  # most runs of ours at once on this machine or GPU, this one included
+    others: NotNegative  # processors that other programs used, mean over the run
+
+
+class Cost(TypedDict, total=False):
+    """What a run took. What is unknown is absent: an external program may know little."""
+
+    train_s: float  # wall seconds
+    cpu_s: float  # processor seconds of training, child processes included
+    reference_s: float  # training in seconds of the reference machine, see `timing.py`
+    timing: TimeRecord
+    setup_s: float  # features, masks and compilation before the first step
+    iterations: int
+    passes: int  # trainings that all of this counts, where there was more than one
+    first_pass_s: float  # of train_s, that of the first
+    ms_per_iteration: float
+    ms_parts: dict[str, float]  # by part of an iteration
+    gaussians: int
+    peak_rss_mb: float
+    peak_cuda_mb: float
+    device: str
+    threads: int
+    fps: float  # median of several rounds
+    fps_low: float
+    fps_high: float
+    model_mb: float  # of point_cloud.ply, 10^6 bytes
+
+
+class Environment(TypedDict, total=False):
+    """Versions and hardware, as in env.json."""
+
+    ambiguous_wild: str
+    python: str
+    platform: str
+    cpu: str
+    cores: int | None
+    device: str
+    packages: dict[str, str | None]  # None = not installed
+    gpu: str
+    gsplat_max_alpha: float  # differs between sources of gsplat
+
+
+class Provenance(TypedDict):
+    """Where a result was made, from which code, and the command that makes it again."""
+
+    environment: Environment
+    code_hash: str
+    reproduce: str
+
+
+class Rescore(TypedDict):
+    """Metrics that `aw rescore` added to a result, and by which code."""
+
+    metrics: list[str]
+    version: str
+    code_hash: str
+
+
+class RunResult(TypedDict):
+    """A result file: metrics.json, or failed.json of a run that failed."""
+
+    schema: int
+    method: Name
+    scene: Name
+    seed: int
+    status: Status
+    error: str | None
+    options: dict[str, Any]  # of the method
+    per_image: list[ImageRow]
+    missing: dict[str, str]  # metric -> why it is missing
+    masks: MaskScores | None  # None: no masks, or no exact ones to compare with
+    facts: dict[str, Any]  # of the method, its effects and the watchdog
+    cost: Cost
+    config_hash: str
+    scene_hash: str
+    version: str
+    # results of earlier versions lack these
+    environment: NotRequired[Environment]
+    code_hash: NotRequired[str]
+    reproduce: NotRequired[str]
+    rescored: NotRequired[list[Rescore]]
+
+
+class SceneConfig(TypedDict):
+    """The scene of a run."""
+
+    name: str
+    sha256: str
+    factor: int | None  # of images_N; None = not known
+    path: str
+
+
+class UnusualConfig(TypedDict, total=False):
+    """Settings of a run that config.yaml holds only where they differ from the usual ones."""
+
+    effects: list[str]
+    protocol: str
+
+
+class RunConfig(UnusualConfig):
+    """config.yaml of a run: everything that decides its result, and where its scene lies."""
+
+    method: str
+    source: str  # hash of a plugin's file; empty for a method of ours
+    options: dict[str, Any]
+    train: dict[str, Any]  # fields of `TrainConfig`
+    scene: SceneConfig
+    device: str
+    version: str
+    config_hash: NotRequired[str]  # added when it is written
+
 
 SCHEMA = 1
 RESULT = "metrics.json"
 FAILED = "failed.json"  # same schema, status "failed"; counts where there is no metrics.json
-# key -> type of a result file; a number may also be an int, "inf" or null
-FIELDS: dict[str, type | tuple[type, ...]] = {
-    "method": str,
-    "scene": str,
-    "seed": int,
-    "status": str,
-    "error": (str, type(None)),
-    "options": dict,
-    "per_image": list,
-    "missing": dict,
-    "masks": (dict, type(None)),
-    "facts": dict,
-    "cost": dict,
-    "config_hash": str,
-    "scene_hash": str,
-    "version": str,
-}
-# Fields that results of earlier versions lack.
-OPTIONAL: dict[str, type | tuple[type, ...]] = {
-    "environment": dict, "code_hash": str, "reproduce": str, "rescored": list,
-}  # fmt: skip
 
 
 def write_result(path: Path | str, result: Mapping[str, Any]) -> None:
@@ -57,7 +204,7 @@ def write_result(path: Path | str, result: Mapping[str, Any]) -> None:
         AwError: the result does not follow the schema.
     """
     encoded = _encode(result)
-    _check(encoded, str(path))
+    _checked(encoded, str(path))
     write_json(path, encoded)
 
 
@@ -78,97 +225,39 @@ def read_result(path: Path | str) -> RunResult:
         raise AwError(f"no result file {path}") from None
     except (OSError, ValueError, RecursionError) as error:
         raise AwError(f"{path} is damaged ({error}); run 'aw bench' again to replace it") from None
-    _check(data, str(path))
-    data["per_image"] = [
-        {k: v if k == "name" else _decode(v) for k, v in row.items()} for row in data["per_image"]
-    ]
-    data["cost"] = {k: _decode(v) for k, v in data["cost"].items()}
-    if data["masks"] is not None:
-        data["masks"] = {k: _decode(v) for k, v in data["masks"].items()}
-    return cast(RunResult, data)
+    return _checked(data, str(path))
 
 
-def _check(data: Any, where: str) -> None:
-    if not isinstance(data, dict):
-        _wrong(where, "it must hold one JSON object")
-    if data.get("schema") != SCHEMA:
-        _wrong(where, f"schema version {data.get('schema')!r}, this version reads {SCHEMA}")
-    for name, kind in FIELDS.items():
-        if name not in data:
-            _wrong(where, f"{name!r} is absent")
-        if not isinstance(data[name], kind) or (kind is int and isinstance(data[name], bool)):
-            _wrong(where, f"{name!r} has the wrong type: {_short(data[name])}")
-    for name, kind in OPTIONAL.items():
-        if name in data and not isinstance(data[name], kind):
-            _wrong(where, f"{name!r} has the wrong type: {_short(data[name])}")
-    for name in ("method", "scene"):
-        if not data[name].strip():
-            _wrong(where, f"{name!r} is empty")
-    if data["status"] not in ("ok", "failed"):
-        _wrong(where, f"'status' must be 'ok' or 'failed', not {_short(data['status'])}")
-    if data["status"] == "failed" and not data["error"]:
-        _wrong(where, "a failed run must say its error")
-    if not all(isinstance(reason, str) for reason in data["missing"].values()):
-        _wrong(where, "'missing' must map a metric to a reason")
-    _check_images(data["per_image"], where)
-    for name, value in (data["masks"] or {}).items():
-        _check_number(value, f"masks.{name}", where)
-    for name, value in data["cost"].items():
-        if name == "timing":
-            _check_timing(value, where)
-        elif name not in ("device", "ms_parts"):
-            _check_number(value, f"cost.{name}", where)
-
-
-def _check_timing(value: Any, where: str) -> None:
-    if not isinstance(value, dict) or value.get("verdict") not in VERDICTS:
-        _wrong(where, f"cost.timing has no verdict of {', '.join(VERDICTS)}: {_short(value)}")
-    if not isinstance(value.get("reason"), str) or not isinstance(value.get("kernel", ""), str):
-        _wrong(where, f"cost.timing has no reason or kernel in words: {_short(value)}")
-    samples = value.get("samples", [])
-    if not isinstance(samples, list) or not all(isinstance(s, list) and len(s) == 2 for s in samples):
-        _wrong(where, f"cost.timing.samples are no pairs of numbers: {_short(samples)}")
-    numbers = [n for pair in samples for n in pair]
-    numbers += [value[name] for name in ("kernel_reference_s", "runs", "others", "load") if name in value]
-    for number in numbers:
-        _check_number(number, "a number of cost.timing", where)
-        if not isinstance(number, (int, float)) or not number >= 0.0:
-            _wrong(where, f"cost.timing holds {_short(number)}, which is no time")
-    if any(not pair[1] > 0.0 for pair in samples):
-        _wrong(where, "cost.timing.samples hold a kernel that took no time")
-
-
-def _check_images(rows: list[Any], where: str) -> None:
-    names = set()
-    for row in rows:
-        if not isinstance(row, dict) or not isinstance(row.get("name"), str):
-            _wrong(where, f"an entry of 'per_image' has no name: {_short(row)}")
-        if row["name"] in names:
-            _wrong(where, f"image {row['name']!r} is there twice")
-        names.add(row["name"])
-        for metric, value in row.items():
-            if metric != "name":
-                _check_number(value, f"{metric} of {row['name']}", where)
-
-
-def _check_number(value: Any, what: str, where: str) -> None:
-    number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    # JSON's whole numbers have no end, floats have
-    number = number and (isinstance(value, float) or abs(value) < 2**1000)
-    if not number and value is not None and value not in ("inf", "-inf"):
-        _wrong(where, f"{what} is no number: {_short(value)}")
-
-
-def _wrong(where: str, what: str) -> NoReturn:
-    raise AwError(f"{where} is no result file of ours: {what}; run 'aw bench' again to replace it")
-
-
-def _short(value: Any) -> str:
+def _checked(data: Any, where: str) -> RunResult:
+    """The result with numbers decoded; AwError where it does not follow `RunResult`."""
     try:
-        text = repr(value)
-    except ValueError:  # a whole number of thousands of digits
-        text = "a number without end"
-    return text if len(text) <= 60 else text[:57] + "..."
+        if not isinstance(data, dict):
+            raise msgspec.ValidationError("it must hold one JSON object")
+        if data.get("schema") != SCHEMA:
+            raise msgspec.ValidationError(
+                f"schema version {data.get('schema')!r}, this version reads {SCHEMA}"
+            )
+        data = data | {name: _decode(data[name]) for name in ("per_image", "cost", "masks") if name in data}
+        known = data
+        if isinstance(data.get("cost"), dict):  # a cost that was not a number is null
+            known = data | {"cost": {k: v for k, v in data["cost"].items() if v is not None}}
+        msgspec.convert(known, RunResult)
+        rows = {row["name"]: metrics_of(row) for row in data["per_image"]}
+        if len(rows) < len(data["per_image"]):
+            raise msgspec.ValidationError("an image is there twice - at `$.per_image`")
+        msgspec.convert(rows, dict[str, dict[str, float | None]])  # metrics of plugins and later versions too
+        if any(kernel <= 0.0 for _, kernel in data["cost"].get("timing", {}).get("samples", ())):
+            raise msgspec.ValidationError("a calibration took no time - at `$.cost.timing.samples`")
+        if data["status"] == "failed" and not data["error"]:
+            raise msgspec.ValidationError("a failed run must say its error")
+    except (msgspec.ValidationError, RecursionError) as error:
+        why = (
+            str(error)[:300].encode("ascii", "backslashreplace").decode()
+        )  # a value may be long or unprintable
+        raise AwError(
+            f"{where} is no result file of ours: {why}; run 'aw bench' again to replace it"
+        ) from None
+    return cast(RunResult, data)
 
 
 def _no_constant(name: str) -> NoReturn:
@@ -188,4 +277,8 @@ def _encode(value: Any) -> Any:
 
 
 def _decode(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: v if k == "name" else _decode(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [_decode(v) for v in value]
     return float(value) if value in ("inf", "-inf") else value

@@ -1,65 +1,161 @@
-"""One method on one scene with one seed: train, render the test views, measure, write the run folder."""
+"""One method on one scene with one seed: its folder, whether that is ours and finished, and the run."""
 
 from __future__ import annotations
 
 import os
 import shutil
+import traceback
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any, Literal
 
 import yaml
 
-from ambiguous_wild.harness.running.cell import Cell, CellReport, Overwrite
-from ambiguous_wild.harness.running.environment import environment
-from ambiguous_wild.harness.running.external import run_program
-from ambiguous_wild.harness.running.provenance import with_provenance
-from ambiguous_wild.harness.running.result_file import FAILED, RESULT, write_result
-from ambiguous_wild.harness.running.run_folder import (
-    CONFIG,
-    EFFECTS,
-    ENVIRONMENT,
-    TRACEBACK,
-    error_line,
-    is_finished,
-    record_failure,
-    refuse_other_config,
-    refuse_strange_folder,
+from ambiguous_wild.core import AwError
+from ambiguous_wild.core.config import flatten
+from ambiguous_wild.harness.running.cell import (
+    IGNORED,
+    Cell,
+    CellReport,
+    Overwrite,
+    RunOptions,
+    environment,
+    provenance,
 )
+from ambiguous_wild.harness.running.external import run_program
+from ambiguous_wild.harness.running.result_file import FAILED, RESULT, read_result, write_result
 from ambiguous_wild.harness.running.training import Tick, train_and_measure
+from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.atomic import sweep, write_json, write_text
 from ambiguous_wild.io.lock import folder_lock
+from ambiguous_wild.methods.external.program import DONE, LOGS, WORK
+
+CONFIG = "config.yaml"
+ENVIRONMENT = "env.json"
+TRACEBACK = "traceback.txt"
+EFFECTS = "effects.json"
+# What a run leaves before anything worth keeping exists in its folder.
+_WORTHLESS = {CONFIG, ENVIRONMENT, EFFECTS, FAILED, TRACEBACK}
 
 
-def run_cell(
-    cell: Cell,
-    folder: Path,
-    *,
-    cache_dir: Path,
-    overwrite: Overwrite = "missing",
-    tick: Tick | None = None,
-    pictures: bool = True,
-) -> CellReport:
-    """Train and measure, or find that it is done.
+def is_finished(folder: Path) -> bool:
+    """Whether the folder has a result that can be read; a damaged one is made again."""
+    if not (folder / RESULT).is_file():
+        return False
+    try:
+        read_result(folder / RESULT)
+    except AwError:
+        return False
+    return True
+
+
+def left_alone(folder: Path, overwrite: Overwrite) -> Literal["kept", "skipped"] | None:
+    """What a run becomes that need not be made: finished before, or to be left as it is; else None."""
+    if overwrite == "never":
+        return "skipped" if folder.exists() else None
+    return "kept" if overwrite == "missing" and is_finished(folder) else None
+
+
+def record_failure(cell: Cell, folder: Path, error: Exception) -> None:
+    """Write failed.json, and the traceback where the error is a fault of this package."""
+    if not isinstance(error, (AwError, OSError)):
+        write_text(folder / TRACEBACK, "".join(traceback.format_exception(error)))
+    write_result(folder / FAILED, {**cell.result(error=error_line(error)), **provenance(cell)})
+
+
+def error_line(error: Exception) -> str:
+    """One line that says what went wrong."""
+    if isinstance(error, AwError):
+        return str(error)
+    if isinstance(error, OSError):
+        return f"{error.filename or 'input or output'}: {error.strerror or error}"
+    return f"{type(error).__name__}: {error}"
+
+
+def refuse_strange_folder(folder: Path) -> None:
+    """Raise AwError if the folder holds files, and no run of this package."""
+    if not folder.is_dir():
+        raise AwError(f"{folder} is a file, not a run folder; choose another -o")
+    names = {p.name for p in folder.iterdir() if not p.name.startswith(".")}
+    if names and not names & {RESULT, FAILED, TRACEBACK} and not _is_our_config(folder / CONFIG):
+        raise AwError(
+            f"{folder} is not empty and no run of ours (no config.yaml with a config_hash); choose another -o"
+        )
+
+
+def _is_our_config(path: Path) -> bool:
+    """Whether it holds the settings of a run; a damaged file may, another program's does not."""
+    if not path.is_file():
+        return False
+    try:
+        return "config_hash" in plain_yaml.read_mapping(path)
+    except AwError:
+        return True
+
+
+def _said(key: str, config: Mapping[str, Any]) -> str:
+    """A value as the command line writes it: a config leaves out the full protocol."""
+    return str(config.get(key, "full" if key == "protocol" else None))
+
+
+def _of_weights(cell: Cell, names: Sequence[str], before: Mapping[str, Any]) -> str:
+    """What to do where weights that came or went since then changed a default; empty elsewhere."""
+    for key in (name.removeprefix("options.") for name in names):
+        if key in cell.method.by_machine() and f"options.{key}" in before:
+            same = f"--set {cell.method.name.partition('@')[0]}.{key}={before[f'options.{key}']}"
+            return f"; the default follows the weights on this machine: as before with {same}"
+    return ""
+
+
+def refuse_other_config(folder: Path, cell: Cell) -> None:
+    """Raise AwError if the folder was made by another configuration; names the keys that differ."""
+    path = folder / CONFIG
+    present = {p.name for p in folder.iterdir() if not p.name.startswith(".")}
+    if not (folder / WORK / DONE).exists():
+        present -= {WORK, LOGS}  # of an external program that has not finished training
+    if not path.exists() or present <= _WORTHLESS:
+        return  # it stopped before the first checkpoint: there is nothing to lose
+    try:
+        old = plain_yaml.read_mapping(path)
+    except AwError as error:
+        raise AwError(f"{error}; start anew with --overwrite always") from None
+    if old.get("config_hash") == cell.identity:
+        return
+    ignored = {f"{part}.{key}" for part, keys in IGNORED.items() for key in keys} | {"config_hash"}
+    before, now = flatten(old), flatten(dict(cell.config))
+    names = [
+        k for k in sorted(before.keys() | now.keys()) if before.get(k) != now.get(k) and k not in ignored
+    ]
+    shown = ", ".join(f"{k} was {_said(k, before)}, is {_said(k, now)}" for k in names[:4]) or "its hash"
+    raise AwError(
+        f"{folder} holds a run of another configuration ({shown}); "
+        f"choose another -o, or replace it with --overwrite always{_of_weights(cell, names, before)}"
+    )
+
+
+def run_cell(cell: Cell, folder: Path, options: RunOptions, tick: Tick | None = None) -> CellReport:
+    """Train and measure, or find that it is done; an error is a report, so that the next cell can run.
 
     Args:
         cell: what to run.
         folder: the run folder.
-        cache_dir: for features and instance masks shared between runs.
-        overwrite: "missing" keeps a finished run and resumes a stopped one, "always" starts anew,
-            "never" leaves a folder that exists as it is.
+        options: how it is made and kept.
         tick: called after every iteration.
-        pictures: draw what the method saw into pictures/; changes no other file.
-
-    Raises:
-        AwError: the folder holds a run of another configuration, or is in use.
-        Exception: the run failed; failed.json says why.
     """
-    folder = Path(os.path.realpath(folder))  # one lock and one place, whatever links lead to it
-    if folder.exists() and overwrite == "never":
+    try:
+        return _run(cell, Path(os.path.realpath(folder)), options, tick)
+    except Exception as error:
+        return CellReport(folder, "failed", error=error_line(error))
+
+
+def _run(cell: Cell, folder: Path, options: RunOptions, tick: Tick | None) -> CellReport:
+    # `folder` is resolved: one lock and one place, whatever links lead to it
+    if folder.exists() and options.overwrite == "never":
         return CellReport(folder, "skipped")
     with folder_lock(folder, f"aw bench --method {cell.method.name}"):
         if folder.exists():
             refuse_strange_folder(folder)
-            if overwrite == "always":
+            if options.overwrite == "always":
                 shutil.rmtree(folder)
             else:
                 refuse_other_config(folder, cell)
@@ -70,28 +166,12 @@ def run_cell(
             if cell.method.program is not None:
                 result = run_program(cell, folder)
             else:
-                result = train_and_measure(cell, folder, cache_dir, tick, pictures)
-            write_result(folder / RESULT, with_provenance(result, cell))
+                result = train_and_measure(cell, folder, options, tick)
+            write_result(folder / RESULT, {**result, **provenance(cell)})
         except Exception as error:
             record_failure(cell, folder, error)
             raise
     return CellReport(folder, "trained", result=result)
-
-
-def run_isolated(
-    cell: Cell,
-    folder: Path,
-    *,
-    cache_dir: Path,
-    overwrite: Overwrite = "missing",
-    tick: Tick | None = None,
-    pictures: bool = True,
-) -> CellReport:
-    """`run_cell`, with the same arguments; an error becomes a report, so that the next cell can run."""
-    try:
-        return run_cell(cell, folder, cache_dir=cache_dir, overwrite=overwrite, tick=tick, pictures=pictures)
-    except Exception as error:
-        return CellReport(folder, "failed", error=error_line(error))
 
 
 def _begin(cell: Cell, folder: Path) -> None:

@@ -13,8 +13,7 @@ import pandas as pd
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.measures import PARTIAL
-from ambiguous_wild.harness.running.records import RunResult, metrics_of
-from ambiguous_wild.harness.running.result_file import FAILED, RESULT, read_result
+from ambiguous_wild.harness.running.result_file import FAILED, RESULT, RunResult, metrics_of, read_result
 from ambiguous_wild.harness.running.timing import timing_of
 from ambiguous_wild.io import plain_yaml
 

@@ -1,4 +1,4 @@
-"""Whether the times of runs can be compared, and in which seconds. Reads records; measures nothing.
+"""Whether the times of runs can be compared, and in which seconds. Reads records.
 
     timing = timing_of(result["cost"])       # verdict and reason of one run
     text = seconds_range([c["train_s"] for c in costs])     # shown instead, unranked
@@ -12,6 +12,7 @@ speed; a contended run keeps it, but is not ranked.
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -79,3 +80,25 @@ def in_reference_seconds(
     inside = np.interp(times, begin, there)
     early, late = np.minimum(times - begin[0], 0.0) * speed[0], np.maximum(times - begin[-1], 0.0) * speed[-1]
     return inside + early + late
+
+
+# ms of a step of 3dgs on the reference machine (splat/calibration.py): a constant, a part for every 1000 px
+# and one for every 1000 Gaussians. Of captures of 240x134 to 480x268 with 32 000 to 102 000 Gaussians; a
+# capture's own share is between these:
+STEP_MS, PIXELS_MS, GAUSSIANS_MS = 2.2, 0.09, 0.22
+LEAST, MOST = 0.67, 1.5
+
+
+def expected_s(iterations: int, pixels: int, gaussians: int) -> float:
+    """Seconds of so many iterations of 3dgs on the reference machine, to within `LEAST` and `MOST`."""
+    return 1e-3 * iterations * (STEP_MS + 1e-3 * (PIXELS_MS * pixels + GAUSSIANS_MS * gaussians))
+
+
+def slowness(device: str = "cpu") -> float:
+    """How many times longer than on the reference machine this one takes now; kernels must be compiled."""
+    import torch
+
+    from ambiguous_wild.splat.calibration import KERNELS, calibration
+
+    kernel = calibration(torch.device(device))
+    return statistics.median(kernel.seconds() for _ in range(3)) / KERNELS[device].reference_s

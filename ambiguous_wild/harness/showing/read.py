@@ -12,8 +12,7 @@ from typing import Any
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import from_plain
 from ambiguous_wild.core.errors import shortlist, unknown
-from ambiguous_wild.harness.running.records import metrics_of
-from ambiguous_wild.harness.running.result_file import RESULT, read_result
+from ambiguous_wild.harness.running.result_file import RESULT, metrics_of, read_result
 from ambiguous_wild.harness.running.store import CONFIG, read_config, run_folders
 from ambiguous_wild.io.ply import splat_count
 from ambiguous_wild.io.scene_folder import load_scene

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 from ambiguous_wild.core import AwError, Camera, Scene, View
 from ambiguous_wild.harness.bench import BenchReport, bench
 from ambiguous_wild.harness.running.callbacks import Callbacks, outcome_line, run_name
-from ambiguous_wild.harness.running.prepare import prepare_cpu
 from ambiguous_wild.harness.showing.read import find_models, open_scene, read_models
 from ambiguous_wild.io.atomic import check_output
 from ambiguous_wild.io.page_parts import narrowed
+from ambiguous_wild.splat.calibration import prepare_cpu
 from ambiguous_wild.viewing.live import LiveView
 from ambiguous_wild.viewing.model import Exported, export
 from ambiguous_wild.viewing.video import (

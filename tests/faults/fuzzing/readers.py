@@ -21,8 +21,8 @@ import yaml
 from ambiguous_wild.core.weight_files import read_tensors
 from ambiguous_wild.harness.audit.table import read_tables
 from ambiguous_wild.harness.leaderboard import board, pictures
-from ambiguous_wild.harness.planning.file import read_plan
-from ambiguous_wild.harness.running.run_folder import refuse_other_config
+from ambiguous_wild.harness.planning.decide import read_plan
+from ambiguous_wild.harness.running.run import refuse_other_config
 from ambiguous_wild.harness.running.store import read_runs
 from ambiguous_wild.io import archive, images, ply, scene_folder
 from ambiguous_wild.io.photos import read_photo

@@ -14,20 +14,14 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from ambiguous_wild.core import AwError, Scene
-from ambiguous_wild.core.config import from_plain, to_plain
-from ambiguous_wild.harness.running.cell import Cell, CellReport, Overwrite, Protocol
+from ambiguous_wild.core.config import from_plain
+from ambiguous_wild.harness.running.cell import Cell, CellReport, RunOptions, code_hash, scene_identity
 from ambiguous_wild.harness.running.choosing import Chosen
-from ambiguous_wild.harness.running.identity import scene_identity
-from ambiguous_wild.harness.running.prepare import prepare_cpu
-from ambiguous_wild.harness.running.provenance import code_hash
-from ambiguous_wild.harness.running.result import failed_result
-from ambiguous_wild.harness.running.result_file import FAILED, RESULT, write_result
-from ambiguous_wild.harness.running.run import run_isolated
-from ambiguous_wild.harness.running.run_folder import error_line
-from ambiguous_wild.io.lock import Busy, folder_lock, patient_lock
+from ambiguous_wild.harness.running.result_file import FAILED, RESULT, RunConfig, write_result
+from ambiguous_wild.harness.running.run import error_line, run_cell
+from ambiguous_wild.io.lock import folder_lock, patient_lock
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.graft import split_graft
 from ambiguous_wild.methods.references import reference_file, with_file
@@ -53,39 +47,16 @@ class Source:
 class Job:
     """How to make a cell again, and how to run it."""
 
-    method: str
-    sources: tuple[Source, ...]
-    options: dict[str, Any]
-    scene: str  # absolute path
-    factor: int | None
-    device: str
-    protocol: Protocol
-    train: dict[str, Any]
+    config: RunConfig
     chosen: Chosen
     identity: str
-    code: str  # `code_hash` of the sender
+    scene: str  # absolute path
     folder: str  # absolute path of the run folder
-    cache_dir: str
-    overwrite: Overwrite
-    pictures: bool
+    options: RunOptions
+    sources: tuple[Source, ...]
     threads: int | None  # of the CPU kernels; None = as many as there are
+    code: str  # `code_hash` of the sender
     token: str = ""  # a file that the runner must see, see `check_storage`
-
-    @property
-    def title(self) -> str:
-        return f"{self.method} on {Path(self.scene).name}, seed {self.train['seed']}"
-
-
-@dataclass(frozen=True)
-class JobSettings:
-    """Settings that all jobs of one grid share."""
-
-    cache_dir: Path
-    overwrite: Overwrite = "missing"
-    pictures: bool = True
-    threads: int | None = None
-    sources: tuple[Source, ...] = ()
-    token: str = ""
 
 
 def read_sources(plugins: Sequence[Path], methods: Sequence[str]) -> tuple[Source, ...]:
@@ -106,50 +77,38 @@ def _source(text: str, plugin: bool, path: Path) -> Source:
     return Source(text, plugin, str(path.resolve()), path.read_bytes())
 
 
-def make_job(cell: Cell, folder: Path, shared: JobSettings) -> Job:
+def make_job(
+    cell: Cell,
+    folder: Path,
+    options: RunOptions,
+    sources: tuple[Source, ...] = (),
+    threads: int | None = None,
+) -> Job:
     """The job of a cell whose method `get_method` finds once the sources are loaded."""
-    return Job(
-        method=cell.method.name,
-        sources=shared.sources,
-        options=to_plain(cell.options),
-        scene=str(cell.scene.root.resolve()),
-        factor=cell.scene.info.get("loaded_factor"),
-        device=cell.device,
-        protocol=cell.protocol,
-        train=to_plain(cell.train),
-        chosen=cell.chosen,
-        identity=cell.identity,
-        code=code_hash(),
-        folder=str(folder.absolute()),
-        cache_dir=str(shared.cache_dir.absolute()),
-        overwrite=shared.overwrite,
-        pictures=shared.pictures,
-        threads=shared.threads,
-        token=shared.token,
-    )
+    config, scene = cell.config, str(cell.scene.root.resolve())
+    options = RunOptions(options.cache_dir.absolute(), options.overwrite, options.pictures)
+    identity, place = cell.identity, str(folder.absolute())
+    return Job(config, cell.chosen, identity, scene, place, options, sources, threads, code_hash())
 
 
 def run_job(job: Job) -> CellReport:
     """Make the cell and run it as `aw bench` does in one process; every error is a report."""
+    from ambiguous_wild.splat import readiness
+    from ambiguous_wild.splat.calibration import prepare_cpu
+
     folder = Path(job.folder)
     try:
         check_storage(job)
         cell = make_cell(job)
-        if cell.method.program is None:
-            if cell.device == "cpu":
-                prepare_cpu(job.threads)
-            else:
-                _prepare_cuda()
-    except Exception as error:
-        return CellReport(folder, "failed", error=error_line(error))
-    try:
+        if cell.method.program is None and cell.device == "cpu":
+            prepare_cpu(job.threads)
+        elif cell.method.program is None:
+            readiness.require(readiness.look())
         with patient_lock(folder, "aw bench", LOCK_WAIT_S):
             pass
-    except Busy as error:
-        return CellReport(folder, "failed", error=str(error))
-    return run_isolated(
-        cell, folder, cache_dir=Path(job.cache_dir), overwrite=job.overwrite, pictures=job.pictures
-    )
+    except Exception as error:
+        return CellReport(folder, "failed", error=f"on {platform.node()}: {error_line(error)}")
+    return run_cell(cell, folder, job.options)
 
 
 def make_cell(job: Job) -> Cell:
@@ -160,26 +119,27 @@ def make_cell(job: Job) -> Cell:
     """
     if job.code != code_hash():
         raise AwError(
-            f"{platform.node()} runs another state of ambiguous_wild than the machine that sent the run: "
+            "here is another state of ambiguous_wild than on the machine that sent the run: "
             "install the same on every node"
         )
     for source in job.sources:
         _load(source)
-    entry = get_method(job.method)
-    scene = _scene(job.scene, job.factor)
+    config = job.config
+    entry = get_method(config["method"])
+    scene = _scene(job.scene, config["scene"]["factor"])
     cell = Cell(
         method=entry,
-        options=from_plain(type(entry.options()), job.options, f"options of {job.method}"),
+        options=from_plain(type(entry.options()), config["options"], f"options of {entry.name}"),
         scene=scene,
         scene_id=scene_identity(scene),
-        train=from_plain(TrainConfig, job.train, "train"),
-        device=job.device,
+        train=from_plain(TrainConfig, config["train"], "train"),
+        device=config["device"],
         chosen=job.chosen,
-        protocol=job.protocol,
+        protocol="half" if config.get("protocol") == "half" else "full",
     )
     if cell.identity != job.identity:
         raise AwError(
-            f"{job.title}: {platform.node()} makes another run of it than the machine that sent it: "
+            f"{entry.name} on {scene.name} would be another run than on the machine that sent it: "
             f"the scene {job.scene} or a file of the method differs there"
         )
     return cell
@@ -195,7 +155,7 @@ def check_storage(job: Job, wait_s: float = 30.0) -> None:
     while job.token and not Path(job.token).exists():  # NFS remembers for seconds what was not there
         if time.monotonic() > deadline:
             raise AwError(
-                f"{platform.node()} does not see {Path(job.token).parent}: give a folder on storage that all "
+                f"it does not see {Path(job.token).parent}: give a folder on storage that all "
                 "nodes share as -o, or send scenes and results with --transfer store"
             )
         time.sleep(1.0)
@@ -206,7 +166,7 @@ def record_lost(cell: Cell, folder: Path, error: str) -> CellReport:
     try:
         with folder_lock(folder, "aw bench"):
             if folder.is_dir() and not (folder / RESULT).exists():
-                write_result(folder / FAILED, failed_result(cell, error))
+                write_result(folder / FAILED, cell.result(error=error))
     except (AwError, OSError):
         pass  # the report below has the error in any case
     return CellReport(folder, "failed", error=error)
@@ -227,11 +187,8 @@ def _load(source: Source) -> None:
 def _present(source: Source) -> Path:
     """The source's own file where this machine has it, else a copy."""
     path = Path(source.path)
-    try:
-        if path.read_bytes() == source.content:
-            return path
-    except OSError:
-        pass
+    if path.is_file() and path.read_bytes() == source.content:
+        return path
     copy = Path(tempfile.mkdtemp(prefix="aw-source-")) / path.name
     copy.write_bytes(source.content)
     return copy
@@ -241,13 +198,3 @@ def _present(source: Source) -> Path:
 def _scene(path: str, factor: int | None) -> Scene:
     # The sender has compared every hash; a copy with other sizes or another scene.json is found all the same.
     return load_scene(path, factor=factor, verify="quick")
-
-
-def _prepare_cuda() -> None:
-    """Prepare the GPU of a cluster's node; elsewhere this is done before any job starts."""
-    from ambiguous_wild.splat import readiness
-
-    try:
-        readiness.require(readiness.look())
-    except AwError as error:
-        raise AwError(f"{platform.node()} cannot use its GPU: {error}") from None

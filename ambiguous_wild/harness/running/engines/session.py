@@ -2,90 +2,27 @@
 
 from __future__ import annotations
 
+import contextlib
+import multiprocessing
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+import signal
+import threading
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
-from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.harness.running.callbacks import Callbacks
+from ambiguous_wild.harness.running.callbacks import Callbacks, Engine
 
 if TYPE_CHECKING:
-    from ambiguous_wild.harness.running.cell import Cell, CellReport, Overwrite
+    from ambiguous_wild.harness.running.cell import Cell, CellReport, RunOptions
     from ambiguous_wild.harness.running.engines.job import Job
     from ambiguous_wild.harness.running.engines.ray_cluster import RayCluster
 
-_RAY_ONLY = ("address", "cpus_per_cell", "gpus_per_cell", "memory_per_cell")
-
-
-@dataclass(frozen=True)
-class Engine:
-    """Where cells run, and how many at a time."""
-
-    engine: Literal["local", "ray"] = "local"
-    jobs: int | None = None  # cells at a time on this machine; None = 1, on cuda one a GPU
-    address: str | None = None  # of a Ray cluster; None = $RAY_ADDRESS, else a Ray of our own
-    cpus_per_cell: float | None = None  # Ray; None = the threads, else 1
-    gpus_per_cell: float | None = None  # Ray; None = 1 on cuda
-    memory_per_cell: float | None = None  # Ray; GB
-    retries: int = 3  # of a cell whose process or node was lost
-    transfer: Literal["shared", "store"] = "shared"  # Ray; "store": scenes and runs travel
-    transfer_limit: float = 4000.0  # Ray; MB of the largest scene or run that travels
-
-    def check(self) -> None:
-        """Raise AwError for settings that exclude each other, before anything heavy is loaded."""
-        stray = [f"--{name.replace('_', '-')}" for name in _RAY_ONLY if getattr(self, name) is not None]
-        if self.engine == "local" and (stray or self.transfer != "shared"):
-            raise AwError(
-                f"{', '.join(stray) or '--transfer'} is for a cluster: add --engine ray, or leave it out"
-            )
-        if self.engine == "ray":
-            from ambiguous_wild.harness.running.engines.ray_cluster import check_ray
-
-            check_ray()
-            if self.jobs is not None and self.address is not None:
-                raise AwError("--jobs is for this machine: a cluster at --address runs as many cells as fit")
-
-    @property
-    def remote(self) -> bool:
-        """Whether it is a running cluster, not a Ray that this process starts."""
-        return self.engine == "ray" and bool(self.address or os.environ.get("RAY_ADDRESS"))
-
-
-@dataclass(frozen=True)
-class Grid:
-    """Cells, and what they have in common when they run."""
-
-    cells: Sequence[Cell]
-    output: Path
-    overwrite: Overwrite
-    cache: Path
-    pictures: bool
-    plugins: Sequence[Path]
-    methods: Sequence[str]  # as they were typed
-
-    def folders(self) -> list[Path]:
-        """The run folder of every cell, checked: see `checked_folders`."""
-        from ambiguous_wild.harness.running.grid import checked_folders
-
-        return checked_folders(self.cells, self.output, self.overwrite, self.cache)
-
-    def jobs(self, threads: int) -> list[Job]:
-        """The cells as jobs, which other processes can run."""
-        from ambiguous_wild.harness.running.engines.job import JobSettings, make_job, read_sources
-
-        sources = read_sources(self.plugins, self.methods)
-        settings = JobSettings(self.cache, self.overwrite, self.pictures, threads, sources)
-        return [make_job(cell, folder, settings) for cell, folder in zip(self.cells, self.folders())]
-
-    def lost(self, index: int, reason: str) -> CellReport:
-        """The report of a cell whose process died too often."""
-        from ambiguous_wild.harness.running.engines.job import record_lost
-        from ambiguous_wild.harness.running.grid import cell_folder
-
-        cell = self.cells[index]
-        return record_lost(cell, cell_folder(self.output, cell), reason)
+VISIBLE = "CUDA_VISIBLE_DEVICES"
+STOP_S = 5.0  # between asking a process to end and ending it
 
 
 class Session:
@@ -108,7 +45,7 @@ class Session:
 
     def __exit__(self, *error: object) -> None:
         if self.cluster is not None:
-            self.cluster.__exit__(*error)
+            self.cluster.close()
 
     def device(self, device: str) -> str:
         """ "cpu" or "cuda": of a cluster by what its nodes offer, else of this machine.
@@ -116,15 +53,15 @@ class Session:
         Raises:
             AwError: "cuda" was asked for and cannot be used here; says what is missing.
         """
-        if not self.engine.remote:
-            if device == "cpu":
-                return device
-            from ambiguous_wild.splat.readiness import choose
-
-            return choose(device, self.callbacks.say)
-        if device != "auto":
+        if self.engine.remote:
+            if device == "auto":
+                return "cuda" if self._connected().has_gpu() else "cpu"
             return device
-        return "cuda" if self._connected().has_gpu() else "cpu"
+        if device == "cpu":
+            return device
+        from ambiguous_wild.splat.readiness import choose
+
+        return choose(device, self.callbacks.say)
 
     def in_process(self, cells: Sequence[Cell]) -> bool:
         """Whether cells run in this process, one by one; else `run` starts others. Each GPU takes a cell."""
@@ -133,69 +70,188 @@ class Session:
         if any(cell.device == "cuda" for cell in cells):
             import torch
 
-            from ambiguous_wild.harness.running.engines.gpu_slots import visible_gpus
-
             self.gpus = visible_gpus(torch.cuda.device_count())
         if self.engine.jobs is None:
             self.engine = replace(self.engine, jobs=max(1, min(len(self.gpus), len(cells))))
         return self.engine.jobs == 1
 
-    def run(self, grid: Grid) -> list[CellReport]:
+    def run(
+        self,
+        cells: Sequence[Cell],
+        output: Path,
+        options: RunOptions,
+        plugins: Sequence[Path],
+        methods: Sequence[str],  # as they were typed
+    ) -> list[CellReport]:
         """Run the cells in processes of this machine or on the cluster; reports in their order."""
-        engine, cluster = self.engine, self._connected() if self.engine.engine == "ray" else None
-        if cluster is not None and engine.gpus_per_cell is None and grid.cells[0].device == "cuda":
-            cluster.options = replace(cluster.options, gpus=1.0)
-        jobs = grid.jobs(self.threads or _share_of_cores(engine, cluster))
-        callbacks, cells = self.callbacks, grid.cells
+        from ambiguous_wild.harness.running.engines.job import make_job, read_sources, record_lost
+        from ambiguous_wild.harness.running.grid import checked_folders
+
+        engine, say = self.engine, self.callbacks.say
+        cluster = self._connected() if engine.engine == "ray" else None
+        threads = self.threads or (
+            max(1, int(engine.cpus_per_cell or 1)) if cluster else max(1, _cores() // (engine.jobs or 1))
+        )
+        sources = read_sources(plugins, methods)
+        folders = checked_folders(cells, output, options)
+        jobs = [make_job(cell, folder, options, sources, threads) for cell, folder in zip(cells, folders)]
+
+        def lost(index: int, reason: str) -> CellReport:
+            return record_lost(cells[index], folders[index], reason)
 
         def ended(index: int, report: CellReport) -> None:
-            callbacks.ended(cells[index], report)
+            self.callbacks.ended(cells[index], report)
 
         if cluster is not None:
-            callbacks.say(f"Ray: {cluster.describe()}")
-            return cluster.run(jobs, lost=grid.lost, on_end=ended, say=callbacks.say)
-        from ambiguous_wild.harness.running.engines.gpu_slots import sharing
-        from ambiguous_wild.harness.running.engines.processes import run_in_processes
-
-        if said := sharing(min(engine.jobs or 1, len(jobs)), self.gpus):
-            callbacks.say(f"warning: {said}")
+            say(f"Ray: {cluster.describe()}")
+            return cluster.run(jobs, lost, ended, say)
+        at_a_time = engine.jobs or 1
+        if self.gpus and min(at_a_time, len(jobs)) > len(self.gpus):
+            have = "1 GPU" if len(self.gpus) == 1 else f"{len(self.gpus)} GPUs"
+            say(
+                f"warning: {at_a_time} cells at a time share {have}, memory and time; "
+                f"--jobs {len(self.gpus)} gives each its own"
+            )
 
         def started(index: int) -> None:
-            callbacks.started(cells[index], Path(jobs[index].folder))
+            self.callbacks.started(cells[index], folders[index])
 
-        return run_in_processes(
-            jobs,
-            engine.jobs or 1,
-            retries=engine.retries,
-            lost=grid.lost,
-            on_start=started,
-            on_end=ended,
-            gpus=self.gpus,
-        )
+        return run_in_processes(jobs, at_a_time, engine.retries, lost, started, ended, self.gpus)
 
     def _connected(self) -> RayCluster:
         if self.cluster is None:
-            from ambiguous_wild.harness.running.engines.ray_cluster import RayCluster, RayOptions
+            from ambiguous_wild.harness.running.engines.ray_cluster import RayCluster
 
-            engine = self.engine
-            self.cluster = RayCluster(
-                RayOptions(
-                    address=engine.address,
-                    jobs=engine.jobs,
-                    cpus=engine.cpus_per_cell or float(self.threads or 1),
-                    gpus=engine.gpus_per_cell or 0.0,
-                    memory_gb=engine.memory_per_cell or 0.0,
-                    retries=engine.retries,
-                    transfer=engine.transfer,
-                    limit_mb=engine.transfer_limit,
-                )
-            )
+            self.cluster = RayCluster(self.engine, self.engine.cpus_per_cell or float(self.threads or 1))
         return self.cluster
 
 
-def _share_of_cores(engine: Engine, cluster: RayCluster | None) -> int:
-    """Threads of one cell."""
-    if cluster is not None:
-        return max(1, int(cluster.options.cpus))
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, cores // (engine.jobs or 1))
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def visible_gpus(count: int) -> list[str]:
+    """The first `count` GPUs of this process by the names that CUDA_VISIBLE_DEVICES of a child needs.
+
+    Where that variable is set here, its own entries: numbers of the machine's GPUs, UUIDs (``GPU-...``) or
+    MIG instances. A child that got 0 to `count` - 1 instead would leave what this process was given. Entries
+    after an invalid one do not count, as for CUDA; torch's count says how many that leaves.
+    """
+    given = os.environ.get(VISIBLE)
+    names = [str(i) for i in range(count)] if given is None else [name.strip() for name in given.split(",")]
+    return names[:count]
+
+
+def run_in_processes(
+    jobs: Sequence[Job],
+    processes: int,
+    retries: int,
+    lost: Callable[[int, str], CellReport],
+    on_start: Callable[[int], None] = lambda index: None,
+    on_end: Callable[[int, CellReport], None] = lambda index, report: None,
+    gpus: Sequence[str] = (),
+) -> list[CellReport]:
+    """Run every job, at most `processes` at a time; a process that dies costs its cell one attempt.
+
+    Not a `ProcessPoolExecutor`: there one killed process ends the others, and running ones cannot be ended.
+
+    Args:
+        jobs: what to run; each writes its own folder.
+        processes: how many at a time.
+        retries: how often a job is run again whose process died (killed, out of memory).
+        lost: makes the report of a job whose process died too often, from its index and the reason.
+        on_start: told the index when a job begins, again when it begins again.
+        on_end: told the index and what became of it.
+        gpus: as CUDA_VISIBLE_DEVICES names them; each process sees one of them, in turns.
+
+    Returns:
+        Reports in the order of the jobs.
+    """
+    waiting, deaths = deque(range(len(jobs))), Counter[int]()
+    reports: dict[int, CellReport] = {}
+    workers: dict[int, _Worker] = {}  # by slot; a new one takes the slot, and the GPU, of one that died
+    try:
+        while len(reports) < len(jobs):
+            for slot in range(processes):
+                if waiting and (slot not in workers or workers[slot].index is None):
+                    if slot not in workers:
+                        workers[slot] = _Worker(gpus[slot % len(gpus)] if gpus else None)
+                    index = waiting.popleft()
+                    on_start(index)
+                    workers[slot].send(index, jobs[index])
+            busy = {worker.connection: slot for slot, worker in workers.items() if worker.index is not None}
+            for slot in [busy[connection] for connection in wait(list(busy))]:  # type: ignore[index]
+                index, report = workers[slot].receive()
+                if report is None:
+                    reason = workers.pop(slot).stop()
+                    deaths[index] += 1
+                    if deaths[index] <= retries:
+                        waiting.appendleft(index)
+                        continue
+                    report = lost(index, f"its process {reason}, {deaths[index]} times")
+                reports[index] = report
+                on_end(index, report)
+    finally:
+        for worker in workers.values():
+            worker.stop()
+    return [reports[index] for index in range(len(jobs))]
+
+
+class _Worker:
+    """A process that runs one job after another."""
+
+    def __init__(self, gpu: str | None) -> None:
+        # Not forked: the threads of torch and Numba do not survive that.
+        context = multiprocessing.get_context("spawn")
+        self.connection, theirs = context.Pipe()
+        self.process = context.Process(target=_serve, args=(theirs, gpu))
+        self.process.start()
+        theirs.close()  # so that the end of the process is the end of the pipe
+        self.index: int | None = None
+
+    def send(self, index: int, job: Job) -> None:
+        self.index = index
+        with contextlib.suppress(OSError):  # it is dead already; `receive` finds out
+            self.connection.send(job)
+
+    def receive(self) -> tuple[int, CellReport | None]:
+        """The job's index and report; None where the process died."""
+        assert self.index is not None
+        index, self.index = self.index, None
+        try:
+            return index, self.connection.recv()
+        except (EOFError, OSError):
+            return index, None
+
+    def stop(self) -> str:
+        """End the process if it has not ended; how it did."""
+        if self.index is not None:
+            self.process.terminate()  # a run in the middle: its checkpoint is what stays
+        self.connection.close()
+        self.process.join(STOP_S)
+        if self.process.is_alive():
+            self.process.kill()
+            self.process.join()
+        code = self.process.exitcode or 0
+        return f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
+
+
+def _serve(connection: Connection, gpu: str | None) -> None:
+    """The loop of a worker process; it ends when the pipe is closed."""
+    if gpu is not None:
+        os.environ[VISIBLE] = gpu  # before torch is imported: CUDA reads it once
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent ends us
+    threading.Thread(target=_follow_parent, daemon=True).start()
+    from ambiguous_wild.harness.running.engines.job import run_job
+
+    with contextlib.suppress(EOFError):
+        while True:
+            connection.send(run_job(connection.recv()))
+
+
+def _follow_parent() -> None:
+    """End when the parent ends: a worker that outlives a killed parent would keep its folder locked."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        wait([parent.sentinel])
+        os._exit(1)

@@ -1,21 +1,89 @@
-"""A result says where it comes from, and its command makes the same cell again."""
+"""A cell: what its scene is known by, what it ran on, and that its command makes the same cell again."""
 
 from __future__ import annotations
 
 import dataclasses
 import shlex
+import shutil
+import sys
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from ambiguous_wild.cli.bench import command, parse_budget
-from ambiguous_wild.harness.running.cell import Cell
+from ambiguous_wild.harness.running.cell import (
+    Cell,
+    code_hash,
+    environment,
+    installed,
+    provenance,
+    reproduce,
+    scene_identity,
+)
 from ambiguous_wild.harness.running.grid import plan_cells
-from ambiguous_wild.harness.running.provenance import code_hash, provenance, reproduce
+from ambiguous_wild.harness.running.training import peak_rss_mb, reset_peak
+from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import registry
 from ambiguous_wild.methods.registry import load_plugin
 from ambiguous_wild.splat.pace import TrainConfig
 from tests.tiny_scene import write_tiny_scene
+
+
+def test_a_scene_is_known_by_what_is_trained_and_scored_on(tmp_path):
+    scene = load_scene(write_tiny_scene(tmp_path / "scene"))
+    files = {name: {"sha256": f"{k}"} for k, name in enumerate(("images/a.png", "truth/capture.json"))}
+
+    def identity(**changed):
+        return scene_identity(replace(scene, info={**scene.info, "files": files | changed}))
+
+    assert identity() == identity(**{"truth/capture.json": {"sha256": "another version's"}})
+    assert identity() != identity(**{"images/a.png": {"sha256": "another photo"}})
+
+
+def test_a_plain_scene_is_known_by_its_photos_masks_and_model(tmp_path):
+    root = write_tiny_scene(tmp_path / "scene")
+    seen = {scene_identity(load_scene(root))}
+
+    def another():
+        found = scene_identity(load_scene(root))
+        new = found not in seen
+        seen.add(found)
+        return new
+
+    assert not another()
+    shutil.copy(root / "images/train_1.png", root / "images/train_0.png")
+    assert another()
+    (root / "masks/train").mkdir(parents=True)
+    shutil.copy(root / "truth/distractor/train_0.png", root / "masks/train/train_0.png")
+    assert another()
+    shutil.copy(root / "truth/distractor/train_1.png", root / "masks/train/train_0.png")
+    assert another()
+    for file, old, new in (
+        ("cameras.txt", "60.0 60.0", "61.0 61.0"),
+        ("points3D.txt", " 0.5\n", " 0.5\n9999 0.1 0.1 4 1 2 3 0.5\n"),
+    ):
+        text = (root / "sparse/0" / file).read_text()
+        (root / "sparse/0" / file).write_text(text.replace(old, new, 1))
+        assert another(), file
+
+
+def test_the_environment_names_what_is_there_and_what_is_not():
+    facts = environment("cpu")
+    assert facts["packages"]["numpy"] == np.__version__
+    assert facts["python"] == ".".join(map(str, sys.version_info[:3]))
+    assert facts["cores"] >= 1
+    assert installed("no-such-distribution") is None
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux can forget a peak")
+def test_the_peak_is_that_of_the_run_not_of_the_process():
+    block = np.ones(40_000_000)  # 320 MB
+    high = peak_rss_mb()
+    del block
+    reset_peak()
+    assert peak_rss_mb() < high - 200
 
 
 @pytest.fixture(scope="module")

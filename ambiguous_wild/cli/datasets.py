@@ -1,0 +1,280 @@
+"""`aw import`, `fetch`, `export-scene`, `package` and `verify`: scenes from elsewhere, and for others."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import click
+
+from ambiguous_wild.cli.options import PathName
+from ambiguous_wild.core.errors import AwError, shortlist
+
+KINDS = (
+    "on-the-go", "robustnerf", "photo-tourism", "drone", "dualsplat", "nerfbaselines", "nerfstudio",
+    "instant-ngp", "blender", "colmap",
+)  # fmt: skip
+
+
+@click.command("import")
+@click.argument("source", type=PathName())
+@click.option("-o", "--output", required=True, type=PathName(), help="Scene folder to make.")
+@click.option("--as", "kind", type=click.Choice(KINDS), help="Layout of SOURCE.  [default: recognised]")
+@click.option("--factor", type=int, help="Downsampling.  [default: as in the papers]")
+@click.option("--name", default="", help="Name of the scene.  [default: the output folder's]")
+@click.option("--license", "license_", default="", help="Licence of the photos, recorded in scene.json.")
+@click.option("--dataset", default="", help="Name of the dataset in tables.  [default: the layout's]")
+@click.option(
+    "--drop-test-only-points",
+    is_flag=True,
+    help="Drop points that only test photos see: they leak clean geometry. Published code keeps them.",
+)
+@click.option("--motion", is_flag=True, help="Match the photos to find what moves, for masks (motion.npz).")
+@click.option("--jobs", type=click.IntRange(min=1), help="Threads; the result does not depend on it.")
+@click.option(
+    "--seed",
+    type=click.IntRange(0),
+    default=0,
+    show_default=True,
+    help="Seed of matching and of random points.",
+)
+@click.option("--overwrite", is_flag=True, help="Replace a scene imported from other files or settings.")
+@click.option("--json", "as_json", is_flag=True, help="Print the same facts as JSON.")
+def import_command(
+    source: Path,
+    output: Path,
+    kind: str | None,
+    factor: int | None,
+    name: str,
+    license_: str,
+    dataset: str,
+    drop_test_only_points: bool,
+    motion: bool,
+    jobs: int | None,
+    seed: int,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    """Import the scene in SOURCE: NeRF On-the-go, RobustNeRF, Photo Tourism, Drone Imagery, DualSplat,
+    NerfBaselines, nerfstudio, instant-ngp, Blender, or COLMAP with images.
+
+    Photos are linked unless they must be undistorted or reduced. Split, factor and test protocol are those
+    of the dataset's papers; 'aw bench' follows them without an option.
+    """
+    from ambiguous_wild.datasets.write import ImportSettings, import_scene
+
+    settings = ImportSettings(kind, factor, name, license_, dataset, drop_test_only_points, seed, motion)
+    done = import_scene(source, output, settings, overwrite=overwrite, jobs=jobs, progress=not as_json)
+    info = done.info
+    if as_json:
+        facts = {k: v for k, v in info.items() if k not in ("files", "photos", "inputs")}
+        extra = {"scene": str(done.scene), "why": done.why, "up_to_date": done.up_to_date}
+        click.echo(json.dumps({**extra, **facts}, indent=2, ensure_ascii=False))
+        return
+    if done.up_to_date:
+        click.echo(f"{output} is up to date")
+    for line in summary(info, done.why):
+        click.echo(line)
+    click.echo(f"next: aw bench --method refinesplat --scene {shlex.quote(str(output))} -o runs")
+
+
+def summary(info: dict[str, Any], why: str) -> list[str]:
+    """What was recognised, counted and decided."""
+    counts, imported = info["counts"], info["imported"]
+    protocol = info.get("evaluation", {}).get("protocol", "full")
+    measured = {"full": "whole test photos", "half": "right halves of test photos"}[protocol]
+    return [
+        f"layout {imported['layout']} ({why}), factor {info['factor']}, measured on {measured}",
+        f"{counts['train']} training and {counts['test']} test photos, {counts['cameras']} cameras, "
+        f"{counts['points']} points, {counts['points_seen_in_test_only']} of them seen in test photos only",
+        *(f"note: {note}" for note in imported["notes"]),
+        *(f"warning: {warning}" for warning in info["warnings"]),
+    ]
+
+
+@click.command("fetch")
+@click.argument("name", required=False)
+@click.option(
+    "-o", "--output", type=PathName(), default=Path("datasets"), show_default=True, help="Folder of datasets."
+)
+@click.option("--list", "listing", is_flag=True, help="List what can be fetched: licence, size, page.")
+@click.option("--unpack/--no-unpack", default=True, show_default=True, help="Unpack the archive.")
+@click.option("--json", "as_json", is_flag=True, help="Print the same facts as JSON.")
+def fetch_command(name: str | None, output: Path, listing: bool, unpack: bool, as_json: bool) -> None:
+    """Download the dataset NAME and unpack it. An interrupted download continues.
+
+    The hash of the first download is stored in OUTPUT/archives/downloads.json; later downloads must match it.
+    """
+    from ambiguous_wild.datasets.fetch import find_public, public_data
+
+    if listing:
+        if as_json:
+            click.echo(json.dumps([asdict(d) for d in public_data().values()], indent=2, ensure_ascii=False))
+            return
+        for data in public_data().values():
+            size = f"{data.size_mb} MB" if data.size_mb else "size not stated"
+            how = f"layout {data.layout}, {size}" if data.url else "from its page only"
+            click.echo(f"{data.name:<30} {how}, licence: {data.license}\n{'':<30} {data.note}; {data.page}")
+        return
+    if name is None:
+        raise AwError("which dataset? 'aw fetch --list' lists them")
+    from tqdm import tqdm
+
+    from ambiguous_wild.datasets.fetch import fetch
+
+    data = find_public(name)
+    click.echo(f"{data.name}: licence: {data.license} ({data.page})", err=True)
+    bar = tqdm(desc=name, unit="B", unit_scale=True, file=sys.stderr, disable=True if as_json else None)
+
+    def tick(done: int, total: int | None) -> None:
+        bar.total = total
+        bar.update(done - bar.n)
+
+    with bar:
+        done = fetch(data, output, unpack=unpack, tick=tick, say=lambda text: click.echo(text, err=True))
+    if as_json:
+        facts = {"archive": str(done.archive), "folder": str(done.folder) if done.folder else None}
+        click.echo(json.dumps({**facts, "sha256": done.sha256, "first": done.first}, indent=2))
+        return
+    known = "recorded now, nothing to compare with" if done.first else "as known"
+    click.echo(f"{done.archive}: sha256 {done.sha256[:16]}... ({known})")
+    if done.folder is not None:
+        click.echo(
+            f"unpacked into {done.folder}; next: aw import {shlex.quote(str(done.folder))}/SCENE -o SCENE"
+        )
+
+
+@click.command("export-scene")
+@click.argument("scene", type=PathName())
+@click.option(
+    "--as",
+    "form",
+    required=True,
+    type=click.Choice(["nerfstudio", "nerfbaselines", "colmap", "on-the-go"]),
+    help="The layout to write.",
+)
+@click.option("-o", "--output", required=True, type=PathName(), help="Folder to make.")
+@click.option("--copy", is_flag=True, help="Copy photos instead of linking them.")
+@click.option("--json", "as_json", is_flag=True, help="Print the same facts as JSON.")
+def export_scene_command(scene: Path, form: str, output: Path, copy: bool, as_json: bool) -> None:
+    """Write SCENE in another tool's layout: photos at their training size, cameras, split, points, masks."""
+    from ambiguous_wild.datasets.export import export_scene
+
+    done = export_scene(scene, form, output, copy=copy)
+    if as_json:
+        facts = {"folder": str(done.folder), "layout": form, "train": done.train, "test": done.test}
+        click.echo(json.dumps({**facts, "left_out": list(done.left_out)}, indent=2))
+        return
+    lost = f"; the layout holds no {', no '.join(done.left_out)}" if done.left_out else ""
+    click.echo(f"wrote {output}: {done.train} training and {done.test} test photos as {form}{lost}")
+
+
+@click.command("package")
+@click.argument("scenes", nargs=-1, type=PathName())
+@click.option("-o", "--output", type=PathName(), help="Folder to make.")
+@click.option(
+    "--info",
+    "info_file",
+    type=PathName(dir_okay=False),
+    help="YAML file with licence, consent, creators; see --template.",
+)
+@click.option("--template", type=PathName(dir_okay=False), help="Write an empty --info file and stop.")
+@click.option("--keep-metadata", is_flag=True, help="Leave EXIF (places, serial numbers) in the photos.")
+@click.option(
+    "--people/--no-people",
+    default=True,
+    show_default=True,
+    help="List photos in which a detector sees a person; it misses most people.",
+)
+@click.option("--jobs", type=click.IntRange(min=1), help="Threads; the result does not depend on it.")
+@click.option("--json", "as_json", is_flag=True, help="Print the same facts as JSON.")
+def package_command(
+    scenes: tuple[Path, ...],
+    output: Path | None,
+    info_file: Path | None,
+    template: Path | None,
+    keep_metadata: bool,
+    people: bool,
+    jobs: int | None,
+    as_json: bool,
+) -> None:
+    """Pack SCENES for release: one zip per scene, croissant.json, a data card, checksums.
+
+    \b
+    aw package --template release.yaml          fill it in
+    aw package scene1 scene2 --info release.yaml -o package
+    aw verify package
+
+    The same scenes give the same bytes. Without licence and consent the package says "not for release".
+    """
+    from ambiguous_wild.datasets.release.describe import TEMPLATE, ReleaseInfo, read_release_info
+
+    if template is not None:
+        if template.exists():
+            raise AwError(f"{template} exists; nothing is overwritten: choose another name")
+        from ambiguous_wild.io.atomic import write_text
+
+        write_text(template, TEMPLATE)
+        click.echo(f"wrote {template}: fill it in, then pass it with --info")
+        return
+    if not scenes or output is None:
+        raise AwError("give at least one scene folder and -o DIR; 'aw package --help' shows examples")
+    from ambiguous_wild.datasets.release.package import package_scenes
+
+    info = read_release_info(info_file) if info_file else ReleaseInfo()
+    done = package_scenes(
+        scenes,
+        output,
+        info,
+        keep_metadata=keep_metadata,
+        look_for_people=people,
+        jobs=jobs or os.cpu_count() or 1,
+        progress=not as_json,
+    )
+    if as_json:
+        facts = {
+            "package": str(done.folder),
+            "scenes": done.scenes,
+            "bytes": done.bytes,
+            "lacking": done.lacking,
+        }
+        click.echo(json.dumps({**facts, "metadata_removed": done.stripped, "people": done.people}, indent=2))
+        return
+    size = f"{done.bytes / 1e6:.1f} MB"
+    click.echo(
+        f"wrote {output}: {len(done.scenes)} scenes, {size}, metadata taken out of {done.stripped} photos"
+    )
+    if done.people is not None:
+        click.echo(f"a person may be seen in {len(done.people)} photos: {shortlist(done.people) or 'none'}")
+    click.echo("look for faces and number plates in every photo before release: the detectors miss most")
+    if done.lacking:
+        click.echo(f"NOT FOR RELEASE: not stated: {', '.join(done.lacking)} (--info FILE)")
+    click.echo(f"check it: aw verify {shlex.quote(str(output))}")
+
+
+@click.command("verify")
+@click.argument("package", type=PathName())
+@click.option(
+    "--scratch", type=PathName(file_okay=False), help="Folder to unpack in.  [default: the system's]"
+)
+@click.option("--json", "as_json", is_flag=True, help="Print the same facts as JSON.")
+def verify_command(package: Path, scratch: Path | None, as_json: bool) -> None:
+    """Check PACKAGE, a folder of 'aw package' or one of its archives: every checksum, table and scene.
+
+    Nothing is trusted: hostile archives are refused.
+    """
+    from ambiguous_wild.datasets.release.verify import verify
+
+    found = verify(package, scratch=scratch)
+    if as_json:
+        facts = {"scenes": found.scenes, "files": found.files, "warnings": found.warnings}
+        click.echo(json.dumps(facts, indent=2, ensure_ascii=False))
+        return
+    for warning in found.warnings:
+        click.echo(f"warning: {warning}")
+    click.echo(f"{package} is whole: {len(found.scenes)} scenes, {found.files} files")

@@ -25,7 +25,7 @@ def command() -> None:
 @click.option("--json", "as_json", is_flag=True, help="Print the list as JSON.")
 def list_command(as_json: bool) -> None:
     """List every network: size, licence, source, use, and whether it is on this machine."""
-    from ambiguous_wild.core.weight_places import folder_fault, weights_folder
+    from ambiguous_wild.core.weight_files import folder_fault, weights_folder
     from ambiguous_wild.vision import weights
 
     every = weights.KNOWN + weights.OTHER_SIZES
@@ -86,7 +86,7 @@ def check_command(names: tuple[str, ...], as_json: bool) -> None:
 
     Exit code 2 if one is missing, damaged, or not the network that its name says.
     """
-    from ambiguous_wild.core.weight_places import folder_fault
+    from ambiguous_wild.core.weight_files import folder_fault
     from ambiguous_wild.vision import weights
     from ambiguous_wild.vision.verify import verify
 

@@ -24,8 +24,8 @@ from ambiguous_wild.splat.parts import MaskPolicy, Parts, Schedule, State
 from ambiguous_wild.splat.rendered import Cotangents
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.backends import make_features, make_instances
+from ambiguous_wild.vision.mask_ops import standing, unsupported
 from ambiguous_wild.vision.precompute import instance_labels, photo_features
-from ambiguous_wild.vision.support import standing, unsupported
 
 
 @dataclass(frozen=True)

@@ -68,7 +68,7 @@ class MethodEntry:
         return cls()
 
     def by_machine(self) -> frozenset[str]:
-        """Options whose defaults depend on the weights on the machine, see vision/chosen.py."""
+        """Options whose defaults depend on the weights on the machine, see vision/backends.py."""
         options = self.options()
         fields = dataclasses.fields(options) if dataclasses.is_dataclass(options) else ()
         return frozenset(f.name for f in fields if f.metadata.get("by_machine"))

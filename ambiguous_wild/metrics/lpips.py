@@ -20,8 +20,7 @@ import numpy as np
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import unknown
-from ambiguous_wild.core.tensor_files import read_tensors
-from ambiguous_wild.core.weight_places import find_file, folder_fault
+from ambiguous_wild.core.weight_files import find_file, folder_fault, read_tensors
 from ambiguous_wild.metrics.image import checked_pair
 
 if TYPE_CHECKING:

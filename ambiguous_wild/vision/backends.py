@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -10,8 +11,9 @@ from pathlib import Path
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import with_options
 from ambiguous_wild.core.errors import unknown
-from ambiguous_wild.core.weight_places import expanded
+from ambiguous_wild.core.weight_files import expanded
 from ambiguous_wild.vision.protocols import Features, Instances
+from ambiguous_wild.vision.weights import find, named
 
 # name in a spec: name of the weights, see vision/weights.py
 DINO = {
@@ -112,8 +114,7 @@ def make_features(spec: str) -> Features:
         _no_options(found, spec)
         return LabHog()
     if found.name == "sceneconv":
-        from ambiguous_wild.vision.sceneconv import SceneConv
-        from ambiguous_wild.vision.sceneconv_train import SceneConvConfig
+        from ambiguous_wild.vision.sceneconv import SceneConv, SceneConvConfig
 
         if found.size is not None:
             raise AwError(f"features {spec!r}: sceneconv takes no size")
@@ -244,3 +245,22 @@ def _weights(options: dict[str, str], key: str = "weights") -> tuple[Path | None
 def _no_options(found: Spec, spec: str) -> None:
     if found.options or found.size is not None:
         raise AwError(f"features {spec!r}: {found.name} takes no options")
+
+
+# Metadata of an option whose default depends on the machine: a command that repeats a run elsewhere names it.
+BY_MACHINE = {"by_machine": True}
+
+
+def first_here(*specs: str) -> str:
+    """The first of these specs that can run here, the last without asking; nothing is loaded."""
+    return next((spec for spec in specs[:-1] if _can_run(parse(spec).name)), specs[-1])
+
+
+def _can_run(name: str) -> bool:
+    """Whether the weights are here, and the package that runs them."""
+    if name in CONV:
+        return find(named(name))[0] is not None
+    weights = (DINO | SAM).get(name)
+    if weights is None:
+        return True
+    return find(named(weights))[0] is not None and importlib.util.find_spec("transformers") is not None

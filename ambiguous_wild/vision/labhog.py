@@ -17,12 +17,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ambiguous_wild.core import AwError
+from ambiguous_wild.vision.protocols import blurred_noisy_copy, check_image, spaced
 
 STRIDE = 4  # px of the image per cell of the grid
 BINS = 9  # orientations over 180 degrees
 LAB_CHANNELS, HOG_CHANNELS = 9, 2 * BINS
-_BLUR_PX, _NOISE = 1.5, 0.02  # of the degraded copies that set the block weights
 _FLAT = 0.05  # HOG cells with less contrast are damped, so that noise is not amplified
 
 # linear sRGB (D65) to XYZ divided by the white point: the arguments of f, one row each
@@ -60,11 +59,7 @@ class LabHog:
         Raises:
             AwError: there is no photo.
         """
-        if not photos:
-            raise AwError("cannot fit features to a scene without training photos")
-        chosen = [
-            photos[i] for i in sorted({round(k * (len(photos) - 1) / max(most - 1, 1)) for k in range(most)})
-        ]
+        chosen = [photos[k] for k in spaced(len(photos), most)]
         pairs = [_blocks(photo) for photo in chosen]
         hogs = torch.cat([hog.reshape(-1, HOG_CHANNELS) for _, hog in pairs]).double()
         device = photos[0].device
@@ -88,8 +83,7 @@ class LabHog:
         Raises:
             AwError: the image is not [H, W, 3] or smaller than 8 px.
         """
-        if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < 8:
-            raise AwError(f"features need an image of [H, W, 3], at least 8x8 px, got {list(image.shape)}")
+        check_image(image)
         lab, hog = _blocks(image)
         weights = self.weights.to(image.dtype).sqrt()
         return torch.cat(
@@ -173,17 +167,3 @@ def _pool(maps: Tensor, size: int) -> Tensor:
 def _box(maps: Tensor, size: int) -> Tensor:
     """Running mean over size x size cells; at the border over the cells inside."""
     return F.avg_pool2d(maps[None], size, stride=1, padding=size // 2, count_include_pad=False)[0]
-
-
-def blurred_noisy_copy(photo: Tensor, seed: int) -> Tensor:
-    """The photo blurred and with noise, similar to a good render of it."""
-    radius = math.ceil(3 * _BLUR_PX)
-    taps = torch.arange(-radius, radius + 1, dtype=photo.dtype, device=photo.device)
-    kernel = torch.exp(-0.5 * (taps / _BLUR_PX) ** 2)
-    kernel = kernel / kernel.sum()
-    maps = photo.permute(2, 0, 1)[:, None]
-    maps = F.pad(maps, (radius, radius, radius, radius), mode="replicate")
-    maps = F.conv2d(F.conv2d(maps, kernel.reshape(1, 1, 1, -1)), kernel.reshape(1, 1, -1, 1))
-    generator = torch.Generator().manual_seed(seed)
-    noise = torch.randn(photo.shape, generator=generator).to(photo.device) * _NOISE
-    return (maps[:, 0].permute(1, 2, 0) + noise).clamp(0.0, 1.0)

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ambiguous_wild.io.motion_points import MotionPoints
 from ambiguous_wild.io.palette import KEPT, MASKED, faded
-from ambiguous_wild.vision.cache import cache_key, cached
+from ambiguous_wild.vision.precompute import cache_key, cached
 from ambiguous_wild.vision.protocols import Instances, PromptedInstances
 from ambiguous_wild.vision.sparse_surface import PIXELS
 

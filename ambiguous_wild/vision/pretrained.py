@@ -17,12 +17,11 @@ from typing import Any
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.core.extras import install_command
-from ambiguous_wild.core.tensor_files import not_finite
-from ambiguous_wild.core.weight_places import expanded
+from ambiguous_wild.core.weight_files import expanded, not_finite
 from ambiguous_wild.io.hashing import sha256_file
-from ambiguous_wild.vision import fetch, hub, weights
+from ambiguous_wild.vision import fetch, weights
 
-TENSORS = "model.safetensors"
+TENSORS = weights.TENSORS
 
 
 @dataclass(frozen=True)
@@ -197,8 +196,8 @@ def _file_digest(path: str, changed_ns: int) -> str:
 def _download(weight: weights.Weight, reason: str) -> Path:
     """Download the weights into the weights folder, unless the hub is switched off."""
     try:
-        if hub.offline():
-            raise fetch.not_from_hub(weight, hub.switched_off())
+        if fetch.offline():
+            raise fetch.not_from_hub(weight, fetch.switched_off())
         return fetch.get([weight], lambda line: print(line, file=sys.stderr, flush=True))[0]
     except AwError as error:
         raise AwError(f"the weights of {weight.name} are missing ({reason}); {error}") from None

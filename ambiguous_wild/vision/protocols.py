@@ -1,15 +1,41 @@
-"""Interfaces that methods use: dense frozen features and per-photo instance labels."""
+"""Interfaces that methods use: dense frozen features, instance labels of photos; and what back ends share."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
+import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from ambiguous_wild.vision.progress import Bar, no_bar
+from ambiguous_wild.core import AwError
+
+Bar: TypeAlias = Callable[[Sequence[Any]], Iterable[Any]]
+
+
+def no_bar(items: Sequence[Any]) -> Iterable[Any]:
+    """The items, without a bar."""
+    return items
+
+
+def terminal_bar(what: str, unit: str = "photo") -> Bar:
+    """A function that wraps a list so that a terminal shows a bar during iteration.
+
+    Args:
+        what: name of the stage, e.g. ``"instance masks"``.
+        unit: name of one item.
+    """
+
+    def wrap(items: Sequence[Any]) -> Iterable[Any]:
+        from tqdm import tqdm
+
+        return tqdm(items, desc=what, unit=unit, disable=None, leave=False)  # None: only on a terminal
+
+    return wrap
 
 
 class Features(Protocol):
@@ -95,7 +121,77 @@ class SceneInstances(Protocol):
         Args:
             photos: [H, W, 3] float32 in [0, 1].
             names: of the photos, with a suffix; their natural order is the order of a sequence.
-            folder: of the cache (`vision.cache`), from which a stopped stage resumes.
+            folder: of the cache (`vision.precompute`), from which a stopped stage resumes.
             bar: wraps the list of items, for a progress bar.
         """
         ...
+
+
+_LEAST_PX = 8
+_BLUR_PX, _NOISE = 1.5, 0.02  # of the degraded copies that set units and weights of features
+
+
+def spaced(count: int, most: int) -> list[int]:
+    """Indices of `most` of `count` training photos, evenly spaced; of all where they are fewer.
+
+    Raises:
+        AwError: there is no photo.
+    """
+    if not count:
+        raise AwError("cannot fit features to a scene without training photos")
+    return sorted({round(k * (count - 1) / max(most - 1, 1)) for k in range(most)})
+
+
+def blurred_noisy_copy(photo: Tensor, seed: int) -> Tensor:
+    """The photo blurred and with noise, similar to a good render of it."""
+    radius = math.ceil(3 * _BLUR_PX)
+    taps = torch.arange(-radius, radius + 1, dtype=photo.dtype, device=photo.device)
+    kernel = torch.exp(-0.5 * (taps / _BLUR_PX) ** 2)
+    kernel = kernel / kernel.sum()
+    maps = photo.permute(2, 0, 1)[:, None]
+    maps = F.pad(maps, (radius, radius, radius, radius), mode="replicate")
+    maps = F.conv2d(F.conv2d(maps, kernel.reshape(1, 1, 1, -1)), kernel.reshape(1, 1, -1, 1))
+    generator = torch.Generator().manual_seed(seed)
+    noise = torch.randn(photo.shape, generator=generator).to(photo.device) * _NOISE
+    return (maps[:, 0].permute(1, 2, 0) + noise).clamp(0.0, 1.0)
+
+
+@torch.no_grad()
+def degraded_distance(features: Callable[[Tensor], Tensor], photos: Sequence[Tensor], most: int) -> float:
+    """Mean cosine distance between photos [H, W, 3] and blurred, noisy copies of them.
+
+    Args:
+        features: of an image, [h, w, C].
+        photos: of the scene.
+        most: photos to use, evenly spaced.
+
+    Raises:
+        AwError: there is no photo.
+    """
+    means = []
+    for index in spaced(len(photos), most):
+        one, two = features(photos[index]), features(blurred_noisy_copy(photos[index], index))
+        means.append((1.0 - F.cosine_similarity(one, two, dim=2)).double().mean().item())
+    # rounded, because it is part of cache keys and its last bits depend on the number of threads
+    return float(f"{max(sum(means) / len(means), 1e-6):.4g}")
+
+
+def check_image(image: Tensor) -> None:
+    """Raise AwError where the image is not [H, W, 3] or smaller than 8 px."""
+    if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < _LEAST_PX:
+        raise AwError(f"features need an image of [H, W, 3], at least 8x8 px, got {list(image.shape)}")
+
+
+def whole_cells(image: Tensor, rows: int, columns: int, cell: int) -> Tensor:
+    """The image [H, W, 3] as [1, 3, rows * cell, columns * cell], resized if needed."""
+    pixels = image.permute(2, 0, 1)[None]
+    size = (rows * cell, columns * cell)
+    if size == tuple(image.shape[:2]):
+        return pixels
+    return F.interpolate(pixels, size=size, mode="bilinear", align_corners=False, antialias=True)
+
+
+def cell_grid(height: int, width: int, size: int, cell: int) -> tuple[int, int]:
+    """Rows and columns of cells for an image whose longer side is resized to `size` px; 0 = not resized."""
+    scale = size / max(height, width) if size else 1.0
+    return max(round(height * scale / cell), 1), max(round(width * scale / cell), 1)

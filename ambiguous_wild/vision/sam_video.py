@@ -20,11 +20,10 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash
-from ambiguous_wild.vision.cache import cache_key, cached
 from ambiguous_wild.vision.mask_ops import add_new
+from ambiguous_wild.vision.precompute import cache_key, cached
 from ambiguous_wild.vision.pretrained import load, locate
-from ambiguous_wild.vision.progress import Bar, no_bar
-from ambiguous_wild.vision.protocols import Instances
+from ambiguous_wild.vision.protocols import Bar, Instances, no_bar
 from ambiguous_wild.vision.sam import SamConfig, SamInstances, fit_to
 
 

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.vision import intact, weights
+from ambiguous_wild.vision import weights
+from ambiguous_wild.vision.weight_files import check_file, check_folder
 from ambiguous_wild.vision.weights import Weight
 
 _SIDE = 64  # px of the picture that features are computed for
@@ -38,12 +39,12 @@ def verify(weight: Weight) -> Verdict:
 
 
 def _file(weight: Weight, path: Path) -> str:
-    count = intact.check_file(weight, path, f"run: {weights.get_command(weight.name)}")
+    count = check_file(weight, path, f"run: {weights.get_command(weight.name)}")
     return f"{count} tensors, sha256 as published"
 
 
 def _folder(weight: Weight, folder: Path) -> str:
-    known = intact.check_folder(weight, folder, f"run: {weights.get_command(weight.name)}")
+    known = check_folder(weight, folder, f"run: {weights.get_command(weight.name)}")
     count = _load(weight, folder)
     return f"{count} tensors, {'sha256 as downloaded' if known else 'no record of their sha256'}"
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from ambiguous_wild.core.weight_places import expanded, file_places, find_file, folder_fault, weights_folder
+from ambiguous_wild.core.weight_files import expanded, file_places, find_file, folder_fault, weights_folder
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Weight:
     package: Package | None = None  # of kind file
     member: str = ""  # of the package
     form: Literal["flax", "torch"] = "torch"  # of the member: a pickle of numpy arrays, or torch's
-    tensors: str = ""  # `convert.tensors_digest` of the published tensors
+    tensors: str = ""  # `weight_files.tensors_digest` of the published tensors
 
     @property
     def source(self) -> str:
@@ -58,7 +58,8 @@ class WeightStatus(NamedTuple):
     command: str  # downloads it, or a comment if none can; "" if present
 
 
-_HUB_FILES = ("config.json", "model.safetensors")
+TENSORS, RECEIPT = "model.safetensors", "source.json"  # of kind hub; where the download came from
+_HUB_FILES = ("config.json", TENSORS)
 _TEXT_FILES = (*_HUB_FILES, "tokenizer.json", "tokenizer_config.json")
 _FEATURES, _MASKS, _TRACKS = "features", "instance masks", "instance masks and identities"
 

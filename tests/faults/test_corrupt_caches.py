@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import ambiguous_wild.splat.cpu.compile  # noqa: F401  sets where kernels are kept, once
-from ambiguous_wild.vision.cache import cached
+from ambiguous_wild.vision.precompute import cached
 
 
 def zip_of(name, data):

@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.core.tensor_files import read_tensors
+from ambiguous_wild.core.weight_files import read_tensors
 from ambiguous_wild.harness.planning.decide import SCHEMA
 from ambiguous_wild.harness.planning.file import read_plan
 from ambiguous_wild.harness.running.result_file import read_result

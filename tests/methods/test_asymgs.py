@@ -8,7 +8,7 @@ import torch
 
 from ambiguous_wild.methods.asymgs import AsymGsConfig, AsymMask
 from ambiguous_wild.splat.effects.slow import SlowAverage, SlowDensity, slow, slow_gaussians
-from ambiguous_wild.vision.support import standing, unsupported
+from ambiguous_wild.vision.mask_ops import standing, unsupported
 from tests.methods.baselines import data_of, parts_of, step_of, trained, trainer_of
 from tests.splat.scenes import gaussians
 from tests.tiny_scene import write_tiny_scene

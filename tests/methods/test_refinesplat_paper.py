@@ -19,7 +19,7 @@ from ambiguous_wild.methods.refinesplat.paper import PaperConfig, PrintedConfig
 from ambiguous_wild.methods.refinesplat.policy import RefineSplatMask
 from ambiguous_wild.methods.refinesplat.recipe import build
 from ambiguous_wild.splat.losses import photometric
-from ambiguous_wild.vision import chosen
+from ambiguous_wild.vision import backends
 from tests.methods.test_refinesplat_policy import (
     HEIGHT,
     VIEWS,
@@ -240,7 +240,7 @@ def test_what_is_not_stated_is_as_in_refinesplat():
 def test_the_papers_networks_are_the_default_where_their_weights_are(tmp_path, monkeypatch):
     monkeypatch.setenv("AW_WEIGHTS", str(tmp_path))
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "hub"))
-    monkeypatch.setattr(chosen.importlib.util, "find_spec", lambda name: object())
+    monkeypatch.setattr(backends.importlib.util, "find_spec", lambda name: object())
     found = [(PaperConfig().features, PaperConfig().instances)]
     for name in ("efficientnet-lite0", "dinov2-small", "sam2.1-hiera-tiny"):
         (tmp_path / name).mkdir()
@@ -250,7 +250,7 @@ def test_the_papers_networks_are_the_default_where_their_weights_are(tmp_path, m
     lite = "efficientnet-lite0"
     assert found == [("labhog", "graph"), (lite, lite), ("dinov2-small", lite), ("dinov2-small", "sam2")]
     assert PrintedConfig().features == "dinov2-small@504"
-    monkeypatch.setattr(chosen.importlib.util, "find_spec", lambda name: None)  # no transformers
+    monkeypatch.setattr(backends.importlib.util, "find_spec", lambda name: None)  # no transformers
     assert (PaperConfig().features, PaperConfig().instances) == (lite, lite)
 
 

@@ -15,7 +15,7 @@ from ambiguous_wild.methods.robustsplat.config import RobustSplatConfig
 from ambiguous_wild.methods.robustsplat.net import MaskNet
 from ambiguous_wild.methods.robustsplat.policy import RobustSplatMask, _fit, coarse_spec
 from ambiguous_wild.methods.robustsplat.recipe import build
-from ambiguous_wild.vision import chosen
+from ambiguous_wild.vision import backends
 from ambiguous_wild.vision.labhog import LabHog
 from tests.methods.baselines import data_of, parts_of, step_of, trained
 from tests.tiny_scene import SQUARE, TRAIN, wall_colour, write_tiny_scene
@@ -260,7 +260,7 @@ def test_the_coarse_stage_has_features_of_its_own():
 def test_its_features_are_the_best_whose_weights_are_here(tmp_path, monkeypatch):
     monkeypatch.setenv("AW_WEIGHTS", str(tmp_path))
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "hub"))
-    monkeypatch.setattr(chosen.importlib.util, "find_spec", lambda name: object())
+    monkeypatch.setattr(backends.importlib.util, "find_spec", lambda name: object())
     found = [RobustSplatConfig().features]
     for name in ("efficientnet-lite0", "dinov2-with-registers-small"):
         (tmp_path / name).mkdir()

@@ -11,7 +11,7 @@ from ambiguous_wild.methods.masking_common import annealed, hashed_uniform, samp
 from ambiguous_wild.methods.spotlesssplats.density import PruningDensity, SpotLessDensityConfig
 from ambiguous_wild.methods.spotlesssplats.net import PlacedNet, placed
 from ambiguous_wild.splat.optim import SplatAdam
-from ambiguous_wild.vision.ward import ward_clusters
+from ambiguous_wild.vision.segments import ward_clusters
 from tests.methods.baselines import data_of, parts_of, step_of, trained
 from tests.splat.scenes import gaussians
 from tests.tiny_scene import TRAIN, write_tiny_scene

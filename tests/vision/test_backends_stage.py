@@ -9,8 +9,7 @@ from ambiguous_wild.vision.grounded import GroundedInstances
 from ambiguous_wild.vision.label_maps import LabelMaps, SceneLabelMaps
 from ambiguous_wild.vision.labhog import LabHog
 from ambiguous_wild.vision.precompute import instance_labels, photo_features
-from ambiguous_wild.vision.progress import terminal_bar
-from ambiguous_wild.vision.protocols import NamedInstances, SceneInstances
+from ambiguous_wild.vision.protocols import NamedInstances, SceneInstances, terminal_bar
 from ambiguous_wild.vision.sam import SamInstances
 from ambiguous_wild.vision.sam_video import SamVideoInstances
 from ambiguous_wild.vision.segments import GraphSegments, SegmentConfig

@@ -14,10 +14,10 @@ import torch.nn.functional as F
 from safetensors.torch import save_file
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.vision import efficientnet, weights
-from ambiguous_wild.vision.convert import read_as_arrays, tensors_digest
+from ambiguous_wild.vision import convnets, weights
 from ambiguous_wild.vision.convnets import NETWORKS, ConvConfig, ConvFeatures
 from ambiguous_wild.vision.labhog import blurred_noisy_copy
+from ambiguous_wild.vision.weight_files import read_as_arrays, tensors_digest
 
 VGG = [(0, 3, 64), (2, 64, 64), (5, 64, 128), (7, 128, 128), (10, 128, 256), (12, 256, 256), (14, 256, 256)]
 
@@ -47,7 +47,7 @@ def efficientnet_tensors() -> dict[str, torch.Tensor]:
         made[f"{norm}.running_var"] = 0.2 + torch.rand(out, generator=g)
 
     conv("_conv_stem", "_bn0", 32, 3, 3)
-    for i, (kernel, _, expansion, into, out) in enumerate(efficientnet.BLOCKS[:5]):
+    for i, (kernel, _, expansion, into, out) in enumerate(convnets.BLOCKS[:5]):
         wide = into * expansion
         if expansion > 1:
             conv(f"_blocks.{i}._expand_conv", f"_blocks.{i}._bn0", wide, into, 1)
@@ -91,7 +91,7 @@ def plain_efficientnet(pixels: torch.Tensor, blocks: int) -> torch.Tensor:
         return F.batch_norm(y, *parts, eps=1e-3)
 
     x = conv(pixels, "_conv_stem", "_bn0", 2).clamp(0, 6)
-    for i, (_, stride, expansion, into, out) in enumerate(efficientnet.BLOCKS[: blocks + 1]):
+    for i, (_, stride, expansion, into, out) in enumerate(convnets.BLOCKS[: blocks + 1]):
         y = x
         if expansion > 1:
             y = conv(y, f"_blocks.{i}._expand_conv", f"_blocks.{i}._bn0").clamp(0, 6)

@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.vision import cache
+from ambiguous_wild.vision import precompute
 from ambiguous_wild.vision import sceneconv as module
 from ambiguous_wild.vision.labhog import blurred_noisy_copy
-from ambiguous_wild.vision.sceneconv import SceneConv
-from ambiguous_wild.vision.sceneconv_train import (
+from ambiguous_wild.vision.sceneconv import (
     Pairs,
+    SceneConv,
     SceneConvConfig,
     imitated_render,
     info_nce,
@@ -140,7 +140,7 @@ def test_the_cache_answers_for_the_same_scene_only(scene, trained, tmp_path, mon
     # a damaged entry is made again
     for entry in tmp_path.glob("*.npz"):
         entry.write_bytes(b"nothing")
-    cache._tidy.cache_clear()
+    precompute._tidy.cache_clear()
     first.fit_scene(photos, tracks, tmp_path)
     assert len(runs) == 5
 

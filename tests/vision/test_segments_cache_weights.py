@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.vision.cache import cache_key, cached
+from ambiguous_wild.vision.precompute import cache_key, cached
 from ambiguous_wild.vision.segments import GraphSegments, SegmentConfig
 
 

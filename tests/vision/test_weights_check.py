@@ -16,7 +16,7 @@ from safetensors.torch import save_file
 from ambiguous_wild.cli.weights import command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.metrics import lpips
-from ambiguous_wild.vision import convert, weights
+from ambiguous_wild.vision import weight_files, weights
 from ambiguous_wild.vision.verify import verify
 from tests.vision.stub_sources import Harmful, pickled
 
@@ -106,9 +106,9 @@ def test_other_tensors_than_the_published_are_named(own: Path) -> None:
 def test_a_classifier_is_not_part_of_the_digest_and_the_container_neither() -> None:
     trunk = {"features.0.weight": np.ones((2, 3), np.float32)}
     weight = weights.named("vgg16")
-    whole = convert.used_tensors(weight, trunk | {"classifier.0.bias": np.zeros(2, np.float32)})
-    assert convert.tensors_digest(whole) == convert.tensors_digest(trunk)
-    assert convert.tensors_digest(trunk) != convert.tensors_digest(
+    whole = weight_files.used_tensors(weight, trunk | {"classifier.0.bias": np.zeros(2, np.float32)})
+    assert weight_files.tensors_digest(whole) == weight_files.tensors_digest(trunk)
+    assert weight_files.tensors_digest(trunk) != weight_files.tensors_digest(
         {"features.0.weight": np.ones(6, np.float32)}
     )
 

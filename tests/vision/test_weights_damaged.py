@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import re
 import shutil
 from contextlib import ExitStack
@@ -18,7 +19,7 @@ from ambiguous_wild.cli.weights import command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.lock import folder_lock
 from ambiguous_wild.metrics import lpips
-from ambiguous_wild.vision import convert, fetch, weights
+from ambiguous_wild.vision import fetch, weight_files, weights
 from ambiguous_wild.vision.backends import make_features
 from ambiguous_wild.vision.dino import DinoFeatures
 from ambiguous_wild.vision.pretrained import locate
@@ -35,7 +36,7 @@ def heads(own: Path, index: Path, without_pip: None) -> weights.Weight:
     fetch.get([weight], lambda line: None)
     path = weights.where(weight)
     assert path is not None
-    digest = convert.tensors_digest(convert.read_as_arrays(path))
+    digest = weight_files.tensors_digest(weight_files.read_as_arrays(path))
     shutil.rmtree(own)
     return dataclasses.replace(weight, tensors=digest)
 
@@ -46,6 +47,49 @@ def said(weight: weights.Weight, again: bool = False) -> list[str]:
     return lines
 
 
+# -- pickles of arrays ------------------------------------------------------------------------------
+
+
+class Calls:
+    """Pickles as a call."""
+
+    def __init__(self, function: Any, *args: Any) -> None:
+        self.call = (function, args)
+
+    def __reduce__(self) -> Any:
+        return self.call
+
+
+def test_arrays_come_out_of_a_pickle_as_they_were(tmp_path: Path) -> None:
+    swapped, flags = np.arange(6).reshape(2, 3).astype(">f4"), np.array([True, False])
+    (tmp_path / "a").write_bytes(pickled({"net": {"kernel": swapped}, "flags": flags}))
+    found = weight_files.unpickled(tmp_path / "a")
+    assert list(found) == ["net.kernel", "flags"]
+    assert np.array_equal(found["net.kernel"], swapped) and np.array_equal(found["flags"], flags)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        Calls(os.system, "touch executed"),
+        {"a": {"b": Calls(exec, "open('executed', 'w')")}},
+        {"a": Calls(np.load, "x.npy")},
+        {"a": np.array([{"x": 1}, None], dtype=object)},
+        {"a": np.array(["text"])},
+        {"a": 3},
+        [np.zeros(2)],
+    ],
+)
+def test_nothing_else_of_a_pickle_is_built(
+    data: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.pkl").write_bytes(pickled(data))
+    with pytest.raises(AwError, match=r"a\.pkl is no pickle of numpy arrays \(.+\)"):
+        weight_files.unpickled(tmp_path / "a.pkl")
+    assert [p.name for p in tmp_path.iterdir()] == ["a.pkl"]
+
+
 # -- damaged files ----------------------------------------------------------------------------------
 
 
@@ -53,11 +97,11 @@ def said(weight: weights.Weight, again: bool = False) -> list[str]:
 def test_a_damaged_file_is_downloaded_again(heads: weights.Weight, own: Path, damage: str) -> None:
     (path,) = fetch.get([heads], lambda line: None)
     whole = path.read_bytes()
-    arrays = convert.read_as_arrays(path)
+    arrays = weight_files.read_as_arrays(path)
     first = next(iter(arrays))
     values = {"other": arrays[first] + 1, "not finite": np.full_like(arrays[first], np.nan)}
     if damage in values:
-        convert.save(arrays | {first: values[damage]}, path)
+        weight_files.save(arrays | {first: values[damage]}, path)
     else:
         path.write_bytes({"empty": b"", "cut": whole[:-8], "longer": whole + b"12345678"}[damage])
     lines = said(heads)

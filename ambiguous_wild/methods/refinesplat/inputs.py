@@ -15,9 +15,8 @@ from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.identity import Psi, psi_arrays, psi_from_arrays, train_psi
 from ambiguous_wild.methods.refinesplat.masking import grid_labels, instance_means
 from ambiguous_wild.splat.step import TrainData
-from ambiguous_wild.vision.cache import cache_key, cached
 from ambiguous_wild.vision.mask_ops import add_new
-from ambiguous_wild.vision.precompute import instance_labels, photo_features
+from ambiguous_wild.vision.precompute import cache_key, cached, instance_labels, photo_features
 from ambiguous_wild.vision.protocols import Features, Instances, SceneFeatures
 
 

@@ -15,7 +15,7 @@ from ambiguous_wild.methods.refinesplat.density import EntropyDensityConfig
 from ambiguous_wild.methods.refinesplat.first_look import FirstLookConfig
 from ambiguous_wild.methods.refinesplat.merging import MergeConfig
 from ambiguous_wild.methods.refinesplat.support import SupportConfig
-from ambiguous_wild.vision.chosen import BY_MACHINE, first_here
+from ambiguous_wild.vision.backends import BY_MACHINE, first_here
 
 # Masks by entropy (Eqs. 3 to 7). Two forms are repaired: Kapur's for the additive objective of T_ent, and the
 # standard deviation for the variance in T_glb. No gate or limit of ours is on but `most`.

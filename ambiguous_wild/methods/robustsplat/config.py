@@ -7,8 +7,7 @@ from typing import Literal
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.splat.density import NO_SIZE_PRUNING, DensityConfig
-from ambiguous_wild.vision.backends import DINO, check_features, parse
-from ambiguous_wild.vision.chosen import BY_MACHINE, first_here
+from ambiguous_wild.vision.backends import BY_MACHINE, DINO, check_features, first_here, parse
 
 _SIZES = dict.fromkeys((*DINO, "vgg16"), 252)  # px of a net's input without "@"; others take the photo's size
 PUBLISHED = "dinov2-small-registers@504,normalise=raw"

@@ -32,7 +32,7 @@ from ambiguous_wild.splat.parts import MaskPolicy, Parts, State
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.backends import check_features, make_features
 from ambiguous_wild.vision.precompute import photo_features
-from ambiguous_wild.vision.ward import ward_clusters
+from ambiguous_wild.vision.segments import ward_clusters
 
 CELLS, BINS = 50, 10_000  # on the longer side of the clusters' grid; of the histogram
 

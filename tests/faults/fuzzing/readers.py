@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from ambiguous_wild.core.tensor_files import read_tensors
+from ambiguous_wild.core.weight_files import read_tensors
 from ambiguous_wild.harness.audit.table import read_tables
 from ambiguous_wild.harness.leaderboard import board, pictures
 from ambiguous_wild.harness.planning.file import read_plan
@@ -31,8 +31,8 @@ from ambiguous_wild.simulate.composite.cutouts import read_cutouts
 from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.study.answers import read_answers
 from ambiguous_wild.study.key import read_key
-from ambiguous_wild.vision.cache import cached
 from ambiguous_wild.vision.label_maps import read_labels
+from ambiguous_wild.vision.precompute import cached
 from tests.faults.fuzzing import mutate as damages
 from tests.faults.fuzzing import samples as valid
 

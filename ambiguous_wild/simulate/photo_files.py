@@ -10,7 +10,7 @@ import numpy as np
 
 from ambiguous_wild import __version__
 from ambiguous_wild.core.camera import Camera
-from ambiguous_wild.io.exif import Exif
+from ambiguous_wild.io.photos import Exif
 from ambiguous_wild.simulate.camera_path import focal_px
 from ambiguous_wild.simulate.records import DrawnEffects
 from ambiguous_wild.simulate.spec import CaptureSpec

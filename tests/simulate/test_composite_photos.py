@@ -15,10 +15,9 @@ from PIL import Image
 from ambiguous_wild.builder.collect import collect
 from ambiguous_wild.cli.composite import command
 from ambiguous_wild.core import AwError
-from ambiguous_wild.io.exif import Exif
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import read_gray, read_png_rgb
-from ambiguous_wild.io.photos import read_photo
+from ambiguous_wild.io.photos import Exif, read_photo
 from ambiguous_wild.simulate.composite.composite_photos import composite_photos
 from ambiguous_wild.simulate.composite.placement import CompositeConfig
 from ambiguous_wild.simulate.photo_files import write_jpeg

@@ -199,7 +199,7 @@ def test_the_judge_is_independent() -> None:
 
 def test_core_needs_numpy_alone() -> None:
     allowed = set(sys.stdlib_module_names) | {"numpy", "ambiguous_wild"}
-    late = {"tensor_files.py": {"torch", "safetensors"}}  # when a file is read
+    late = {"weight_files.py": {"torch", "safetensors"}}  # when a file is read
     for path in PACKAGE.glob("core/*.py"):
         assert {m.split(".")[0] for m, _, _ in imports(path)} <= allowed | late.get(path.name, set()), path
 

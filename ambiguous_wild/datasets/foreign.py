@@ -12,6 +12,7 @@ import numpy as np
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.core.scene import Split
 from ambiguous_wild.io.colmap_records import LARGEST_COORDINATE, Model
+from ambiguous_wild.io.scene_folder import TEST_EVERY
 
 SIDES: tuple[Split, Split] = ("train", "test")
 SUFFIXES = (".jpg", ".jpeg", ".png", ".JPG", ".JPEG", ".PNG")
@@ -32,7 +33,7 @@ class ForeignScene:
     Names are those of the model, relative to the folder of photos.
     """
 
-    kind: str  # the layout, a key of `recognise.READERS`
+    kind: str  # the layout, a key of `readers.READERS`
     root: Path
     model: Model  # poses and cameras at full size; may have no points
     photos: Path  # folder that the model's names refer to
@@ -65,6 +66,11 @@ def inside(name: str, root: Path) -> str:
 def without_suffix(name: str) -> str:
     """The name without its last extension."""
     return str(PurePosixPath(name).with_suffix(""))
+
+
+def plain(name: str) -> str:
+    """A scene's name without what its spellings differ in: Patio-High, patio_high."""
+    return "".join(c for c in name.casefold() if c.isalnum())
 
 
 def split_by_lists(
@@ -123,6 +129,12 @@ def _index(names: Iterable[str], key: Callable[[str], str]) -> dict[str, list[st
     for name in names:
         found.setdefault(key(name), []).append(name)
     return found
+
+
+def every_nth(names: Iterable[str]) -> tuple[dict[str, Split], str]:
+    """Sides where the dataset states none: every 8th photo tests; and the note that says so."""
+    sides: dict[str, Split] = {n: "train" if i % TEST_EVERY else "test" for i, n in enumerate(sorted(names))}
+    return sides, f"no test set given: every {TEST_EVERY}th photo tests, distractors in it count as truth"
 
 
 def find_photo(folder: Path, name: str) -> Path | None:

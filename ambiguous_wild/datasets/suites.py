@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ambiguous_wild.core.errors import AwError, shortlist, unknown
-from ambiguous_wild.datasets.readers.on_the_go import plain
+from ambiguous_wild.datasets.foreign import plain
 from ambiguous_wild.io.plain_yaml import read_mapping
 
 FILE = Path(__file__).with_name("suites.yaml")

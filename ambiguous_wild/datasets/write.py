@@ -21,7 +21,7 @@ from ambiguous_wild.core.names import check_name
 from ambiguous_wild.datasets.foreign import SIDES, ForeignScene
 from ambiguous_wild.datasets.photos import PhotoPlan, PlacedPhoto, place_mask, place_photo, plan_photos
 from ambiguous_wild.datasets.points import drop_test_only, find_motion, random_points, triangulate
-from ambiguous_wild.datasets.recognise import read_foreign
+from ambiguous_wild.datasets.readers import read_foreign
 from ambiguous_wild.datasets.suites import differences, suite_of
 from ambiguous_wild.io.atomic import check_output, refuse_foreign_files, write_json, write_text
 from ambiguous_wild.io.colmap_model import write_model

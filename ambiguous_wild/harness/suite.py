@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ambiguous_wild.core.errors import AwError, shortlist
-from ambiguous_wild.datasets.readers.on_the_go import plain
+from ambiguous_wild.datasets.foreign import plain
 from ambiguous_wild.datasets.suites import Suite, find_scenes, scene_id
 
 if TYPE_CHECKING:

@@ -163,7 +163,7 @@ def _graph(found: Spec, spec: str) -> Instances:
 
 def _grouped(found: Spec, spec: str) -> Instances:
     from ambiguous_wild.vision.convnets import ConvConfig, ConvFeatures
-    from ambiguous_wild.vision.grouped import GroupConfig, GroupedSegments
+    from ambiguous_wild.vision.segments import GroupConfig, GroupedSegments
 
     folder, options = _weights(found.options)
     network = {k: v for k, v in options.items() if k == "layer"}

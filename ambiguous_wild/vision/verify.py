@@ -31,22 +31,16 @@ def verify(weight: Weight) -> Verdict:
         place = weights.where(weight)
         if place is None:
             raise AwError(weights.missing(weight))
+        advice = f"run: {weights.get_command(weight.name)}"
         if weight.kind == "file":
-            return Verdict(weight.name, True, f"{_file(weight, place)}: {place}")
-        return Verdict(weight.name, True, f"{_folder(weight, place)}: {place}")
+            count, known = check_file(weight, place, advice), "sha256 as published"
+        else:
+            recorded = check_folder(weight, place, advice)
+            count, known = _load(weight, place), "sha256 as downloaded"
+            known = known if recorded else "no record of their sha256"
+        return Verdict(weight.name, True, f"{count} tensors, {known}: {place}")
     except AwError as error:
         return Verdict(weight.name, False, str(error))
-
-
-def _file(weight: Weight, path: Path) -> str:
-    count = check_file(weight, path, f"run: {weights.get_command(weight.name)}")
-    return f"{count} tensors, sha256 as published"
-
-
-def _folder(weight: Weight, folder: Path) -> str:
-    known = check_folder(weight, folder, f"run: {weights.get_command(weight.name)}")
-    count = _load(weight, folder)
-    return f"{count} tensors, {'sha256 as downloaded' if known else 'no record of their sha256'}"
 
 
 def _load(weight: Weight, folder: Path) -> int:

@@ -35,7 +35,7 @@ def convert(weight: Weight, source: Path, target: Path) -> None:
     Raises:
         AwError: not such a file; nothing of it was run.
     """
-    arrays = read_as_arrays(source) if weight.form == "torch" else _from_flax(weight, _unpickled(source))
+    arrays = read_as_arrays(source) if weight.form == "torch" else _from_flax(weight, unpickled(source))
     digest = tensors_digest(arrays)
     if weight.tensors and digest != weight.tensors:
         raise AwError(f"{source} holds other tensors than those published as {weight.name}; not installed")
@@ -50,7 +50,7 @@ def save(arrays: Mapping[str, np.ndarray], target: Path) -> None:
 
 
 def read_as_arrays(path: Path, advice: str = "download it again") -> dict[str, np.ndarray]:
-    """See `core.tensor_files.read_tensors`."""
+    """See `core.weight_files.read_tensors`."""
     return {key: value.numpy() for key, value in read_tensors(path, advice).items()}
 
 
@@ -82,7 +82,7 @@ class _ArrayPickle(pickle.Unpickler):
         raise pickle.UnpicklingError(f"asks for {module}.{name}"[:120])
 
 
-def _unpickled(path: Path) -> dict[str, np.ndarray]:
+def unpickled(path: Path) -> dict[str, np.ndarray]:
     """The arrays of a pickled nested dict, by their keys joined with dots.
 
     The package's sha256 was compared with the registry's before.

@@ -11,7 +11,7 @@ from ambiguous_wild.builder.downsample import downsample_photo
 from ambiguous_wild.cli import bench
 from ambiguous_wild.cli import datasets as import_dataset
 from ambiguous_wild.core import AwError
-from ambiguous_wild.datasets.recognise import READERS, recognise
+from ambiguous_wild.datasets.readers import READERS, recognise
 from ambiguous_wild.datasets.suites import suites
 from ambiguous_wild.datasets.write import ImportSettings, import_scene
 from ambiguous_wild.harness.running.grid import plan_cells

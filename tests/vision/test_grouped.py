@@ -8,14 +8,14 @@ import pytest
 import torch
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.vision.grouped import (
+from ambiguous_wild.vision.segments import (
     GroupConfig,
     GroupedSegments,
+    SegmentConfig,
     group,
     neighbours,
     segment_features,
 )
-from ambiguous_wild.vision.segments import SegmentConfig
 
 
 def stripes(count: int, height: int = 24, each: int = 8) -> np.ndarray:

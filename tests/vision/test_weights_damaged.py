@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import re
 import shutil
 from contextlib import ExitStack
@@ -44,6 +45,49 @@ def said(weight: weights.Weight, again: bool = False) -> list[str]:
     lines: list[str] = []
     fetch.get([weight], lines.append, again)
     return lines
+
+
+# -- pickles of arrays ------------------------------------------------------------------------------
+
+
+class Calls:
+    """Pickles as a call."""
+
+    def __init__(self, function: Any, *args: Any) -> None:
+        self.call = (function, args)
+
+    def __reduce__(self) -> Any:
+        return self.call
+
+
+def test_arrays_come_out_of_a_pickle_as_they_were(tmp_path: Path) -> None:
+    swapped, flags = np.arange(6).reshape(2, 3).astype(">f4"), np.array([True, False])
+    (tmp_path / "a").write_bytes(pickled({"net": {"kernel": swapped}, "flags": flags}))
+    found = weight_files.unpickled(tmp_path / "a")
+    assert list(found) == ["net.kernel", "flags"]
+    assert np.array_equal(found["net.kernel"], swapped) and np.array_equal(found["flags"], flags)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        Calls(os.system, "touch executed"),
+        {"a": {"b": Calls(exec, "open('executed', 'w')")}},
+        {"a": Calls(np.load, "x.npy")},
+        {"a": np.array([{"x": 1}, None], dtype=object)},
+        {"a": np.array(["text"])},
+        {"a": 3},
+        [np.zeros(2)],
+    ],
+)
+def test_nothing_else_of_a_pickle_is_built(
+    data: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.pkl").write_bytes(pickled(data))
+    with pytest.raises(AwError, match=r"a\.pkl is no pickle of numpy arrays \(.+\)"):
+        weight_files.unpickled(tmp_path / "a.pkl")
+    assert [p.name for p in tmp_path.iterdir()] == ["a.pkl"]
 
 
 # -- damaged files ----------------------------------------------------------------------------------

@@ -1,1 +1,113 @@
-"""One file a layout: each turns a folder into a `ForeignScene`."""
+"""One file a layout: each turns a folder into a `ForeignScene`; and which layout a folder has."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from ambiguous_wild.core.errors import AwError, unknown
+from ambiguous_wild.datasets.foreign import ForeignScene, plain
+from ambiguous_wild.datasets.readers import colmap, nerfbaselines, on_the_go, phototourism, transforms
+from ambiguous_wild.io.colmap_model import read_model
+
+READERS: dict[str, Callable[[Path], ForeignScene]] = {
+    "on-the-go": on_the_go.read_on_the_go,
+    "robustnerf": colmap.read_robustnerf,
+    "photo-tourism": phototourism.read_phototourism,
+    "drone": colmap.read_drone,
+    "dualsplat": colmap.read_dualsplat,
+    "nerfbaselines": nerfbaselines.read_nerfbaselines,
+    "nerfstudio": transforms.read_transforms,
+    "instant-ngp": transforms.read_transforms,
+    "blender": transforms.read_blender,
+    "colmap": colmap.read_plain,
+}
+DRONE_SCENES = ("Cultural_Center", "TangTian", "Pavilion", "Simingshan", "Intersection", "Sculpture")
+
+
+def recognise(root: Path) -> tuple[str, str]:
+    """(layout, the evidence for it).
+
+    Raises:
+        AwError: no layout, two that contradict each other, or a scene of ours.
+    """
+    if not root.is_dir():
+        what = "is a file; unpack archives first" if root.exists() else "does not exist"
+        raise AwError(f"dataset {root} {what}")
+    if (root / "scene.json").is_file():
+        raise AwError(f"{root} is a scene already (it holds scene.json): run 'aw bench' on it")
+    candidates = _candidates(root)
+    if not candidates:
+        raise AwError(
+            f"{root} has no known layout: no COLMAP model, transforms.json, transforms_train.json, "
+            "split.json "
+            f"or nb-info.json; give the folder of one scene, name the layout with --as "
+            f"({', '.join(READERS)}), "
+            "or build a scene from photos with 'aw build-scene'"
+        )
+    if len(candidates) > 1:
+        found = "; ".join(f"{kind} ({why})" for kind, why in candidates)
+        raise AwError(f"{root} may be two layouts, whose splits differ: {found}; choose one with --as")
+    return candidates[0]
+
+
+def _candidates(root: Path) -> list[tuple[str, str]]:
+    """Layouts whose own files are there; several where they state different splits."""
+    if (root / "nb-info.json").is_file():
+        return [("nerfbaselines", "nb-info.json")]
+    found = []
+    if (root / "transforms_train.json").is_file():
+        found.append(("blender", "transforms_train.json"))
+    if (root / "split.json").is_file():
+        found.append(("on-the-go", "split.json"))
+    if sorted(root.glob("*.tsv")):
+        found.append(("photo-tourism", "a .tsv table"))
+    elif (root / "dense" / "sparse").is_dir():
+        found.append(("photo-tourism", "dense/sparse"))
+    if found:
+        return found
+    folder = colmap.model_folder(root)
+    if (root / "transforms.json").is_file() and (folder is None or not colmap.has_lists(root)):
+        data = transforms.read_json(root / "transforms.json")
+        studio = any(key in data for key in ("ply_file_path", "camera_model", "applied_transform"))
+        return [("nerfstudio" if studio else "instant-ngp", "transforms.json")]
+    if folder is None:
+        return []
+    if (root / "sam_masks").is_dir() or (root / "pseudo_masks").is_dir():
+        return [("dualsplat", "sam_masks or pseudo_masks")]
+    if (root / "masks" / "masks.json").is_file():
+        return [("drone", "masks/masks.json")]
+    if colmap.has_lists(root):
+        name = plain(root.resolve().name)
+        if on_the_go.is_scene_name(name):
+            return [("on-the-go", f"lists, and a scene called {root.resolve().name}")]
+        if name in {plain(s) for s in DRONE_SCENES}:
+            return [("drone", f"lists, and a scene called {root.resolve().name}")]
+        return [("colmap", "a COLMAP model and lists")]
+    if colmap.has_keywords(image.name for image in read_model(folder).images.values()):
+        return [("robustnerf", "clutter and extra in the names")]
+    return [("colmap", "a COLMAP model")]
+
+
+def read_foreign(root: Path, kind: str | None = None) -> tuple[ForeignScene, str]:
+    """Read a dataset's scene.
+
+    Args:
+        root: its folder.
+        kind: the layout; None = recognised.
+
+    Returns:
+        The scene, and why it is taken for this layout.
+
+    Raises:
+        AwError: unknown layout, or a folder that is not of it.
+    """
+    if kind is None:
+        kind, why = recognise(root)
+    else:
+        if kind not in READERS:
+            raise unknown("layout", kind, READERS)
+        if not root.is_dir():
+            raise AwError(f"dataset {root} does not exist or is no folder")
+        why = "--as"
+    return READERS[kind](root), why

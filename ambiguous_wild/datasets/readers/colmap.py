@@ -7,10 +7,10 @@ from pathlib import Path, PurePosixPath
 
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.core.scene import Split
-from ambiguous_wild.datasets.foreign import SIDES, ForeignScene, inside, split_by_lists
+from ambiguous_wild.datasets.foreign import SIDES, ForeignScene, every_nth, inside, split_by_lists
 from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.colmap_records import Model
-from ambiguous_wild.io.scene_folder import TEST_EVERY, read_list
+from ambiguous_wild.io.scene_folder import read_list
 
 LISTS: dict[Split, str] = {"train": "train_list.txt", "test": "test_list.txt"}
 KEYWORDS: dict[str, Split | None] = {"clutter": "train", "extra": "test", "clean": None}
@@ -99,8 +99,7 @@ def read_plain(root: Path) -> ForeignScene:
     if has_lists(root):
         split, missing = split_by_lists(names, read_lists(root), root)
         return ForeignScene("colmap", root, model, photo_folder(root), split, factor, missing)
-    sides: dict[str, Split] = {n: "train" if i % TEST_EVERY else "test" for i, n in enumerate(names)}
-    note = f"no test set given: every {TEST_EVERY}th photo tests, distractors in it count as truth"
+    sides, note = every_nth(names)
     return ForeignScene("colmap", root, model, photo_folder(root), sides, factor, notes=(note,))
 
 

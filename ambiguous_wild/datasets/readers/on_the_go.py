@@ -7,7 +7,7 @@ from typing import Any
 
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.core.scene import Split
-from ambiguous_wild.datasets.foreign import ForeignScene, split_by_lists
+from ambiguous_wild.datasets.foreign import ForeignScene, plain, split_by_lists
 from ambiguous_wild.datasets.readers.colmap import (
     model_folder,
     model_names,
@@ -23,11 +23,6 @@ FACTOR, LOW_FACTOR = 8, 4
 LOW_RESOLUTION = ("patio", "arcdetriomphe")  # 1920x1080 sources, published at factor 4
 # Of the twelve, those with undistorted copies: other names are common words.
 SCENES = ("mountain", "fountain", "corner", "patio", "spot", "patio_high", "arcdetriomphe")
-
-
-def plain(name: str) -> str:
-    """A scene's name without what its spellings differ in: Patio-High, patio_high."""
-    return "".join(c for c in name.casefold() if c.isalnum())
 
 
 def is_scene_name(name: str) -> bool:

@@ -14,6 +14,7 @@ from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.core.scene import Split
 from ambiguous_wild.datasets.foreign import (
     ForeignScene,
+    every_nth,
     find_photo,
     inside,
     pose_from_opengl,
@@ -25,7 +26,6 @@ from ambiguous_wild.io.colmap_model import check_camera
 from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage, points_without_tracks
 from ambiguous_wild.io.images import header_size
 from ambiguous_wild.io.ply import read_point_ply
-from ambiguous_wild.io.scene_folder import TEST_EVERY
 
 _LARGEST = 100_000_000  # bytes
 _LENS = ("k1", "k2", "p1", "p2")
@@ -206,8 +206,8 @@ def read_transforms(root: Path) -> ForeignScene:
     elif has_lists(root):
         split, missing = split_by_lists(names, read_lists(root), root)
     else:
-        split = {n: "train" if i % TEST_EVERY else "test" for i, n in enumerate(names)}
-        notes.append(f"no test set given: every {TEST_EVERY}th photo tests, distractors in it count as truth")
+        split, note = every_nth(names)
+        notes.append(note)
     masks = _masks(named, split, root)
     points = data.get("ply_file_path")
     studio = isinstance(points, str) or "camera_model" in data or "applied_transform" in data

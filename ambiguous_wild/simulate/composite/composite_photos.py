@@ -22,10 +22,9 @@ from ambiguous_wild.core.camera import Camera
 from ambiguous_wild.core.config import to_plain
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.io.atomic import atomic_dir, write_json
-from ambiguous_wild.io.exif import Exif
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import write_png
-from ambiguous_wild.io.photos import PHOTO_SUFFIXES, UnreadablePhoto, read_photo
+from ambiguous_wild.io.photos import PHOTO_SUFFIXES, Exif, UnreadablePhoto, read_photo
 from ambiguous_wild.simulate.composite.composite_scene import check_folders
 from ambiguous_wild.simulate.composite.cutouts import (
     SMALLEST_PX,

@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -22,10 +22,7 @@ from ambiguous_wild.splat.pace import Pace, TrainConfig
 from ambiguous_wild.splat.records import ROWS, Clock, Timeline, clock_for
 from ambiguous_wild.splat.rendered import Rendered
 from ambiguous_wild.splat.step import TrainData
-from ambiguous_wild.splat.watchdog import NonFinite, Watchdog
-
-if TYPE_CHECKING:
-    from ambiguous_wild.splat.watchdog import Sentinel
+from ambiguous_wild.splat.watchdog import NonFinite, Sentinel, Watchdog
 
 Probe = Callable[[Callable[[Camera], Tensor]], float]
 

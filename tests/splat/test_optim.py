@@ -73,7 +73,7 @@ def test_equals_torch_adam_run_dense(rest):
 def test_rows_put_off_for_long_take_the_same_bits_in_one_go_or_in_pieces():
     whole, pieces, dense = (gaussians(1, 30) for _ in range(3))
     a, b, c = SplatAdam(whole, RATES), SplatAdam(pieces, RATES), SplatAdam(dense, RATES, lazy=False)
-    for step in range(1500):
+    for step in range(800):
         grads, visible = gradients_at(whole, step)
         if step > 20:
             visible[:] = False

@@ -18,7 +18,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.photos import Exif, read_photo
-from ambiguous_wild.simulate.composite.composite_photos import composite_photos
+from ambiguous_wild.simulate.composite.composite_photos import _write_jpeg, composite_photos
 from ambiguous_wild.simulate.composite.placement import CompositeConfig
 
 NAMES = [f"p{i:02d}" for i in range(13)]

@@ -6,8 +6,10 @@ import fnmatch
 from collections.abc import Callable, Iterable, Sequence
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.stress import mask_cases, render_cases, training_cases
 from ambiguous_wild.stress.case import REGISTERED, Case, Outcome, run
 
+FILES = (render_cases, training_cases, mask_cases)  # each registers its cases when it is imported
 CASES: tuple[Case, ...] = tuple(sorted(REGISTERED, key=lambda c: c.row))
 
 

@@ -12,9 +12,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ambiguous_wild.core import AwError, Scene
+from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist, unknown
-from ambiguous_wild.harness.running.store import read_config, read_runs
+from ambiguous_wild.harness.running.store import read_runs
+from ambiguous_wild.harness.showing.read import open_scene
 from ambiguous_wild.io.atomic import write_json, write_text
 from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.page_parts import data_uri, fill_page, jpeg_bytes, narrowed
@@ -125,7 +126,7 @@ def _pairs_of_scene(scene: str, folders: dict[str, Path], truth: bool) -> list[P
         without = [m for m, r in renders.items() if not r]
         which = f"{shortlist(without)} lacks renders/test" if without else "they share no test view"
         raise AwError(f"the runs on {scene} cannot be compared: {which}; make them again with 'aw bench'")
-    photos = _test_photos(scene, next(iter(folders.values()))) if truth else {}
+    photos = _test_photos(next(iter(folders.values()))) if truth else {}
     missing = sorted(common - set(photos)) if truth else []
     if missing:
         raise AwError(
@@ -138,15 +139,11 @@ def _pairs_of_scene(scene: str, folders: dict[str, Path], truth: bool) -> list[P
     ]
 
 
-def _test_photos(name: str, run: Path) -> dict[str, Path]:
-    settings: Any = read_config(run).get("scene")
-    where = settings.get("path") if isinstance(settings, dict) else None
-    if not isinstance(where, str) or not Path(where).is_dir():
-        raise AwError(
-            f"the runs on {name} were made from {where or 'an unknown folder'}, which does not exist: "
-            "move the scene back, or leave the photo out (--no-truth)"
-        )
-    scene: Scene = load_scene(where, factor=settings.get("factor"), verify=False)
+def _test_photos(run: Path) -> dict[str, Path]:
+    try:
+        scene = open_scene(run)
+    except AwError as error:
+        raise AwError(f"{error}; --no-truth leaves the photos out") from None
     return {_stem(v.name): v.image_path for v in scene.test}
 
 

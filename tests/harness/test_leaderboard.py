@@ -26,7 +26,7 @@ from ambiguous_wild.harness.leaderboard.board import (
 from ambiguous_wild.harness.leaderboard.edit import check
 from ambiguous_wild.harness.running.cell import config_identity
 from ambiguous_wild.io.images import read_png_rgb, write_png
-from tests.harness.board_runs import write_run, write_scene
+from tests.harness.board_runs import change_result, write_run, write_scene
 
 HOSTILE = '=HYPERLINK("x")</script><img src=x onerror=alert(1)>/../../etc'
 
@@ -94,13 +94,6 @@ def test_a_hostile_name_stays_text(runs: Path, tmp_path: Path) -> None:
             assert not cell.lstrip().startswith(("=", "+", "@", "-"))
     assert {p.name for p in tmp_path.iterdir()} == {"board"}
     assert all(set(p.name) <= set("abcdefghijklmnopqrstuvwxyz0123456789-.") for p in tmp_path.rglob("*.jpg"))
-
-
-def change_result(run: Path, change: Callable[[dict], None]) -> None:
-    path = run / "metrics.json"
-    data = json.loads(path.read_text())
-    change(data)
-    path.write_text(json.dumps(data))
 
 
 def change_config(run: Path, change: Callable[[dict], None], *, hashed: bool) -> None:

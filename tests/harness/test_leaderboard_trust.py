@@ -26,7 +26,7 @@ from ambiguous_wild.harness.running.regions import find_regions
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.metrics.image import flip, psnr_affine
-from tests.harness.board_runs import write_run, write_scene
+from tests.harness.board_runs import change_result, write_run, write_scene
 
 
 def add(board: Path, *words: object) -> Result:
@@ -44,13 +44,6 @@ def one(tmp_path: Path) -> Path:
 def board(one: Path, tmp_path: Path) -> Path:
     assert add(tmp_path / "board", one).exit_code == 0
     return tmp_path / "board"
-
-
-def change_result(run: Path, change: Callable[[dict], object]) -> None:
-    path = run / "metrics.json"
-    data = json.loads(path.read_text())
-    change(data)
-    path.write_text(json.dumps(data))
 
 
 def edit(board: Path) -> None:

@@ -1,4 +1,4 @@
-"""PSNR and SSIM against scikit-image (valid region) and a plain double loop (zero padding)."""
+"""What holds for the metrics of any picture; test_oracles.py has the values of other people's code."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from skimage.metrics import peak_signal_noise_ratio
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.metrics.image import METRICS, psnr, ssim, ssim_inria
+from ambiguous_wild.metrics.image import METRICS, flip, flip_map, psnr, psnr_affine, ssim, ssim_inria
 
 
 def pair(
@@ -85,3 +86,84 @@ def test_unusable_pictures_are_named(bad: np.ndarray, words: str) -> None:
     for metric in METRICS.values():
         with pytest.raises(AwError, match=words):
             metric(np.zeros((4, 4, 3)), bad)
+
+
+def codes(seed: int = 0, size: tuple[int, int] = (20, 24)) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (*size, 3), dtype=np.uint8)
+
+
+def test_identity_symmetry_range_and_kinds_of_numbers() -> None:
+    a, b = codes(0), codes(1)
+    assert flip(a, a) == 0.0
+    assert flip(a, b) == pytest.approx(flip(b, a), abs=1e-12)
+    error = flip_map(a, b)
+    assert error.shape == (20, 24) and error.min() >= 0.0 and 0.1 < error.max() <= 1.0
+    assert flip(a / 255.0, b) == pytest.approx(flip(a, b), abs=1e-12)
+
+
+def test_the_error_lies_where_the_pictures_differ_and_grows_with_the_difference() -> None:
+    grey = np.full((60, 60, 3), 128, np.uint8)
+    errors = []
+    for level in (132, 150, 200):
+        changed = grey.copy()
+        changed[25:35, 25:35] = level
+        error = flip_map(grey, changed)
+        assert error[28:32, 28:32].min() > 5 * max(error[:8].max(), 1e-9)
+        errors.append(error.mean())
+    assert errors == sorted(errors)
+
+
+def test_pictures_of_two_sizes_have_no_flip() -> None:
+    with pytest.raises(AwError, match="different size"):
+        flip(codes(), codes(size=(20, 25)))
+
+
+def recoloured(seed=0, size=(23, 31), noise=0.05):
+    rng = np.random.default_rng(seed)
+    photo = rng.random((*size, 3))
+    return np.clip(0.7 * photo[..., [1, 0, 2]] + 0.1 + noise * rng.standard_normal(photo.shape), 0, 1), photo
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_it_equals_least_squares_on_all_pixels(seed):
+    render, photo = recoloured(seed)
+    design = np.column_stack([render.reshape(-1, 3), np.ones(render.size // 3)])
+    fit = np.linalg.lstsq(design, photo.reshape(-1, 3), rcond=None)[0]
+    oracle = peak_signal_noise_ratio(photo.reshape(-1, 3), np.clip(design @ fit, 0, 1), data_range=1.0)
+    assert psnr_affine(render, photo) == pytest.approx(oracle, abs=1e-6)
+    bytes_ = [np.uint8(255 * picture + 0.5) for picture in (render, photo)]
+    assert psnr_affine(*bytes_) == pytest.approx(psnr_affine(*(b / 255 for b in bytes_)), abs=1e-9)
+
+
+def test_exposure_and_white_balance_do_not_count():
+    photo = 0.2 + 0.6 * recoloured()[1]
+    render = 0.1 + 0.5 * photo * [0.8, 1.0, 1.2]
+    assert psnr(render, photo) < 20 and psnr_affine(render, photo) > 100
+    other = photo.copy()
+    other[:12] = 0.5  # but what is elsewhere does
+    assert psnr_affine(other, photo) < 25
+
+
+@pytest.mark.parametrize(
+    "render", [np.full((8, 9, 3), 0.3), np.repeat(recoloured(size=(8, 9))[0][..., :1], 3, axis=2)]
+)
+def test_flat_and_grey_renders_are_fitted_too(render):
+    photo = recoloured(size=(8, 9))[1]
+    assert math.isfinite(psnr_affine(render, photo)) and psnr_affine(render, photo) >= psnr(render, photo)
+
+
+def test_one_pixel_is_always_fitted_and_a_copy_is_told_by_infinity():
+    photo = recoloured(size=(4, 5))[1]
+    assert psnr_affine(photo, photo) == math.inf
+    assert psnr_affine(np.full((1, 1, 3), 0.2), np.full((1, 1, 3), 0.7)) > 100
+
+
+def test_it_is_never_below_psnr():
+    for seed in range(20):
+        render, photo = recoloured(seed, (5, 6), noise=0.4)
+        assert psnr_affine(render, photo) >= psnr(render, photo)
+
+
+def test_other_sizes_are_refused():
+    with pytest.raises(AwError, match="different size"):
+        psnr_affine(np.zeros((4, 4, 3)), np.zeros((4, 5, 3)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import re
 from collections.abc import Iterable, Sequence
@@ -11,6 +10,7 @@ from pathlib import Path
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.harness.tables.plain_formats import read_csv
 
 REQUIRED = ("method", "scene", "metric", "value")
 OPTIONAL = ("table", "setting", "dataset", "variant", "mark", "printed")
@@ -78,31 +78,13 @@ def read_tables(paths: Sequence[Path]) -> list[Number]:
 
 
 def _read(path: Path) -> list[Number]:
-    try:
-        if path.stat().st_size > LARGEST:
-            raise AwError(f"{path} is larger than {LARGEST // 1_000_000} MB: no table of results")
-        with open(path, newline="", encoding="utf-8-sig") as f:
-            reader = csv.DictReader(f, strict=True)
-            head = list(reader.fieldnames or ())
-            missing = [c for c in REQUIRED if c not in head]
-            if missing:
-                raise AwError(
-                    f"{path} lacks the column {shortlist(missing)}; a table has {', '.join(REQUIRED)} "
-                    f"and may have {', '.join(OPTIONAL)}"
-                )
-            return [n for row in reader if (n := _number(path, reader.line_num, row)) is not None]
-    except UnicodeDecodeError:
-        raise AwError(f"{path} is no text in UTF-8: save it as CSV") from None
-    except csv.Error as error:
-        raise AwError(f"{path} is malformed CSV: {error}") from None
-    except OSError as error:
-        raise AwError(f"cannot read {path}: {error.strerror}") from None
+    advice = f"a table of results has {', '.join(REQUIRED)} and may have {', '.join(OPTIONAL)}"
+    rows = read_csv(path, REQUIRED, LARGEST, advice)[1]
+    return [n for line, row in rows if (n := _number(path, line, row)) is not None]
 
 
 def _number(path: Path, line: int, row: dict[str, str]) -> Number | None:
     where = f"{path.name}:{line}"
-    if None in row or None in row.values():
-        raise AwError(f"{path} line {line} has too few or too many cells")
     cell = {k: row.get(k, "").strip() for k in (*REQUIRED, *OPTIONAL)}
     if not cell["value"]:
         return None

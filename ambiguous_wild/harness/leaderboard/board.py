@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import math
 import re
@@ -58,26 +57,9 @@ def read_csv(path: Path, required: Sequence[str]) -> tuple[list[str], list[dict[
     Raises:
         AwError: unreadable, malformed, or without a column that must be there.
     """
-    try:
-        if path.stat().st_size > LARGEST:
-            raise AwError(f"{path} is larger than {LARGEST // 1_000_000} MB: no file of a leaderboard")
-        with open(path, newline="", encoding="utf-8") as f:
-            lines = list(csv.reader(f, strict=True))
-    except UnicodeDecodeError:
-        raise AwError(f"{path} is no text in UTF-8: restore it from your version control") from None
-    except csv.Error as error:
-        raise AwError(f"{path} is malformed CSV ({error}): restore it from your version control") from None
-    except OSError as error:
-        raise AwError(f"cannot read {path}: {error.strerror}") from None
-    head = lines[0] if lines else []
-    lacking = [c for c in required if c not in head]
-    if lacking or len(set(head)) != len(head):
-        what = f"lacks the column {lacking[0]!r}" if lacking else "names a column twice"
-        raise AwError(f"{path} {what}: it is no file of a leaderboard, or was changed by hand; restore it")
-    for at, line in enumerate(lines[1:], 2):
-        if len(line) != len(head):
-            raise AwError(f"{path} row {at} has {len(line)} cells, not {len(head)}: restore the file")
-    return head, [dict(zip(head, line)) for line in lines[1:]]
+    advice = "it is no file of a leaderboard, or was changed by hand: restore it from your version control"
+    head, rows = plain_formats.read_csv(path, required, LARGEST, advice)
+    return head, [cells for _, cells in rows]
 
 
 def to_count(text: str, where: str) -> int:

@@ -13,8 +13,10 @@ import re
 import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
+from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.harness.measures import Measure
 from ambiguous_wild.harness.tables.table import ARROWS, TIE, Cell, Column, Row, Table
 
@@ -204,6 +206,43 @@ def _csv_cell(value: Any, text: Callable[[str], str], number: Callable[[float], 
     if isinstance(value, float):
         return "" if math.isnan(value) else number(value)
     return str(value)
+
+
+def read_csv(
+    path: Path, required: Sequence[str], most_bytes: int, advice: str
+) -> tuple[list[str], list[tuple[int, dict[str, str]]]]:
+    """Columns, and (line, cells by column) of each row; cells as they stand.
+
+    Args:
+        path: the file.
+        required: columns that it must have.
+        most_bytes: a larger file is not read.
+        advice: ends an error.
+
+    Raises:
+        AwError: unreadable, malformed, or without a column that must be there.
+    """
+    try:
+        if path.stat().st_size > most_bytes:
+            raise AwError(f"{path} is larger than {most_bytes // 1_000_000} MB; {advice}")
+        with open(path, newline="", encoding="utf-8-sig") as f:
+            reader = csv.reader(f, strict=True)
+            head = next(reader, [])
+            rows = [(reader.line_num, cells) for cells in reader if cells]
+    except UnicodeDecodeError:
+        raise AwError(f"{path} is no text in UTF-8; {advice}") from None
+    except csv.Error as error:
+        raise AwError(f"{path} is malformed CSV ({error}); {advice}") from None
+    except OSError as error:
+        raise AwError(f"cannot read {path}: {error.strerror}") from None
+    missing = [column for column in required if column not in head]
+    if missing or len(set(head)) != len(head):
+        what = f"lacks the column {shortlist(missing)}" if missing else "names a column twice"
+        raise AwError(f"{path} {what}; {advice}")
+    for line, cells in rows:
+        if len(cells) != len(head):
+            raise AwError(f"{path} line {line} has too few or too many cells; {advice}")
+    return head, [(line, dict(zip(head, cells))) for line, cells in rows]
 
 
 LONG_HEAD = ("table", "kind", "method", "dataset", "column", "scene", "metric", "value", "std", "rank",

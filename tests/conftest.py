@@ -1,8 +1,8 @@
 """Tests that need a GPU are skipped elsewhere, and slow ones without AW_SLOW_TESTS=1.
 
-Parallel test processes use one kernel thread each. The calibration of the machine is a small one in tests,
-and frames a second are counted for an instant: runs are shorter than the real ones take. Weights that lie on the machine are not seen, for methods choose
-their features by them; `machine_weights` shows them.
+Parallel test processes use one kernel thread each. Runs are short in tests: the calibration of the machine is
+a small one, and frames a second are counted for an instant. Weights that lie on the machine are not seen, for
+methods choose their features by them; `machine_weights` shows them.
 """
 
 from __future__ import annotations

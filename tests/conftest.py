@@ -1,8 +1,8 @@
 """Tests that need a GPU are skipped elsewhere, and slow ones without AW_SLOW_TESTS=1.
 
-Parallel test processes use one kernel thread each. The calibration of the machine is a small one in tests:
-their runs are shorter than the real one. Weights that lie on the machine are not seen, for methods choose
-their features by them; `machine_weights` shows them.
+Parallel test processes use one kernel thread each. Runs are short in tests: the calibration of the machine is
+a small one, and frames a second are counted for an instant. Weights that lie on the machine are not seen, for
+methods choose their features by them; `machine_weights` shows them.
 """
 
 from __future__ import annotations
@@ -81,6 +81,9 @@ def pytest_runtest_setup(item):
     calibration = sys.modules.get("ambiguous_wild.splat.calibration")
     if calibration is not None:
         calibration.KERNELS["cpu"] = calibration.Size("cpu-3", 0.0625, 300, 32, 32, 1)
+    evaluate = sys.modules.get("ambiguous_wild.harness.running.evaluate")
+    if evaluate is not None:
+        evaluate.FPS_SECONDS = 0.05  # two seconds a run, which say nothing here
     numba = sys.modules.get("numba")
     if numba is not None and "PYTEST_XDIST_WORKER" in os.environ:
         numba.set_num_threads(1)

@@ -186,8 +186,8 @@ def command(
         scenes, protocol = tuple(prepared.scenes.values()), protocol or prepared.suite.protocol
     elif root is not None:
         raise AwError("--root goes with --suite: name the suite whose scenes it holds")
-    for flag, given in (("--method", methods), ("--scene", scenes)):
-        if not given:
+    for flag, names in (("--method", methods), ("--scene", scenes)):
+        if not names:
             raise AwError(f"{flag} is missing: 'aw bench --help' shows examples")
     if math.isnan(checkpoint_every):
         raise AwError("--checkpoint-every nan: give a number of seconds")

@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -163,17 +162,7 @@ class Regions:
         return values
 
 
-@dataclass(frozen=True, eq=False)
-class _Same:
-    """A scene as a key of a cache: equal only to itself."""
-
-    scene: Scene
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and other.scene is self.scene
-
-    def __hash__(self) -> int:
-        return id(self.scene)
+_last: list[tuple[Scene, Regions]] = []  # of the scene that was asked about last
 
 
 def find_regions(scene: Scene) -> Regions:
@@ -182,12 +171,12 @@ def find_regions(scene: Scene) -> Regions:
     Raises:
         AwError: a mask of a test photo has another size than the photo.
     """
-    return _find_regions(_Same(scene))
+    if not _last or _last[0][0] is not scene:
+        _last[:] = [(scene, _find_regions(scene))]
+    return _last[0][1]
 
 
-@lru_cache(maxsize=1)
-def _find_regions(key: _Same) -> Regions:
-    scene = key.scene
+def _find_regions(scene: Scene) -> Regions:
     pixels: dict[str, dict[str, np.ndarray]] = {}
     missing: dict[str, str] = {}
     kept = {view.name: mask for view in scene.test if (mask := _user_keep(scene, view)) is not None}

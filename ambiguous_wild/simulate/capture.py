@@ -297,7 +297,8 @@ def _facts(spec: CaptureSpec, seed: int, identity: str, photos: dict[str, PhotoT
 def _code_hash() -> str:
     """Hash of the simulator's source: a capture of another version is not reused."""
     here = Path(__file__).parent
-    return config_hash([__version__, *(sha256_file(p) for p in sorted(here.glob("*.py")))])
+    sources = sorted([*here.glob("*.py"), *here.glob("*.yaml")])
+    return config_hash([__version__, *(sha256_file(p) for p in sources)])
 
 
 def _camera_json(spec: CaptureSpec, camera: Camera) -> CameraRecord:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from ambiguous_wild.simulate import textures as tx
-from ambiguous_wild.simulate.kernels import BOX, CYLINDER, ELLIPSOID
+from ambiguous_wild.simulate.kernels import CYLINDER, ELLIPSOID
 from ambiguous_wild.simulate.shapes import Shape, between, figure, placed, vector
 from ambiguous_wild.simulate.spec import PLANS, WorldSpec
-from ambiguous_wild.simulate.things import circle_of, shapes_of_thing
+from ambiguous_wild.simulate.things import circle_of, parts_of, shapes_of_thing
 from ambiguous_wild.simulate.tracer import build_atlas
 from ambiguous_wild.simulate.world import (
     WALL_AXES,
@@ -74,12 +74,7 @@ def _furniture(rng: np.random.Generator) -> tuple[list[Shape], list[tuple[float,
             top = (x + 0.04, y, 2 * half + 0.2)
             shapes.append(box(top, (0.26, 0.2, 0.2), yaw + 25, "timber", offset=tuple(rng.random(2))))
     bx, by, yaw = rng.uniform(-2.4, -2.0), rng.uniform(0.5, 0.9), rng.uniform(-30, -10)
-    bench = [
-        Shape(BOX, (0, 0, 0.43), (0.75, 0.2, 0.035), "timber"),
-        Shape(BOX, (-0.6, 0, 0.2), (0.06, 0.18, 0.2), "stone"),
-        Shape(BOX, (0.6, 0, 0.2), (0.06, 0.18, 0.2), "stone", offset=(0.3, 0.5)),
-    ]
-    shapes += placed(bench, (bx, by, 0), yaw)
+    shapes += placed(parts_of("courtyard bench"), (bx, by, 0), yaw)
     circles.append((bx, by, 0.85))
     sx, sy = rng.uniform(1.9, 2.2), rng.uniform(0.5, 0.8)
     shapes += [
@@ -113,11 +108,6 @@ def courtyard(
     if what.statue:
         circles.append((statue[0], statue[1], 0.65))
     circles += [circle_of(thing) for thing in what.things]
-    plinth = [
-        Shape(BOX, (0, 0, 0.08), (0.55, 0.55, 0.08), "stone"),
-        Shape(BOX, (0, 0, 0.52), (0.4, 0.4, 0.36), "stone", offset=(0.4, 0.2)),
-        Shape(BOX, (0, 0, 0.915), (0.46, 0.46, 0.035), "stone", offset=(0.7, 0.6)),
-    ]
     yaw = float(rng.uniform(-20, 20))
     ground = tx.gravel_ground(rng, *PLAN.ground_m, d)
     shade_feet(ground, circles, d, PLAN)
@@ -136,7 +126,7 @@ def courtyard(
         *furniture,
     ]
     if what.statue:
-        shapes += placed(plinth, (statue[0], statue[1], 0), yaw)
+        shapes += placed(parts_of("courtyard plinth"), (statue[0], statue[1], 0), yaw)
         shapes += placed(figure("stone", "stone", 0.07, 0.8), statue, yaw)
     shapes += [s for thing in what.things for s in shapes_of_thing(thing, PLAN)]
     keep_out = np.array(circles, float).reshape(-1, 3)

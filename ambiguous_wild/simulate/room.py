@@ -8,10 +8,10 @@ import numpy as np
 
 from ambiguous_wild.simulate import built_textures as built
 from ambiguous_wild.simulate import textures as tx
-from ambiguous_wild.simulate.kernels import BOX, CYLINDER, ELLIPSOID, PLANAR, QUAD
+from ambiguous_wild.simulate.kernels import BOX, ELLIPSOID, PLANAR, QUAD
 from ambiguous_wild.simulate.shapes import Shape, between, placed, vector
 from ambiguous_wild.simulate.spec import PLANS, WorldSpec
-from ambiguous_wild.simulate.things import circle_of, shapes_of_thing, statue
+from ambiguous_wild.simulate.things import circle_of, parts_of, shapes_of_thing, statue
 from ambiguous_wild.simulate.tracer import build_atlas
 from ambiguous_wild.simulate.world import (
     WALL_AXES,
@@ -28,7 +28,6 @@ from ambiguous_wild.simulate.world import (
 
 PLAN = PLANS["room"]
 WHITE = (2.0, 2.0, 2.0)  # tint of stone that gives painted wood
-SOFA = (0.10, 0.17, 0.24)  # tints of cloth
 CURTAIN = (0.42, 0.30, 0.12)
 # left, right, bottom and top in m, along the wall from its middle
 _WINDOWS = {"wall_left": (-1.4, 0.5, 0.95, 2.3), "wall_back": (1.2, 2.6, 0.95, 2.3)}
@@ -65,11 +64,7 @@ def room(rng: np.random.Generator, detail_px_per_m: float, samples: int, what: W
     }
     shapes = [*ground_and_sky(PLAN), *_hull(), *_pictures(streams[4]), *shapes]
     if what.statue:
-        pedestal = [
-            Shape(BOX, (0, 0, 0.03), (0.27, 0.27, 0.03), "stone", offset=(0.2, 0.3)),
-            Shape(BOX, (0, 0, 0.45), (0.2, 0.2, 0.42), "stone", offset=(0.7, 0.1)),
-            *placed([statue("bust", "stone", 0.75)], (0, 0, 0.87), 0.0),
-        ]
+        pedestal = [*parts_of("room pedestal"), *placed([statue("bust", "stone", 0.75)], (0, 0, 0.87), 0.0)]
         shapes += placed(pedestal, hub, float(rng.uniform(-20, 20)))
     shapes += [s for thing in what.things for s in shapes_of_thing(thing, PLAN)]
     # The sun comes in through the windows; light that walls throw back is part of the sky's.
@@ -185,33 +180,16 @@ def _shelf(rng: np.random.Generator, wide: float) -> list[Shape]:
     return [*boards, *sides, back, *rows]
 
 
-def _chair() -> list[Shape]:
-    """A chair that faces -y."""
-    legs = [between((x, y, 0), (x, y, 0.44), 0.02, "timber") for x in (-0.18, 0.18) for y in (-0.18, 0.18)]
-    rails = [between((x, 0.2, 0.44), (x, 0.24, 0.9), 0.02, "timber") for x in (-0.18, 0.18)]
-    back = [Shape(BOX, (0, 0.23, z), (0.2, 0.012, 0.05), "timber", offset=(0.3, z)) for z in (0.62, 0.82)]
-    return [*legs, *rails, *back, Shape(BOX, (0, 0, 0.455), (0.21, 0.21, 0.02), "timber", offset=(0.7, 0.2))]
-
-
-def _sofa() -> list[Shape]:
-    """A sofa that faces +x, 1.9 m wide."""
-    cloth: dict[str, Any] = {"tint": SOFA}
-    shapes = [
-        Shape(BOX, (0, 0, 0.22), (0.42, 0.95, 0.14), "cloth", **cloth),
-        Shape(BOX, (-0.36, 0, 0.55), (0.1, 0.95, 0.3), "cloth", offset=(0.2, 0.6), **cloth),
-    ]
-    for y in (-0.88, 0.88):
-        shapes.append(between((-0.4, y, 0.5), (0.4, y, 0.5), 0.1, "cloth", offset=(0.4, y), **cloth))
-        shapes.append(Shape(BOX, (0, y, 0.3), (0.42, 0.09, 0.2), "cloth", offset=(0.6, y), **cloth))
-    for k, y in enumerate((-0.4, 0.4)):
-        shapes.append(
-            Shape(
-                ELLIPSOID, (0.03, y, 0.4), (0.42, 0.42, 0.12), "cloth", offset=(0.3 + 0.3 * k, 0.2), **cloth
-            )
-        )
-    for y, tint in ((-0.62, (0.55, 0.16, 0.05)), (0.6, (0.6, 0.5, 0.2))):
-        shapes.append(Shape(ELLIPSOID, (-0.16, y, 0.6), (0.1, 0.22, 0.2), "cloth", tint=tint))
-    return shapes
+def _leaves(
+    rng: np.random.Generator,
+    at: tuple[float, float, float],
+    reach: float,
+    half: tuple[float, float, float],
+    count: int,
+) -> list[Shape]:
+    """A plant in a pot: `count` balls around its middle."""
+    middles = [np.array(at) + rng.uniform(-reach, reach, 3) for _ in range(count)]
+    return [Shape(ELLIPSOID, vector(middle), half, "foliage") for middle in middles]
 
 
 def _furniture(rng: np.random.Generator) -> tuple[list[Shape], list[Circle]]:
@@ -227,77 +205,31 @@ def _furniture(rng: np.random.Generator) -> tuple[list[Shape], list[Circle]]:
         shapes += placed(_shelf(rng, 1.1), (x, 2.82, 0), 0)
         circles.append((x, 2.82, 0.55))
     sofa = (-3.1, float(rng.uniform(-0.3, 0.0)), 0.0)
-    shapes += placed(_sofa(), sofa, 0.0)
+    shapes += placed(parts_of("sofa"), sofa, 0.0)
     circles += [(sofa[0], sofa[1] + dy, 0.6) for dy in (-0.5, 0.5)]
     table = (float(rng.uniform(2.0, 2.15)), float(rng.uniform(0.1, 0.3)), 0.0)
     top = [
-        Shape(BOX, (0, 0, 0.74), (0.45, 0.7, 0.02), "timber", gloss=(0.35, 40.0)),
-        *(between((x, y, 0), (x, y, 0.73), 0.03, "timber") for x in (-0.38, 0.38) for y in (-0.62, 0.62)),
-        between((0.1, 0.25, 0.76), (0.1, 0.25, 0.98), 0.07, "clay", CYLINDER),
-        *(
-            Shape(
-                ELLIPSOID,
-                vector(np.array([0.1, 0.25, 1.1]) + rng.uniform(-0.12, 0.12, 3)),
-                (0.1, 0.1, 0.12),
-                "foliage",
-            )
-            for _ in range(5)
-        ),
-        Shape(
-            ELLIPSOID,
-            (-0.12, -0.2, 0.79),
-            (0.16, 0.16, 0.05),
-            "clay",
-            tint=(0.5, 0.7, 1.2),
-            gloss=(0.4, 50.0),
-        ),
-        *(
-            Shape(ELLIPSOID, (-0.12 + dx, -0.2 + dy, 0.84), (0.04, 0.04, 0.04), "cloth", tint=tint)
-            for dx, dy, tint in (
-                (0.03, 0.05, (0.6, 0.1, 0.02)),
-                (-0.05, 0.0, (0.5, 0.45, 0.03)),
-                (0.04, -0.05, (0.2, 0.4, 0.03)),
-            )
-        ),
+        *parts_of("table"),
+        *_leaves(rng, (0.1, 0.25, 1.1), 0.12, (0.1, 0.1, 0.12), 5),
+        *parts_of("bowl"),
         *placed(_books(rng, 0.22, 0.3), (-0.3, 0.4, 0.76), 15.0),
     ]
     shapes += placed(top, table, 0.0)
     circles.append((table[0], table[1], 0.85))
     for x, y, yaw in ((-0.62, -0.25, -90.0), (-0.6, 0.35, -80.0), (0.0, -1.0, 180.0), (0.05, 1.0, 10.0)):
         at = (table[0] + x, table[1] + y, 0.0)
-        shapes += placed(_chair(), at, yaw + float(rng.uniform(-15, 15)))
+        shapes += placed(parts_of("chair"), at, yaw + float(rng.uniform(-15, 15)))
         circles.append((at[0], at[1], 0.3))
     cupboard = [
-        Shape(BOX, (0, 0, 0.42), (0.7, 0.22, 0.36), "timber", tint=(0.75, 0.6, 0.5), gloss=(0.5, 60.0)),
-        *(Shape(BOX, (x, 0, 0.03), (0.03, 0.15, 0.03), "asphalt") for x in (-0.6, 0.6)),
-        Shape(BOX, (0, -0.222, 0.42), (0.004, 0.004, 0.33), "asphalt"),
-        between((0.35, 0, 0.78), (0.35, 0, 1.0), 0.1, "clay", CYLINDER),
-        *(
-            Shape(
-                ELLIPSOID,
-                vector(np.array([0.35, 0, 1.2]) + rng.uniform(-0.16, 0.16, 3)),
-                (0.13, 0.13, 0.17),
-                "foliage",
-            )
-            for _ in range(6)
-        ),
-        Shape(BOX, (-0.3, 0, 0.87), (0.26, 0.09, 0.09), "enamel", tint=(0.4, 0.1, 0.08), gloss=(0.4, 40.0)),
-        Shape(ELLIPSOID, (-0.42, -0.09, 0.87), (0.06, 0.01, 0.06), "asphalt"),
+        *parts_of("cupboard"),
+        *_leaves(rng, (0.35, 0, 1.2), 0.16, (0.13, 0.13, 0.17), 6),
+        *parts_of("radio"),
     ]
     shapes += placed(cupboard, (1.9, 2.72, 0), 0)
     circles.append((1.9, 2.72, 0.7))
     lamp = (-2.9, 1.75, 0.0)
-    shapes += [
-        between(lamp, (*lamp[:2], 1.5), 0.018, "enamel", tint=(0.25, 0.22, 0.18)),
-        between((*lamp[:2], 0.0), (*lamp[:2], 0.04), 0.16, "enamel", CYLINDER, tint=(0.25, 0.22, 0.18)),
-        between((*lamp[:2], 1.45), (*lamp[:2], 1.72), 0.19, "cloth", CYLINDER, tint=(0.95, 0.85, 0.65)),
-    ]
+    shapes += placed(parts_of("floor lamp"), lamp, 0.0)
     circles.append((lamp[0], lamp[1], 0.25))
-    crate = [
-        Shape(BOX, (0, 0, 0.2), (0.26, 0.2, 0.2), "timber", offset=(0.2, 0.9)),
-        *(Shape(BOX, (0.02 * k, 0, 0.41 + 0.03 * k), (0.2, 0.14, 0.014), "cloth", tint=t) for k, t in
-          enumerate(((0.5, 0.1, 0.1), (0.1, 0.3, 0.5), (0.6, 0.5, 0.2), (0.1, 0.4, 0.2)))),
-    ]  # fmt: skip
-    shapes += placed(crate, (-1.55, 1.75, 0), float(rng.uniform(10, 40)))
+    shapes += placed(parts_of("books on a crate"), (-1.55, 1.75, 0), float(rng.uniform(10, 40)))
     circles.append((-1.55, 1.75, 0.35))
     return shapes, circles

@@ -1,11 +1,14 @@
-"""Objects that a spec adds to a place: boxes, balls, columns, boards, statues, cars."""
+"""Objects of places and specs: those of `objects.yaml`, boxes, balls, columns, boards, statues, cars."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
+from pathlib import Path
 from typing import Any
 
-from ambiguous_wild.simulate.kernels import BOX, BY_FACE, CYLINDER, ELLIPSOID, VOLUME
+from ambiguous_wild.io import plain_yaml
+from ambiguous_wild.simulate.kernels import BOX, BY_FACE, CAPSULE, CYLINDER, ELLIPSOID, VOLUME
 from ambiguous_wild.simulate.shapes import SHEET_M, Shape, between, figure, placed
 from ambiguous_wild.simulate.spec import STATUES, GroundPlan, Thing
 
@@ -40,33 +43,27 @@ def placard(texture: str, plan: GroundPlan) -> list[Shape]:
 
 def car(texture: str, length_m: float = 4.1) -> list[Shape]:
     """A small car at the origin that faces +x: body, glass, wheels, lamps."""
-    body: dict[str, Any] = {"gloss": (0.5, 60.0)}
-    dark = (0.12, 0.13, 0.15)
-    shapes = [
-        Shape(BOX, (0, 0, 0.56), (1.78, 0.8, 0.25), texture, **body),
-        Shape(ELLIPSOID, (1.35, 0, 0.6), (0.72, 0.8, 0.3), texture, offset=(0.2, 0.6), **body),
-        Shape(ELLIPSOID, (-1.4, 0, 0.62), (0.66, 0.8, 0.34), texture, offset=(0.8, 0.4), **body),
-        Shape(ELLIPSOID, (-0.2, 0, 0.86), (1.3, 0.72, 0.56), "enamel", tint=dark, gloss=(0.9, 120.0)),
-        Shape(ELLIPSOID, (-0.25, 0, 1.22), (0.95, 0.6, 0.22), texture, offset=(0.4, 0.8), **body),
-        Shape(BOX, (0, 0, 0.33), (1.75, 0.76, 0.07), "asphalt", tint=(0.5, 0.5, 0.5)),
-    ]
-    for x in (-1.2, 1.2):
-        for side in (-1.0, 1.0):
-            shapes += [
-                between(
-                    (x, side * 0.62, 0.32), (x, side * 0.84, 0.32), 0.32, "asphalt", CYLINDER, tint=(0.4,) * 3
-                ),
-                between((x, side * 0.8, 0.32), (x, side * 0.855, 0.32), 0.19, "enamel", CYLINDER),
-            ]
-    for side in (-1.0, 1.0):
-        shapes += [
-            Shape(ELLIPSOID, (1.86, side * 0.56, 0.64), (0.14, 0.18, 0.09), "enamel", gloss=(0.9, 80.0)),
-            Shape(ELLIPSOID, (-1.9, side * 0.6, 0.68), (0.1, 0.15, 0.1), "enamel", tint=(0.6, 0.03, 0.02)),
-        ]
-    shapes += [
-        Shape(BOX, (x, 0, 0.44), (0.02, 0.26, 0.06), "enamel", offset=(0.3, 0.2)) for x in (-2.0, 2.02)
-    ]
-    return placed(shapes, (0, 0, 0), 0.0, length_m / 4.1)
+    return placed(parts_of("car", texture), (0, 0, 0), 0.0, length_m / 4.1)
+
+
+@cache
+def _objects() -> dict[str, list[dict[str, Any]]]:
+    return plain_yaml.read_mapping(Path(__file__).with_name("objects.yaml"))
+
+
+def parts_of(name: str, texture: str = "") -> list[Shape]:
+    """An object of `objects.yaml` at the origin; `texture` is its own."""
+    shapes = []
+    for part in _objects()[name]:
+        shown = texture if part["texture"] == "own" else part["texture"]
+        more: dict[str, Any] = {key: tuple(part[key]) for key in ("offset", "tint", "gloss") if key in part}
+        if "from" in part:
+            kind = CAPSULE if part["shape"] == "rod" else CYLINDER
+            shapes.append(between(part["from"], part["to"], part["radius"], shown, kind, **more))
+        else:
+            kind = BOX if part["shape"] == "box" else ELLIPSOID
+            shapes.append(Shape(kind, tuple(part["at"]), tuple(part["half"]), shown, **more))
+    return shapes
 
 
 def shapes_of_thing(thing: Thing, plan: GroundPlan) -> list[Shape]:

@@ -12,7 +12,7 @@ from ambiguous_wild.simulate import textures as tx
 from ambiguous_wild.simulate.kernels import BOX, CYLINDER, ELLIPSOID
 from ambiguous_wild.simulate.shapes import Shape, between, figure, placed, vector
 from ambiguous_wild.simulate.spec import PLANS, WorldSpec
-from ambiguous_wild.simulate.things import car, circle_of, shapes_of_thing
+from ambiguous_wild.simulate.things import car, circle_of, parts_of, shapes_of_thing
 from ambiguous_wild.simulate.tracer import build_atlas
 from ambiguous_wild.simulate.world import (
     WALL_AXES,
@@ -74,11 +74,7 @@ def yard(rng: np.random.Generator, detail_px_per_m: float, samples: int, what: W
     }
     shapes = [*ground_and_sky(PLAN), *_fronts(streams[2]), *shapes]
     if what.statue:
-        plinth = [
-            Shape(BOX, (0, 0, 0.08), (0.55, 0.55, 0.08), "stone"),
-            Shape(BOX, (0, 0, 0.45), (0.4, 0.4, 0.3), "stone", offset=(0.4, 0.2)),
-            *placed(figure("stone", "stone", 0.07, 0.8), (0, 0, 0.75), 0.0),
-        ]
+        plinth = [*parts_of("yard plinth"), *placed(figure("stone", "stone", 0.07, 0.8), (0, 0, 0.75), 0.0)]
         shapes += placed(plinth, foot, float(rng.uniform(-110, -70)))
     shapes += [s for thing in what.things for s in shapes_of_thing(thing, PLAN)]
     keep_out = np.array(circles, float).reshape(-1, 3)
@@ -151,13 +147,7 @@ def _standing(rng: np.random.Generator) -> tuple[list[Shape], list[Circle]]:
             box((x, y, 1.08), (0.31, 0.31, 0.04), 4.0 * k, "enamel", **bin_),
         ]
         circles.append((x, y, 0.4))
-    bench = [
-        Shape(BOX, (0, 0, 0.43), (0.8, 0.2, 0.035), "timber"),
-        Shape(BOX, (0, 0.2, 0.75), (0.8, 0.03, 0.2), "timber", offset=(0.2, 0.3)),
-        Shape(BOX, (-0.6, 0, 0.2), (0.06, 0.18, 0.2), "stone"),
-        Shape(BOX, (0.6, 0, 0.2), (0.06, 0.18, 0.2), "stone", offset=(0.3, 0.5)),
-    ]
-    shapes += placed(bench, (-7.4, -4.6, 0), 75.0)
+    shapes += placed(parts_of("yard bench"), (-7.4, -4.6, 0), 75.0)
     circles.append((-7.4, -4.6, 0.85))
     for x, y in ((7.2, 0.6), (6.9, -2.3)):
         shapes.append(between((x, y, 0), (x, y, 0.6), 0.4, "clay", CYLINDER, offset=tuple(rng.random(2))))

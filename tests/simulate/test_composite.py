@@ -116,12 +116,9 @@ def test_truth_lies_beside_every_train_photo_and_tells_the_truth(base: Path, mad
         assert (gap[mask] > 0.02).mean() > 0.9
 
 
-@pytest.mark.parametrize("coverage", [0.05, 0.25])
-def test_mean_coverage_is_what_was_asked_for(
-    base: Path, cutouts: Path, tmp_path: Path, coverage: float
-) -> None:
-    facts = composite(base, tmp_path / "out", replace(CONFIG, coverage=coverage), cutouts)
-    assert facts["occlusion"]["mean"] == pytest.approx(coverage, rel=0.2)
+def test_mean_coverage_is_what_was_asked_for(base: Path, cutouts: Path, tmp_path: Path) -> None:
+    facts = composite(base, tmp_path / "out", replace(CONFIG, coverage=0.25), cutouts)
+    assert facts["occlusion"]["mean"] == pytest.approx(0.25, rel=0.2)
 
 
 def test_same_seed_same_bytes_another_seed_other_places(
@@ -359,12 +356,3 @@ def test_a_run_that_breaks_leaves_nothing(base: Path, cutouts: Path, tmp_path: P
     with pytest.raises(KeyboardInterrupt):
         composite(base, tmp_path / "out", CONFIG, cutouts, progress=breaks)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_cutouts_on_a_real_capture() -> None:
-    folder = Path(__file__).resolve().parents[2].parent / "shared/data/cutouts"
-    if not folder.is_dir():
-        pytest.skip(f"{folder} is not there")
-    cutouts = read_cutouts(folder)
-    assert len(cutouts) == 5 and all(0.2 < c.filled < 0.95 for c in cutouts)
-    assert all((c.light[..., :3] <= c.light[..., 3:] + 1e-6).all() for c in cutouts)  # premultiplied

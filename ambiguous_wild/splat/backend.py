@@ -92,6 +92,14 @@ class Backend(ABC):
         """[count] float64: sums of values [P] float64 by labels [P] int64 below `count`; None counts them."""
 
     @abstractmethod
+    def pose(self, camera: Camera, like: Tensor) -> Tensor:
+        """`cam_from_world` [4, 4] where `like` lies."""
+
+    @abstractmethod
+    def nearest(self, points: Tensor, count: int) -> Tensor:
+        """Rows [M, count] int64 of the points [M, 3] nearest to each, itself among them; count <= M."""
+
+    @abstractmethod
     def adam(self, parameters: Iterable[torch.nn.Parameter], lr: float) -> torch.optim.Adam:
         """Adam on a net's parameters; on a GPU one kernel, which keeps the step count there."""
 
@@ -152,6 +160,17 @@ class CpuBackend(Backend):
 
     def label_sums(self, labels: Tensor, count: int, values: Tensor | None = None) -> Tensor:
         return torch.bincount(labels, weights=values, minlength=count).double()
+
+    def pose(self, camera: Camera, like: Tensor) -> Tensor:
+        return torch.tensor(camera.cam_from_world.tolist(), dtype=like.dtype)
+
+    def nearest(self, points: Tensor, count: int) -> Tensor:
+        from scipy.spatial import cKDTree
+
+        xyz = points.double().numpy()
+        # many centres coincide after cloning: the tree needs leaves that split on ties
+        rows = cKDTree(xyz, balanced_tree=False).query(xyz, k=count)[1]
+        return torch.from_numpy(rows.reshape(len(xyz), count)).long()
 
     def adam(self, parameters: Iterable[torch.nn.Parameter], lr: float) -> torch.optim.Adam:
         return torch.optim.Adam(parameters, lr=lr)
@@ -222,6 +241,16 @@ class GpuBackend(Backend):
         lane = torch.arange(len(labels), device=labels.device) % _LANES
         sums = values.new_zeros(count * _LANES).scatter_add_(0, labels * _LANES + lane, values)
         return sums.reshape(count, _LANES).sum(dim=1)
+
+    def pose(self, camera: Camera, like: Tensor) -> Tensor:
+        from ambiguous_wild.splat.gpu.render import on_device
+
+        return on_device(camera, like.device).viewmat[0]
+
+    def nearest(self, points: Tensor, count: int) -> Tensor:
+        from ambiguous_wild.splat.gpu.nearest import nearest
+
+        return nearest(points, count)
 
     def adam(self, parameters: Iterable[torch.nn.Parameter], lr: float) -> torch.optim.Adam:
         return torch.optim.Adam(parameters, lr=lr, fused=True)

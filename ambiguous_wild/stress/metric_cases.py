@@ -36,20 +36,20 @@ def _line(positions: list[float]) -> Gaussians:
 
 
 def _pairs(g: Gaussians, **config: float) -> set[tuple[int, int]]:
-    everyone = np.ones(len(g), bool)
-    return {(int(a), int(b)) for a, b in merge_pairs(g, everyone, MergeConfig(**config))}  # type: ignore[arg-type]
+    everyone = torch.ones(len(g), dtype=torch.bool)
+    return {(a, b) for a, b in merge_pairs(g, everyone, MergeConfig(**config)).tolist()}  # type: ignore[arg-type]
 
 
 @case(19, "identical Gaussians, a chain, a thousand, far apart, orthogonal needles")
 def merging(device: str) -> Measured:
     chain = _line([0.0, 2.0, 4.0])
-    pairs = merge_pairs(chain, np.ones(3, bool), MergeConfig())
+    pairs = merge_pairs(chain, torch.ones(3).bool(), MergeConfig())
     thousand = _line([0.0] * 1000)
-    cluster = clusters(1000, merge_pairs(thousand, np.ones(1000, bool), MergeConfig(neighbours=999)))
+    cluster = clusters(1000, merge_pairs(thousand, torch.ones(1000).bool(), MergeConfig(neighbours=999)))
     merged = merge_members(thousand, cluster)
     needles = _line([0.0, 0.0])
     needles.log_scales[:] = torch.log(torch.tensor([[1e3, 1e-4, 1e-4], [1e-4, 1e3, 1e-4]]))
-    crossed = covariances(merge_members(needles, np.zeros(2, int)))[0]
+    crossed = covariances(merge_members(needles, torch.zeros(2).long()))[0]
     coloured = _line([0.0, 0.1])
     coloured.sh0[1] = 0.2 / SH_C0
     checks = {
@@ -68,7 +68,7 @@ def merging(device: str) -> Measured:
 
 def _own_overlap(g: Gaussians) -> float:
     cov = covariances(g)
-    return float(overlap(np.zeros((len(g), 3)), cov, cov).min())
+    return float(overlap(torch.zeros(len(g), 3).double(), cov, cov).min())
 
 
 @case(20, "moments of the merged Gaussian")
@@ -77,9 +77,9 @@ def moments(device: str) -> Measured:
     g = cloud(9, 5)
     g.log_scales[::3] = torch.log(torch.tensor([1.0, 1e-3, 1e-3]))
     cluster = np.array([7, 7, 2, 2, 2, 9, 9, 9, 9])
-    merged = merge_members(g, cluster)
-    cov, alpha = covariances(g), torch.sigmoid(g.opacity_logits.double()).numpy()
-    means, found, worst = g.means.double().numpy(), covariances(merged), 0.0
+    merged = merge_members(g, torch.from_numpy(cluster))
+    cov, alpha = covariances(g).numpy(), torch.sigmoid(g.opacity_logits.double()).numpy()
+    means, found, worst = g.means.double().numpy(), covariances(merged).numpy(), 0.0
     for row, name in enumerate((2, 7, 9)):
         rows = cluster == name
         w = alpha[rows] / alpha[rows].sum()

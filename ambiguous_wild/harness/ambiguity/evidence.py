@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import torch
 
 from ambiguous_wild.io.motion_points import MotionPoints
 from ambiguous_wild.methods.refinesplat.structure import GREY, correlation
@@ -57,7 +58,8 @@ def distractors(
     differs = unlike = sure = moves = None
     if behind is not None:
         differs = am.colour_residual(photo, behind) > am.COLOUR_THRESHOLD
-        unlike = correlation(photo @ GREY, behind @ GREY) < CORRELATED
+        grey = (torch.from_numpy((image @ GREY).astype(np.float32)) for image in (photo, behind))
+        unlike = correlation(*grey).numpy() < CORRELATED
         sure = np.ones(differs.shape, bool) if known is None else known
         differs, unlike, sure = (
             cv2.resize(x.astype(np.uint8), shape, interpolation=cv2.INTER_NEAREST) > 0

@@ -127,7 +127,7 @@ class Labels:
         sums = backend.label_sums(self.of_pixel[view], self.most + 1, pixels.double().flatten())
         return sums[1:] / self.areas[view]
 
-    def on_pixels(self, view: int, values: Tensor, shape: torch.Size) -> Tensor:
+    def on_pixels(self, view: int, values: Tensor, shape: tuple[int, ...]) -> Tensor:
         """A value of each instance [K] at its pixels [H, W]; 0 where there is none."""
         return F.pad(values, (1, 0)).index_select(0, self.of_pixel[view]).view(shape)
 

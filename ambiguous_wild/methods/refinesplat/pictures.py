@@ -55,7 +55,7 @@ def panels(policy: Policy, step: Step, *, begun: bool = True) -> dict[str, np.nd
     labels = policy.inputs.labels[step.view]
     photo = (policy.data.photos[step.view].cpu().numpy() * 255 + 0.5).astype(np.uint8)
     grey = faded(photo)
-    entropy = enlarge(entropy, *labels.shape).cpu().numpy()
+    on_pixels = enlarge(entropy, labels.shape[0], labels.shape[1]).cpu().numpy()
     local, global_, final, means = (
         t.cpu().numpy() for t in (masks.local, masks.global_, masks.keep < 0.5, masks.means)
     )
@@ -67,7 +67,7 @@ def panels(policy: Policy, step: Step, *, begun: bool = True) -> dict[str, np.nd
     points = policy.points.get(policy.data.scene.train[step.view].name)
     return {
         **({} if points is None else {POINTS: draw_points(photo, points)}),
-        f"entropy, mean {entropy.mean():.2f}": ramp(entropy, 0.0, 1.0),
+        f"entropy, mean {entropy.mean():.2f}": ramp(on_pixels, 0.0, 1.0),
         f"instances, {cut}": _outlined(ramp(of_pixel, 0.0, top), labels),
         f"local {100 * local.mean():.0f} %": tint(grey, local, LOCAL),
         f"global {100 * global_.mean():.0f} %": tint(grey, global_, GLOBAL),

@@ -38,9 +38,10 @@ from ambiguous_wild.io.atomic import write_json, write_text
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import get_method
 from ambiguous_wild.methods.refinesplat.entropy import contrast, entropy, surprise
+from ambiguous_wild.methods.refinesplat.evidence import ratio, uncertainty
 from ambiguous_wild.methods.refinesplat.inputs import FrozenInputs
 from ambiguous_wild.methods.refinesplat.losses import consistency_loss, identity_loss, instance_matrix
-from ambiguous_wild.methods.refinesplat.masking import enlarge, instance_means, ratio, uncertainty
+from ambiguous_wild.methods.refinesplat.masks import enlarge, instance_means
 from ambiguous_wild.methods.refinesplat.paper import PaperConfig
 from ambiguous_wild.splat.cpu import set_threads
 from ambiguous_wild.splat.data import load_train_data
@@ -96,13 +97,13 @@ def judged(data: TrainData, renders: Sequence[torch.Tensor], backend: str, sigma
         if mask is None:
             continue
         maps = _maps(found, view, render, data.photos[view], features, sigma)
-        labels, count = inputs.labels[view], inputs.counts[view]
-        share, areas = instance_means(mask.astype(np.float64), labels, count)
+        labels, count = torch.from_numpy(inputs.labels[view]), inputs.counts[view]
+        share, areas = (t.numpy() for t in instance_means(torch.from_numpy(mask), labels, count))
         truth.append(mask.ravel())
         guilty.append(share[areas > 0] > 0.5)
         for name, grid in maps.items():
-            pixels[name].append(enlarge(grid, *mask.shape).ravel())
-            grouped[name].append(instance_means(grid, labels, count)[0][areas > 0])
+            pixels[name].append(enlarge(grid, *mask.shape).numpy().ravel())
+            grouped[name].append(instance_means(grid, labels, count)[0].numpy()[areas > 0])
         sizes.append(_gradients(data, found, inputs.counts[view], view, render, features, sigma))
     if not truth:
         raise AwError(f"{data.scene.name} has no exact masks of its train photos (truth/distractor)")
@@ -121,7 +122,7 @@ def judged(data: TrainData, renders: Sequence[torch.Tensor], backend: str, sigma
 @torch.no_grad()
 def _maps(
     found: Any, view: int, render: torch.Tensor, photo: torch.Tensor, features: Any, sigma: Any
-) -> dict[str, np.ndarray]:
+) -> dict[str, torch.Tensor]:
     phi = features(render)
     mine, theirs = found.psi(phi), found.psi(found.phi[view])
     cosine = torch.cosine_similarity(found.phi[view], phi, dim=2)
@@ -135,8 +136,8 @@ def _maps(
         "distance": 1.0 - cosine,
         "residual": boxed,
     }
-    arrays = {name: value.double().numpy() for name, value in maps.items()}
-    return arrays | {"U / H": ratio(uncertainty(cosine.double().numpy()), arrays["entropy"])}
+    maps = {name: value.double() for name, value in maps.items()}
+    return maps | {"U / H": ratio(uncertainty(cosine.double()), maps["entropy"])}
 
 
 def _gradients(

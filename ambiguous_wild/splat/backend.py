@@ -119,12 +119,18 @@ class Backend:
         """Rows [M, count] int64 of the points [M, 3] nearest to each, the nearest, itself, first."""
         from scipy.spatial import cKDTree
 
-        xyz = points.detach().numpy()
-        return torch.from_numpy(cKDTree(xyz).query(xyz, k=list(range(1, count + 1)))[1])
+        xyz = points.detach().double().numpy()
+        # many centres coincide after cloning: the tree needs leaves that split on ties
+        tree = cKDTree(xyz, balanced_tree=False)
+        return torch.from_numpy(tree.query(xyz, k=list(range(1, count + 1)))[1])
 
     def label_sums(self, labels: Tensor, count: int, values: Tensor | None = None) -> Tensor:
         """[count] float64: sums of values [P] float64 by labels [P] int64 below `count`; None counts them."""
         return torch.bincount(labels, weights=values, minlength=count).double()
+
+    def pose(self, camera: Camera, like: Tensor) -> Tensor:
+        """`cam_from_world` [4, 4] where `like` lies."""
+        return torch.tensor(camera.cam_from_world.tolist(), dtype=like.dtype)
 
     def adam(self, parameters: Iterable[torch.nn.Parameter], lr: float) -> torch.optim.Adam:
         """Adam on a net's parameters; on a GPU one kernel, which keeps the step count there."""
@@ -212,6 +218,11 @@ class GpuBackend(Backend):
         lane = torch.arange(len(labels), device=labels.device) % _LANES
         sums = values.new_zeros(count * _LANES).scatter_add_(0, labels * _LANES + lane, values)
         return sums.reshape(count, _LANES).sum(dim=1)
+
+    def pose(self, camera: Camera, like: Tensor) -> Tensor:
+        from ambiguous_wild.splat.gpu.render import on_device
+
+        return on_device(camera, like.device).viewmat[0]
 
     def adam(self, parameters: Iterable[torch.nn.Parameter], lr: float) -> torch.optim.Adam:
         return torch.optim.Adam(parameters, lr=lr, fused=True)

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.methods.refinesplat import masking
 from ambiguous_wild.methods.refinesplat.entropy import Variant, entropy
+from ambiguous_wild.methods.refinesplat.evidence import global_mask, ratio, uncertainty
 from ambiguous_wild.methods.refinesplat.losses import consistency_loss
+from ambiguous_wild.methods.refinesplat.masks import instance_means
 from ambiguous_wild.methods.refinesplat.merging import (
     MergeConfig,
     clusters,
@@ -21,7 +23,7 @@ from ambiguous_wild.methods.refinesplat.merging import (
     merge_pairs,
     overlap,
 )
-from ambiguous_wild.methods.refinesplat.threshold import LearntWeight, objective, t_ent
+from ambiguous_wild.methods.refinesplat.threshold import learnt, objective, pool_of, t_ent
 from ambiguous_wild.metrics import ambiguity
 from ambiguous_wild.metrics.image import psnr, ssim, ssim_inria
 from ambiguous_wild.metrics.masks import confusion, psnr_valid
@@ -32,6 +34,11 @@ from ambiguous_wild.stress.case import UNIT, Measured, case, cloud, failed_check
 
 def _logits(n: int, channels: int, scale: float, seed: int = 0) -> torch.Tensor:
     return scale * torch.randn(n, channels, generator=torch.Generator().manual_seed(seed))
+
+
+def _flagged(values: np.ndarray, *settings: Any, **more: Any) -> np.ndarray:
+    """[K] bool, instances above T_ent."""
+    return values > float(t_ent(pool_of(torch.from_numpy(values)), *settings, **more).threshold)
 
 
 @case(11, "entropy at logits of 1e4 either way, for 1, 2 and 255 identities")
@@ -56,24 +63,21 @@ def entropy_saturated(device: str) -> Measured:
 
 @case(12, "0, 1 and 2 instances, equal values, gaps and negative labels")
 def few_instances(device: str) -> Measured:
-    none = np.zeros((8, 8), np.int32)
-    labels = np.array([[-2, 1, 1, 0], [3, 3, -1, 1], [0, 3, 3, 3], [1, 1, 1, 1]], np.int32)  # no label 2
-    grid = np.arange(16.0).reshape(4, 4)
-    means, areas = masking.instance_means(grid, labels, 3)
-    one_pixel = none.copy()
-    one_pixel[5, 6] = 1
-    two = t_ent(np.array([0.1, 0.9]))
+    none = torch.zeros(8, 8, dtype=torch.int32)
+    labels = torch.tensor([[-2, 1, 1, 0], [3, 3, -1, 1], [0, 3, 3, 3], [1, 1, 1, 1]])  # no label 2
+    grid = torch.arange(16.0).reshape(4, 4).double()
+    means, areas = instance_means(grid, labels, 3)
+    two = np.array([0.1, 0.9])
     checks = {
-        "none": not t_ent(np.array([])).flagged.size and masking.instance_means(grid, none, 0)[0].size == 0,
-        "one": not t_ent(np.array([0.4]), gate=3.0).flagged.any(),
-        "two": two.flagged.tolist() == [False, True] and 0.1 < two.threshold < 0.9,
-        "equal": not t_ent(np.full(50, 0.2), gate=3.0).flagged.any(),
-        "means": np.isclose(means[0], grid[labels == 1].mean())
-        and np.isclose(means[2], grid[labels == 3].mean()),
-        "a label without pixels": bool(np.isnan(means[1]) and areas[1] == 0),
-        "one over the photo": masking.instance_means(np.full((2, 2), 0.25), none + 1, 1)[0][0] == 0.25,
-        "one pixel": masking.local_mask(one_pixel, np.array([True])).sum() == 1,
-        "negative labels": not masking.local_mask(none - 1, np.array([True])).any(),
+        "none": not _flagged(np.array([np.nan])).any() and instance_means(grid, none, 0)[0].numel() == 0,
+        "one": not _flagged(np.array([0.4]), gate=3.0).any(),
+        "two": _flagged(two).tolist() == [False, True],
+        "equal": not _flagged(np.full(50, 0.2), gate=3.0).any(),
+        "means": torch.isclose(means[0], grid[labels == 1].mean())
+        and torch.isclose(means[2], grid[labels == 3].mean()),
+        "a label without pixels": bool(means[1].isnan() and areas[1] == 0),
+        "one over the photo": instance_means(torch.full((2, 2), 0.25), none + 1, 1)[0][0] == 0.25,
+        "negative labels": not instance_means(grid, none - 1, 1)[1].any(),
     }
     return failed_checks({k: bool(v) for k, v in checks.items()}, "no mask without outliers")
 
@@ -84,13 +88,13 @@ def skewed(device: str) -> Measured:
     checks = {}
     for high in (1, 3, 20):
         low, far = rng.normal(0.1, 0.01, 50 - high), rng.normal(0.8, 0.03, high)
-        threshold = t_ent(np.r_[low, far], gate=5.0).threshold
+        threshold = float(t_ent(pool_of(torch.from_numpy(np.r_[low, far])), gate=5.0).threshold)
         checks[f"{high} of 50 apart"] = bool(low.max() < threshold < far.min())
     many = np.r_[0.05, rng.normal(0.8, 0.01, 49)]
-    checks["49 of 50: the majority is the scene"] = bool(t_ent(many, gate=5.0).flagged.mean() < 0.1)
+    checks["49 of 50: the majority is the scene"] = bool(_flagged(many, gate=5.0).mean() < 0.1)
     tail = rng.pareto(1.5, 400) + 0.1
-    cut = t_ent(tail, gate=3.0)
-    checks["heavy tail"] = bool(0 < cut.flagged.mean() < 0.3 and cut.threshold > np.quantile(tail, 0.7))
+    high = _flagged(tail, gate=3.0)
+    checks["heavy tail"] = bool(0 < high.mean() < 0.3 and tail[high].min() > np.quantile(tail, 0.7))
     return failed_checks(checks, "the threshold lies between the groups")
 
 
@@ -100,9 +104,10 @@ def nothing_to_mask(device: str) -> Measured:
     shares = []
     for _ in range(10):
         h, cosine = rng.uniform(0.4, 0.6, (34, 60)), rng.uniform(0.9, 1.0, (34, 60))
-        mask = masking.global_mask(masking.ratio(masking.uncertainty(cosine), h), spread="std", gate=6.0)
-        local = t_ent(rng.normal(0.3, 0.03, 40), gate=5.0).flagged
-        shares += [float(mask.mean()), float(local.mean())]
+        r = ratio(uncertainty(torch.from_numpy(cosine)), torch.from_numpy(h))
+        mask = global_mask(r, spread="std", gate=6.0)
+        local = _flagged(rng.normal(0.3, 0.03, 40), gate=5.0)
+        shares += [float(mask.double().mean()), float(local.mean())]
     return Measured(max(shares), 0.02, "share of masked pixels and instances, from the list", "below 2 %")
 
 
@@ -112,8 +117,9 @@ def planted_region(device: str) -> Measured:
     h, cosine = rng.uniform(0.3, 0.6, (34, 60)), rng.uniform(0.85, 1.0, (34, 60))
     h[:, :30] = 0.0
     cosine[10:16, 8:16], cosine[0, 0], cosine[1, 1] = -1.0, np.nan, 1.0
-    r = masking.ratio(masking.uncertainty(cosine), h)
-    found = masking.global_mask(r, spread="std", gate=6.0)
+    ratios = ratio(uncertainty(torch.from_numpy(cosine)), torch.from_numpy(h))
+    r, found = ratios.numpy(), global_mask(ratios, spread="std", gate=6.0).numpy()
+    extremes = torch.tensor([-1.0, 1.0, math.nan, math.inf])
     grown = np.zeros_like(found)
     grown[9:17, 7:17] = True
     checks = {
@@ -121,7 +127,7 @@ def planted_region(device: str) -> Measured:
         "H of 0 counts at most a hundred times": bool(r[20:, :30].max() < 100 * r[20:, 30:].max()),
         "the region is found": bool(found[11:15, 9:15].all()),
         "nothing else is": not bool((found & ~grown).any()),
-        "U is at least 1": bool((masking.uncertainty(np.array([-1.0, 1.0, np.nan, np.inf])) >= 1).all()),
+        "U is at least 1": bool((uncertainty(extremes) >= 1).all()),
     }
     return failed_checks(checks, "U / H finite, the planted region found")
 
@@ -129,17 +135,17 @@ def planted_region(device: str) -> Measured:
 @case(16, "printed formulas where they degenerate")
 def literal(device: str) -> Measured:
     values = np.r_[np.full(20, 0.05), 0.25, 0.3] + np.arange(22) * 1e-4
-    scores = objective(np.sort(values), np.arange(22), 0.5, "literal")
-    unit, zero = np.eye(3)[None], np.zeros((1, 3))
+    scores = objective(pool_of(torch.from_numpy(values)), 0.5, "literal")[0].numpy()
+    unit, zero = torch.eye(3, dtype=torch.float64)[None], torch.zeros(1, 3, dtype=torch.float64)
     away = np.array([[-2.0, 0, 0], [2.0, 0, 0]])
     printed = (np.eye(3) + away[:, :, None] * -away[:, None, :]).mean(0)
     rng = np.random.default_rng(0)
     h, cosine = rng.uniform(0.3, 0.6, (34, 60)), rng.uniform(0.85, 1.0, (34, 60))
     h[:, :30], cosine[10:16, 8:16] = 0.0, -0.99
-    raw = masking.uncertainty(cosine) / (h + 1e-6)
+    raw = uncertainty(torch.from_numpy(cosine)) / torch.from_numpy(h + 1e-6)
     checks = {
-        "Ent: w2 below 1/2 flags all but one": t_ent(values, 0.4, "literal").flagged.sum() == 21,
-        "Ent: w2 above 1/2 flags nothing": t_ent(values, 0.6, "literal").flagged.sum() == 0,
+        "Ent: w2 below 1/2 flags all but one": _flagged(values, 0.4, "literal").sum() == 21,
+        "Ent: w2 above 1/2 flags nothing": _flagged(values, 0.6, "literal").sum() == 0,
         "Ent: w2 of 1/2 decides nothing": bool(np.ptp(scores) < 1e-12),
         "overlap: depends on the unit": bool(
             overlap(zero, unit, unit, "literal")[0]
@@ -147,7 +153,7 @@ def literal(device: str) -> Measured:
             < overlap(zero, unit * 1e-6, unit * 1e-6, "literal")[0]
         ),
         "merged covariance: indefinite": bool(np.linalg.eigvalsh(printed).min() < 0),
-        "global mask: the variance swallows it": not bool(masking.global_mask(raw, spread="var").any()),
+        "global mask: the variance swallows it": not bool(global_mask(raw, spread="var").any()),
     }
     return failed_checks(
         {k: bool(v) for k, v in checks.items()}, "each fails as described in docs/refinesplat.md"
@@ -203,12 +209,14 @@ def consistency_saturated(device: str) -> Measured:
 def learnt_weight(device: str) -> Measured:
     checks = {}
     for name, residual in (("down", 1e6), ("up", 0.0)):
-        rng, weight = np.random.default_rng(0), LearntWeight(rate=5.0)  # much larger than in use
+        rng, theta = np.random.default_rng(0), torch.zeros((), dtype=torch.float64)
+        one = torch.ones(40, dtype=torch.float64)
         for _ in range(300):
-            weight.learn(rng.gamma(2.0, 1.0, 40), np.full(40, residual), np.ones(40), floor=0.5)
-        single = float(torch.sigmoid(torch.tensor(weight.theta, dtype=torch.float32)))
-        checks[f"{name}: inside (0, 1), in float32 too"] = 0 < weight.value < 1 and 0 < single < 1
-        checks[f"{name}: moved that way"] = (weight.value < 0.5) == (name == "down")
+            pool = pool_of(torch.from_numpy(rng.gamma(2.0, 1.0, 40)))
+            theta = learnt(theta, pool, residual * one, one, torch.tensor(0.5))
+        w2, single = float(torch.sigmoid(theta)), float(torch.sigmoid(theta.float()))
+        checks[f"{name}: inside (0, 1), in float32 too"] = 0 < w2 < 1 and 0 < single < 1
+        checks[f"{name}: moved that way"] = (w2 < 0.5) == (name == "down")
     return failed_checks(checks, "stays inside (0, 1)")
 
 
@@ -222,20 +230,20 @@ def _line(positions: list[float]) -> Gaussians:
 
 
 def _pairs(g: Gaussians, **config: float) -> set[tuple[int, int]]:
-    everyone = np.ones(len(g), bool)
-    return {(int(a), int(b)) for a, b in merge_pairs(g, everyone, MergeConfig(**config))}  # type: ignore[arg-type]
+    everyone = torch.ones(len(g), dtype=torch.bool)
+    return {(a, b) for a, b in merge_pairs(g, everyone, MergeConfig(**config)).tolist()}  # type: ignore[arg-type]
 
 
 @case(19, "identical Gaussians, a chain, a thousand, far apart, orthogonal needles")
 def merging(device: str) -> Measured:
     chain = _line([0.0, 2.0, 4.0])
-    pairs = merge_pairs(chain, np.ones(3, bool), MergeConfig())
+    pairs = merge_pairs(chain, torch.ones(3).bool(), MergeConfig())
     thousand = _line([0.0] * 1000)
-    cluster = clusters(1000, merge_pairs(thousand, np.ones(1000, bool), MergeConfig(neighbours=999)))
+    cluster = clusters(1000, merge_pairs(thousand, torch.ones(1000).bool(), MergeConfig(neighbours=999)))
     merged = merge_members(thousand, cluster)
     needles = _line([0.0, 0.0])
     needles.log_scales[:] = torch.log(torch.tensor([[1e3, 1e-4, 1e-4], [1e-4, 1e3, 1e-4]]))
-    crossed = covariances(merge_members(needles, np.zeros(2, int)))[0]
+    crossed = covariances(merge_members(needles, torch.zeros(2).long()))[0]
     coloured = _line([0.0, 0.1])
     coloured.sh0[1] = 0.2 / SH_C0
     checks = {
@@ -254,7 +262,7 @@ def merging(device: str) -> Measured:
 
 def _own_overlap(g: Gaussians) -> float:
     cov = covariances(g)
-    return float(overlap(np.zeros((len(g), 3)), cov, cov).min())
+    return float(overlap(torch.zeros(len(g), 3).double(), cov, cov).min())
 
 
 @case(20, "moments of the merged Gaussian")
@@ -263,9 +271,9 @@ def moments(device: str) -> Measured:
     g = cloud(9, 5)
     g.log_scales[::3] = torch.log(torch.tensor([1.0, 1e-3, 1e-3]))
     cluster = np.array([7, 7, 2, 2, 2, 9, 9, 9, 9])
-    merged = merge_members(g, cluster)
-    cov, alpha = covariances(g), torch.sigmoid(g.opacity_logits.double()).numpy()
-    means, found, worst = g.means.double().numpy(), covariances(merged), 0.0
+    merged = merge_members(g, torch.from_numpy(cluster))
+    cov, alpha = covariances(g).numpy(), torch.sigmoid(g.opacity_logits.double()).numpy()
+    means, found, worst = g.means.double().numpy(), covariances(merged).numpy(), 0.0
     for row, name in enumerate((2, 7, 9)):
         rows = cluster == name
         w = alpha[rows] / alpha[rows].sum()

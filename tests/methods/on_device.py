@@ -1,4 +1,4 @@
-"""What the tests of masks on an accelerator share: numbers as tensors, and a small scene visited in turn.
+"""What the tests of masks share: numbers as tensors, and a small scene visited in turn.
 
 The accelerator's path runs here on the CPU, with numbers; and on torch's `meta` device, where reading a
 value, choosing rows by a mask and mixing devices all raise.
@@ -15,8 +15,6 @@ import numpy as np
 import torch
 
 from ambiguous_wild.methods.refinesplat.config import MaskConfig, RefineSplatConfig
-from ambiguous_wild.methods.refinesplat.on_device.mask_builder import DeviceMasks
-from ambiguous_wild.methods.refinesplat.on_host import HostMasks
 from ambiguous_wild.methods.refinesplat.policy import RefineSplatMask
 from ambiguous_wild.splat import device as devices
 from tests.methods.test_refinesplat_policy import (
@@ -78,13 +76,10 @@ def visit(scene, number: int):
     return step
 
 
-def both(scene, monkeypatch, config=PLAIN) -> tuple[RefineSplatMask, RefineSplatMask]:
-    host = made(scene, config)
-    monkeypatch.setattr(devices, "accelerated", lambda device: True)
-    device = made(scene, config)
-    assert isinstance(host.masks, HostMasks) and isinstance(device.masks, DeviceMasks)
-    return host, device
-
-
 def differing(a: torch.Tensor, b: torch.Tensor) -> float:
     return float((a != b).double().mean())
+
+
+def on(monkeypatch, accelerated: bool) -> None:
+    """Take an accelerator's path, or the CPU's, from now on."""
+    monkeypatch.setattr(devices, "accelerated", lambda device: accelerated)

@@ -7,10 +7,12 @@ import pytest
 import torch
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.methods.refinesplat import masking
+from ambiguous_wild.methods.refinesplat import evidence as maps_of
+from ambiguous_wild.methods.refinesplat import masks, regions
 from ambiguous_wild.methods.refinesplat.config import MaskConfig
 from ambiguous_wild.methods.refinesplat.entropy import contrast, entropy, surprise
-from ambiguous_wild.methods.refinesplat.threshold import LearntWeight, objective, soft_threshold, t_ent
+from ambiguous_wild.methods.refinesplat.threshold import TEMPERATURE, learnt, objective, pool_of, t_ent
+from tests.methods.on_device import tensor
 
 
 @pytest.mark.parametrize("variant", ["sigmoid", "softmax"])
@@ -56,6 +58,13 @@ def test_unknown_variant_is_named():
 # -- the threshold ------------------------------------------------------------------------------------
 
 
+def cut_of(values, *settings, **more) -> tuple[float, np.ndarray]:
+    """T_ent and the instances above it; the pool has gaps, as the stack of all photos has them."""
+    padded = np.r_[np.nan, values, np.nan, np.nan]
+    threshold = float(t_ent(pool_of(tensor(padded)), *settings, **more).threshold)
+    return threshold, np.asarray(values) > threshold
+
+
 def brute_force(values: np.ndarray, w2: float, form: str) -> float:
     """The smallest upper value of the best cut, by the formula as it is written."""
 
@@ -75,7 +84,7 @@ def brute_force(values: np.ndarray, w2: float, form: str) -> float:
 def test_the_cut_equals_brute_force(form, w2):
     for seed in range(20):
         values = np.random.default_rng(seed).uniform(0.01, 0.3, 12)
-        cut = t_ent(values, w2, form)
+        threshold, flagged = cut_of(values, w2, form)
         best = brute_force(values, w2, form)
         # an argmax tie between equal objectives does not occur at w2 = 0.5 in the literal form only
         if form == "literal" and w2 == 0.5:
@@ -83,29 +92,44 @@ def test_the_cut_equals_brute_force(form, w2):
         if form == "kapur" and best == values.min():
             continue  # not a cut: the default wants two sides
         if form == "literal":  # printed: the subset is H >= t, the mask H > T
-            assert cut.threshold == best
-            assert np.array_equal(cut.flagged, values > best)
+            assert threshold == best
         else:
-            assert cut.threshold < best
-            assert np.array_equal(cut.flagged, values >= best)
+            assert threshold < best
+            assert np.array_equal(flagged, values >= best)
 
 
 def test_the_printed_objective_degenerates():
     values = np.r_[np.full(20, 0.05), 0.25, 0.3] + np.arange(22) * 1e-4
-    assert t_ent(values, 0.4, "literal").flagged.sum() == 21  # w2 < 1/2: all but the smallest value
-    assert t_ent(values, 0.6, "literal").flagged.sum() == 0  # w2 > 1/2: nothing
-    order = np.sort(values)
-    scores = objective(order, np.arange(22), 0.5, "literal")
-    assert np.ptp(scores) < 1e-12  # w2 = 1/2: any threshold is as good as any other
-    cut = t_ent(values, 0.5, "kapur", gate=3.0)
-    assert cut.flagged.sum() == 2
+    assert cut_of(values, 0.4, "literal")[1].sum() == 21  # w2 < 1/2: all but the smallest value
+    assert cut_of(values, 0.6, "literal")[1].sum() == 0  # w2 > 1/2: nothing
+    scores, _ = objective(pool_of(tensor(values)), 0.5, "literal")
+    assert np.ptp(scores.numpy()) < 1e-12  # w2 = 1/2: any threshold is as good as any other
+    assert cut_of(values, 0.5, "kapur", gate=3.0)[1].sum() == 2
 
 
 @pytest.mark.parametrize("values", [[], [0.4], [0.2, 0.2, 0.2], [0.0, 0.0], [0.0] * 50])
-def test_nothing_stands_apart(values):
-    for form in ("kapur", "literal"):
-        cut = t_ent(np.array(values), form=form, gate=3.0)  # type: ignore[arg-type]
-        assert not cut.flagged.any()
+@pytest.mark.parametrize("gate", [0.0, 3.0])
+@pytest.mark.parametrize("form", ["kapur", "literal", "statistics"])
+def test_nothing_stands_apart(values, gate, form):
+    assert cut_of(values, form=form, gate=gate)[0] == math.inf
+    all_but_equal = 0.3 + 1e-11 * np.arange(9)
+    assert cut_of(all_but_equal, form=form, gate=gate)[0] == math.inf
+
+
+def test_thresholds_it_is_compared_with():
+    values = np.array([1.0, 2.0, 3.0, 20.0])
+    assert cut_of(values, form="hard", hard=12.0)[1].tolist() == [False, False, False, True]
+    assert cut_of(values, form="hard", hard=12.0, gate=50.0, least=99.0)[0] == 12.0
+    assert cut_of([15.0], form="hard", hard=12.0)[1].tolist() == [True]
+    assert cut_of(values, form="statistics")[0] == pytest.approx(values.mean() + values.std())
+    assert not cut_of(values, form="statistics", least=25.0)[1].any()
+    cut = t_ent(pool_of(tensor(values)), gate=3.0)
+    spread = 1.4826 * np.median(np.abs(values - 2.5))
+    assert float(cut.floor) == pytest.approx(2.5 + 3 * spread)
+    low = cut.below(torch.tensor(1.7, dtype=torch.float64))
+    assert float(low.threshold) == float(low.floor) == pytest.approx(1.7)
+    with pytest.raises(AwError, match="kapur"):
+        t_ent(pool_of(tensor(values)), form="kapurr")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("high", [1, 3, 20])
@@ -113,73 +137,74 @@ def test_skewed_groups_are_cut_between(high):
     rng = np.random.default_rng(high)
     low = rng.normal(0.1, 0.01, 50 - high)
     far = rng.normal(0.8, 0.03, high)
-    cut = t_ent(np.r_[low, far], gate=5.0)
-    assert low.max() < cut.threshold < far.min()
+    assert low.max() < cut_of(np.r_[low, far], gate=5.0)[0] < far.min()
 
 
 def test_a_heavy_tail_is_cut_in_the_tail():
     values = np.random.default_rng(0).pareto(1.5, 400) + 0.1
-    cut = t_ent(values, gate=3.0)
-    assert 0.0 < cut.flagged.mean() < 0.3
-    assert cut.threshold > np.quantile(values, 0.7)
+    threshold, flagged = cut_of(values, gate=3.0)
+    assert 0.0 < flagged.mean() < 0.3
+    assert threshold > np.quantile(values, 0.7)
 
 
 def test_a_majority_is_never_flagged():
     values = np.r_[0.05, np.random.default_rng(0).normal(0.8, 0.01, 49)]
-    assert t_ent(values, gate=5.0).flagged.mean() < 0.1
+    assert cut_of(values, gate=5.0)[1].mean() < 0.1
 
 
-@pytest.mark.parametrize("residual", [0.0, 10.0])
-def test_learnt_weight_stays_inside(residual):
+def taught(visits, cost: float, floor: float, form: str = "kapur") -> torch.Tensor:
+    theta = torch.zeros((), dtype=torch.float64)
+    for values in visits:
+        one = torch.ones(len(values), dtype=torch.float64)
+        theta = learnt(theta, pool_of(tensor(values)), cost * one, one, torch.tensor(floor), form)
+    return theta
+
+
+@pytest.mark.parametrize("cost", [0.0, 10.0])
+def test_learnt_weight_stays_inside(cost):
     rng = np.random.default_rng(0)
-    weight = LearntWeight()
-    for _ in range(2000):
-        values = rng.gamma(2.0, 1.0, 40)
-        weight.learn(values, np.full(40, residual), np.ones(40), floor=0.5)
-    assert 0.0 < weight.value < 1.0
-    assert math.isfinite(weight.theta)
-    assert 0.0 < float(torch.sigmoid(torch.tensor(weight.theta, dtype=torch.float32))) < 1.0
+    theta = taught((rng.gamma(2.0, 1.0, 40) for _ in range(500)), cost, 0.5)
+    assert torch.isfinite(theta)
+    assert 0.0 < float(torch.sigmoid(theta.float())) < 1.0
 
 
-def test_learnt_weight_follows_the_residuals():
-    """Dear upper instances lower the threshold, cheap ones raise it."""
-    rng = np.random.default_rng(1)
-    values = np.sort(rng.gamma(2.0, 1.0, 60))
-    dear, cheap = LearntWeight(), LearntWeight()
-    for _ in range(50):
-        dear.learn(values, np.full(60, 5.0), np.ones(60), floor=1.0)
-        cheap.learn(values, np.full(60, 0.0), np.ones(60), floor=1.0)
-    assert t_ent(values, dear.value).threshold <= t_ent(values, cheap.value).threshold
-    assert dear.value < 0.5 < cheap.value
+@pytest.mark.parametrize("form", ["kapur", "literal"])
+def test_learnt_weight_follows_the_residuals(form):
+    """Dear upper instances lower the threshold, cheap ones raise it; printed, to all or to nothing."""
+    values = np.sort(np.random.default_rng(1).gamma(2.0, 1.0, 60))
+    values = np.linspace(0.02, 0.3, 30) if form == "literal" else values
+    floor = -math.inf if form == "literal" else 1.0
+    dear, cheap = (float(torch.sigmoid(taught([values] * 50, cost, floor, form))) for cost in (5.0, 0.0))
+    assert dear < 0.5 < cheap
+    assert cut_of(values, dear, form)[0] <= cut_of(values, cheap, form)[0]
+    if form == "literal":
+        assert cut_of(values, dear, form)[1].sum() == 29 and not cut_of(values, cheap, form)[1].any()
 
 
-def test_the_printed_weight_learns_through_the_printed_form():
-    """The gradient written out by hand: dT/dw2 = sum p (t - T) (Ent below t - Ent from t) / tau."""
-    values = np.array([0.05, 0.1, 0.12, 0.3])
-    starts, w2, tau = np.arange(4), 0.45, 0.1
-    ent = np.array([-(v * np.log(v)) for v in values])
-    upper = np.array([ent[k:].sum() for k in starts])
-    lower = np.array([ent[:k].sum() for k in starts])
-    scores = ((1 - w2) * upper + w2 * lower) / tau
-    p = np.exp(scores - scores.max()) / np.exp(scores - scores.max()).sum()
-    soft = (p * values).sum()
-    weight = torch.tensor(w2, dtype=torch.float64, requires_grad=True)
-    found = soft_threshold(torch.from_numpy(values), torch.from_numpy(starts), weight, tau, "literal")
-    (slope,) = torch.autograd.grad(found, weight)
-    assert float(found.detach()) == pytest.approx(soft)
-    assert float(slope) == pytest.approx((p * (values - soft) * (lower - upper)).sum() / tau)
+@pytest.mark.parametrize("form", ["kapur", "literal"])
+def test_the_weights_step_is_the_gradient_of_the_loss(form):
+    """Against autograd through the soft threshold, with missing instances among the others."""
+    rng = np.random.default_rng(2)
+    values, areas, costs = np.sort(rng.uniform(0.02, 0.3, 9)), rng.uniform(1, 99, 9), rng.uniform(0, 4, 9)
+    theta = torch.tensor(-0.3, dtype=torch.float64, requires_grad=True)
+    x, w2 = tensor(values), torch.sigmoid(theta)
 
+    def ent(part):
+        part = part / part.sum() if form == "kapur" else part
+        return -(part * part.log()).sum()
 
-def test_the_printed_weight_falls_to_all_and_rises_to_nothing():
-    """Additive, the printed threshold knows only these two ends; what masking is worth picks one."""
-    values = np.linspace(0.02, 0.3, 30)
-    dear, cheap = LearntWeight(), LearntWeight()
-    for _ in range(50):
-        dear.learn(values, np.full(30, 5.0), np.ones(30), -math.inf, "literal")
-        cheap.learn(values, np.zeros(30), np.ones(30), -math.inf, "literal")
-    assert dear.value < 0.5 < cheap.value
-    assert t_ent(values, dear.value, "literal").flagged.sum() == 29
-    assert t_ent(values, cheap.value, "literal").flagged.sum() == 0
+    starts = range(form == "kapur", 9)
+    scores = torch.stack([(1 - w2) * ent(x[k:]) + w2 * ent(x[:k]) for k in starts])
+    t = (torch.softmax(scores / TEMPERATURE, 0) * x[list(starts)]).sum()
+    member = torch.sigmoid((x - t) / (values.std() / 4))
+    share = tensor(areas / areas.sum())
+    (slope,) = torch.autograd.grad((share * ((1 - member) * tensor(costs) + member)).sum(), theta)
+    order = rng.permutation(9)
+    padded = [tensor(np.r_[np.nan, a[order], np.nan]) for a in (values, costs, areas)]
+    found = learnt(theta.detach(), pool_of(padded[0]), *padded[1:], torch.tensor(-math.inf), form)
+    assert float(found - theta.detach()) == pytest.approx(-float(slope), rel=1e-9)
+    alone = learnt(theta.detach(), pool_of(padded[0]), *padded[1:], torch.tensor(0.29), form)
+    assert float(alone) == float(theta.detach())  # one candidate: w2 has no influence
 
 
 # -- masks --------------------------------------------------------------------------------------------
@@ -190,7 +215,7 @@ def test_instance_means_against_a_loop_with_gaps_and_negative_labels():
     labels = rng.integers(-2, 7, (27, 40)).astype(np.int32)
     labels[labels == 3] = 5  # label 3 has no pixels
     grid = rng.random((7, 10))
-    means, areas = masking.instance_means(grid, labels, 6)
+    means, areas = masks.instance_means(tensor(grid), tensor(labels), 6)
     for j in range(1, 7):
         cells = [grid[r * 7 // 27, c * 10 // 40] for r, c in zip(*np.nonzero(labels == j))]
         assert areas[j - 1] == len(cells)
@@ -201,23 +226,19 @@ def test_instance_means_against_a_loop_with_gaps_and_negative_labels():
 
 
 def test_instances_of_one_pixel_and_of_the_whole_photo():
-    whole = np.ones((8, 8), np.int32)
-    means, areas = masking.instance_means(np.full((2, 2), 0.25), whole, 1)
-    assert means[0] == 0.25
-    assert areas[0] == 64
-    single = np.zeros((8, 8), np.int32)
+    whole, single = torch.ones(8, 8, dtype=torch.int32), torch.zeros(8, 8, dtype=torch.int32)
+    means, areas = masks.instance_means(torch.full((2, 2), 0.25), whole, 1)
+    assert means[0] == 0.25 and areas[0] == 64
     single[5, 6] = 1
-    grid = np.arange(4.0).reshape(2, 2)
-    assert masking.instance_means(grid, single, 1)[0][0] == 3.0
-    assert masking.local_mask(single, np.array([True])).sum() == 1
-    assert not masking.local_mask(np.full((4, 4), -1, np.int32), np.array([True])).any()
-    assert masking.instance_means(grid, np.zeros((8, 8), np.int32), 0)[0].shape == (0,)
+    grid = torch.arange(4.0).reshape(2, 2)
+    assert masks.instance_means(grid, single, 1)[0][0] == 3.0
+    assert masks.instance_means(grid, torch.zeros_like(single), 0)[0].shape == (0,)
 
 
 @pytest.mark.parametrize("cosine", [-1.0, 1.0, np.nan, np.inf, -5.0])
 def test_uncertainty_is_finite(cosine):
-    u = masking.uncertainty(np.full((3, 3), cosine))
-    assert np.isfinite(u).all()
+    u = maps_of.uncertainty(torch.full((3, 3), cosine))
+    assert u.isfinite().all()
     assert (u >= 1.0).all()
 
 
@@ -227,41 +248,50 @@ def test_a_planted_region_is_found_although_h_is_zero_over_half_the_photo():
     h[:, :30] = 0.0
     cosine = rng.uniform(0.85, 1.0, (34, 60))
     cosine[10:16, 8:16] = -0.99
-    r = masking.ratio(masking.uncertainty(cosine), h)
-    assert np.isfinite(r).all()
-    found = masking.global_mask(r, spread="std", gate=6.0)
+    r = maps_of.ratio(maps_of.uncertainty(tensor(cosine)), tensor(h))
+    assert r.isfinite().all()
+    found = maps_of.global_mask(r, spread="std", gate=6.0).numpy()
     assert found[11:15, 9:15].all()
     planted = np.zeros_like(found)
     planted[9:17, 7:17] = True
     assert not (found & ~planted).any()
     # as printed, with a small perturbation in the denominator, the variance swallows the region
-    printed = masking.ratio(masking.uncertainty(cosine), h, perturbation=1e-6)
+    printed = maps_of.ratio(maps_of.uncertainty(tensor(cosine)), tensor(h), perturbation=1e-6)
     assert np.allclose(printed, 2.0 / (np.maximum(cosine, -0.999) + 1.0) / (h + 1e-6))
-    assert not masking.global_mask(printed, spread="var").any()
+    assert not maps_of.global_mask(printed, spread="var").any()
 
 
 def test_a_photo_that_agrees_with_its_render_has_no_global_mask():
     rng = np.random.default_rng(1)
-    r = masking.ratio(masking.uncertainty(rng.uniform(0.9, 1.0, (34, 60))), rng.uniform(0.4, 0.6, (34, 60)))
-    assert masking.global_mask(r, spread="std", gate=6.0).mean() < 0.02
+    cosine, h = tensor(rng.uniform(0.9, 1.0, (34, 60))), tensor(rng.uniform(0.4, 0.6, (34, 60)))
+    r = maps_of.ratio(maps_of.uncertainty(cosine), h)
+    assert maps_of.global_mask(r, spread="std", gate=6.0).double().mean() < 0.02
 
 
 def test_a_fixed_global_threshold_and_the_adaptive_one_by_hand():
-    r = np.array([[1.0, 2.0], [3.0, 10.0]])
-    assert np.array_equal(masking.global_mask(r, 1, "hard", hard=2.5), [[False, False], [True, True]])
-    assert np.array_equal(masking.global_mask(r, 1, "hard", hard=10.0), np.zeros((2, 2), bool))
+    r = torch.tensor([[1.0, 2.0], [3.0, 10.0]], dtype=torch.float64)
+    assert maps_of.global_mask(r, 1, "hard", hard=2.5).tolist() == [[False, False], [True, True]]
+    assert not maps_of.global_mask(r, 1, "hard", hard=10.0).any()
     # mean 4, variance 12.5, deviation 3.54
-    assert not masking.global_mask(r, 1, "var").any()
-    assert np.array_equal(masking.global_mask(r, 1, "std"), [[False, False], [False, True]])
+    assert not maps_of.global_mask(r, 1, "var").any()
+    assert maps_of.global_mask(r, 1, "std").tolist() == [[False, False], [False, True]]
+    # median 2.5, MAD 1
+    assert maps_of.global_mask(r, 1, "robust", gate=1.0).tolist() == [[False, False], [False, True]]
+    with pytest.raises(AwError, match="robust"):
+        maps_of.global_mask(r, 1, "robst")  # type: ignore[arg-type]
+
+
+def grown(mask: np.ndarray, config: MaskConfig, evidence: np.ndarray) -> np.ndarray:
+    return regions.grown(tensor(mask), config, tensor(evidence)).numpy()
 
 
 def test_the_mask_is_bounded_and_the_surest_pixels_go():
     evidence, config = np.arange(100.0).reshape(10, 10), MaskConfig(most=0.6, fill=0.0, dilation=1)
-    mask = masking.grown(np.ones((10, 10), bool), config, evidence)
+    mask = grown(np.ones((10, 10), bool), config, evidence)
     assert mask.sum() == 59 and not mask.ravel()[:40].any()
     small = evidence > 80
-    assert np.array_equal(masking.grown(small, config, evidence), small)
-    assert not masking.grown(np.ones((4, 4), bool), config, np.zeros((4, 4))).any()
+    assert np.array_equal(grown(small, config, evidence), small)
+    assert not grown(np.ones((4, 4), bool), config, np.zeros((4, 4))).any()
 
 
 def test_gaps_of_a_cut_mask_are_filled():
@@ -272,7 +302,7 @@ def test_gaps_of_a_cut_mask_are_filled():
     evidence = np.where(block & ~gap, 5.0, 1.0)
     evidence[0, 0] = 4.0  # the cut is open: it is the first that is not masked
     config = MaskConfig(most=385 / 1600, fill=0.05, dilation=1)
-    assert np.array_equal(masking.grown(np.ones((40, 40), bool), config, evidence), block)
+    assert np.array_equal(grown(np.ones((40, 40), bool), config, evidence), block)
 
 
 def test_gaps_are_not_filled_where_nearly_all_would_be_masked():
@@ -281,12 +311,35 @@ def test_gaps_are_not_filled_where_nearly_all_would_be_masked():
     evidence = np.where(lines, 5.0, 1.0)
     evidence[1, 1] = 4.0
     config = MaskConfig(most=(lines.sum() + 1) / 1600, fill=0.05, dilation=1)
-    assert masking.fill_holes(lines, 0.05).mean() > 0.9
-    assert np.array_equal(masking.grown(np.ones((40, 40), bool), config, evidence), lines)
+    assert regions.fill_holes(tensor(lines), 0.05).float().mean() > 0.9
+    assert np.array_equal(grown(np.ones((40, 40), bool), config, evidence), lines)
 
 
 def test_dilation_is_a_square():
-    mask = np.zeros((15, 15), bool)
+    mask = torch.zeros(15, 15, dtype=torch.bool)
     mask[7, 7] = True
-    assert masking.dilate(mask, 5).sum() == 25
-    assert np.array_equal(masking.dilate(mask, 1), mask)
+    assert regions.dilate(mask, 5).sum() == 25
+    assert regions.dilate(mask, 1) is mask
+
+
+def test_hysteresis_keeps_weak_pixels_that_touch_strong_ones():
+    values = torch.zeros(6, 12)
+    values[1:4, 1:5], values[2, 2], values[1:4, 8:11] = 5.0, 9.0, 5.0
+
+    def found(low, high):
+        return regions.hysteresis(values[None], torch.tensor(low), torch.tensor(high))[0]
+
+    assert found(4.0, 8.0)[1:4, 1:5].all() and found(4.0, 8.0).sum() == 12
+    assert not found(4.0, math.inf).any()
+    assert found(4.0, 4.5).sum() == 21
+
+
+def test_small_gaps_are_filled_and_large_ones_are_not():
+    mask = torch.zeros(40, 40, dtype=torch.bool)
+    mask[5:15, 5:15], mask[8:10, 8:10] = True, False
+    mask[20:38, 5:35], mask[22:36, 8:32] = True, False
+    found = regions.fill_holes(mask, 0.01)
+    assert found[8:10, 8:10].all() and not found[22:36, 8:32].any()
+    assert found.sum() == mask.sum() + 4
+    assert regions.fill_holes(mask, 0.0) is mask
+    assert not regions.fill_holes(torch.zeros(4, 4, dtype=torch.bool), 0.5).any()

@@ -5,6 +5,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
+from ambiguous_wild.core import AwError
 from ambiguous_wild.methods.refinesplat.losses import consistency_loss, identity_loss, instance_matrix
 from ambiguous_wild.methods.refinesplat.merging import (
     MergeConfig,
@@ -109,30 +110,31 @@ def line(positions, sigma: float = 1.0) -> Gaussians:
 def test_overlap_of_identical_gaussians_is_one_and_of_others_less():
     g = cloud(40, 0)
     cov = covariances(g)
-    assert np.allclose(overlap(np.zeros((40, 3)), cov, cov), 1.0)
-    delta = g.means.double().numpy() - g.means.double().numpy()[::-1]
-    other = overlap(delta, cov, cov[::-1])
+    assert torch.allclose(overlap(torch.zeros(40, 3).double(), cov, cov), torch.ones(40).double())
+    delta = g.means.double() - g.means.double().flip(0)
+    other = overlap(delta, cov, cov.flip(0))
     assert ((other >= 0) & (other <= 1)).all()
     # against the integral it stands for, sqrt(N_i N_j) up to the covariances' sum: by quadrature in 1-D form
     expected = np.exp(-0.5 * 4.0 / 2.0)
-    unit = np.eye(3)[None]
-    assert overlap(np.array([[2.0, 0, 0]]), unit, unit)[0] == pytest.approx(expected)
+    unit = torch.eye(3, dtype=torch.float64)[None]
+    assert float(overlap(torch.tensor([[2.0, 0, 0]]).double(), unit, unit)) == pytest.approx(expected)
 
 
 def test_the_printed_overlap_depends_on_the_scale_of_the_scene():
-    unit = np.eye(3)[None]
-    d = np.zeros((1, 3))
+    unit, d = torch.eye(3, dtype=torch.float64)[None], torch.zeros(1, 3, dtype=torch.float64)
     assert overlap(d, unit, unit, "literal")[0] < 0.3 < overlap(d, unit * 1e-6, unit * 1e-6, "literal")[0]
-    assert overlap(d, unit * 1e-6, unit * 1e-6)[0] == pytest.approx(1.0)
+    assert float(overlap(d, unit * 1e-6, unit * 1e-6)) == pytest.approx(1.0)
+    with pytest.raises(AwError, match="normalised"):
+        overlap(d, unit, unit, "normal")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("factor", [1e-3, 1e3])
 def test_clusters_do_not_depend_on_the_scale_of_the_scene(factor):
     g = cloud(300, 3, spread=0.7)
     config = MergeConfig(colour=1.0)
-    everyone = np.ones(300, bool)
-    here = {tuple(p) for p in merge_pairs(g, everyone, config)}
-    there = {tuple(p) for p in merge_pairs(scaled(g, factor), everyone, config)}
+    everyone = torch.ones(300, dtype=torch.bool)
+    here = {tuple(p) for p in merge_pairs(g, everyone, config).tolist()}
+    there = {tuple(p) for p in merge_pairs(scaled(g, factor), everyone, config).tolist()}
     assert len(here) > 20
     assert here == there
 
@@ -140,8 +142,8 @@ def test_clusters_do_not_depend_on_the_scale_of_the_scene(factor):
 def test_merged_moments_are_those_of_the_mixture():
     g = cloud(9, 5)
     cluster = np.array([7, 7, 2, 2, 2, 9, 9, 9, 9])
-    merged = merge_members(g, cluster)
-    cov, alpha = covariances(g), torch.sigmoid(g.opacity_logits).double().numpy()
+    merged = merge_members(g, torch.from_numpy(cluster))
+    cov, alpha = covariances(g).numpy(), torch.sigmoid(g.opacity_logits).double().numpy()
     means = g.means.double().numpy()
     for row, name in enumerate((2, 7, 9)):
         rows = cluster == name
@@ -150,7 +152,7 @@ def test_merged_moments_are_those_of_the_mixture():
         # second moment about the origin, minus the mean's: an order of sums other than the code's
         second = np.einsum("n,nij->ij", w, cov[rows] + means[rows][:, :, None] * means[rows][:, None, :])
         assert np.allclose(merged.means[row], mu, atol=1e-6)
-        got = covariances(merged)[row]
+        got = covariances(merged)[row].numpy()
         assert np.allclose(got, second - np.outer(mu, mu), atol=2e-6)
         assert np.linalg.eigvalsh(got).min() > 0
         assert float(torch.sigmoid(merged.opacity_logits[row])) == pytest.approx(alpha[rows].mean(), rel=1e-5)
@@ -162,20 +164,20 @@ def test_the_printed_sign_would_be_indefinite():
     g = line([0.0, 4.0])
     means = g.means.double().numpy()
     away = means - means.mean(0)
-    printed = (covariances(g) + away[:, :, None] * -away[:, None, :]).mean(0)
+    printed = (covariances(g).numpy() + away[:, :, None] * -away[:, None, :]).mean(0)
     assert np.linalg.eigvalsh(printed).min() < 0
-    assert np.linalg.eigvalsh(covariances(merge_members(g, np.zeros(2, int)))[0]).min() > 0
+    assert np.linalg.eigvalsh(covariances(merge_members(g, torch.zeros(2).long()))[0]).min() > 0
 
 
 def test_coincident_orthogonal_needles_stay_positive_definite():
     g = line([0.0, 0.0])
     g.log_scales[:] = torch.log(torch.tensor([[1e3, 1e-4, 1e-4], [1e-4, 1e3, 1e-4]]))
-    merged = merge_members(g, np.zeros(2, int))
+    merged = merge_members(g, torch.zeros(2).long())
     assert torch.isfinite(merged.log_scales).all()
     values = np.linalg.eigvalsh(covariances(merged)[0])
     assert values.min() > 0
     assert values.max() == pytest.approx(0.5e6, rel=1e-4)
-    assert not len(merge_pairs(g, np.ones(2, bool), MergeConfig()))  # they hardly overlap
+    assert not len(merge_pairs(g, torch.ones(2).bool(), MergeConfig()))  # they hardly overlap
 
 
 def test_identical_gaussians_merge_into_themselves():
@@ -183,7 +185,7 @@ def test_identical_gaussians_merge_into_themselves():
     g = one
     for _ in range(999):
         g = g.cat(one)
-    pairs = merge_pairs(g, np.ones(1000, bool), MergeConfig(neighbours=999))
+    pairs = merge_pairs(g, torch.ones(1000).bool(), MergeConfig(neighbours=999))
     cluster = clusters(1000, pairs)
     assert len(np.unique(cluster)) == 1
     merged = merge_members(g, cluster)
@@ -193,16 +195,16 @@ def test_identical_gaussians_merge_into_themselves():
 
 def test_a_chain_merges_by_union_find_and_not_under_a_limit():
     g = line([0.0, 2.0, 4.0])
-    pairs = merge_pairs(g, np.ones(3, bool), MergeConfig())
-    assert {tuple(p) for p in pairs} == {(0, 1), (1, 2)}  # the ends do not overlap
+    pairs = merge_pairs(g, torch.ones(3).bool(), MergeConfig())
+    assert {tuple(p) for p in pairs.tolist()} == {(0, 1), (1, 2)}  # the ends do not overlap
     assert len(np.unique(clusters(3, pairs))) == 1
     assert len(np.unique(clusters(3, pairs, most=2))) == 2
 
 
 def test_far_apart_or_other_colour_or_other_gradient_does_not_merge():
-    assert not len(merge_pairs(line([0.0, 100.0]), np.ones(2, bool), MergeConfig()))
+    assert not len(merge_pairs(line([0.0, 100.0]), torch.ones(2).bool(), MergeConfig()))
     g = line([0.0, 0.1])
-    assert len(merge_pairs(g, np.ones(2, bool), MergeConfig())) == 1
-    assert not len(merge_pairs(g, np.array([True, False]), MergeConfig()))
+    assert len(merge_pairs(g, torch.ones(2).bool(), MergeConfig())) == 1
+    assert not len(merge_pairs(g, torch.tensor([True, False]), MergeConfig()))
     g.sh0[1] = 0.2 / SH_C0
-    assert not len(merge_pairs(g, np.ones(2, bool), MergeConfig()))
+    assert not len(merge_pairs(g, torch.ones(2).bool(), MergeConfig()))

@@ -219,12 +219,13 @@ def test_the_first_look_the_ceiling_and_the_sparse_points_reach_the_masks(scene)
     assert factor.max() > 1.3 and factor.min() < 0.7
     _, alone, _ = examined(first_look=dataclasses.replace(look, weight=1.0))
     assert np.allclose(maps.statistic, alone.statistic * factor, rtol=1e-5)
-    assert policy.pixels.other_views.static[0] is not None and 0 in policy.pixels.alone
+    pixels = policy.masks.pixels
+    assert pixels.other_views.queries[0].sparse_depth is not None and pixels.seen[0] is not None
     low = dataclasses.replace(FAST.mask, ceiling=1e-6, least=50.0)
     for least in (7.0, 9.0):
         _, _, masks = examined(mask=dataclasses.replace(low, ceiling_least=least))
-        assert masks.cut.threshold == pytest.approx(least)
-    unseen = policy.pixels.unseen(0)
+        assert float(masks.cut.threshold) == pytest.approx(least)
+    unseen = ~pixels.seen[0]
     step = step_of(data, 0, torch.zeros(HEIGHT, WIDTH, 3))  # nothing of what the photo shows
     keep = policy.examine(step)[1].keep
     assert unseen.any() and (keep[unseen] == 1.0).all() and keep.min() == 0.0
@@ -312,7 +313,7 @@ def test_identities_scale_the_evidence_of_pixels(scene):
     config = RefineSplatConfig(psi=FAST.psi, min_mask_start=1, mask=MaskConfig(entropy_weight=0.5))
     plain, scaled = fresh(scene, RefineSplatConfig(min_mask_start=1)), fresh(scene, config)
     step = step_of(scene.data, 0, blurred(scene.clean[0], 0))
-    ratio = scaled.examine(step)[0].statistic / np.maximum(plain.examine(step)[0].statistic, 1e-6)
+    ratio = (scaled.examine(step)[0].statistic / plain.examine(step)[0].statistic.clamp(min=1e-6)).numpy()
     truth = cv2.erode(scene.truths[0].astype(np.uint8), np.ones((9, 9))).astype(bool)
     assert ratio.min() > 0.49
     assert ratio.max() < 1.51

@@ -5,11 +5,21 @@ import pytest
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.methods.refinesplat.config import MaskConfig
-from ambiguous_wild.methods.refinesplat.evidence import Maps, make_masks
-from ambiguous_wild.methods.refinesplat.multiview import MultiViewConfig, OtherViews
-from ambiguous_wild.methods.refinesplat.pixels import PixelEvidence
+from ambiguous_wild.methods.refinesplat.multiview import MultiViewConfig
 from ambiguous_wild.vision.sparse_surface import seldom_seen, static_surfaces
-from tests.methods.test_refinesplat_pixels import PLANE, H, W, camera, noise
+from tests.methods.on_device import noise
+from tests.methods.test_refinesplat_pixels import (
+    PLANE,
+    H,
+    W,
+    asked,
+    camera,
+    looked,
+    masks_of,
+    others_of,
+    pixel_evidence,
+    store,
+)
 
 CAR = np.s_[12:28, 20:44]
 
@@ -27,10 +37,10 @@ def told(renders, *, known=True, size=(H // 2, W // 2), **config):
     cameras = [camera(0.1 * i) for i in range(len(renders))]
     surfaces = [(1.0 / slope(c, size)).astype(np.float32) for c in cameras] if known else ()
     photos = [np.full((H, W, 3), 0.5, np.float32)] * len(renders)
-    other_views = OtherViews(cameras, photos, MultiViewConfig(**config), surfaces)
+    other_views = others_of(cameras, photos, MultiViewConfig(**config), surfaces)
     for view, factor in enumerate(renders):
-        other_views.remember(view, noise(view, H, W), factor * slope(cameras[view], (H, W)))
-    return other_views.ask(0)
+        store(other_views, view, noise(view, H, W), factor * slope(cameras[view], (H, W)))
+    return asked(other_views, 0)
 
 
 @pytest.mark.parametrize("others", [1.0, 3.0])  # whether their renders know the surface
@@ -57,13 +67,13 @@ def test_where_the_render_is_seen_by_enough_nobody_is_asked_again():
         cameras = [camera(0.1 * i) for i in range(views)]
         far = [np.full((H // 2, W // 2), 1.0 / (4 * PLANE), np.float32)] * views
         with_, without = (
-            OtherViews(cameras, [np.full((H, W, 3), 0.5, np.float32)] * views, MultiViewConfig(), s)
+            others_of(cameras, [np.full((H, W, 3), 0.5, np.float32)] * views, MultiViewConfig(), s)
             for s in (far, ())
         )
         for view in range(views):
             for other_views in (with_, without):
-                other_views.remember(view, noise(view, H, W), np.full((H, W), PLANE))
-        a, b = with_.ask(1), without.ask(1)
+                store(other_views, view, noise(view, H, W), np.full((H, W), PLANE))
+        a, b = asked(with_, 1), asked(without, 1)
         middle = np.s_[:, 6:-6]  # which all see
         assert np.isfinite(b.evidence[middle]).all()
         assert np.array_equal(a.evidence[middle], b.evidence[middle])
@@ -78,13 +88,13 @@ def test_a_car_before_a_field_that_is_not_learnt_is_not_excused(views, plain):
     photos[0][CAR] = [0.8, 0.15, 0.15] if plain else noise(9, 16, 24, 3).round()
     cameras = [camera(0.02 * i) for i in range(views)]
     surfaces = [np.full((H // 2, W // 2), 1.0 / PLANE, np.float32)] * views
-    other_views = OtherViews(cameras, photos, MultiViewConfig(), surfaces)
+    other_views = others_of(cameras, photos, MultiViewConfig(), surfaces)
     for view in range(views):
         depth = np.full((H, W), PLANE)
         if view == 0:
             depth[CAR] = 2.5 * PLANE
-        other_views.remember(view, np.ones((H, W)), depth)
-    found = other_views.ask(0)
+        store(other_views, view, np.ones((H, W)), depth)
+    found = asked(other_views, 0)
     car = np.s_[8:12, 12:20]
     assert np.isfinite(found.evidence[car]).all()  # they do see what is behind it
     assert found.weight[car].mean() < 0.1  # a pixel may look like the field by chance
@@ -152,15 +162,9 @@ def test_outside_the_points_the_nearest_depth_holds_and_one_photo_asks_nobody():
 
 def evidence_of(cameras, surfaces, **config):
     photos = [np.full((H, W, 3), 0.5, np.float32) + 0.1 * noise(i, H, W, 3) for i in range(len(cameras))]
-    pixels = PixelEvidence(
-        photos, cameras, MultiViewConfig(**config), base=0.3, least_alpha=0.5, memory=0.0, surfaces=surfaces
-    )
-    flat = np.full((H, W), PLANE, np.float32)
-    found = [
-        pixels.look(view, noise(9 + view, H, W, 3), np.ones((H, W), np.float32), flat, remember=True)
-        for view in range(len(cameras))
-    ]
-    return pixels, found
+    pixels = pixel_evidence(photos, cameras, surfaces, multiview=MultiViewConfig(**config))
+    renders = (noise(9 + view, H, W, 3) for view in range(len(cameras)))
+    return pixels, [looked(pixels, view, render, remember=True) for view, render in enumerate(renders)]
 
 
 def test_where_nobody_else_looks_nothing_is_evidence_and_nothing_is_normal():
@@ -170,14 +174,14 @@ def test_where_nobody_else_looks_nothing_is_evidence_and_nothing_is_normal():
     surfaces = [np.full((H, W), 1.0 / PLANE, np.float32)] * 7
     pixels, found = evidence_of(cameras, surfaces)
     assert (found[0][:, :2] == 0.0).all() and found[0][:, 8:].min() > 0.0
-    assert np.array_equal(pixels.unseen(0), found[0] == 0.0)
+    assert np.array_equal(~pixels.seen[0], found[0] == 0.0)
     assert all((f == 0.0).all() for f in found[3:])
-    assert sorted(pixels.normal) == [0, 1, 2] and pixels.unit > 0.0
+    assert pixels.normal.isfinite().tolist() == [True] * 3 + [False] * 4
     everywhere, found = evidence_of(cameras, surfaces, seen_by=0)
-    assert everywhere.unseen(0) is None and found[0][:, :2].min() > 0.0
-    assert len(everywhere.normal) == 7
+    assert everywhere.seen[0] is None and found[0][:, :2].min() > 0.0
+    assert everywhere.normal.isfinite().all()
     without, found = evidence_of(cameras, ())
-    assert without.unseen(0) is None and found[0][:, :2].min() > 0.0
+    assert without.seen[0] is None and found[0][:, :2].min() > 0.0
 
 
 @pytest.mark.parametrize("settings", [{}, {"combine": "union"}, {"use_global": False}, {"dilation": 5}])
@@ -189,6 +193,6 @@ def test_an_instance_is_judged_by_what_may_be_judged_and_masked_there_alone(sett
     values = np.where(labels > 0, 13.0, 1.0)
     values[unseen] = 0.0
     config = MaskConfig(threshold="hard", hard=10.0, **settings)
-    keep = make_masks(Maps(values, values), labels, np.zeros(1, bool), [], 0.5, config, unseen=unseen).keep
+    keep = masks_of(values, labels, config, unseen=unseen).keep.numpy()
     assert (keep[10:30, 30:40] == 0.0).all()
     assert (keep[unseen] == 1.0).all()

@@ -64,7 +64,10 @@ def distractors(
     differs = unlike = sure = moves = None
     if behind is not None:
         differs = am.colour_residual(photo, behind) > am.COLOUR_THRESHOLD
-        unlike = correlation(photo @ GREY, behind @ GREY) < CORRELATED
+        import torch
+
+        grey = (torch.from_numpy((image @ GREY).astype(np.float32)) for image in (photo, behind))
+        unlike = correlation(*grey).numpy() < CORRELATED
         sure = np.ones(differs.shape, bool) if known is None else known
         differs, unlike, sure = (
             cv2.resize(x.astype(np.uint8), shape, interpolation=cv2.INTER_NEAREST) > 0

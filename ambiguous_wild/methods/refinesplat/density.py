@@ -7,16 +7,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.core.errors import unknown
-from ambiguous_wild.methods.refinesplat.merging import MergeConfig, clusters, merge_members, merge_pairs
-from ambiguous_wild.methods.refinesplat.on_device.merging import merge_couples
+from ambiguous_wild.methods.refinesplat.merging import MergeConfig, merged
 from ambiguous_wild.methods.refinesplat.support import Support, SupportConfig
-from ambiguous_wild.splat import device as devices
 from ambiguous_wild.splat.density import (
     NO_SIZE_PRUNING,
     DensityConfig,
@@ -138,7 +135,7 @@ class EntropyAwareDensity(DensityControl):
         # rows that no view has seen since the last round (fresh copies above all) have no statistic to judge
         score = self.grad_sum / self.seen.clamp(min=1)
         candidates = (self.seen > 0) & (score < config.merge_grad)
-        found = self._merged(gaussians, candidates)
+        found = merged(gaussians, candidates, config.merge)
         if found is None:
             return gaussians
         rows, new = found
@@ -151,22 +148,6 @@ class EntropyAwareDensity(DensityControl):
         self.merged += len(rows) - len(new)
         self.log.merge(len(rows) - len(new), new.means)
         return gaussians
-
-    def _merged(self, gaussians: Gaussians, candidates: Tensor) -> tuple[Tensor, Gaussians] | None:
-        """Rows that merge and what they become; None where nothing merges."""
-        config = self.config.merge
-        if config.most == 2 and devices.accelerated(gaussians.device):
-            found = merge_couples(gaussians, candidates, config)
-            return None if found is None else (found[0].flatten(), found[1])
-        pairs = merge_pairs(gaussians, candidates.cpu().numpy(), config)
-        if not len(pairs):
-            return None
-        cluster = clusters(len(gaussians), pairs, config.most)
-        joined = np.bincount(cluster, minlength=len(cluster))[cluster] > 1
-        if not joined.any():
-            return None
-        rows = torch.from_numpy(np.flatnonzero(joined)).to(gaussians.device)
-        return rows, merge_members(gaussians.select(rows), cluster[joined])
 
     def _select(self, stay: Tensor) -> None:
         super()._select(stay)

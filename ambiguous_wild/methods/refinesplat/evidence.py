@@ -1,58 +1,36 @@
-"""One photo compared with one render: the maps, and the masks made from them. Pure functions."""
+"""One photo compared with one render on features: the maps, and M_global of the paper (Eq. 6)."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import get_args
 
-import cv2
-import numpy as np
 import torch
 from torch import Tensor
 
 from ambiguous_wild.core.errors import unknown
-from ambiguous_wild.methods.refinesplat import masking
-from ambiguous_wild.methods.refinesplat.config import MaskConfig
+from ambiguous_wild.methods.refinesplat.config import MaskConfig, Spread
 from ambiguous_wild.methods.refinesplat.entropy import Statistic, contrast, entropy, surprise
 from ambiguous_wild.methods.refinesplat.identity import Psi
-from ambiguous_wild.methods.refinesplat.threshold import Cut, robust_floor, t_ent
+from ambiguous_wild.methods.refinesplat.ranks import spread_of
+from ambiguous_wild.methods.refinesplat.structure import box, resized
+
+_COS_FLOOR = -1.0 + 1e-3  # U stays below 2000
 
 
 @dataclass(frozen=True)
 class Maps:
-    """Float arrays of one photo compared with one render: on the feature grid [h, w], or on pixels [H, W]."""
+    """Maps of one photo compared with one render: on the feature grid [h, w], or on pixels [H, W]."""
 
-    statistic: np.ndarray  # what is judged, in its unit
-    distance: np.ndarray  # distance of photo and render, in units of the normal one
-    entropy: np.ndarray | None = None  # H of the render, in [0, 1]
-    cosine: np.ndarray | None = None  # cos(phi(I), phi(render))
-
-
-@dataclass(frozen=True)
-class Judged:
-    """Statistics of the instances of one photo; those of other photos say what is normal in the scene."""
-
-    values: np.ndarray  # [K] float64, mean statistic (Hbar)
-    distances: np.ndarray  # [K] float64, mean distance in units
-    areas: np.ndarray  # [K] float64, px
-
-
-@dataclass(frozen=True)
-class Masks:
-    """On the photo's pixels, [H, W] bool, True = transient; and what they were made from."""
-
-    local: np.ndarray
-    global_: np.ndarray
-    keep: np.ndarray  # [H, W] float32, 1 - M_final, bounded
-    judged: Judged
-    cut: Cut
+    statistic: Tensor  # what is judged, in its unit
+    distance: Tensor  # distance of photo and render, in units of the normal one
+    entropy: Tensor | None = None  # H of the render, in [0, 1]
+    cosine: Tensor | None = None  # cos(phi(I), phi(render))
 
 
 @torch.no_grad()
 def compare(phi_photo: Tensor, phi_render: Tensor, psi: Psi | None, unit: float, config: MaskConfig) -> Maps:
-    """Entropy, statistic and distance maps of features [h, w, C] of photo and render.
+    """Entropy, statistic and distance maps in float64 of features [h, w, C] of photo and render.
 
     Without psi (no instance has an identity) the entropy is 0 and the distance alone is judged.
     """
@@ -61,8 +39,9 @@ def compare(phi_photo: Tensor, phi_render: Tensor, psi: Psi | None, unit: float,
     cosine = torch.where(norms > 0, (phi_photo * phi_render).sum(2) / norms.clamp(min=1e-12), 1.0)
     distance = (1.0 - cosine).clamp(min=0.0) / unit
     if psi is None:
-        zero = np.zeros(tuple(distance.shape))
-        return Maps(_array(distance), _array(distance), zero, _array(cosine))
+        return Maps(
+            distance.double(), distance.double(), torch.zeros_like(distance).double(), cosine.double()
+        )
     render = psi(phi_render)
     h = entropy(render, config.variant)
     if config.statistic == "entropy":
@@ -75,23 +54,21 @@ def compare(phi_photo: Tensor, phi_render: Tensor, psi: Psi | None, unit: float,
         statistic = torch.sqrt(contrast(render, psi(phi_photo), config.variant) * distance)
     else:
         raise unknown("statistic", config.statistic, get_args(Statistic))
-    return Maps(_array(statistic), _array(distance), _array(h), _array(cosine))
+    return Maps(statistic.double(), distance.double(), h.double(), cosine.double())
 
 
-def silence(maps: Maps, unseen: np.ndarray) -> Maps:
+def silence(maps: Maps, unseen: Tensor) -> Maps:
     """The maps without evidence where the model is not learnt yet (bool [h, w]).
 
     A sky without points differs from every photo until it is learnt; if masked, it would never be learnt.
     """
+    cosine = None if maps.cosine is None else maps.cosine.masked_fill(unseen, 1.0)
     return Maps(
-        np.where(unseen, 0.0, maps.statistic),
-        np.where(unseen, 0.0, maps.distance),
-        maps.entropy,
-        None if maps.cosine is None else np.where(unseen, 1.0, maps.cosine),
+        maps.statistic.masked_fill(unseen, 0.0), maps.distance.masked_fill(unseen, 0.0), maps.entropy, cosine
     )
 
 
-def scaled_by(structure: np.ndarray, evidence: np.ndarray, weight: float) -> np.ndarray:
+def scaled_by(structure: Tensor, evidence: Tensor, weight: float) -> Tensor:
     """Pixel evidence [H, W], raised where identities disagree and lowered where they agree.
 
     The factor 1 + weight (2 g - 1), g = evidence / (evidence + 4), lies in [1 - weight, 1 + weight]: the unit
@@ -102,106 +79,69 @@ def scaled_by(structure: np.ndarray, evidence: np.ndarray, weight: float) -> np.
         evidence: [h, w] on the feature grid, in units; instances are suspect from 4 on.
         weight: 0 = identities are ignored.
     """
-    share = np.maximum(evidence, 0.0)
+    share = evidence.clamp(min=0.0)
     factor = 1.0 + weight * (2.0 * share / (share + 4.0) - 1.0)
-    size = (structure.shape[1], structure.shape[0])
-    return structure * cv2.resize(factor.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
+    return structure * resized(factor.float(), (structure.shape[0], structure.shape[1]))
 
 
-def make_masks(
-    maps: Maps,
-    labels: np.ndarray,
-    static: np.ndarray,
-    others: Sequence[Judged],
-    w2: float,
-    config: MaskConfig,
-    ceiling: float = math.inf,
-    unseen: np.ndarray | None = None,
-) -> Masks:
-    """M_local, M_global and the keep map of one photo (Eqs. 3-7).
+def uncertainty(cosine: Tensor) -> Tensor:
+    """U = 2 / (cos + 1) in [1, 2000] (Eq. 6); a cosine that is not finite counts as 1 (no evidence)."""
+    cosine = cosine.nan_to_num(nan=1.0, posinf=1.0, neginf=1.0)
+    return 2.0 / (cosine.clamp(_COS_FLOOR, 1.0) + 1.0)
+
+
+def calibrated_cosine(distance: Tensor, normal: float) -> Tensor:
+    """A cosine that uses its whole range: 1 at distance 0, 0 at `normal` units, -1 at twice that and beyond.
+
+    Cosines of hand-made features stay above 0.99, where U is 1 everywhere; so the distance is taken in units
+    of what blur and noise alone make.
+    """
+    return 1.0 - (distance / normal).clamp(0.0, 2.0)
+
+
+def ratio(u: Tensor, h: Tensor, eps_share: float = 0.1, perturbation: float | None = None) -> Tensor:
+    """R = U / max(H, eps) with eps = `eps_share` of H's own mean, so that no H = 0 dominates var(R).
+
+    With a `perturbation` (printed; its value is not) R = U / (H + perturbation).
+    """
+    if perturbation is not None:
+        return u / (h + perturbation)
+    return u / torch.maximum(h, (eps_share * h.mean()).clamp(min=1e-6))
+
+
+def global_mask(
+    r: Tensor, size: int = 3, spread: Spread = "var", gate: float = 0.0, hard: float = 0.0
+) -> Tensor:
+    """M_global [h, w] bool: box-filtered R above its threshold (Eq. 6).
 
     Args:
-        maps: from `compare`.
-        labels: [H, W] int32 instances, 0 = none.
-        static: [K] bool, instances that are not to be masked.
-        others: instances of the scene's other photos when they were last judged (`scope` = scene).
-        w2: weight of T_ent's lower subset.
-        config: thresholds.
-        ceiling: upper limit of the threshold.
-        unseen: [H, W] bool, pixels that are not judged: part of no instance, and never masked.
+        r: [h, w] float64.
+        size: side of the box filter in cells.
+        spread: threshold mean + var (printed), mean + std, robust: median + gate * 1.4826 MAD, or hard: the
+            fixed value `hard` (T_hard, with which the paper compares T_glb).
+        gate: for every spread, also the least number of robust deviations above the median; 0 = none.
+        hard: of spread `hard`.
     """
-    if unseen is not None:
-        labels = np.where(unseen, 0, labels)
-    height, width = labels.shape
-    count = len(static)
-    means, areas = masking.instance_means(maps.statistic, labels, count)
-    distances, _ = masking.instance_means(maps.distance, labels, count)
-    known = areas > 0
-    judged = Judged(means[known], distances[known], areas[known])
-    pool = pooled([judged, *others] if config.scope == "scene" else [judged])
-    cut = t_ent(pool.values, w2, config.threshold, config.gate, config.floor, config.hard)
-    if cut.threshold > ceiling:
-        cut = Cut(ceiling, pool.values > ceiling, min(cut.floor, ceiling))
-    flagged = np.zeros(count, dtype=bool)
-    flagged[known] = judged.values > cut.threshold
-    if config.statistic != "structure":
-        flagged[known] &= differs(judged, pool, config)
-    flagged &= ~static
-    local = masking.local_mask(labels, flagged) if config.use_local else np.zeros(labels.shape, bool)
-    pixels = masking.enlarge(maps.statistic, height, width)
-    if config.use_global:
-        global_ = _global(maps, pixels, cut.threshold, config) & ~masking.local_mask(labels, static)
+    if spread not in get_args(Spread):
+        raise unknown("spread", spread, get_args(Spread))
+    smooth = box(r[None], size)[0]
+    middle, deviation = spread_of(smooth.flatten())
+    floor = middle + gate * deviation
+    if spread == "robust":
+        return smooth > floor
+    if spread == "hard":
+        threshold = torch.full_like(floor, hard)
     else:
-        global_ = np.zeros(labels.shape, bool)
-    final, judging = local | global_, pixels
-    if config.combine == "fused" and config.use_local and config.use_global:
-        of_pixel = np.r_[0.0, np.nan_to_num(means)][np.clip(labels, 0, count)]
-        # a pixel without an instance is judged alone
-        judging = np.where(labels > 0, np.sqrt(pixels * of_pixel), pixels)
-        final = masking.hysteresis(judging, config.hold * cut.threshold, cut.threshold)
-        final &= ~masking.local_mask(labels, static)
-    if unseen is not None:
-        final &= ~unseen
-    final = masking.grown(final, config, judging)
-    if unseen is not None:
-        final &= ~unseen
-    return Masks(local, global_, (~final).astype(np.float32), judged, cut)
+        threshold = r.mean() + (r.var(correction=0) if spread == "var" else r.std(correction=0))
+    return smooth > (torch.maximum(threshold, floor) if gate > 0 else threshold)
 
 
-def _global(maps: Maps, pixels: np.ndarray, threshold: float, config: MaskConfig) -> np.ndarray:
-    """M_global [H, W]: pixels above the threshold, or on the feature grid Eq. 6's ratio of U and H."""
-    if config.statistic == "structure":
-        return masking.hysteresis(pixels, config.hold * threshold, threshold)
+def global_of(maps: Maps, config: MaskConfig) -> Tensor:
+    """M_global on the feature grid, [h, w] bool: Eq. 6's ratio of U and H above its threshold."""
     assert maps.cosine is not None and maps.entropy is not None  # `compare` fills them
     cosine = maps.cosine
     if config.cosine == "calibrated":
-        cosine = masking.calibrated_cosine(maps.distance, config.normal_units)
-    r = masking.ratio(masking.uncertainty(cosine), maps.entropy, perturbation=config.perturbation)
-    coarse = masking.global_mask(r, config.box, config.spread, config.global_gate, config.global_hard)
-    if config.global_units > 0:
-        coarse &= maps.distance > config.global_units
-    return masking.enlarge(coarse, *pixels.shape)
-
-
-def pooled(parts: Sequence[Judged]) -> Judged:
-    """The instances of several photos as one set."""
-    return Judged(
-        np.concatenate([p.values for p in parts]),
-        np.concatenate([p.distances for p in parts]),
-        np.concatenate([p.areas for p in parts]),
-    )
-
-
-def differs(judged: Judged, pool: Judged, config: MaskConfig) -> np.ndarray:
-    """[K] bool: instances in which photo and render disagree more than is normal.
-
-    An instance whose identity psi is unsure of is no distractor if the render agrees with the photo.
-    """
-    if config.disagree <= 0:
-        return np.ones(len(judged.distances), dtype=bool)
-    floor = robust_floor(pool.distances, config.disagree)
-    return judged.distances > max(floor, config.disagree_units)
-
-
-def _array(t: Tensor) -> np.ndarray:
-    return t.double().cpu().numpy()
+        cosine = calibrated_cosine(maps.distance, config.normal_units)
+    r = ratio(uncertainty(cosine), maps.entropy, perturbation=config.perturbation)
+    coarse = global_mask(r, config.box, config.spread, config.global_gate, config.global_hard)
+    return coarse & (maps.distance > config.global_units) if config.global_units > 0 else coarse

@@ -24,14 +24,16 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import torch
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import check_limits
-from ambiguous_wild.methods.refinesplat.agreement import common_offset, quantile_of
 from ambiguous_wild.methods.refinesplat.multiview import nearest_views
+from ambiguous_wild.methods.refinesplat.ranks import Ranks, common_offset
 from ambiguous_wild.vision.sparse_surface import BEHIND, PIXELS, in_map, world_points
 
 _SETTLED = 0.005  # share of pixels: if fewer change in a round, it is the last
+_SAME = 0.06  # difference of colour in [0, 1] up to which two photos show the same
 _EDGE = 0.003  # variance of colours in [0, 1] that is an edge for the filter
 _FEW = 0.1  # of a photo: if surfaces are known for less, its answer says nothing of a mask's size
 _WINDOW = np.ones((3, 3), np.uint8)  # px of the map around the place where a colour may lie
@@ -232,8 +234,16 @@ def _seen_by(
     if masked is not None:
         sees &= cv2.remap(masked, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) <= 0.5
     low, high = (cv2.remap(c, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for c in limits)
-    offset = common_offset(ours - 0.5 * (low + high), sees)
-    return _Seen(low, high, offset, sees)
+    return _Seen(low, high, _offset(ours - 0.5 * (low + high), sees), sees)
+
+
+def _offset(difference: np.ndarray, sees: np.ndarray) -> np.ndarray:
+    """Colour offset [3] of two photos from differences [h, w, 3] in [0, 1] at every second pixel."""
+    colours = torch.from_numpy(difference[::2, ::2][sees[::2, ::2]]).T[None] * 255.0  # [1, 3, P]
+    if not colours.numel():
+        return np.zeros(3, np.float32)
+    everywhere = torch.ones_like(colours[:, 0], dtype=torch.bool)
+    return (common_offset(colours, everywhere, _SAME)[0] / 255.0).numpy()
 
 
 def _smoothed(answer: np.ndarray, photo: np.ndarray, smooth: float) -> np.ndarray:
@@ -249,8 +259,10 @@ def _judge(ours: np.ndarray, seen: list[_Seen], config: FirstLookConfig) -> np.n
     if not seen:
         return None
     stack = np.stack([view.outside(ours) for view in seen])
-    evidence = quantile_of(stack, config.quantile)
-    known = np.isfinite(stack).sum(axis=0) >= config.known_by
+    views = np.isfinite(stack).sum(axis=0)
+    ranks = Ranks(len(stack), config.quantile, "cpu")
+    evidence = ranks.quantile_of(torch.from_numpy(stack), torch.from_numpy(views)).numpy()
+    known = views >= config.known_by
     if not known.any():
         return None
     # normal difference: distractors cover less than half of a photo, else nothing could be decided

@@ -13,7 +13,7 @@ from ambiguous_wild.core import Scene
 from ambiguous_wild.methods.refinesplat.association import Identities, associate
 from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.identity import Psi, psi_arrays, psi_from_arrays, train_psi
-from ambiguous_wild.methods.refinesplat.masking import grid_labels, instance_means
+from ambiguous_wild.methods.refinesplat.masks import instance_means
 from ambiguous_wild.splat.step import TrainData
 from ambiguous_wild.vision.mask_ops import add_new
 from ambiguous_wild.vision.precompute import cache_key, cached, instance_labels, photo_features
@@ -105,6 +105,13 @@ class FrozenInputs:
             min_similarity=config.identity_similarity,
             most=most,
         )
+
+
+def grid_labels(labels: np.ndarray, h: int, w: int) -> np.ndarray:
+    """Labels [h, w] at the centre of each cell of labels [H, W]."""
+    rows = ((np.arange(h) * 2 + 1) * labels.shape[0]) // (2 * h)
+    columns = ((np.arange(w) * 2 + 1) * labels.shape[1]) // (2 * w)
+    return labels[rows[:, None], columns[None, :]]
 
 
 def untracked(tracked: np.ndarray, found: np.ndarray) -> np.ndarray:
@@ -216,9 +223,9 @@ def _mean_features(phi: list[Tensor], labels: list[np.ndarray], counts: list[int
     mean, std = stack.mean(0), stack.std(0, correction=0).clamp(min=1e-6)
     result = []
     for p, label, count in zip(phi, labels, counts):
-        standard = ((p.double() - mean) / std).cpu().numpy()
-        columns = [instance_means(standard[:, :, c], label, count)[0] for c in range(standard.shape[2])]
-        means = np.nan_to_num(np.stack(columns, axis=1))
+        standard, on_host = ((p.double() - mean) / std).cpu(), torch.from_numpy(label)
+        columns = [instance_means(channel, on_host, count)[0] for channel in standard.unbind(2)]
+        means = torch.stack(columns, 1).nan_to_num_().numpy()
         result.append(means / np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-12))
     return result
 

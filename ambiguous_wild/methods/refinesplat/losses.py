@@ -8,7 +8,6 @@ from torch import Tensor
 
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.methods.refinesplat.entropy import Variant
-from ambiguous_wild.splat import device as devices
 
 
 def identity_loss(
@@ -49,15 +48,8 @@ def consistency_loss(logits: Tensor, one_hot: Tensor, variant: Variant = "sigmoi
     """
     sizes = one_hot.sum(1)
     used = sizes > 0
-    if devices.accelerated(logits.device):
-        # instances without cells stay, with weights of 0: the host does not read which they are
-        weights = one_hot / torch.where(used, sizes, 1.0)[:, None]
-        count = used.sum().clamp(min=1)
-    else:
-        if not bool(used.any()):
-            return (logits * 0.0).sum()
-        one_hot = one_hot[used]
-        weights, count = one_hot / sizes[used, None], None
+    # instances without cells stay, with weights of 0: which they are is not read on the host
+    weights = one_hot / torch.where(used, sizes, 1.0)[:, None]
     # logits beyond +-1e4 are saturated; the clamp keeps products finite
     logits = logits.clamp(-1e4, 1e4)
     if variant == "sigmoid":
@@ -73,7 +65,7 @@ def consistency_loss(logits: Tensor, one_hot: Tensor, variant: Variant = "sigmoi
     # mean[s l] - mean[s] mean[l] = mean[(s - mean s) (l - mean l)]: if the cells agree, the first form is a
     # difference of numbers that are equal to seven digits
     total = weights @ ((s - middle) * (log_s - middle_log)).sum(1)
-    return total.mean() if count is None else total.sum() / count
+    return total.sum() / used.sum().clamp(min=1)
 
 
 def instance_matrix(labels: Tensor, count: int, weights: Tensor | None = None) -> Tensor:

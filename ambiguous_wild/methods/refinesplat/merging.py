@@ -16,18 +16,18 @@ import numpy as np
 import torch
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.core.errors import unknown
+from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.density import rotation_matrices
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
 
 Overlap = Literal["normalised", "literal"]
 EIGEN_FLOOR = 1e-14  # of the largest eigenvalue: condition numbers up to needles of 1e7 to 1
+_PAIRS = 2**20  # of which overlaps are computed at a time
 
 
 @dataclass(frozen=True)
@@ -50,79 +50,132 @@ class MergeConfig:
             raise AwError("refinesplat.density.merge.most is 0 (any number) or at least 2, got 1")
 
 
-def covariances(gaussians: Gaussians) -> np.ndarray:
+@torch.no_grad()
+def merged(gaussians: Gaussians, candidates: Tensor, config: MergeConfig) -> tuple[Tensor, Gaussians] | None:
+    """What merges, the most overlapping pairs first.
+
+    Args:
+        gaussians: N of them.
+        candidates: [N] bool, rows that may merge (accumulated gradient below tau_e).
+        config: thresholds.
+
+    Returns:
+        Rows [n] that merge and the Gaussians that they become, or None where nothing merges.
+    """
+    pairs = merge_pairs(gaussians, candidates, config)
+    if config.most == 2:
+        couples = pairs[matching(len(gaussians), pairs)]
+        rows, cluster = couples.flatten(), torch.arange(len(couples), device=pairs.device)
+        cluster = cluster.repeat_interleave(2, output_size=len(rows))
+    else:
+        whole = clusters(len(gaussians), pairs, config.most)
+        rows = torch.nonzero(torch.bincount(whole)[whole] > 1).squeeze(1)
+        cluster = whole[rows]
+    return (rows, merge_members(gaussians.select(rows), cluster)) if len(rows) else None
+
+
+def merge_pairs(gaussians: Gaussians, candidates: Tensor, config: MergeConfig) -> Tensor:
+    """Pairs of rows [n, 2] int64 to merge, the most overlapping first; arguments as `merged`."""
+    rows = torch.nonzero(candidates).squeeze(1)
+    if len(rows) < 2:
+        return rows.new_zeros((0, 2))
+    chosen = gaussians.select(rows)
+    # many centres coincide after cloning: a point itself may not be among its neighbours
+    near = backend_of(rows.device).neighbours(chosen.means, min(config.neighbours + 1, len(rows)))
+    i = torch.arange(len(rows), device=rows.device)[:, None].expand_as(near)
+    keys = torch.minimum(i, near) * len(rows) + torch.maximum(i, near)
+    keys = torch.unique(keys[i != near])  # as one number a pair: rows take forty times as long to sort
+    pairs = torch.stack([keys // len(rows), keys % len(rows)], 1)
+    colours = chosen.sh0.double() * SH_C0 + 0.5
+    alike = torch.linalg.vector_norm(colours[pairs[:, 0]] - colours[pairs[:, 1]], dim=1) < config.colour
+    pairs = pairs[alike]
+    ratio = torch.cat([overlap_of_rows(chosen, part, config.form) for part in pairs.split(_PAIRS)])
+    kept = ratio > config.overlap
+    pairs, ratio = pairs[kept], ratio[kept]
+    # stable: ties stay in the order of rows
+    return rows[pairs[ratio.argsort(descending=True, stable=True)]]
+
+
+def covariances(gaussians: Gaussians) -> Tensor:
     """[N, 3, 3] float64, R diag(exp(log_scales))^2 R^T."""
-    rotation = rotation_matrices(gaussians.quats.detach().cpu().double()).numpy()
-    scale = np.exp(gaussians.log_scales.detach().cpu().double().numpy())
-    half = rotation * scale[:, None, :]
-    return half @ half.transpose(0, 2, 1)
+    half = rotation_matrices(gaussians.quats.double()) * gaussians.log_scales.double().exp()[:, None, :]
+    return half @ half.mT
 
 
-def overlap(
-    delta: np.ndarray, cov_i: np.ndarray, cov_j: np.ndarray, form: Overlap = "normalised"
-) -> np.ndarray:
-    """Overlap ratio of pairs (Eq. 11).
+def overlap_of_rows(gaussians: Gaussians, pairs: Tensor, form: Overlap) -> Tensor:
+    """`overlap` of rows [n, 2], [n] float64."""
+    a, b = (gaussians.select(pairs[:, side]) for side in range(2))
+    return overlap(a.means.double() - b.means.double(), covariances(a), covariances(b), form)
+
+
+def overlap(delta: Tensor, cov_i: Tensor, cov_j: Tensor, form: Overlap = "normalised") -> Tensor:
+    """Overlap ratio of pairs (Eq. 11), [n] float64.
 
     normalised: exp(-d^T (Si + Sj)^-1 d / 2) (|2 Si| |2 Sj|)^(1/4) / |Si + Sj|^(1/2), in [0, 1], 1 for
     identical Gaussians and the same at every scale of the scene (Bhattacharyya's form with Si + Sj).
     literal: the printed density exp(...) / sqrt((2 pi)^3 |Si + Sj|), in 1/volume.
 
     Args:
-        delta: mu_i - mu_j [n, 3].
+        delta: mu_i - mu_j [n, 3] float64.
         cov_i: [n, 3, 3].
         cov_j: [n, 3, 3].
+        form: which of the two.
     """
     total = cov_i + cov_j
     # unit variance on the diagonal first: a scene in millimetres must not underflow
-    scale = np.sqrt(np.maximum(np.einsum("nii->ni", total), 1e-300))
-    normed = total / scale[:, :, None] / scale[:, None, :]
+    scale = total.diagonal(dim1=1, dim2=2).clamp(min=1e-300).sqrt()
     d = delta / scale
-    # by eigenvalues, floored: two parallel needles of aspect 1e12 are singular in float64, and solve raises
-    values, vectors = np.linalg.eigh(normed)
-    squared = (np.einsum("nij,ni->nj", vectors, d) ** 2 / np.maximum(values, EIGEN_FLOOR)).sum(1)
-    log_total = _log_det(normed) + 2 * np.log(scale).sum(1)
+    # L D L^T with pivots that are floored: the sum of two parallel needles is singular in float64
+    lower, pivots = _factors(total / scale[:, :, None] / scale[:, None, :])
+    y0 = d[:, 0]
+    y1 = d[:, 1] - lower[0] * y0
+    y2 = d[:, 2] - lower[1] * y0 - lower[2] * y1
+    squared = y0 * y0 + y1 * y1 / pivots[0] + y2 * y2 / pivots[1]
+    log_total = pivots[0].log() + pivots[1].log() + 2 * scale.log().sum(1)
     if form == "normalised":
-        log_parts = 0.25 * (_log_det(cov_i) + _log_det(cov_j) + 6 * math.log(2.0))
-        return np.exp(np.minimum(-0.5 * squared + log_parts - 0.5 * log_total, 0.0))
+        log_parts = 0.25 * (torch.linalg.slogdet(torch.stack([cov_i, cov_j]))[1].sum(0) + 6 * math.log(2.0))
+        return (-0.5 * squared + log_parts - 0.5 * log_total).clamp(max=0.0).exp()
     if form == "literal":
-        return np.exp(np.minimum(-0.5 * squared - 0.5 * (3 * math.log(2 * math.pi) + log_total), 700.0))
+        return (-0.5 * squared - 0.5 * (3 * math.log(2 * math.pi) + log_total)).clamp(max=700.0).exp()
     raise unknown("overlap", form, ("normalised", "literal"))
 
 
-def merge_pairs(gaussians: Gaussians, candidates: np.ndarray, config: MergeConfig) -> np.ndarray:
-    """Pairs of rows [n, 2] to merge, the most overlapping first.
+def _factors(normed: Tensor) -> tuple[tuple[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]:
+    """L (1,0), (2,0), (2,1) and the last two pivots, floored, of L D L^T; the diagonal [n, 3, 3] is 1."""
+    l10, l20 = normed[:, 1, 0], normed[:, 2, 0]
+    second = (1.0 - l10 * l10).clamp(min=EIGEN_FLOOR)
+    l21 = (normed[:, 2, 1] - l20 * l10) / second
+    third = (1.0 - l20 * l20 - l21 * l21 * second).clamp(min=EIGEN_FLOOR)
+    return (l10, l20, l21), (second, third)
+
+
+def matching(count: int, pairs: Tensor) -> Tensor:
+    """[n] bool: the pairs that are taken if each is tried in turn and a row is taken once.
+
+    A pair that is the first of both its rows is taken whatever comes later; so all of these are taken at
+    once, and the rows that are left are asked again.
 
     Args:
-        gaussians: all of them.
-        candidates: [N] bool, rows that may merge (accumulated gradient below tau_e).
-        config: thresholds.
+        count: rows.
+        pairs: [n, 2] in the order they are tried.
     """
-    rows = np.flatnonzero(candidates)
-    if len(rows) < 2:
-        return np.zeros((0, 2), dtype=np.int64)
-    chosen = gaussians.select(torch.from_numpy(rows).to(gaussians.device))
-    means = chosen.means.detach().cpu().double().numpy()
-    # many centres coincide after cloning: the tree needs leaves that split on ties
-    _, near = cKDTree(means, balanced_tree=False).query(means, k=min(config.neighbours + 1, len(rows)))
-    i = np.repeat(np.arange(len(rows)), near.shape[1])
-    j = near.ravel()
-    low, high = np.minimum(i, j)[i != j], np.maximum(i, j)[i != j]
-    # as one number a pair: rows take forty times as long to sort
-    pairs = np.stack(np.divmod(np.unique(low * len(rows) + high), len(rows)), 1)
-    colour = chosen.sh0.detach().cpu().double().numpy() * SH_C0 + 0.5
-    alike = np.linalg.norm(colour[pairs[:, 0]] - colour[pairs[:, 1]], axis=1) < config.colour
-    pairs = pairs[alike]
-    cov = covariances(chosen)
-    a, b = pairs[:, 0], pairs[:, 1]
-    ratio = overlap(means[a] - means[b], cov[a], cov[b], config.form)
-    keep = ratio > config.overlap
-    pairs, ratio = pairs[keep], ratio[keep]
-    order = np.lexsort((pairs[:, 1], pairs[:, 0], -ratio))
-    return rows[pairs[order]]
+    place = torch.arange(len(pairs), device=pairs.device)
+    taken = torch.zeros(len(pairs), dtype=torch.bool, device=pairs.device)
+    free = torch.ones(count, dtype=torch.bool, device=pairs.device)
+    alive = place
+    while len(alive):
+        a, b = pairs[alive].unbind(1)
+        first = torch.full((count,), len(pairs), dtype=torch.int64, device=pairs.device)
+        first = first.scatter_reduce(0, a, alive, "amin").scatter_reduce(0, b, alive, "amin")
+        sure = alive[(first[a] == alive) & (first[b] == alive)]
+        taken[sure] = True
+        free[pairs[sure].flatten()] = False
+        alive = alive[free[a] & free[b]]
+    return taken
 
 
-def clusters(count: int, pairs: np.ndarray, most: int = 0) -> np.ndarray:
-    """Cluster of every row [count]: rows joined by pairs share a number.
+def clusters(count: int, pairs: Tensor, most: int = 0) -> Tensor:
+    """Cluster of every row [count] int64: rows joined by pairs share a number; on the host.
 
     Without a limit a chain of pairs becomes one cluster, and a plain wall, whose neighbours all overlap,
     one Gaussian; with `most`, a pair whose cluster would exceed it is skipped.
@@ -133,8 +186,10 @@ def clusters(count: int, pairs: np.ndarray, most: int = 0) -> np.ndarray:
         most: members of a cluster at most; 0 = no limit (union-find over all pairs).
     """
     if most <= 0:
-        graph = sparse.coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
-        return connected_components(graph, directed=False)[1].astype(np.int64)
+        i, j = pairs.T.cpu().numpy()
+        graph = sparse.coo_matrix((np.ones(len(i)), (i, j)), shape=(count, count))
+        found = connected_components(graph, directed=False)[1].astype(np.int64)
+        return torch.from_numpy(found).to(pairs.device)
     parent = list(range(count))
     size = [1] * count
 
@@ -149,68 +204,70 @@ def clusters(count: int, pairs: np.ndarray, most: int = 0) -> np.ndarray:
         if a != b and size[a] + size[b] <= most:
             parent[max(a, b)] = min(a, b)
             size[min(a, b)] += size[max(a, b)]
-    return np.array([root(k) for k in range(count)], dtype=np.int64)
+    return torch.tensor([root(k) for k in range(count)], dtype=torch.int64, device=pairs.device)
 
 
-def merge_members(members: Gaussians, cluster: np.ndarray) -> Gaussians:
+def merge_members(members: Gaussians, cluster: Tensor) -> Gaussians:
     """One Gaussian a cluster with the first two moments of the opacity-weighted mixture (Eq. 12).
 
     Args:
         members: the rows that merge.
-        cluster: [len(members)], any numbers; the result is in their order.
+        cluster: [len(members)] int64, any numbers; the result is in their order.
 
     Returns:
         Gaussians, float32: mu*, c* and SH weighted by opacity, alpha* the mean opacity, Sigma* the mixture's.
     """
-    _, index = np.unique(cluster, return_inverse=True)
-    count = int(index.max()) + 1
-    alpha = torch.sigmoid(members.opacity_logits.detach().cpu().double()).numpy()
+    names, index, sizes = torch.unique(cluster, return_inverse=True, return_counts=True)
+
+    def summed(x: Tensor) -> Tensor:
+        return x.new_zeros(len(names), *x.shape[1:]).index_add_(0, index, x)
+
+    alpha = torch.sigmoid(members.opacity_logits.double())
     # weights floored: a cluster of invisible members still has a mean
-    total = np.bincount(index, weights=np.maximum(alpha, 1e-12), minlength=count)
-    weight = np.maximum(alpha, 1e-12) / total[index]
-    mix = sparse.csr_matrix((weight, (index, np.arange(len(index)))), shape=(count, len(index)))
+    weight = alpha.clamp(min=1e-12)
+    weight = weight / summed(weight)[index]
 
-    means = members.means.detach().cpu().double().numpy()
-    center = mix @ means
-    away = means - center[index]
-    second = covariances(members) + away[:, :, None] * away[:, None, :]
-    cov = (mix @ second.reshape(-1, 9)).reshape(-1, 3, 3)
-    log_scales, quats = scale_rotation(cov)
+    def mixed(x: Tensor) -> Tensor:
+        return summed(x.double() * weight.view(-1, *[1] * (x.dim() - 1)))
 
-    mean_alpha = np.bincount(index, weights=alpha, minlength=count) / np.bincount(index, minlength=count)
-    logits = np.log(np.clip(mean_alpha, 1e-7, 1 - 1e-7)) - np.log1p(-np.clip(mean_alpha, 1e-7, 1 - 1e-7))
-    sh_rest = members.sh_rest.detach().cpu().double().numpy().reshape(len(members), -1)
+    center = mixed(members.means)
+    away = members.means.double() - center[index]
+    log_scales, quats = scale_rotation(mixed(covariances(members) + away[:, :, None] * away[:, None, :]))
+    mean_alpha = (summed(alpha) / sizes).clamp(1e-7, 1 - 1e-7)
     return Gaussians(
-        means=_tensor(center),
-        quats=_tensor(quats),
-        log_scales=_tensor(log_scales),
-        opacity_logits=_tensor(logits),
-        sh0=_tensor(mix @ members.sh0.detach().cpu().double().numpy()),
-        sh_rest=_tensor((mix @ sh_rest).reshape(count, members.sh_rest.shape[1], 3)),
-        extra={name: _mixed(mix, values, count) for name, values in members.extra.items()},
-    ).to(members.device)
+        means=center.float(),
+        quats=quats.float(),
+        log_scales=log_scales.float(),
+        opacity_logits=(mean_alpha.log() - (-mean_alpha).log1p()).float(),
+        sh0=mixed(members.sh0).float(),
+        sh_rest=mixed(members.sh_rest).float(),
+        extra={name: mixed(values).float() for name, values in members.extra.items()},
+    )
 
 
-def _mixed(mix: sparse.csr_matrix, values: Tensor, count: int) -> Tensor:
-    """Weighted means [count, ...] of what every member carries."""
-    flat = values.detach().cpu().double().numpy().reshape(len(values), -1)
-    return _tensor((mix @ flat).reshape(count, *values.shape[1:]))
-
-
-def scale_rotation(cov: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def scale_rotation(cov: Tensor) -> tuple[Tensor, Tensor]:
     """log_scales [n, 3] and quats [n, 4] (w, x, y, z) of covariances [n, 3, 3], rotation right-handed."""
-    values, vectors = np.linalg.eigh(cov)
-    largest = np.maximum(values[:, 2:], 1e-300)
-    values = np.maximum(values, largest * EIGEN_FLOOR)
-    left = np.linalg.det(vectors) < 0
-    vectors[left, :, 0] *= -1.0
-    xyzw = Rotation.from_matrix(vectors).as_quat()
-    return 0.5 * np.log(values), xyzw[:, [3, 0, 1, 2]]
+    values, vectors = torch.linalg.eigh(cov)
+    values = torch.maximum(values, values[:, 2:].clamp(min=1e-300) * EIGEN_FLOOR)
+    flip = torch.where(torch.linalg.det(vectors) < 0, -1.0, 1.0).to(vectors)
+    vectors = torch.cat([vectors[:, :, :1] * flip[:, None, None], vectors[:, :, 1:]], 2)
+    return 0.5 * values.log(), _quaternions(vectors)
 
 
-def _log_det(cov: np.ndarray) -> np.ndarray:
-    return np.linalg.slogdet(cov)[1]
-
-
-def _tensor(array: np.ndarray) -> Tensor:
-    return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
+def _quaternions(r: Tensor) -> Tensor:
+    """[n, 4] (w, x, y, z) of rotations [n, 3, 3], by the largest of the four components (Shepperd)."""
+    xx, yy, zz = r.diagonal(dim1=1, dim2=2).unbind(1)
+    four = torch.stack([1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz], 1)
+    x, y, z = r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]
+    xy, xz, yz = r[:, 0, 1] + r[:, 1, 0], r[:, 0, 2] + r[:, 2, 0], r[:, 1, 2] + r[:, 2, 1]
+    rows = torch.stack(
+        [
+            torch.stack([four[:, 0], x, y, z], 1),
+            torch.stack([x, four[:, 1], xy, xz], 1),
+            torch.stack([y, xy, four[:, 2], yz], 1),
+            torch.stack([z, xz, yz, four[:, 3]], 1),
+        ],
+        1,
+    )
+    best = four.argmax(1)[:, None, None].expand(-1, 1, 4)
+    return torch.nn.functional.normalize(rows.gather(1, best)[:, 0], dim=1)

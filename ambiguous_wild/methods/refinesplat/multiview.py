@@ -12,31 +12,33 @@ scene every view has evidence everywhere, and would discount distractors of the 
 A surface that is not learnt yet has a wrong depth. So where fewer than `known_by` views see the render's
 surface, the sparse points' surface is used. Where fewer than `seen_by` other views look at all, at the rim of
 a capture, nothing is masked: no other photo could teach the surface.
+
+All neighbours of a view are looked up at once. A map covers the whole frame of its camera. A position is
+given in shares of the frame, from -1 to 1, and is the same in maps of any size. A view without stored
+evidence has depths of 0, so it matches no surface.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+import torch
+from torch import Tensor
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import check_limits
-from ambiguous_wild.methods.refinesplat.agreement import (
-    agree,
-    agreement_weight,
-    colour_difference,
-    common_offset,
-    quantile_of,
-)
+from ambiguous_wild.methods.refinesplat.maps import MapStack, Selected, sized
+from ambiguous_wild.methods.refinesplat.ranks import Ranks, agree, agreement_weight, common_offset
+from ambiguous_wild.methods.refinesplat.structure import blur_and_shrink, nearest, resized
+from ambiguous_wild.splat.backend import backend_of
 
 SPREAD = 9  # px, box over a view's evidence before others read it: depth is off by a few pixels
 _BLUR = 5  # px, box over photos before their colours are compared, for the same reason
 _SHRINK = 2  # maps are kept at half the photo's size
-_ROW = 64  # px, single pixels that are looked up are put in rows of this length
 
 
 @dataclass(frozen=True)
@@ -69,178 +71,276 @@ class MultiViewConfig:
 class MultiViewEvidence:
     """Evidence of other views about the surfaces of one view, maps [h, w] float32."""
 
-    evidence: np.ndarray  # at the quantile of the config; NaN where no other view sees the surface
-    weight: np.ndarray  # in [0, 1]: how far their photos agree with this one
+    evidence: Tensor  # at the quantile of the config; NaN where no other view sees the surface
+    weight: Tensor  # in [0, 1]: how far their photos agree with this one
 
 
 @dataclass(frozen=True)
-class _ViewEvidence:
-    """Evidence of one view at points [h, w] of another."""
+class _Query:
+    """The constants of one view's queries to its n neighbours."""
 
-    evidence: np.ndarray  # [h, w] float32, NaN where it sees another surface or none
-    agree: np.ndarray  # [h, w] bool, where it sees the surface in the same colour
-    offset: np.ndarray  # [3] float32, its colour offset
+    neighbours: Tensor  # [n] int64
+    right: Tensor  # [n, 3, 1, 1] a step along its own x axis, y axis and z axis in the others' frames
+    down: Tensor
+    ahead: Tensor
+    origin: Tensor  # [n, 3, 1]
+    x: Tensor  # [w] of its rays at depth 1
+    y: Tensor  # [h, 1]
+    sparse_depth: Tensor | None  # [h, w] of the sparse points' surface, NaN where there is none
+    shrink: tuple[Tensor, Tensor]  # of its evidence, [h, H] and [W, w], see `blur_and_shrink`
+
+
+@dataclass(frozen=True)
+class _Points:
+    """The P pixels of a view as rays in the frames of its n neighbours, and the neighbours' maps."""
+
+    rays: Tensor  # [n, 3, P] at depth 1
+    origin: Tensor  # [n, 3, 1]
+    colours: Tensor  # [3, P] in the view's photo, 0 to 255
+    stored: Selected  # of the neighbours: evidence, and colours from 0 to 255
+    depth: Selected
+    surface: Selected  # depth of the sparse points
+
+
+@dataclass(frozen=True)
+class _Answers:
+    """What n views say about P points of another view, [n, P] each."""
+
+    evidence: Tensor  # float32, NaN where a view sees another surface or none
+    same: Tensor  # bool, where it sees the surface
+    agree: Tensor  # bool, where it sees the surface in the same colour
 
 
 class OtherViews:
-    """The last evidence of every view about its surfaces, and their depth, at half the photo's size."""
+    """The last evidence of every view about the surfaces it shows, in three stacks of maps."""
 
     def __init__(
         self,
         cameras: Sequence[Camera],
-        photos: Sequence[np.ndarray],
+        photos: Sequence[np.ndarray],  # [H, W, 3] float32 in [0, 1]
         config: MultiViewConfig,
-        surfaces: Sequence[np.ndarray | None] = (),  # inverse depths of the sparse points, or none at all
+        surfaces: Sequence[np.ndarray | None],
+        device: torch.device | str,
     ) -> None:
-        self.cameras, self.config = list(cameras), config
-        self.neighbours = nearest_views(cameras, config.views)
-        self.colours = [small_colours(photo, half_size(c)) for photo, c in zip(photos, cameras, strict=True)]
-        # inverse depths of the sparse points' surface, [h, w] of any size, NaN where there is none
-        self.static = list(surfaces) if config.sparse and surfaces else [None] * len(self.cameras)
-        self.evidence: dict[int, np.ndarray] = {}  # view: [h, w] float32
-        self.depth: dict[int, np.ndarray] = {}  # view: [h, w] float32, along the camera's axis
+        self.config = config
+        sparse = list(surfaces) if config.sparse and surfaces else [None] * len(cameras)
+        self.sizes = [half_size(camera)[::-1] for camera in cameras]  # (height, width)
+        near = nearest_views(cameras, config.views)
+        self.count = len(near[0])
+        self.ranks = Ranks(self.count, config.quantile, device)
+        # evidence, and colours from 0 to 255
+        stored = [
+            np.concatenate([np.zeros((1, *size), np.float32), np.moveaxis(colours, 2, 0).astype(np.float32)])
+            for size, photo, camera in zip(self.sizes, photos, cameras, strict=True)
+            for colours in [small_colours(photo, half_size(camera))]
+        ]
+        self.stored = MapStack(stored, device, pad="edge")
+        self.depth = MapStack([np.zeros((1, *size), np.float32) for size in self.sizes], device)
+        # 0 until the view has stored evidence, as its depth
+        self.known_surfaces = [None if s is None else sized(_depths(s), device) for s in sparse]
+        blank = np.zeros((1, 1), np.float32)
+        self.surface = MapStack([np.zeros_like(blank if s is None else s)[None] for s in sparse], device)
+        self.stored_views: set[int] = set()  # views with stored evidence
+        # once a size: they take as much memory as the maps
+        shrinks = {
+            (camera.height, camera.width): (
+                sized(blur_and_shrink(camera.height, h, SPREAD), device),
+                sized(blur_and_shrink(camera.width, w, SPREAD).T, device),
+            )
+            for camera, (h, w) in zip(cameras, self.sizes)
+        }
+        self.queries = [
+            _query_of(
+                view,
+                cameras,
+                near[view],
+                self.sizes[view],
+                sparse[view],
+                shrinks[camera.height, camera.width],
+            )
+            for view, camera in enumerate(cameras)
+        ]
 
-    def remember(self, view: int, evidence: np.ndarray, depth: np.ndarray) -> None:
+    def remember(self, view: int, evidence: Tensor, depth: Tensor) -> None:
         """Store the evidence of a view.
 
         Args:
             view: which.
             evidence: [H, W] of the photo's size.
-            depth: [H', W'] expected depth of the render, of any size.
+            depth: [h, w] of its half, from `halved`.
         """
-        size = half_size(self.cameras[view])
-        wide = cv2.blur(
-            np.ascontiguousarray(evidence, dtype=np.float32),
-            (SPREAD, SPREAD),
-            borderType=cv2.BORDER_REPLICATE,
-        )
-        self.evidence[view] = cv2.resize(wide, size, interpolation=cv2.INTER_AREA)
-        self.depth[view] = cv2.resize(depth.astype(np.float32), size, interpolation=cv2.INTER_NEAREST)
+        rows, columns = self.queries[view].shrink
+        self.stored.put(view, rows @ evidence @ columns, channel=0)
+        self.depth.put(view, depth)
+        self._mark_known(view)
 
-    def ask(self, view: int) -> MultiViewEvidence | None:
-        """The other views' evidence about the surface that each pixel shows; None if none is stored."""
-        used = [j for j in self.neighbours[view] if j in self.depth]
-        if not used or view not in self.depth:
-            return None
-        xyz = _surface(self.cameras[view], self.depth[view])
-        views = [self._at(j, xyz, self.colours[view]) for j in used]
-        evidence, agreeing = np.stack([v.evidence for v in views]), np.stack([v.agree for v in views])
-        few = np.isfinite(evidence).sum(axis=0) < self.config.known_by
-        again = self._look_up_sparse(view, used, few, [v.offset for v in views], evidence, agreeing)
-        return MultiViewEvidence(
-            quantile_of(evidence, self.config.quantile),
-            # a few views that see the render's surface have full weight; views that see the sparse points'
-            # surface may look past a distractor at the background
-            agreement_weight(np.isfinite(evidence), agreeing, self.config.agreeing, few & ~again),
-        )
+    def restore(self, evidence: dict[int, Tensor], depth: dict[int, Tensor]) -> None:
+        """Restore the evidence of views from a checkpoint, [h, w] at half their photos' size."""
+        for view, known in evidence.items():
+            self.stored.put(view, known, channel=0)
+            self.depth.put(view, depth[view])
+            self._mark_known(view)
 
-    def _look_up_sparse(
-        self,
-        view: int,
-        used: list[int],
-        few: np.ndarray,
-        offsets: list[np.ndarray],
-        evidence: np.ndarray,
-        agreeing: np.ndarray,
-    ) -> np.ndarray:
-        """Use evidence about the sparse points' surface where few views see the render's and more see it.
+    def _mark_known(self, view: int) -> None:
+        surface = self.known_surfaces[view]
+        if view not in self.stored_views and surface is not None:
+            self.surface.put(view, surface)
+        self.stored_views.add(view)
+
+    def halved(self, view: int, depth: Tensor) -> Tensor:
+        """Expected depth of any size, [h, w] at half the photo's."""
+        return nearest(depth, self.sizes[view])
+
+    def ask(self, view: int, depth: Tensor) -> MultiViewEvidence | None:
+        """The other views' evidence about the surface that each pixel shows; None if there is no other view.
 
         Args:
             view: the querying view.
-            used: the n other views.
-            few: [h, w] bool, pixels to look up.
-            offsets: of colours, from the first lookup: these pixels alone could take a car for exposure.
-            evidence, agreeing: [n, h, w], changed in place.
-
-        Returns:
-            [h, w] bool, pixels that were replaced.
+            depth: [h, w] of its surface, from `halved`.
         """
-        again = np.zeros(few.shape, bool)
-        inverse = self.static[view]
-        if inverse is None:
-            return again
-        depth = 1.0 / cv2.resize(inverse, few.shape[::-1], interpolation=cv2.INTER_NEAREST)
-        at = np.flatnonzero(few & np.isfinite(depth))
-        if not len(at):
-            return again
-        # as pictures, for OpenCV; the last row is padded with the first pixel
-        rows = np.pad(at, (0, -len(at) % _ROW), constant_values=at[0]).reshape(-1, _ROW)
-        xyz = _surface(self.cameras[view], depth).reshape(-1, 3)[rows]
-        colour = self.colours[view].reshape(-1, 3)[rows]
-        views = [self._at(j, xyz, colour, sparse=True, offset=o) for j, o in zip(used, offsets, strict=True)]
-        found = np.stack([v.evidence.ravel()[: len(at)] for v in views])
-        same = np.stack([v.agree.ravel()[: len(at)] for v in views])
-        first = evidence.reshape(len(used), -1)
-        more = np.isfinite(found).sum(axis=0) > np.isfinite(first[:, at]).sum(axis=0)
-        first[:, at[more]] = found[:, more]
-        agreeing.reshape(len(used), -1)[:, at[more]] = same[:, more]
-        again.ravel()[at[more]] = True
-        return again
+        if not self.count:
+            return None
+        own, config, shape = self.queries[view], self.config, depth.shape
+        stacks = self.stored, self.depth, self.surface
+        points = _Points(
+            torch.addcmul(torch.addcmul(own.ahead, own.down, own.y), own.right, own.x).flatten(2),
+            own.origin,
+            self.stored.of(view)[1:].flatten(1),
+            *(stack.select(own.neighbours) for stack in stacks),
+        )
+        found, difference = self._look_up(points, slice(None), depth.flatten())
+        offset = None
+        if difference is not None:
+            offset = common_offset(*(_every_second(t, shape) for t in (difference, found.same)), config.agree)
+            found = replace(found, agree=agree(difference, found.same, config.agree, offset))
+        few = found.same.sum(0) < config.known_by
+        if own.sparse_depth is not None:
+            self._look_up_sparse(points, own.sparse_depth.flatten(), found, few, offset)
+        seen = found.same.sum(0)
+        weight = agreement_weight(seen, found.agree.sum(0), config.agreeing, few)
+        evidence = self.ranks.quantile_of(found.evidence, seen)
+        return MultiViewEvidence(evidence.view(shape), weight.float().view(shape))
 
-    def _at(
-        self,
-        view: int,
-        xyz: np.ndarray,
-        colour: np.ndarray,
-        *,
-        sparse: bool = False,
-        offset: np.ndarray | None = None,
-    ) -> _ViewEvidence:
-        """A view's evidence at world points [h, w, 3] of another view, whose colours are [h, w, 3] uint8.
+    def _look_up_sparse(
+        self, points: _Points, depth: Tensor, found: _Answers, few: Tensor, offset: Tensor | None
+    ) -> None:
+        """Use evidence about the sparse points' surface where few views see the render's and more see it.
 
         Args:
-            view: the view that is looked up.
-            xyz: the points.
-            colour: of the points in the querying view's photo.
-            sparse: they lie on the sparse points' surface, so seeing that is enough.
-            offset: [3], colour offset of the two photos; None: found from these points.
+            points: of the querying view.
+            depth: [P] of the sparse points' surface, NaN where there is none.
+            found: answers about the render's surface, changed in place.
+            few: [P] bool, where few views see that. Where the answers change it becomes False: a few views
+                that see the render's surface have full weight, but views that see the sparse points' surface
+                may look past a distractor at the background.
+            offset: of colours, from the first answers: these pixels alone could take a car for exposure.
         """
-        camera, depth = self.cameras[view], self.depth[view]
-        pose = camera.cam_from_world.astype(np.float32)
-        local = xyz @ pose[:3, :3].T + pose[:3, 3]
-        z = local[..., 2]
-        ahead = np.maximum(z, 1e-6)
-        # as shares of the frame
-        u = (local[..., 0] / ahead * camera.fx + camera.cx) / camera.width
-        v = (local[..., 1] / ahead * camera.fy + camera.cy) / camera.height
-        x, y = _in_map(u, v, depth.shape)
-        same = self._near(cv2.remap(depth, x, y, cv2.INTER_NEAREST, borderValue=-1.0), z)
-        static = self.static[view]
-        if sparse and static is not None:
-            there = cv2.remap(static, *_in_map(u, v, static.shape), cv2.INTER_NEAREST, borderValue=-1.0)
-            same |= self._near(1.0 / np.where(there > 0, there, np.nan), z)
-        evidence = cv2.remap(self.evidence[view], x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        own = np.where(same, evidence, np.float32(np.nan))
-        if self.config.agree <= 0:
-            return _ViewEvidence(own, same, np.zeros(3, np.float32))
-        theirs = cv2.remap(self.colours[view], x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        difference = colour_difference(colour, theirs)
-        if offset is None:
-            offset = common_offset(difference, same, self.config.agree)
-        return _ViewEvidence(own, agree(difference, same, self.config.agree, offset), offset)
+        rows = backend_of(few.device).rows(lambda: few & depth.isfinite())
+        again, difference = self._look_up(points, rows, depth[rows], sparse=True)
+        if difference is not None and offset is not None:
+            again = replace(again, agree=agree(difference, again.same, self.config.agree, offset))
+        more = few[rows] & (again.same.sum(0) > found.same[:, rows].sum(0))
+        pairs = ((found.evidence, again.evidence), (found.same, again.same), (found.agree, again.agree))
+        for old, new in pairs:
+            old[:, rows] = torch.where(more, new, old[:, rows])
+        few[rows] &= ~more
 
-    def _near(self, there: np.ndarray, z: np.ndarray) -> np.ndarray:
-        """Points of depth z that lie on the view's surface of depth `there`; NaN or below 0 = no surface."""
-        return (z > 0) & (there > 0) & (np.abs(z - there) < self.config.depth * there)
+    def _look_up(
+        self, points: _Points, rows: Tensor | slice, depth: Tensor, *, sparse: bool = False
+    ) -> tuple[_Answers, Tensor | None]:
+        """The neighbours' answers at depths [P'] of some pixels, and how the colours differ, [n, 3, P'].
+
+        Args:
+            points: of the querying view.
+            rows: P' of its pixels.
+            depth: [P'] along the rays.
+            sparse: this is the sparse points' surface, so seeing that is enough.
+
+        Returns:
+            The answers, and the differences; None where colours are not compared.
+        """
+        at = torch.addcmul(points.origin, points.rays[:, :, rows], depth)
+        z = at[:, 2]
+        # far outside is clamped to a little outside, so that every pixel index fits
+        places = (at[:, :2] / z[:, None].clamp(min=1e-6)).clamp_(-2.0, 2.0).permute(0, 2, 1)[:, None]
+        same = self._near(points.depth.nearest(places)[:, 0, 0], z)
+        if sparse:
+            same |= self._near(points.surface.nearest(places)[:, 0, 0], z)
+        theirs = points.stored.linear(places)[:, :, 0]
+        evidence = torch.where(same, theirs[:, 0], torch.nan)
+        if self.config.agree <= 0:
+            return _Answers(evidence, same, same.clone()), None
+        return _Answers(evidence, same, same), points.colours[:, rows] - theirs[:, 1:].round_()
+
+    def _near(self, there: Tensor, z: Tensor) -> Tensor:
+        """Points of depth z that lie on a view's surface of depth `there`; 0 = none."""
+        return ((z - there).abs_() < self.config.depth * there) & (z > 0)
+
+
+def _every_second(x: Tensor, shape: torch.Size) -> Tensor:
+    """[..., P] at every second row and column of the maps [h, w] that they are, flat."""
+    return x.view(*x.shape[:-1], *shape)[..., ::2, ::2].flatten(-2)
 
 
 def discount(
-    evidence: np.ndarray, others: MultiViewEvidence | None, unit: float, config: MultiViewConfig
-) -> np.ndarray:
+    evidence: Tensor, others: MultiViewEvidence | None, unit: Tensor, config: MultiViewConfig
+) -> Tensor:
     """Evidence [H, W] / sqrt(1 + strength * excess), excess = weight * (the others' evidence above `free`).
 
     Args:
         evidence: [H, W] >= 0.
         others: from `OtherViews.ask`, any size; NaN evidence discounts nothing.
-        unit: evidence that is normal in the scene.
+        unit: 0-d, above 0: evidence that is normal in the scene.
         config: strength and `free`.
     """
-    if others is None or config.strength <= 0 or unit <= 0:
+    if others is None:
         return evidence
-    excess = np.nan_to_num(np.maximum(others.evidence / unit - config.free, 0.0), nan=0.0)
-    excess = (excess * others.weight).astype(np.float32)
-    at_pixels = cv2.resize(excess, evidence.shape[::-1], interpolation=cv2.INTER_LINEAR)
-    return evidence / np.sqrt(1.0 + config.strength * at_pixels)
+    excess = (others.evidence / unit - config.free).clamp_(min=0.0) * others.weight
+    at_pixels = resized(excess.nan_to_num_(nan=0.0), (evidence.shape[0], evidence.shape[1]))
+    return evidence / (1.0 + config.strength * at_pixels).sqrt_()
+
+
+def _query_of(
+    view: int,
+    cameras: Sequence[Camera],
+    near: Sequence[int],
+    size: tuple[int, int],
+    inverse: np.ndarray | None,
+    shrink: tuple[Tensor, Tensor],
+) -> _Query:
+    camera, (h, w), device = cameras[view], size, shrink[0].device
+    world_from_own = np.linalg.inv(camera.cam_from_world)
+    frames = np.zeros((len(near), 3, 4))
+    for row, other in enumerate(near):
+        o = cameras[other]
+        pose = o.cam_from_world @ world_from_own
+        frames[row, 0] = 2.0 * o.fx / o.width * pose[0] + (2.0 * o.cx / o.width - 1.0) * pose[2]
+        frames[row, 1] = 2.0 * o.fy / o.height * pose[1] + (2.0 * o.cy / o.height - 1.0) * pose[2]
+        frames[row, 2] = pose[2]
+    right, down, ahead = (sized(frames[:, :, k, None, None], device) for k in range(3))
+    x = ((np.arange(w) + 0.5) * (camera.width / w) - camera.cx) / camera.fx
+    y = ((np.arange(h) + 0.5) * (camera.height / h) - camera.cy) / camera.fy
+    sparse = None
+    if inverse is not None:
+        with np.errstate(divide="ignore"):
+            sparse = 1.0 / cv2.resize(inverse, (w, h), interpolation=cv2.INTER_NEAREST)
+    return _Query(
+        neighbours=torch.from_numpy(np.array(near, np.int64)).to(device),
+        right=right,
+        down=down,
+        ahead=ahead,
+        origin=sized(frames[:, :, 3:], device),
+        x=sized(x, device),
+        y=sized(y[:, None], device),
+        sparse_depth=None if sparse is None else sized(sparse, device),
+        shrink=shrink,
+    )
+
+
+def _depths(inverse: np.ndarray) -> np.ndarray:
+    """Depths of a map of inverse ones, float32; 0 where nothing is known."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(inverse > 0, 1.0 / inverse, 0.0).astype(np.float32)
 
 
 def half_size(camera: Camera) -> tuple[int, int]:
@@ -255,14 +355,6 @@ def small_colours(photo: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return np.clip(np.rint(small * 255.0), 0, 255).astype(np.uint8)
 
 
-def _in_map(u: np.ndarray, v: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Columns and rows float32 in a map of the frame, for OpenCV, of positions in shares of the frame."""
-    # pixel centres lie at .5 in our cameras and at whole numbers for OpenCV
-    x = np.clip(u * shape[1] - 0.5, -9, shape[1] + 9)
-    y = np.clip(v * shape[0] - 0.5, -9, shape[0] + 9)
-    return x.astype(np.float32), y.astype(np.float32)
-
-
 def nearest_views(cameras: Sequence[Camera], count: int) -> list[list[int]]:
     """For each camera the `count` most similar others: near, and with the same direction."""
     centres = np.stack([np.linalg.inv(c.cam_from_world)[:3, 3] for c in cameras])
@@ -275,13 +367,3 @@ def nearest_views(cameras: Sequence[Camera], count: int) -> list[list[int]]:
         order = np.argsort(score, kind="stable")[: min(count, len(cameras) - 1)]
         result.append([int(j) for j in order])
     return result
-
-
-def _surface(camera: Camera, depth: np.ndarray) -> np.ndarray:
-    """World points [h, w, 3] float32 that a depth map [h, w] of the camera shows."""
-    h, w = depth.shape
-    x = ((np.arange(w, dtype=np.float32) + 0.5) * (camera.width / w) - camera.cx) / camera.fx
-    y = ((np.arange(h, dtype=np.float32) + 0.5) * (camera.height / h) - camera.cy) / camera.fy
-    local = np.stack([x[None, :] * depth, y[:, None] * depth, depth], axis=2)
-    world = np.linalg.inv(camera.cam_from_world).astype(np.float32)
-    return local.astype(np.float32) @ world[:3, :3].T + world[:3, 3]

@@ -11,10 +11,10 @@ import numpy as np
 from ambiguous_wild.io.atomic import atomic_path
 from ambiguous_wild.io.motion_points import MotionPoints
 from ambiguous_wild.io.palette import GLOBAL, LOCAL, MASKED, NEUTRAL, faded, plot_colour, ramp, tint
-from ambiguous_wild.methods.refinesplat import masking
 from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
-from ambiguous_wild.methods.refinesplat.evidence import Judged, Maps, Masks
+from ambiguous_wild.methods.refinesplat.evidence import Maps
 from ambiguous_wild.methods.refinesplat.inputs import FrozenInputs
+from ambiguous_wild.methods.refinesplat.masks import Judged, Masks, enlarge
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.moving import POINTS, draw_points
 
@@ -55,21 +55,22 @@ def panels(policy: Policy, step: Step, *, begun: bool = True) -> dict[str, np.nd
     labels = policy.inputs.labels[step.view]
     photo = (policy.data.photos[step.view].cpu().numpy() * 255 + 0.5).astype(np.uint8)
     grey = faded(photo)
-    height, width = labels.shape
-    means, _ = masking.instance_means(maps.statistic, labels, len(policy.inputs.static[step.view]))
-    threshold = masks.cut.threshold
+    on_pixels = enlarge(entropy, labels.shape[0], labels.shape[1]).cpu().numpy()
+    local, global_, final, means = (
+        t.cpu().numpy() for t in (masks.local, masks.global_, masks.keep < 0.5, masks.means)
+    )
+    threshold = float(masks.cut.threshold)
     top = 2 * threshold if math.isfinite(threshold) else 1.5 * float(np.nanmax(means, initial=1e-9))
     cut = f"T {threshold:.2f}" if math.isfinite(threshold) else "nothing stands apart"
     of_pixel = np.r_[np.nan, means][np.clip(labels, 0, len(means))]
-    final = masks.keep < 0.5
     used = "" if begun else ", not used yet"
     points = policy.points.get(policy.data.scene.train[step.view].name)
     return {
         **({} if points is None else {POINTS: draw_points(photo, points)}),
-        f"entropy, mean {entropy.mean():.2f}": masking.enlarge(ramp(entropy, 0.0, 1.0), height, width),
+        f"entropy, mean {entropy.mean():.2f}": ramp(on_pixels, 0.0, 1.0),
         f"instances, {cut}": _outlined(ramp(of_pixel, 0.0, top), labels),
-        f"local {100 * masks.local.mean():.0f} %": tint(grey, masks.local, LOCAL),
-        f"global {100 * masks.global_.mean():.0f} %": tint(grey, masks.global_, GLOBAL),
+        f"local {100 * local.mean():.0f} %": tint(grey, local, LOCAL),
+        f"global {100 * global_.mean():.0f} %": tint(grey, global_, GLOBAL),
         f"final {100 * final.mean():.0f} %{used}": tint(grey, final, MASKED),
     }
 

@@ -1,4 +1,4 @@
-"""Evidence of a distractor at every pixel of a photo, in units of what is normal in the scene."""
+"""Evidence of a distractor at every pixel of a photo: pixels.py with torch."""
 
 from __future__ import annotations
 
@@ -9,15 +9,14 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from torch import Tensor
 
 from ambiguous_wild.core import Camera
-from ambiguous_wild.methods.refinesplat.multiview import (
-    MultiViewConfig,
-    MultiViewEvidence,
-    OtherViews,
-    discount,
-)
-from ambiguous_wild.methods.refinesplat.structure import structure_residual, unrelated_residual
+from ambiguous_wild.methods.refinesplat.config import MaskConfig
+from ambiguous_wild.methods.refinesplat.maps import sized
+from ambiguous_wild.methods.refinesplat.multiview import OtherViews, discount
+from ambiguous_wild.methods.refinesplat.ranks import low_quantile, median
+from ambiguous_wild.methods.refinesplat.structure import resized, structure_residual, unrelated_residual
 from ambiguous_wild.vision.sparse_surface import seldom_seen
 
 STATIC_QUANTILE = 0.25  # of a photo's pixels: static even where distractors cover two thirds of it
@@ -30,36 +29,35 @@ class PixelEvidence:
         self,
         photos: Sequence[np.ndarray],  # [H, W, 3] float32 in [0, 1]
         cameras: Sequence[Camera],
-        config: MultiViewConfig,
-        *,
-        base: float,
-        least_alpha: float,
-        memory: float,
-        surfaces: Sequence[np.ndarray | None] = (),  # inverse depths of the sparse points, or none at all
+        surfaces: Sequence[np.ndarray | None],  # inverse depths of the sparse points, or none at all
+        config: MaskConfig,
+        device: torch.device | str,
+        tensors: Sequence[Tensor] | None = None,  # the photos, if they are on the device already
     ) -> None:
-        self.photos = list(photos)
-        self.config, self.base, self.least_alpha, self.memory = config, base, least_alpha, memory
-        self.other_views = OtherViews(cameras, self.photos, config, surfaces)
-        # view: [h, w] uint8 of any size, 1 where too few other views look, so that nothing is masked
-        self.alone = {
-            view: few.astype(np.uint8)
-            for view, few in enumerate(seldom_seen(cameras, surfaces, config.seen_by))
-            if few is not None and few.any()
-        }
-        self.unrelated = unrelated_residual(self.photos, base)
-        self.normal: dict[int, float] = {}  # view: quantile of its residual that static pixels have
-        # view: [H, W], its residual averaged over its visits; half precision, a checkpoint holds all of them
-        self.before: dict[int, np.ndarray] = {}
-
-    @property
-    def unit(self) -> float:
-        """Normal residual of the scene: the median over views; 0 before any was seen."""
-        return float(np.median([self.normal[v] for v in sorted(self.normal)])) if self.normal else 0.0
+        self.config = config
+        # unchanged: photos that do not fit on the device are sent there one at a time
+        self.photos = tensors or [sized(photo, device) for photo in photos]
+        self.other_views = OtherViews(cameras, photos, config.multiview, surfaces, device)
+        self.unseen_on_host = [
+            None if few is None or not few.any() else _at_size(few, photo.shape)
+            for few, photo in zip(
+                seldom_seen(cameras, surfaces, config.multiview.seen_by) or [None] * len(photos), photos
+            )
+        ]
+        # [H, W] bool of each view, where masks may be; None: everywhere
+        self.seen = [
+            None if unseen is None else torch.from_numpy(~unseen).to(device) for unseen in self.unseen_on_host
+        ]
+        self.unrelated = unrelated_residual([torch.from_numpy(photo) for photo in photos], config.base)
+        # quantile of each view's residual that static pixels have; NaN before it was looked at
+        self.normal = torch.full((len(photos),), torch.nan, dtype=torch.float64, device=device)
+        # view: [H, W] float16, its residual averaged over its visits
+        self.before: dict[int, Tensor] = {}
 
     def look(
-        self, view: int, image: np.ndarray, alpha: np.ndarray, depth: np.ndarray, *, remember: bool
-    ) -> np.ndarray:
-        """Evidence [H, W] float32 in units, at the photo's size.
+        self, view: int, image: Tensor, alpha: Tensor, depth: Tensor, *, remember: bool
+    ) -> tuple[Tensor, Tensor]:
+        """Evidence in units, and that unit.
 
         Args:
             view: which photo.
@@ -67,81 +65,73 @@ class PixelEvidence:
             alpha: [h, w] its opacity; below `least_alpha` the model is not learnt yet: no evidence.
             depth: [h, w] sum of weight times z.
             remember: whether the evidence is stored for other views.
+
+        Returns:
+            [H, W] float32 at the photo's size, and 0-d float64.
         """
-        photo = self.photos[view]
-        size = (photo.shape[1], photo.shape[0])
-        judged = _resized(alpha, size) >= self.least_alpha
-        unseen = self.unseen(view)
-        if unseen is not None:
-            judged &= ~unseen
-        evidence = structure_residual(photo, _resized(image, size), self.base)
-        evidence[~judged] = 0.0
-        if self.memory > 0 and view in self.before:
-            evidence = self.memory * self.before[view].astype(np.float32) + (1.0 - self.memory) * evidence
-        normal = float(np.quantile(evidence[judged], STATIC_QUANTILE)) if judged.any() else 0.0
+        photo, config = self.photos[view], self.config
+        size = (photo.shape[0], photo.shape[1])
+        judged, seen = resized(alpha, size) >= config.least_alpha, self.seen[view]
+        left_out = ~(judged if seen is None else judged & seen)
+        evidence = structure_residual(photo, resized(image, size), config.base)
+        evidence = evidence.masked_fill_(left_out, 0.0)
+        if config.memory > 0 and view in self.before:
+            evidence = torch.lerp(evidence, self.before[view].float(), config.memory)
+        normal, count = low_quantile(evidence, left_out, STATIC_QUANTILE)
         others = None
-        if self.config.strength > 0:
-            mean_depth = np.where(alpha > 1e-3, depth / np.maximum(alpha, 1e-3), 0.0)
-            others = self._others(view, evidence, mean_depth, remember)
+        if config.multiview.strength > 0:
+            mean_depth = depth / alpha.clamp(min=1e-3) * (alpha > 1e-3)
+            halved = self.other_views.halved(view, mean_depth)
+            others = self.other_views.ask(view, halved)
+            if remember:
+                self.other_views.remember(view, evidence, halved)
         if remember:
-            if judged.any():
-                self.normal[view] = normal
-            if self.memory > 0:
-                self.before[view] = evidence.astype(np.float16)
+            self.normal[view].copy_(torch.where(count > 0, normal, self.normal[view]))
+            if config.memory > 0:
+                self.before[view] = evidence.half()
         unit = self._unit(normal)
-        return discount(evidence, others, unit, self.config) / unit
+        return discount(evidence, others, unit, config.multiview) / unit, unit
 
-    def unseen(self, view: int) -> np.ndarray | None:
-        """Pixels that too few other views see, which are never masked, [H, W] bool; None: there are none."""
-        if view not in self.alone:
-            return None
-        size = self.photos[view].shape[1::-1]
-        return cv2.resize(self.alone[view], size, interpolation=cv2.INTER_NEAREST) > 0
+    def ceiling(self, unit: Tensor) -> Tensor | None:
+        """Upper limit of thresholds, in the unit that `look` divided by, 0-d; None: no limit.
 
-    def ceiling(self, view: int, share: float, least: float = 0.0) -> float:
-        """That share of the residual of unrelated pictures, in the unit that `look` divided by; 0 = inf.
-
-        Never below `least`: while the model is hardly learnt, every pixel has such a residual.
+        `ceiling` of the residual of unrelated pictures, never below `ceiling_least`: while the model is
+        hardly learnt, every pixel has such a residual.
         """
+        share = self.config.ceiling
         if share <= 0 or self.unrelated <= 0:
-            return math.inf
-        return max(share * self.unrelated / self._unit(self.normal.get(view, 0.0)), least)
+            return None
+        return (share * self.unrelated / unit).clamp_(min=self.config.ceiling_least)
 
-    def _unit(self, normal: float) -> float:
-        return max(self.unit or normal, 1e-4)  # a perfect render of a synthetic scene has no noise at all
-
-    def _others(
-        self, view: int, evidence: np.ndarray, depth: np.ndarray, remember: bool
-    ) -> MultiViewEvidence | None:
-        others = self.other_views
-        before = others.evidence.get(view), others.depth.get(view)
-        others.remember(view, evidence, depth)
-        found = others.ask(view)
-        if not remember:
-            for kept, old in zip((others.evidence, others.depth), before):
-                if old is None:
-                    del kept[view]
-                else:
-                    kept[view] = old
-        return found
+    def _unit(self, normal: Tensor) -> Tensor:
+        """Normal residual of the scene: the median over views; of this view alone before any was seen."""
+        found = median(self.normal)
+        # a perfect render of a synthetic scene has no noise at all
+        return torch.where(found > 0, found, normal).clamp_(min=1e-4)
 
     def state_dict(self) -> dict[str, Any]:
+        others, normal = self.other_views, self.normal.tolist()
+        views = sorted(others.stored_views)
         return {
-            "normal": {str(v): x for v, x in self.normal.items()},
-            "before": {str(v): torch.from_numpy(x) for v, x in self.before.items()},
-            "evidence": {str(v): torch.from_numpy(x) for v, x in self.other_views.evidence.items()},
-            "depth": {str(v): torch.from_numpy(x) for v, x in self.other_views.depth.items()},
+            "normal": {str(v): x for v, x in enumerate(normal) if not math.isnan(x)},
+            "before": {str(v): x.cpu() for v, x in self.before.items()},
+            "evidence": {str(v): others.stored.of(v)[0].cpu().contiguous() for v in views},
+            "depth": {str(v): others.depth.of(v)[0].cpu().contiguous() for v in views},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.normal = {int(v): float(x) for v, x in state["normal"].items()}
-        self.before = {int(v): x.numpy() for v, x in state["before"].items()}
-        self.other_views.evidence = {int(v): x.numpy() for v, x in state["evidence"].items()}
-        self.other_views.depth = {int(v): x.numpy() for v, x in state["depth"].items()}
+        device = self.normal.device
+        normal = np.full(len(self.photos), np.nan)
+        for view, x in state["normal"].items():
+            normal[int(view)] = x
+        self.normal = torch.from_numpy(normal).to(device)
+        self.before = {int(v): x.to(device) for v, x in state["before"].items()}
+        self.other_views.restore(
+            {int(v): x.to(device) for v, x in state["evidence"].items()},
+            {int(v): x.to(device) for v, x in state["depth"].items()},
+        )
 
 
-def _resized(x: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """[h, w] or [h, w, 3] at (width, height), bilinear."""
-    if x.shape[1::-1] == size:
-        return x
-    return cv2.resize(np.ascontiguousarray(x), size, interpolation=cv2.INTER_LINEAR)
+def _at_size(few: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """A coarse bool map at the size of a photo of that shape."""
+    return cv2.resize(few.astype(np.uint8), shape[1::-1], interpolation=cv2.INTER_NEAREST) > 0

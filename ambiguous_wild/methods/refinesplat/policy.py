@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +14,11 @@ from ambiguous_wild.io.motion_points import MotionPoints, read_motion_points
 from ambiguous_wild.methods.masking_common import PausingMask, upsampled
 from ambiguous_wild.methods.refinesplat import pictures
 from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
-from ambiguous_wild.methods.refinesplat.evidence import Judged, Maps, Masks, compare, silence
+from ambiguous_wild.methods.refinesplat.evidence import Maps, compare, silence
 from ambiguous_wild.methods.refinesplat.first_look import FirstLook, first_look, masked_share
 from ambiguous_wild.methods.refinesplat.inputs import FrozenInputs
 from ambiguous_wild.methods.refinesplat.losses import consistency_loss, identity_loss, instance_matrix
-from ambiguous_wild.methods.refinesplat.on_device.mask_builder import DeviceMasks, only_on_host
-from ambiguous_wild.methods.refinesplat.on_device.pixels import PixelEvidence as DevicePixelEvidence
-from ambiguous_wild.methods.refinesplat.on_host import HostMasks
-from ambiguous_wild.methods.refinesplat.pixels import PixelEvidence
-from ambiguous_wild.splat import device as devices
+from ambiguous_wild.methods.refinesplat.masks import Judged, Masks, MaskStore
 from ambiguous_wild.splat.data import shrink_keep
 from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.parts import State
@@ -40,7 +35,7 @@ class RefineSplatMask(PausingMask):
 
     config: RefineSplatConfig
     inputs: FrozenInputs
-    masks: HostMasks | DeviceMasks  # makes and keeps them
+    masks: MaskStore  # makes and keeps them
 
     def __init__(
         self,
@@ -67,7 +62,10 @@ class RefineSplatMask(PausingMask):
             moving = self._moving(surfaces) if config.first_look.motion > 0 else None
             found = first_look(data.cameras, photos, surfaces, config.first_look, moving)
             self.looks = {view: look for view, look in enumerate(found) if look is not None}
-        self.masks = self._mask_builder(photos, surfaces)
+        self.masks = MaskStore(
+            config, photos, data.cameras, surfaces, self.looks, self.inputs.labels, self.inputs.static,
+            data.device, self.compare, data.photos,
+        )  # fmt: skip
         # view: keep map before masks begin, [H, W] float32; absent if everything is kept
         self.first = {
             view: torch.from_numpy(keep.astype(np.float32)).to(data.device)
@@ -87,30 +85,16 @@ class RefineSplatMask(PausingMask):
                 found[k] = moving_map(known, labels, surface.shape)
         return found
 
-    def _mask_builder(
-        self, photos: list[np.ndarray], surfaces: list[np.ndarray | None]
-    ) -> HostMasks | DeviceMasks:
-        data, inputs = self.data, self.inputs
-        known = (
-            self.config, photos, data.cameras, surfaces, self.looks, inputs.labels, inputs.static, data.device
-        )  # fmt: skip
-        if devices.accelerated(data.device):
-            setting = only_on_host(self.config)
-            if setting is None:
-                return DeviceMasks(*known, tensors=data.photos)
-            warnings.warn(f"masks are made on the host, and the GPU waits for them: {setting}", stacklevel=3)
-        return HostMasks(*known, compare=self.compare)
-
     def keep(self, step: Step) -> Tensor | None:
         if not self.begun(step):
             first = self.first.get(step.view)
             return None if first is None else shrink_keep(first, step.divisor)
         visit = self.visits.get(step.view, 0)
-        due = not self.masks.has(step.view) or visit % self.config.mask_every == 0
+        due = step.view not in self.masks.keeps or visit % self.config.mask_every == 0
         if due and not self.paused(step):
             self.masks.renew(step)
         self.visits[step.view] = visit + 1
-        keep = self.masks.keep_of(step.view)
+        keep = self.masks.keeps.get(step.view)
         if keep is not None and self.config.factor == "transient":
             keep = 1.0 - keep
         return None if keep is None else shrink_keep(keep, step.divisor)
@@ -146,7 +130,7 @@ class RefineSplatMask(PausingMask):
     def predict(self, step: Step) -> Tensor | None:
         if not self.begun(step):
             return None
-        return shrink_keep(self.masks.predict(step), step.divisor)
+        return shrink_keep(self.masks.examine(step)[1].keep, step.divisor)
 
     def facts(self) -> dict[str, Any]:
         shares = self.shares
@@ -176,11 +160,6 @@ class RefineSplatMask(PausingMask):
         return self.masks.w2
 
     @property
-    def pixels(self) -> PixelEvidence | DevicePixelEvidence:
-        """Evidence at pixels, discounted by other views."""
-        return self.masks.pixels
-
-    @property
     def shares(self) -> dict[int, tuple[float, float, float, float]]:
         """View: share masked in all, locally, globally, and T_ent when its mask was last made."""
         return self.masks.shares
@@ -191,7 +170,7 @@ class RefineSplatMask(PausingMask):
         return self.masks.judged
 
     def examine(self, step: Step, *, remember: bool = False) -> tuple[Maps, Masks]:
-        """The maps of the step's view and its masks at the photo's own size, as arrays.
+        """The maps of the step's view and its masks at the photo's own size.
 
         Args:
             step: of any train view.
@@ -207,7 +186,7 @@ class RefineSplatMask(PausingMask):
         image = upsampled(step.rendered.image, *self.data.photos[step.view].shape[:2])
         maps = compare(found.phi[step.view], features(image), found.psi, features.unit, mask)
         alpha = F.adaptive_avg_pool2d(step.rendered.alpha[None, None], maps.distance.shape)[0, 0]
-        return silence(maps, (alpha < mask.least_alpha).cpu().numpy())
+        return silence(maps, alpha < mask.least_alpha)
 
     def _entropy_terms(self, image: Tensor, step: Step, keep: Tensor | None) -> Tensor:
         inputs, config = self.inputs.semantics, self.config

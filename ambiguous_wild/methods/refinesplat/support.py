@@ -16,10 +16,9 @@ from torch import Tensor
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import check_limits
-from ambiguous_wild.splat import device as devices
+from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.density import rotation_matrices
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.gpu.render import on_device
 
 
 @dataclass(frozen=True)
@@ -56,30 +55,18 @@ class Support:
             camera: of the step.
             keep: [H, W] float32 at the camera's size, 1 = static; None = all of it.
         """
-        if devices.accelerated(gaussians.device):
-            self._look_at_all(gaussians, visible, camera, keep)
-            return
-        rows = torch.nonzero(visible).squeeze(1)
-        inside, supported = _on_kept(gaussians.means[rows], camera, keep)
-        self.looked[rows] += inside.to(self.looked.dtype)
-        hidden = rows[inside & ~supported]
-        if len(hidden):
-            # a large one is supported at its flanks too
-            parts = gaussians.means[hidden], gaussians.quats[hidden], gaussians.log_scales[hidden]
-            supported[inside & ~supported] = _flank_on_kept(*parts, camera, keep)
-        self.kept[rows] += (inside & supported).to(self.kept.dtype)
-
-    def _look_at_all(
-        self, gaussians: Gaussians, visible: Tensor, camera: Camera, keep: Tensor | None
-    ) -> None:
-        """As `look` without reading rows on the host: all are computed, invisible ones count 0."""
-        inside, supported = _on_kept(gaussians.means, camera, keep)
+        backend = backend_of(gaussians.device)
+        rows = backend.rows(lambda: visible)
+        means = gaussians.means[rows]
+        inside, supported = _on_kept(means, camera, keep)
         if keep is not None:
-            parts = gaussians.means, gaussians.quats, gaussians.log_scales
-            supported |= _flank_on_kept(*parts, camera, keep)
-        inside &= visible
-        self.looked += inside.to(self.looked.dtype)
-        self.kept += (inside & supported).to(self.kept.dtype)
+            hidden = backend.rows(lambda: inside & ~supported)
+            # a large one is supported at its flanks too
+            parts = means[hidden], gaussians.quats[rows][hidden], gaussians.log_scales[rows][hidden]
+            supported[hidden] |= _flank_on_kept(*parts, camera, keep)
+        inside &= visible[rows]
+        self.looked[rows] += inside.to(self.looked.dtype)
+        self.kept[rows] += (inside & supported).to(self.kept.dtype)
 
     def judge(self) -> Tensor:
         """Gaussians to remove, [N] bool; counts of judged ones that stay are halved."""
@@ -122,10 +109,7 @@ def _flank_on_kept(
 
 def _on_kept(points: Tensor, camera: Camera, keep: Tensor | None) -> tuple[Tensor, Tensor]:
     """Of world points [N, 3]: inside the frame, and on a kept pixel, [N] bool each."""
-    if devices.accelerated(points.device):
-        pose = on_device(camera, points.device).viewmat[0]
-    else:
-        pose = torch.tensor(camera.cam_from_world.tolist(), dtype=points.dtype)
+    pose = backend_of(points.device).pose(camera, points)
     local = points @ pose[:3, :3].T + pose[:3, 3]
     z = local[:, 2].clamp(min=1e-6)
     u = torch.floor((local[:, 0] / z * camera.fx + camera.cx).clamp(-1.0, camera.width)).long()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -15,11 +16,8 @@ def sized(array: np.ndarray, device: torch.device | str) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32)).to(device)
 
 
-class Maps:
-    """[views, channels, h, w] float32; smaller maps lie at the upper left, the rest is padding.
-
-    Places are [n, rows, columns, 2], x and y from -1 to 1 over the map, as for `grid_sample`.
-    """
+class MapStack:
+    """[views, channels, h, w] float32; smaller maps lie at the upper left, the rest is padding."""
 
     def __init__(self, maps: Sequence[np.ndarray], device: torch.device | str, pad: str = "zero") -> None:
         """
@@ -57,16 +55,28 @@ class Maps:
         h, w = self.sizes[view]
         return self.stack[view, :, :h, :w]
 
-    def nearest(self, views: Tensor, places: Tensor) -> Tensor:
+    def select(self, views: Tensor) -> Selected:
+        """Copies of n views' maps, views [n] int64."""
+        shares = None if self.shares is None else self.shares.index_select(0, views)
+        return Selected(self.stack.index_select(0, views), shares)
+
+
+@dataclass(frozen=True)
+class Selected:
+    """Maps of n views, read at places [n, rows, columns, 2], x and y from -1 to 1 (`grid_sample`)."""
+
+    maps: Tensor  # [n, channels, h, w]
+    shares: Tensor | None  # [n, 1, 1, 2], see `MapStack`
+
+    def nearest(self, places: Tensor) -> Tensor:
         """The nearest pixel [n, channels, rows, columns] of each view; 0 outside (cv2.INTER_NEAREST)."""
-        return self._read(views, places, "nearest", "zeros")
+        return self._read(places, "nearest", "zeros")
 
-    def linear(self, views: Tensor, places: Tensor) -> Tensor:
+    def linear(self, places: Tensor) -> Tensor:
         """Bilinear between pixels, the border replicated (cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)."""
-        return self._read(views, places, "bilinear", "border")
+        return self._read(places, "bilinear", "border")
 
-    def _read(self, views: Tensor, places: Tensor, mode: str, outside: str) -> Tensor:
+    def _read(self, places: Tensor, mode: str, outside: str) -> Tensor:
         if self.shares is not None:
-            places = (places + 1.0) * self.shares.index_select(0, views) - 1.0
-        maps = self.stack.index_select(0, views)
-        return F.grid_sample(maps, places, mode=mode, padding_mode=outside, align_corners=False)
+            places = (places + 1.0) * self.shares - 1.0
+        return F.grid_sample(self.maps, places, mode=mode, padding_mode=outside, align_corners=False)

@@ -93,8 +93,8 @@ def skewed(device: str) -> Measured:
     many = np.r_[0.05, rng.normal(0.8, 0.01, 49)]
     checks["49 of 50: the majority is the scene"] = bool(_flagged(many, gate=5.0).mean() < 0.1)
     tail = rng.pareto(1.5, 400) + 0.1
-    high = _flagged(tail, gate=3.0)
-    checks["heavy tail"] = bool(0 < high.mean() < 0.3 and tail[high].min() > np.quantile(tail, 0.7))
+    flagged = _flagged(tail, gate=3.0)
+    checks["heavy tail"] = bool(0 < flagged.mean() < 0.3 and tail[flagged].min() > np.quantile(tail, 0.7))
     return failed_checks(checks, "the threshold lies between the groups")
 
 

@@ -47,7 +47,7 @@ def store(others: OtherViews, view: int, evidence: np.ndarray, depth: np.ndarray
 def asked(others: OtherViews, view: int) -> MultiViewEvidence:
     """What the others say about the surface that the view stored, as arrays."""
     found = others.ask(view, others.depth.of(view)[0])
-    return MultiViewEvidence(found.evidence.numpy(), found.weight.numpy())
+    return MultiViewEvidence(*(x.numpy() for x in (found.evidence, found.weight, found.taught)))
 
 
 def pixel_evidence(photos, cameras, surfaces=(), **changes) -> PixelEvidence:
@@ -118,6 +118,7 @@ def test_a_surface_at_another_depth_or_outside_says_nothing():
     assert np.isnan(asked(other_views, 0).evidence).all()
     store(other_views, 1, np.ones((H, W)), np.full((H, W), 1.05 * PLANE))
     assert np.nanmin(asked(other_views, 0).evidence) == pytest.approx(1.0)
+    assert (asked(other_views, 0).taught == np.isfinite(asked(other_views, 0).evidence)).all()
     far = others_of([camera(0.0), camera(1000.0)], plain(2))
     store(far, 0, np.ones((H, W)), np.full((H, W), PLANE))
     store(far, 1, np.ones((H, W)), np.full((H, W), PLANE))
@@ -141,14 +142,15 @@ def test_discount_by_hand():
     evidence = torch.full((4, 6), 10.0)
     said, whole = torch.full((2, 3), 0.6), torch.ones(2, 3)  # 6 units: 4 above what is free
 
-    def left(said, weight):
-        return discount(evidence, MultiViewEvidence(said, weight), number(0.1), config)
+    def left(said, weight, taught=whole):
+        return discount(evidence, MultiViewEvidence(said, weight, taught), number(0.1), config)
 
     assert np.allclose(left(said, whole), 10.0 / np.sqrt(1 + 2 * 4))
     assert np.allclose(left(said, 0.5 * whole), 10.0 / np.sqrt(1 + 2 * 2))
     for said_, weight in ((said, 0 * whole), (said * torch.nan, whole), (said * 0.1, whole)):
         assert torch.equal(left(said_, weight), evidence)
     assert discount(evidence, None, number(0.1), config) is evidence
+    assert np.allclose(left(said, whole, 0.5 * whole), 5.0 / np.sqrt(1 + 2 * 4))
 
 
 def test_views_that_show_another_colour_have_no_word():
@@ -235,9 +237,11 @@ def test_nearest_views_are_near_and_look_the_same_way():
     assert nearest_views([camera(0.0), camera(1.0)], 8) == [[1], [0]]
 
 
-def looked(pixels: PixelEvidence, view: int, image: np.ndarray, alpha: float = 1.0, **kwargs) -> np.ndarray:
+def looked(
+    pixels: PixelEvidence, view: int, image: np.ndarray, alpha: float = 1.0, depth: float = PLANE, **kwargs
+) -> np.ndarray:
     a = torch.full((H, W), alpha)
-    return pixels.look(view, tensor(image), a, PLANE * a, **kwargs)[0].numpy()
+    return pixels.look(view, tensor(image), a, depth * a, **kwargs)[0].numpy()
 
 
 def test_hard_surfaces_are_forgiven_and_what_one_view_shows_is_not():
@@ -253,6 +257,19 @@ def test_hard_surfaces_are_forgiven_and_what_one_view_shows_is_not():
     found = looked(pixels, 0, renders[0], remember=False)
     assert found[28:32, 46:54].min() > 3 * found[4:8, 6:20].max()
     assert np.median(found) < 3
+
+
+def test_a_surface_that_too_few_others_see_is_no_evidence():
+    """A render with a wrong depth, and no sparse points: no other photo could teach what is masked."""
+    cameras, photos = [camera(0.05 * i) for i in range(4)], plain(4)
+    for least, wrong in ((2, 0.0), (0, 1.0)):
+        pixels = pixel_evidence(photos, cameras, multiview=MultiViewConfig(seen_by=least))
+        for view in range(4):
+            looked(pixels, view, photos[view], remember=True)
+        off = np.full((H, W, 3), 0.9, np.float32)
+        right = looked(pixels, 0, off, remember=False)[H // 2, W // 2]
+        far = looked(pixels, 0, off, depth=3 * PLANE, remember=False)[H // 2, W // 2]
+        assert right > 0.5 and far == pytest.approx(wrong * right)
 
 
 def test_a_look_that_is_not_remembered_leaves_no_trace():

@@ -163,8 +163,10 @@ def test_outside_the_points_the_nearest_depth_holds_and_one_photo_asks_nobody():
 def evidence_of(cameras, surfaces, **config):
     photos = [np.full((H, W, 3), 0.5, np.float32) + 0.1 * noise(i, H, W, 3) for i in range(len(cameras))]
     pixels = pixel_evidence(photos, cameras, surfaces, multiview=MultiViewConfig(**config))
-    renders = (noise(9 + view, H, W, 3) for view in range(len(cameras)))
-    return pixels, [looked(pixels, view, render, remember=True) for view, render in enumerate(renders)]
+    renders = [noise(9 + view, H, W, 3) for view in range(len(cameras))]
+    for remember in (True, False):  # a view that is looked at before all others has nobody who sees the same
+        found = [looked(pixels, view, render, remember=remember) for view, render in enumerate(renders)]
+    return pixels, found
 
 
 def test_where_nobody_else_looks_nothing_is_evidence_and_nothing_is_normal():
@@ -174,14 +176,14 @@ def test_where_nobody_else_looks_nothing_is_evidence_and_nothing_is_normal():
     surfaces = [np.full((H, W), 1.0 / PLANE, np.float32)] * 7
     pixels, found = evidence_of(cameras, surfaces)
     assert (found[0][:, :2] == 0.0).all() and found[0][:, 8:].min() > 0.0
-    assert np.array_equal(~pixels.seen[0], found[0] == 0.0)
+    assert (found[0][~pixels.seen[0].numpy()] == 0.0).all()
     assert all((f == 0.0).all() for f in found[3:])
     assert pixels.normal.isfinite().tolist() == [True] * 3 + [False] * 4
     everywhere, found = evidence_of(cameras, surfaces, seen_by=0)
     assert everywhere.seen[0] is None and found[0][:, :2].min() > 0.0
     assert everywhere.normal.isfinite().all()
     without, found = evidence_of(cameras, ())
-    assert without.seen[0] is None and found[0][:, :2].min() > 0.0
+    assert without.seen[0] is None and (found[0][:, :2] == 0.0).all() and found[0][:, 8:].min() > 0.0
 
 
 @pytest.mark.parametrize("settings", [{}, {"combine": "union"}, {"use_global": False}, {"dilation": 5}])

@@ -66,8 +66,8 @@ def distractors(
         differs = am.colour_residual(photo, behind) > am.COLOUR_THRESHOLD
         import torch
 
-        grey = (torch.from_numpy((image @ GREY).astype(np.float32)) for image in (photo, behind))
-        unlike = correlation(*grey).numpy() < CORRELATED
+        ours, theirs = (torch.from_numpy((image @ GREY).astype(np.float32)) for image in (photo, behind))
+        unlike = correlation(ours, theirs).numpy() < CORRELATED
         sure = np.ones(differs.shape, bool) if known is None else known
         differs, unlike, sure = (
             cv2.resize(x.astype(np.uint8), shape, interpolation=cv2.INTER_NEAREST) > 0

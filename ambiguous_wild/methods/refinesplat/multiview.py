@@ -10,8 +10,10 @@ Their evidence is used only where their photos show the same colour as this one:
 scene every view has evidence everywhere, and would discount distractors of the others.
 
 A surface that is not learnt yet has a wrong depth. So where fewer than `known_by` views see the render's
-surface, the sparse points' surface is used. Where fewer than `seen_by` other views look at all, at the rim of
-a capture, nothing is masked: no other photo could teach the surface.
+surface, the sparse points' surface is used. Where fewer than `seen_by` other views see either, as at the rim
+of a capture or on a lawn without sparse points, evidence does not count: the model has not learnt the
+surface, and no other photo would teach it. Sceaux with cut-outs, nine photos, 800 iterations: 16.1 dB
+without, 18.9 with it.
 
 All neighbours of a view are looked up at once. A map covers the whole frame of its camera. A position is
 given in shares of the frame, from -1 to 1, and is the same in maps of any size. A view without stored
@@ -55,9 +57,9 @@ class MultiViewConfig:
     # with fewer seeing views the colours are not tested, and the sparse points' surface is looked up too
     known_by: int = 3
     sparse: bool = True  # where fewer see the render's surface, look up that of the sparse points
-    seen_by: int = (
-        2  # other views (all, if fewer) that must have a place in their frame; else it is not masked
-    )
+    # other views (all, if fewer) that must see a surface; else its evidence does not count, and where as many
+    # do not even have the place in their frame, nothing is masked
+    seen_by: int = 2
 
     def __post_init__(self) -> None:
         check_limits(
@@ -73,6 +75,7 @@ class MultiViewEvidence:
 
     evidence: Tensor  # at the quantile of the config; NaN where no other view sees the surface
     weight: Tensor  # in [0, 1]: how far their photos agree with this one
+    taught: Tensor  # in [0, 1]: views that see the surface, 1 = `seen_by` or more
 
 
 @dataclass(frozen=True)
@@ -211,7 +214,8 @@ class OtherViews:
         found, difference = self._look_up(points, slice(None), depth.flatten())
         offset = None
         if difference is not None:
-            offset = common_offset(*(_every_second(t, shape) for t in (difference, found.same)), config.agree)
+            some, same = (_every_second(t, shape) for t in (difference, found.same))
+            offset = common_offset(some, same, config.agree)
             found = replace(found, agree=agree(difference, found.same, config.agree, offset))
         few = found.same.sum(0) < config.known_by
         if own.sparse_depth is not None:
@@ -219,7 +223,10 @@ class OtherViews:
         seen = found.same.sum(0)
         weight = agreement_weight(seen, found.agree.sum(0), config.agreeing, few)
         evidence = self.ranks.quantile_of(found.evidence, seen)
-        return MultiViewEvidence(evidence.view(shape), weight.float().view(shape))
+        least = min(config.seen_by, self.count)
+        taught = (seen / least).clamp_(max=1.0) if least else torch.ones(seen.shape, device=seen.device)
+        maps = (evidence, weight.float(), taught.float())
+        return MultiViewEvidence(*(x.view(shape) for x in maps))
 
     def _look_up_sparse(
         self, points: _Points, depth: Tensor, found: _Answers, few: Tensor, offset: Tensor | None
@@ -285,7 +292,9 @@ def _every_second(x: Tensor, shape: torch.Size) -> Tensor:
 def discount(
     evidence: Tensor, others: MultiViewEvidence | None, unit: Tensor, config: MultiViewConfig
 ) -> Tensor:
-    """Evidence [H, W] / sqrt(1 + strength * excess), excess = weight * (the others' evidence above `free`).
+    """Evidence [H, W] * taught / sqrt(1 + strength * excess).
+
+    excess = weight * (the others' evidence above `free`).
 
     Args:
         evidence: [H, W] >= 0.
@@ -296,8 +305,9 @@ def discount(
     if others is None:
         return evidence
     excess = (others.evidence / unit - config.free).clamp_(min=0.0) * others.weight
-    at_pixels = resized(excess.nan_to_num_(nan=0.0), (evidence.shape[0], evidence.shape[1]))
-    return evidence / (1.0 + config.strength * at_pixels).sqrt_()
+    size = (evidence.shape[0], evidence.shape[1])
+    at_pixels = resized(excess.nan_to_num_(nan=0.0), size)
+    return evidence * resized(others.taught, size) / (1.0 + config.strength * at_pixels).sqrt_()
 
 
 def _query_of(

@@ -185,7 +185,8 @@ class RefineSplatMask(PausingMask):
         features = self.inputs.features
         image = upsampled(step.rendered.image, *self.data.photos[step.view].shape[:2])
         maps = compare(found.phi[step.view], features(image), found.psi, features.unit, mask)
-        alpha = F.adaptive_avg_pool2d(step.rendered.alpha[None, None], maps.distance.shape)[0, 0]
+        h, w = maps.distance.shape
+        alpha = F.adaptive_avg_pool2d(step.rendered.alpha[None, None], (h, w))[0, 0]
         return silence(maps, alpha < mask.least_alpha)
 
     def _entropy_terms(self, image: Tensor, step: Step, keep: Tensor | None) -> Tensor:

@@ -183,7 +183,7 @@ def test_where_nobody_else_looks_nothing_is_evidence_and_nothing_is_normal():
     assert everywhere.seen[0] is None and found[0][:, :2].min() > 0.0
     assert everywhere.normal.isfinite().all()
     without, found = evidence_of(cameras, ())
-    assert without.seen[0] is None and (found[0][:, :2] == 0.0).all() and found[0][:, 8:].min() > 0.0
+    assert without.seen[0] is None and (found[0][:, :1] == 0.0).all() and found[0][:, 8:].min() > 0.0
 
 
 @pytest.mark.parametrize("settings", [{}, {"combine": "union"}, {"use_global": False}, {"dilation": 5}])

@@ -140,30 +140,6 @@ def serpentine(h: int, w: int) -> np.ndarray:
     return mask
 
 
-def spiral(h: int, w: int) -> np.ndarray:
-    """One path of width 1 from a corner inwards, walls of width 1."""
-    mask = np.zeros((h, w), bool)
-    y, x, dy, dx = 0, 0, 0, 1
-    mask[0, 0] = True
-
-    def free(a: int, b: int) -> bool:
-        return 0 <= a < h and 0 <= b < w and not mask[a, b]
-
-    turned = 0
-    while turned < 2:
-        ahead = y + dy, x + dx
-        beyond = ahead[0] + dy, ahead[1] + dx
-        blocked = 0 <= beyond[0] < h and 0 <= beyond[1] < w and mask[beyond]
-        if free(*ahead) and not blocked:
-            y, x = ahead
-            mask[y, x] = True
-            turned = 0
-        else:
-            dy, dx = dx, -dy
-            turned += 1
-    return mask
-
-
 def maze(seed: int, h: int, w: int) -> np.ndarray:
     """A random tree of corridors of width 1 that reaches every second pixel."""
     rng = np.random.default_rng(seed)
@@ -188,29 +164,11 @@ def maze(seed: int, h: int, w: int) -> np.ndarray:
     return mask
 
 
-def comb(h: int, w: int) -> np.ndarray:
-    mask = np.zeros((h, w), bool)
-    mask[:, ::2] = mask[-1] = True
-    return mask
-
-
-def stairs(h: int, w: int) -> np.ndarray:
-    """Diagonals joined at their ends in turn, one path for 8 neighbours."""
-    y, x = np.mgrid[:h, :w]
-    k = (x + y) // 3
-    ends = np.where(k % 2 == 0, (y == 0) | (x == w - 1), (x == 0) | (y == h - 1))
-    return ((x + y) % 3 == 0) | ends
-
-
 SHAPES = {
     "serpentine": lambda h, w: serpentine(h, w),
     "upright serpentine": lambda h, w: serpentine(w, h).T,
-    "spiral": spiral,
     "maze": lambda h, w: maze(2, h, w),
     "mirrored maze": lambda h, w: maze(0, h, w)[::-1, ::-1],
-    "comb": comb,
-    "hanging comb": lambda h, w: comb(h, w)[::-1, ::-1],
-    "stairs": stairs,
     "blobs": lambda h, w: cv2.GaussianBlur(noise(0, h, w), (0, 0), 2) > 0.5,
     "8 neighbours percolate": lambda h, w: noise(1, h, w) < 0.407,
     "4 neighbours percolate": lambda h, w: noise(2, h, w) < 0.593,

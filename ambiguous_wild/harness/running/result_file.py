@@ -23,6 +23,7 @@ from ambiguous_wild.io.atomic import write_json
 
 Status = Literal["ok", "failed"]
 NotNegative = Annotated[float, Meta(ge=0.0)]
+Count = Annotated[int, Meta(ge=0, le=10**15)]  # more is no number of anything
 Name = Annotated[str, Meta(pattern=r"\S")]
 
 
@@ -88,12 +89,12 @@ class Cost(TypedDict, total=False):
     reference_s: float  # training in seconds of the reference machine, see `timing.py`
     timing: TimeRecord
     setup_s: float  # features, masks and compilation before the first step
-    iterations: int
+    iterations: Count
     passes: int  # trainings that all of this counts, where there was more than one
     first_pass_s: float  # of train_s, that of the first
     ms_per_iteration: float
     ms_parts: dict[str, float]  # by part of an iteration
-    gaussians: int
+    gaussians: Count
     peak_rss_mb: float
     peak_cuda_mb: float
     device: str

@@ -57,8 +57,8 @@ class MultiViewConfig:
     # with fewer seeing views the colours are not tested, and the sparse points' surface is looked up too
     known_by: int = 3
     sparse: bool = True  # where fewer see the render's surface, look up that of the sparse points
-    # other views (all, if fewer) that must see a surface; else its evidence does not count, and where as many
-    # do not even have the place in their frame, nothing is masked
+    # other views (all with stored evidence, if fewer) that must see a surface; else its evidence does not
+    # count, and where as many do not even have the place in their frame, nothing is masked
     seen_by: int = 2
 
     def __post_init__(self) -> None:
@@ -128,7 +128,7 @@ class OtherViews:
         self.config = config
         sparse = list(surfaces) if config.sparse and surfaces else [None] * len(cameras)
         self.sizes = [half_size(camera)[::-1] for camera in cameras]  # (height, width)
-        near = nearest_views(cameras, config.views)
+        self.near = near = nearest_views(cameras, config.views)
         self.count = len(near[0])
         self.ranks = Ranks(self.count, config.quantile, device)
         # evidence, and colours from 0 to 255
@@ -223,7 +223,7 @@ class OtherViews:
         seen = found.same.sum(0)
         weight = agreement_weight(seen, found.agree.sum(0), config.agreeing, few)
         evidence = self.ranks.quantile_of(found.evidence, seen)
-        least = min(config.seen_by, self.count)
+        least = min(config.seen_by, len(self.stored_views.intersection(self.near[view])))
         taught = (seen / least).clamp_(max=1.0) if least else torch.ones(seen.shape, device=seen.device)
         maps = (evidence, weight.float(), taught.float())
         return MultiViewEvidence(*(x.view(shape) for x in maps))

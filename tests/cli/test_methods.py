@@ -75,7 +75,7 @@ def test_every_builtin_method_is_described_in_full() -> None:
 def test_options_of_refinesplats_masks_are_explained_however_their_lines_are_wrapped() -> None:
     (one,) = json.loads(shown("refinesplat", "--json"))
     said = {o["key"]: o["comment"] for o in one["options"]}
-    assert "must have a place in their frame" in said["mask.multiview.seen_by"]  # wrapped by the formatter
+    assert "must see a surface" in said["mask.multiview.seen_by"]  # wrapped by the formatter
     assert said["first_look.consensus"].startswith("in a crowd")  # on the lines above
     assert [k for k in said if k.startswith(("mask.", "first_look.")) and not said[k]] == []
 

@@ -34,14 +34,16 @@ BASES = ("monstree", "sceaux", "seneca", "skull")
 WAYS = ("auto", "thorough", "colmap", "colmap-global")
 TURNED_DEG, MOVED_PERCENT = 1.0, 5.0  # a photo is placed rightly below both
 COLMAP = """
-import sys, zlib, pycolmap
+import os, sys, zlib, pycolmap
 photos, out, mapper = sys.argv[1:]
 pycolmap.set_random_seed(0)
 extraction = pycolmap.FeatureExtractionOptions(use_gpu=False, max_image_size=1600)
 extraction.sift.max_num_features = 3000
-database = out + "/database.db"
-pycolmap.extract_features(database, photos, extraction_options=extraction)
-pycolmap.match_exhaustive(database, matching_options=pycolmap.FeatureMatchingOptions(use_gpu=False))
+database = out + "/../colmap.db"  # of both mappers
+if not os.path.exists(database):
+    pycolmap.extract_features(database + ".part", photos, extraction_options=extraction)
+    pycolmap.match_exhaustive(database + ".part", matching_options=pycolmap.FeatureMatchingOptions(use_gpu=False))
+    os.rename(database + ".part", database)
 mapping = pycolmap.global_mapping if mapper == "colmap-global" else pycolmap.incremental_mapping
 models = mapping(database, photos, out)
 if not models:

@@ -41,9 +41,10 @@ extraction = pycolmap.FeatureExtractionOptions(use_gpu=False, max_image_size=160
 extraction.sift.max_num_features = 3000
 database = out + "/../colmap.db"  # of both mappers
 if not os.path.exists(database):
-    pycolmap.extract_features(database + ".part", photos, extraction_options=extraction)
-    pycolmap.match_exhaustive(database + ".part", matching_options=pycolmap.FeatureMatchingOptions(use_gpu=False))
-    os.rename(database + ".part", database)
+    part, matching = database + ".part", pycolmap.FeatureMatchingOptions(use_gpu=False)
+    pycolmap.extract_features(part, photos, extraction_options=extraction)
+    pycolmap.match_exhaustive(part, matching_options=matching)
+    os.rename(part, database)
 mapping = pycolmap.global_mapping if mapper == "colmap-global" else pycolmap.incremental_mapping
 models = mapping(database, photos, out)
 if not models:

@@ -183,6 +183,8 @@ def run_mapping(job: MappingJob) -> None:
         model = largest()
     placement = None
     if model is not None:
+        other = Matched.read(database)  # with the cameras that the pairs voted for
+        other.distorted = matched.distorted
         change = matched.take_cameras(model)
         rival = largest(held=True) if change > FOCAL_DOUBT else None
         if change > FOCAL_CHANGE:
@@ -194,13 +196,11 @@ def run_mapping(job: MappingJob) -> None:
         placement = Placement(matched, database, model, job["seed"])
         placement.run()
         if rival is not None:
-            other = Matched.read(database)
             other.take_cameras(rival)
             other.load_motions(Path(job["motions"]))
             second = Placement(other, database, rival, job["seed"])
             second.run()
-            if second.model.compute_num_observations() > placement.model.compute_num_observations():
-                placement = second
+            placement = max(placement, second, key=_explained)
     left_out = dict.fromkeys(matched.names, "no pair of photos to start from")
     if placement is not None:
         left_out = {matched.names[photo]: reason for photo, reason in placement.left_out.items()}
@@ -229,6 +229,12 @@ def run_mapping(job: MappingJob) -> None:
             "cameras": placement.cameras(),
         },
     )
+
+
+def _explained(placement: Placement) -> int:
+    """Observations of a model; 0 where it lost its photos, whose points are those of an earlier turn."""
+    enough = len(placement.poses) >= LEAST_PHOTOS
+    return int(placement.model.compute_num_observations()) if enough else 0
 
 
 def run_triangulation(job: TriangulationJob) -> None:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 _CODE = (
     "import os\n"
     "if hasattr(os, 'nice'): os.nice(19)\n"
-    "from ambiguous_wild.splat.cpu.warmup import warm_up\n"
+    "from ambiguous_wild.splat.calibration import warm_up\n"
     "warm_up()\n"
 )
 

@@ -23,7 +23,7 @@ from ambiguous_wild.splat.step import TrainData
 def load_train_data(scene: Scene, *, device: torch.device, seed: int, cache_dir: Path) -> TrainData:
     """Read the train photos and the user's own keep masks.
 
-    Masks lie on the device; so do photos, unless they would fill it (`splat/data.py`).
+    Masks lie on the device; so do photos, unless they would fill it.
 
     Raises:
         AwError: no train view, or a photo whose size is not its camera's.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import subprocess
+from pathlib import Path
 from typing import ClassVar
 
 import pytest
@@ -43,3 +44,11 @@ def test_what_is_compiled_already_is_left_alone(monkeypatch, tmp_path):
     (tmp_path / "adam_1" / "adam.catch_up_all-128.py311.nbi").touch()
     with kernels.kernels_meanwhile():
         assert Process.started == []
+
+
+@pytest.mark.parametrize("code", [kernels._CODE, Path("scripts/test").read_text(encoding="utf-8")])
+def test_what_compiles_beside_a_command_can_be_imported(code):
+    lines = [line for line in code.splitlines() if line.startswith("from ambiguous_wild")]
+    assert lines
+    for line in lines:
+        exec(line, {})

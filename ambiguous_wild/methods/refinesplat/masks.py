@@ -260,7 +260,10 @@ class MaskStore:
         """w2 from all instances; the price of a masked pixel is a robustly high distance."""
         config = self.config.mask
         rows = slice(None) if config.scope == "scene" else slice(view, view + 1)
-        distances, areas = self.distances[rows].reshape(-1), self.labels.areas[rows].reshape(-1)
+        # instances of photos without a mask yet have no value: they teach nothing
+        judged = ~self.means[rows].isnan()
+        areas = self.labels.areas[rows].masked_fill(~judged, torch.nan).reshape(-1)
+        distances = self.distances[rows].reshape(-1)
         middle, spread = (
             (made.pool.middle, made.pool.spread) if self.distances is self.means else spread_of(distances)
         )

@@ -1,4 +1,4 @@
-"""Evidence of a distractor at every pixel of a photo: pixels.py with torch."""
+"""Evidence of a distractor at every pixel of a photo, in units of what is normal in the scene."""
 
 from __future__ import annotations
 

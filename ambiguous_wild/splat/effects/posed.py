@@ -34,9 +34,8 @@ _cameras: OrderedDict[tuple[int, torch.device, torch.dtype], tuple[Camera, OnDev
 def on_device(camera: Camera, device: torch.device, dtype: torch.dtype = torch.float32) -> OnDevice:
     """The camera's matrices there, copied once: a copy from the host in every step would make it wait."""
     if isinstance(camera, PosedCamera):  # of pose refinement: another one in every step, made there
-        return OnDevice(
-            camera.pose.to(dtype)[None], camera.intrinsics_there.to(dtype)[None], camera.centre.to(dtype)
-        )
+        matrices = camera.pose[None], camera.intrinsics_there[None], camera.centre
+        return OnDevice(*(matrix.to(device, dtype) for matrix in matrices))
     key = (id(camera), device, dtype)
     if key not in _cameras:
         host = camera.cam_from_world[None], camera.intrinsics[None], camera.center

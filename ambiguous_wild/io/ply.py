@@ -123,7 +123,8 @@ def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     if not all(c in names for c in _COLOURS):
         return xyz, np.full(xyz.shape, 128, np.uint8)
     rgb = np.stack([table[c] for c in _COLOURS], axis=1)
-    return xyz, np.clip(rgb * (255.0 if rgb.dtype.kind == "f" else 1.0), 0, 255).astype(np.uint8)
+    shares = rgb.dtype.kind == "f" and not (rgb > 1.0).any()  # others write 0 to 255 as floats
+    return xyz, np.clip(rgb * (255.0 if shares else 1.0), 0, 255).astype(np.uint8)
 
 
 def write_point_ply(

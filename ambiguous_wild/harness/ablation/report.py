@@ -266,7 +266,7 @@ def ablation(folder: Path, metrics: tuple[str, ...] = ()) -> list[Table]:
         return _tables(data, [ours.get(key, measure(key)) for key in keys])
     except FileNotFoundError:
         raise AwError(f"no {REPORT} in {folder}: 'aw ablate -o {folder}' writes it") from None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise AwError(f"{path} is damaged ({error!r}): run 'aw ablate' again") from None
 
 

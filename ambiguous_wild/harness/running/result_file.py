@@ -24,6 +24,7 @@ from ambiguous_wild.io.atomic import write_json
 Status = Literal["ok", "failed"]
 NotNegative = Annotated[float, Meta(ge=0.0)]
 Count = Annotated[int, Meta(ge=0, le=10**15)]  # more is no number of anything
+Finite = Annotated[float, Meta(ge=-1e300, le=1e300)]
 Name = Annotated[str, Meta(pattern=r"\S")]
 
 
@@ -239,15 +240,17 @@ def _checked(data: Any, where: str) -> RunResult:
                 f"schema version {data.get('schema')!r}, this version reads {SCHEMA}"
             )
         data = data | {name: _decode(data[name]) for name in ("per_image", "cost", "masks") if name in data}
-        known = data
-        if isinstance(data.get("cost"), dict):  # a cost that was not a number is null
-            known = data | {"cost": {k: v for k, v in data["cost"].items() if v is not None}}
+        # a number that was not finite is null, and another program may write a count with a point
+        known = data | {name: _plain(data[name]) for name in ("cost", "environment") if name in data}
         msgspec.convert(known, RunResult)
+        for name, kind in (("cost", Cost), ("masks", MaskScores)):  # what plugins and later versions add
+            more = {k: v for k, v in (known.get(name) or {}).items() if k not in kind.__annotations__}
+            msgspec.convert(more, dict[str, Finite | None])
         rows = {row["name"]: metrics_of(row) for row in data["per_image"]}
         if len(rows) < len(data["per_image"]):
             raise msgspec.ValidationError("an image is there twice - at `$.per_image`")
         msgspec.convert(rows, dict[str, dict[str, float | None]])  # metrics of plugins and later versions too
-        if any(kernel <= 0.0 for _, kernel in data["cost"].get("timing", {}).get("samples", ())):
+        if any(kernel <= 0.0 for _, kernel in known["cost"].get("timing", {}).get("samples", ())):
             raise msgspec.ValidationError("a calibration took no time - at `$.cost.timing.samples`")
         if data["status"] == "failed" and not data["error"]:
             raise msgspec.ValidationError("a failed run must say its error")
@@ -259,6 +262,13 @@ def _checked(data: Any, where: str) -> RunResult:
             f"{where} is no result file of ours: {why}; run 'aw bench' again to replace it"
         ) from None
     return cast(RunResult, data)
+
+
+def _plain(value: Any) -> Any:
+    """Without null in objects, and whole numbers as integers."""
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items() if v is not None}
+    return int(value) if isinstance(value, float) and value.is_integer() and abs(value) < 1e15 else value
 
 
 def _no_constant(name: str) -> NoReturn:

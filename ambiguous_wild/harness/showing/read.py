@@ -108,12 +108,13 @@ def find_models(paths: Sequence[Path]) -> tuple[list[Found], list[str]]:
     return _with_labels(found), notes
 
 
-def open_scene(run: Path, folder: Path | None = None) -> Scene:
+def open_scene(run: Path, folder: Path | None = None, *, verify: bool = True) -> Scene:
     """The scene of a run, with the photos it was trained on.
 
     Args:
         run: its folder.
         folder: where the scene lies; None = where the run says.
+        verify: whether its files are compared with their hashes.
 
     Raises:
         AwError: it is not there, or damaged.
@@ -124,10 +125,11 @@ def open_scene(run: Path, folder: Path | None = None) -> Scene:
     path = Path(str(asked.get("path"))) if folder is None else folder
     if not path.is_dir():
         raise AwError(
-            f"the scene of {run} is not at {path}: move the scene back, or name its folder (--scene-folder)"
+            f"the scene of {run} is not at {path}: move the scene back ('aw view', 'aw video' and 'aw export' "
+            "take its folder: --scene-folder)"
         )
     factor = asked.get("factor")
-    return load_scene(path, factor=factor if isinstance(factor, int) else None)
+    return load_scene(path, factor=factor if isinstance(factor, int) else None, verify=verify)
 
 
 def _found(run: Path) -> Found:

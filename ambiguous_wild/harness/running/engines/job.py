@@ -7,6 +7,7 @@ sent, so that another version of the code, of a plugin or of the scene is an err
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import platform
 import tempfile
@@ -187,8 +188,9 @@ def _load(source: Source) -> None:
 def _present(source: Source) -> Path:
     """The source's own file where this machine has it, else a copy."""
     path = Path(source.path)
-    if path.is_file() and path.read_bytes() == source.content:
-        return path
+    with contextlib.suppress(OSError):  # another user's, or not there
+        if path.read_bytes() == source.content:
+            return path
     copy = Path(tempfile.mkdtemp(prefix="aw-source-")) / path.name
     copy.write_bytes(source.content)
     return copy

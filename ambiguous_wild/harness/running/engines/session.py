@@ -204,8 +204,17 @@ class _Worker:
         # Not forked: the threads of torch and Numba do not survive that.
         context = multiprocessing.get_context("spawn")
         self.connection, theirs = context.Pipe()
-        self.process = context.Process(target=_serve, args=(theirs, gpu))
-        self.process.start()
+        self.process = context.Process(target=_serve, args=(theirs,))
+        # there from the start: spawn imports the caller's main module first, and CUDA reads it once
+        before = os.environ.get(VISIBLE)
+        if gpu is not None:
+            os.environ[VISIBLE] = gpu
+        try:
+            self.process.start()
+        finally:
+            if gpu is not None:
+                os.environ.pop(VISIBLE)
+                os.environ.update({} if before is None else {VISIBLE: before})
         theirs.close()  # so that the end of the process is the end of the pipe
         self.index: int | None = None
 
@@ -236,10 +245,8 @@ class _Worker:
         return f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
 
 
-def _serve(connection: Connection, gpu: str | None) -> None:
+def _serve(connection: Connection) -> None:
     """The loop of a worker process; it ends when the pipe is closed."""
-    if gpu is not None:
-        os.environ[VISIBLE] = gpu  # before torch is imported: CUDA reads it once
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent ends us
     threading.Thread(target=_follow_parent, daemon=True).start()
     from ambiguous_wild.harness.running.engines.job import run_job

@@ -19,6 +19,27 @@ from ambiguous_wild.harness.running.store import read_runs
 from tests.harness.fake_runs import failed, fake_result, save, start
 
 
+@pytest.mark.parametrize(
+    ("cost", "problem"),
+    [
+        ({"timing": None, "ms_parts": {"render": None, "loss": 2.0}}, None),
+        ({"iterations": 7000.0, "render_s": 3, "of_a_plug_in": None}, None),  # as other programs write them
+        ({"render_s": 10**400}, "out of range"),
+        ({"render_s": "abc"}, "got `str`"),
+        ({"gaussians": 10**400}, "cost.gaussians"),
+    ],
+)
+def test_costs_that_other_programs_write(tmp_path: Path, cost: dict[str, Any], problem: str | None) -> None:
+    result: dict[str, Any] = dict(fake_result("3dgs"))
+    result["cost"] = result["cost"] | cost
+    (tmp_path / "metrics.json").write_text(json.dumps(result))
+    if problem is None:
+        assert read_result(tmp_path / "metrics.json")["cost"]["iterations"] == result["cost"]["iterations"]
+        return
+    with pytest.raises(AwError, match=f"no result file.*{problem}"):
+        read_result(tmp_path / "metrics.json")
+
+
 def test_a_result_comes_back_as_it_was(tmp_path: Path) -> None:
     result = fake_result("3dgs", psnr=(20.5, math.inf), masks={"iou": 0.5, "recall": math.nan, "images": 3})
     before = copy.deepcopy(result)

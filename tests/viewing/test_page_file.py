@@ -157,7 +157,7 @@ def test_what_cannot_be_shown_is_one_line(runs: Path, tmp_path: Path) -> None:
         ([tmp_path / "none"], "no folder of runs"),
         ([tmp_path], "no finished run with a point_cloud.ply"),
         ([runs, "--scene", "hall"], "unknown scene 'hall'"),
-        ([runs, "--scene-folder", tmp_path / "gone"], "name its folder (--scene-folder)"),
+        ([runs, "--scene-folder", tmp_path / "gone"], "take its folder: --scene-folder"),
         ([], "no RUNS"),
         ([runs, "--live", runs.parent / "porch"], "leave RUNS out"),
     ):

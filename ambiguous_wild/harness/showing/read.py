@@ -125,8 +125,8 @@ def open_scene(run: Path, folder: Path | None = None, *, verify: bool = True) ->
     path = Path(str(asked.get("path"))) if folder is None else folder
     if not path.is_dir():
         raise AwError(
-            f"the scene of {run} is not at {path}: move the scene back ('aw view', 'aw video' and 'aw export' "
-            "take its folder: --scene-folder)"
+            f"the scene of {run} is not at {path}: move the scene back "
+            "('aw view', 'aw video' and 'aw export' take its folder: --scene-folder)"
         )
     factor = asked.get("factor")
     return load_scene(path, factor=factor if isinstance(factor, int) else None, verify=verify)

@@ -183,10 +183,11 @@ def run_mapping(job: MappingJob) -> None:
         model = largest()
     placement = None
     if model is not None:
-        other = Matched.read(database)  # with the cameras that the pairs voted for
-        other.distorted = matched.distorted
         change = matched.take_cameras(model)
         rival = largest(held=True) if change > FOCAL_DOUBT else None
+        if rival is not None:
+            other = Matched.read(database)  # now: with the cameras that the pairs voted for
+            other.distorted = matched.distorted
         if change > FOCAL_CHANGE:
             # poses of pairs were wrong by as much: once more, with the focal length that the model found
             matched.write_agreed(database, matched.find_motions(job["jobs"]))

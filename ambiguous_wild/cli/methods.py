@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ambiguous_wild.cli.options import PathName
+from ambiguous_wild.cli.options import plugin_option
 
 if TYPE_CHECKING:
     from ambiguous_wild.methods.entry import MethodEntry
@@ -21,8 +21,7 @@ WIDTH = 100
 @click.command(name="methods")
 @click.argument("names", nargs=-1, metavar="[NAME]...")
 @click.option("--table", is_flag=True, help="Table of the parts of each method: masks, density, ...")
-@click.option("--plugin", "plugins", multiple=True, type=PathName(),
-              help="A Python file that registers your methods; repeatable.")  # fmt: skip
+@plugin_option
 @click.option("--json", "as_json", is_flag=True, help="Print the same as JSON.")
 def command(names: tuple[str, ...], table: bool, plugins: tuple[Path, ...], as_json: bool) -> None:
     """List the methods: name, summary, paper, extra requirements.

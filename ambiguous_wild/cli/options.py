@@ -23,6 +23,17 @@ class PathName(click.Path):
         return super().convert(value, param, ctx)
 
 
+plugin_option = click.option(
+    "--plugin",
+    "plugins",
+    multiple=True,
+    type=PathName(),
+    help="A Python file that registers your methods; repeatable.",
+)
+scene_folder_option = click.option(
+    "--scene-folder", type=PathName(file_okay=False), help="The scene folder.  [default: as the runs say]"
+)
+
 _TRAINING = (
     click.option(
         "--seed",
@@ -52,13 +63,7 @@ _TRAINING = (
         type=click.IntRange(4),
         help="Growth stops at this number of Gaussians.  [default: the method's]",
     ),
-    click.option(
-        "--plugin",
-        "plugins",
-        multiple=True,
-        type=PathName(),
-        help="Python file that registers your methods; repeatable.",
-    ),
+    plugin_option,
     click.option(
         "--overwrite",
         type=click.Choice(["never", "missing", "always"]),

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ambiguous_wild.cli.options import PathName, say
+from ambiguous_wild.cli.options import PathName, plugin_option, say, scene_folder_option
 from ambiguous_wild.core.errors import AwError
 
 if TYPE_CHECKING:
@@ -27,20 +27,12 @@ MOST_GAUSSIANS = 150_000
     help="Folder of the page; with --live, of the run (default then: runs).",
 )  # fmt: skip
 @click.option("--scene", help="Name of the scene, if the runs have several.")
-@click.option(
-    "--scene-folder", type=PathName(file_okay=False), help="The scene folder.  [default: as the runs say]"
-)
+@scene_folder_option
 @click.option(
     "--max-gaussians", type=click.IntRange(1), default=MOST_GAUSSIANS, show_default=True,
     help="A larger model is reduced to this number of Gaussians in the page, with a note.",
 )  # fmt: skip
-@click.option(
-    "--plugin",
-    "plugins",
-    multiple=True,
-    type=PathName(),
-    help="A Python file that registers your methods; repeatable.",
-)
+@plugin_option
 @click.option("--title", help="Title of the page.  [default: the scene's name]")
 @click.option(
     "--live",
@@ -162,16 +154,8 @@ def view_command(
 @click.option("--gif-seconds", type=click.FloatRange(0.5, 30), default=4.0, show_default=True)
 @click.option("--gif-width", type=click.IntRange(16, 2048), default=640, show_default=True, help="Width, px.")
 @click.option("--scene", help="Name of the scene, if the runs have several.")
-@click.option(
-    "--scene-folder", type=PathName(file_okay=False), help="The scene folder.  [default: as the runs say]"
-)
-@click.option(
-    "--plugin",
-    "plugins",
-    multiple=True,
-    type=PathName(),
-    help="A Python file that registers your methods; repeatable.",
-)
+@scene_folder_option
+@plugin_option
 @click.option("--threads", type=click.IntRange(1), help="CPU threads.")
 def video_command(
     runs: tuple[Path, ...], output: Path, path: str, plugins: tuple[Path, ...], **options: Any
@@ -232,16 +216,8 @@ FORMATS = ("compressed-ply", "spz", "sog", "gltf")
 @click.option(
     "--loss/--no-loss", default=True, show_default=True, help="Render the test views to measure the loss."
 )
-@click.option(
-    "--scene-folder", type=PathName(file_okay=False), help="The scene folder.  [default: as the runs say]"
-)
-@click.option(
-    "--plugin",
-    "plugins",
-    multiple=True,
-    type=PathName(),
-    help="A Python file that registers your methods; repeatable.",
-)
+@scene_folder_option
+@plugin_option
 @click.option("--threads", type=click.IntRange(1), help="CPU threads.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
 def export_command(

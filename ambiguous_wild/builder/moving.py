@@ -1,7 +1,8 @@
 """Features that move: matches that fit another motion of their pair than the place's.
 
 Structure from motion throws these matches away. A distractor that looks like the place, or like itself a
-moment later, is told by nothing else.
+moment later, is told by nothing else. Features of what stands still in some photos fit the place; they are
+told by photos that show what lies behind their 3D points.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from ambiguous_wild.builder.matched import Matched
 from ambiguous_wild.builder.motions import LEAST
@@ -25,6 +27,11 @@ from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 CLEARLY = 2.0  # times what fits: by as much is a match off that moves
 LEAST_FITTING = 0.25  # of a photo's partners must share a motion that fits its pose
+# Seen through a point: as many at most, no farther from it than this share of the photo's longer side, and
+# deeper by this factor
+AROUND, THROUGH, BEHIND = 12, 0.02, 1.2
+LEAST_THROUGH = 2  # photos that see through a point
+NEIGHBOURS = 0.05  # of the longer side: points that are seen through and lie as near are of one thing
 
 
 @dataclass
@@ -73,11 +80,55 @@ def count_votes(
     return votes
 
 
+def seen_through(model: pycolmap.Reconstruction, photos: Mapping[int, int]) -> dict[int, np.ndarray]:
+    """Of every feature of a photo, [N] photos that show what lies behind its 3D point instead of the point.
+
+    A distractor that stands still in some photos and is gone in others has points like the place's own. A
+    photo sees through a point if the points that it observes around the point's projection, on three sides
+    at least, lie behind it.
+
+    Args:
+        model: with points.
+        photos: image of the model -> photo; these are asked, and their features are told.
+    """
+    row_of = {number: row for row, number in enumerate(model.points3D)}
+    xyz = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
+    through, rows = np.zeros(len(xyz) + 1, int), {}  # the last row is of features without a point
+    for number, photo in photos.items():
+        image = model.images[number]
+        camera, pose = model.cameras[image.camera_id], image.cam_from_world().matrix()
+        rows[photo] = np.array([row_of.get(p.point3D_id, -1) for p in image.points2D], int)
+        own = np.unique(rows[photo][rows[photo] >= 0])
+        local = xyz @ pose[:, :3].T + pose[:, 3]
+        others = local[:, 2] > 0
+        others[own] = False
+        asked, size = np.flatnonzero(others), np.array([camera.width, camera.height])
+        if not len(own) or not len(asked):
+            continue
+        xy, around = (
+            np.asarray(camera.img_from_cam(local[asked])),
+            np.asarray(camera.img_from_cam(local[own])),
+        )
+        seen = np.flatnonzero(((xy >= 0) & (xy < size)).all(axis=1))  # NaN: outside of what the lens can show
+        asked, xy = asked[seen], xy[seen]
+        reach = THROUGH * size.max()
+        away, near = cKDTree(around).query(xy, AROUND, distance_upper_bound=reach)
+        some, near = np.isfinite(away), np.minimum(near, len(own) - 1)
+        side = (around[near] > xy[:, None]) @ [1, 2]
+        sides = np.zeros(len(asked), int)
+        for quarter in range(4):
+            sides += (some & (side == quarter)).any(axis=1)
+        behind = ~some | (local[own][near, 2] > BEHIND * local[asked, 2][:, None])
+        through[asked] += (sides >= 3) & behind.all(axis=1)
+    return {photo: through[numbers] for photo, numbers in rows.items()}
+
+
 def motion_points(
     matched: Matched,
     poses: Mapping[int, np.ndarray],
     names: Mapping[str, str],
     pinholes: Mapping[str, ModelCamera],
+    through: Mapping[int, np.ndarray],
 ) -> dict[str, MotionPoints]:
     """Points of the train photos, by their names in the scene.
 
@@ -88,10 +139,18 @@ def motion_points(
         poses: photo -> [3, 4] camera from world.
         names: of the train photos, work name -> name in the scene.
         pinholes: of the undistorted photos, by these names.
+        through: `seen_through` of the photos.
     """
     voters = {k: names[name] for k, name in enumerate(matched.names) if name in names}
     rays, found = matched.rays(), {}
     for photo, votes in count_votes(matched, poses, voters).items():
+        behind = through.get(photo, np.zeros_like(votes.moving))
+        gone = np.flatnonzero(behind >= LEAST_THROUGH)
+        votes.moving[gone] += behind[gone]
+        reach = NEIGHBOURS * max(matched.cameras[photo].width, matched.cameras[photo].height)
+        if len(gone):
+            together = cKDTree(matched.features[photo][gone]).query_pairs(reach, output_type="ndarray")
+            votes.motions += list(gone[together])
         camera = pinholes[voters[photo]]
         fx, fy, cx, cy = camera.pinhole()
         xy = (rays[photo] * [fx, fy] + [cx, cy]) / [camera.width, camera.height]
@@ -127,7 +186,16 @@ def write_motion(
     matched.load_motions(motions)
     undistorted = read_model(flat)
     pinholes = {image.name: undistorted.cameras[image.camera_id] for image in undistorted.images.values()}
-    points = motion_points(matched, matched.poses(found), names, pinholes)
+    # a model from elsewhere has no points of these features
+    photos = {
+        number: k
+        for k, number in enumerate(matched.ids)
+        if matched.names[k] in names
+        and number in found.images
+        and found.images[number].num_points2D() == len(matched.features[k])
+    }
+    through = seen_through(found, photos)
+    points = motion_points(matched, matched.poses(found), names, pinholes, through)
     write_motion_points(folder / FILE, points)
     return {
         "static": sum(int((~p.moves).sum()) for p in points.values()),

@@ -26,7 +26,8 @@ class MotionPoints:
 
     xy: np.ndarray  # [N, 2] float32, share of the photo's width and height
     static: np.ndarray  # [N] uint8, photos in which it is where the place puts it
-    moving: np.ndarray  # [N] uint8, photos in which it fits another rigid motion, and not the place
+    # [N] uint8, photos in which it fits another rigid motion, and not the place, or that see through it
+    moving: np.ndarray
     motion: np.ndarray  # [N] int16, from 1: features of the photo that move together; 0 = does not move
 
     @property

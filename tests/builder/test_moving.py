@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 import torch
 
-from ambiguous_wild.builder.moving import Votes, _together
+from ambiguous_wild.builder.moving import Votes, _together, seen_through
 from ambiguous_wild.builder.pipeline import build_scene
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError
 from ambiguous_wild.datasets.export import export_scene
 from ambiguous_wild.datasets.write import ImportSettings, import_scene
 from ambiguous_wild.io.motion_points import FILE, MotionPoints, read_motion_points, write_motion_points
+from ambiguous_wild.io.safe_pycolmap import pycolmap
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.motion import MotionConfig, MotionMask
 from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
@@ -239,3 +240,40 @@ def test_nothing_near_says_nothing():
     assert answer[10, 12] > 0.7 and answer[90, 108] < 0.3
     assert answer[25, 35] > 0.5  # far away, but in the feature's segment
     assert answer[50, 60] == pytest.approx(0.5, abs=1e-3)
+
+
+def test_what_stands_in_some_photos_and_is_gone_in_others_is_seen_through():
+    rng, cameras = np.random.default_rng(0), 10
+    wall = np.column_stack([rng.uniform(-4, 4, (4000, 2)), np.full(4000, 6.0)])
+    parcel = np.column_stack([rng.uniform(-0.4, 0.4, (60, 2)), np.full(60, 4.0)])
+    board = parcel + np.array([1.5, 0.0, 0.0])  # stands in all photos
+    xyz = np.concatenate([wall, parcel, board])
+    kind = np.repeat([0, 1, 2], [len(wall), len(parcel), len(board)])
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId.PINHOLE, 400.0, 640, 480)
+    model.add_camera_with_trivial_rig(camera)
+    tracks: dict[int, list[tuple[int, int]]] = {}
+    shown = {}  # image -> rows of xyz, one a feature
+    for number in range(1, cameras + 1):
+        moved = xyz - [0.15 * (number - 5), 0.0, 0.0]
+        xy = 400.0 * moved[:, :2] / moved[:, 2:] + [320, 240]
+        there = ((xy >= 0) & (xy < [640, 480])).all(axis=1) & ((kind != 1) | (number <= 4))
+        for thing in (1, 2):  # hides the wall behind it
+            mine = xy[there & (kind == thing)]
+            if len(mine):
+                hidden = ((xy > mine.min(0)) & (xy < mine.max(0))).all(axis=1)
+                there &= ~hidden | (kind != 0)
+        shown[number] = np.flatnonzero(there)
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([-0.15 * (number - 5), 0.0, 0.0]))
+        image = pycolmap.Image(f"p{number:02d}", keypoints=xy[shown[number]], camera_id=1, image_id=number)
+        model.add_image_with_trivial_frame(image, pose)
+        for feature, row in enumerate(shown[number]):
+            tracks.setdefault(row, []).append((number, feature))
+    for row, places in tracks.items():
+        if len(places) > 1:
+            elements = [pycolmap.TrackElement(*place) for place in places]
+            model.add_point3D(xyz[row], pycolmap.Track(elements), np.zeros(3, np.uint8))
+    through = seen_through(model, {number: number for number in range(1, cameras + 1)})
+    of_kind = [np.concatenate([through[n][kind[shown[n]] == k] for n in shown]) for k in range(3)]
+    assert np.mean(of_kind[1] >= 4) > 0.9  # the six photos that it is gone in, less the borders
+    assert of_kind[0].max() == 0 and np.mean(of_kind[2] >= 2) < 0.02

@@ -106,6 +106,33 @@ def test_first_second_third_follow_the_direction_of_merit(key: str, order: str, 
     assert ranks == {m: (order.index(m) + 1 if m in order[:3] else None) for m in psnr}
 
 
+def test_unequal_effects_are_a_column_and_a_note_of_every_format(tmp_path: Path) -> None:
+    on = {"effects": ["exposure", "skybox"]}
+    unequal = table_of(tmp_path / "u", fake_result("a", facts=on), fake_result("b"))
+    for name, render in RENDERERS.items():
+        text = render(unequal)
+        assert "exposure, skybox" in text and ("not comparable: effects" in text or name == "csv"), name
+    shown = [line for line in to_latex(unequal).splitlines() if not line.startswith("%")]
+    assert any("not comparable: effects" in line for line in shown)
+    equal = table_of(tmp_path / "e", fake_result("a", facts=on), fake_result("b", facts=on))
+    assert "effects" not in keys(equal)
+    assert "all methods trained with effects: exposure, skybox" in to_text(equal)
+    assert not any("not comparable" in note for note in equal[-1].notes)
+
+
+def test_unequal_features_and_protocols_are_named(tmp_path: Path) -> None:
+    half = {"protocol": "half", "fitted": {"steps": 0}}
+    table = table_of(
+        tmp_path,
+        fake_result("a", options={"masks": {"features": "dino"}}),
+        fake_result("b", options={"features": "none"}, facts=half),
+        fake_result("c"),
+    )
+    notes = "\n".join(table[-1].notes)
+    assert "not comparable: features differ on yard: a: dino, b: none;" in notes
+    assert "not comparable: protocol differ on yard" in notes
+
+
 def test_equal_in_print_shares_the_rank(tmp_path: Path) -> None:
     table = table_of(
         tmp_path,

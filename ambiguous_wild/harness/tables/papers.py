@@ -95,8 +95,17 @@ def side_by_side(title: str, tables: Sequence[tuple[str, Table]], *, dataset: st
         tables: (heading of its columns, table), from the left; their notes are left out.
         dataset: that the scenes belong to.
     """
-    columns = [replace(c, group=group, dataset=dataset) for group, table in tables for c in table.columns]
-    rows = []
+    shown, rows = [], []
+    for number, (group, table) in enumerate(tables, start=1):
+        # words about a row stand once, at its end
+        own = [i for i, c in enumerate(table.columns) if not c.words or number == len(tables)]
+        shown.append((group, table.picked(own)))
+    tables = shown
+    columns = [
+        replace(c, group="" if c.words else group, dataset=dataset)
+        for group, table in tables
+        for c in table.columns
+    ]
     for same in zip(*(table.rows for _, table in tables)):
         note = next((row.note for row in same if row.note), "")
         rows.append(Row(same[0].name, tuple(cell for row in same for cell in row.cells), note=note))

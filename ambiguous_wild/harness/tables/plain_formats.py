@@ -275,7 +275,11 @@ def to_wide_csv(tables: Sequence[Table]) -> str:
     head = ["scene", "method", "status", "runs"]
     for column in tables[0].columns:
         key = column.measure.key
-        head += [key, f"{key}_std", *([f"{key}_low", f"{key}_high"] if column.measure.per_image else [])]
+        head += (
+            [key]
+            if column.words
+            else [key, f"{key}_std", *([f"{key}_low", f"{key}_high"] if column.measure.per_image else [])]
+        )
     rows = (
         [table.columns[0].scene, row.name, _status(row), row.runs, *_wide_values(table, row)]
         for table in tables
@@ -284,8 +288,11 @@ def to_wide_csv(tables: Sequence[Table]) -> str:
     return to_csv(head, rows, number=shortest)
 
 
-def _wide_values(table: Table, row: Row) -> Iterator[float]:
+def _wide_values(table: Table, row: Row) -> Iterator[float | str]:
     for column, cell in zip(table.columns, row.cells):
+        if column.words:
+            yield cell.printed
+            continue
         yield from (cell.value, cell.spread, *((cell.low, cell.high) if column.measure.per_image else ()))
 
 
@@ -297,8 +304,8 @@ def _status(row: Row) -> str:
 WIDTH = 100
 # What is shown first; what is not listed comes after, in the order of the table.
 FIRST = (
-    "psnr", "lpips_alex", "train_s", "ssim", "mask_iou", "psnr_covered", "gaussians", "lpips_vgg", "flip",
-    "fps", "model_mb",
+    "psnr", "effects", "lpips_alex", "train_s", "ssim", "mask_iou", "psnr_covered", "gaussians", "lpips_vgg",
+    "flip", "fps", "model_mb",
 )  # fmt: skip
 
 

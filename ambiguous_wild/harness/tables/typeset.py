@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from html import escape
 
 from ambiguous_wild.harness.measures import Measure
+from ambiguous_wild.harness.tables.notes import UNEQUAL
 from ambiguous_wild.harness.tables.plain_formats import plain
 from ambiguous_wild.harness.tables.table import TIE, Cell, Row, Table
 
@@ -78,7 +79,10 @@ def _tabular(table: Table) -> list[str]:
             ]
             before = row.kind
         lines.append(_latex_row(table, row))
-    return [*lines, "\\bottomrule", "\\end{tabular}}"]
+    below = [note for note in table.notes if note.startswith(UNEQUAL)]
+    width = f"\\multicolumn{{{len(table.columns) + 1}}}{{p{{\\linewidth}}}}"
+    lines += ["\\bottomrule", *(f"{width}{{\\footnotesize {latex_text(note)}}} \\\\" for note in below)]
+    return [*lines, "\\end{tabular}}"]
 
 
 def _caption(table: Table) -> str:

@@ -12,6 +12,7 @@ Imports nothing heavy until names and options are checked.
 from __future__ import annotations
 
 import dataclasses
+import math
 import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -61,13 +62,14 @@ class RunReport:
     result: RunResult | None  # as in metrics.json; None = no result that can be read
 
     def mean(self, metric: str) -> float | None:
-        """Mean of an image metric over the test views; None where any value is missing."""
+        """Mean of an image metric over the test views, of the finite values; None where any is missing."""
         from ambiguous_wild.harness.running.result_file import metrics_of
+        from ambiguous_wild.metrics import stats
 
         rows = [] if self.result is None else self.result["per_image"]
         values = [metrics_of(row).get(metric) for row in rows]
-        known = [value for value in values if value is not None]
-        return sum(known) / len(known) if known and len(known) == len(values) else None
+        mean = stats.mean([math.nan if value is None else value for value in values])
+        return None if math.isnan(mean) else mean
 
     def show(self, height: int = 640) -> Viewer:
         """The page of `aw view` for this run; as the last value of a notebook's cell it is shown there.

@@ -146,7 +146,7 @@ def test_equal_in_print_shares_the_rank(tmp_path: Path) -> None:
     assert [cell(table, m, "gaussians").rank for m in "abc"] == [None] * 3
 
 
-def test_infinite_psnr_stays_visible_everywhere(tmp_path: Path) -> None:
+def test_an_infinite_psnr_enters_no_mean_and_no_rank(tmp_path: Path) -> None:
     table = table_of(
         tmp_path,
         fake_result("a", "one", psnr=(math.inf, 20.0)),
@@ -154,11 +154,11 @@ def test_infinite_psnr_stays_visible_everywhere(tmp_path: Path) -> None:
         fake_result("a", "two", psnr=(20.0,)),
         fake_result("b", "two", psnr=(20.0,)),
     )
-    assert cell(table, "a", "psnr").value == math.inf and cell(table, "a", "psnr").rank == 1
-    assert "inf (1)" in to_text(table)
-    assert "**inf** (1)" in to_markdown(table)
-    assert r"$\infty$" in to_latex(table)
-    assert next(csv.DictReader(io.StringIO(to_wide_csv(table))))["psnr"] == "inf"
+    assert cell(table, "a", "psnr").value == 20.0 and cell(table, "a", "psnr").rank == 2
+    assert cell(table, "b", "psnr").value == 22.5 and cell(table, "b", "psnr").rank == 1
+    assert "psnr of a on one: mean of 1 of 2 values, the others are not finite" in to_text(table)
+    only = table_of(tmp_path / "only", fake_result("a", psnr=(math.inf,)), fake_result("b", psnr=(20.0,)))
+    assert cell(only, "a", "psnr").state == "missing" and cell(only, "b", "psnr").rank is None
 
 
 def test_a_mean_over_a_missing_scene_is_missing_and_said(tmp_path: Path) -> None:

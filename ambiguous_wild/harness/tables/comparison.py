@@ -202,7 +202,10 @@ def _scene_row(index: _Index, method: str, scene: str, columns: tuple[Measure, .
             images = index.images[method, scene, column.key].pivot_table(
                 index="image", columns="seed", values="value", aggfunc="mean", dropna=False
             )
-            interval = stats.bootstrap_interval(images.to_numpy().mean(axis=1))
+            means = images.to_numpy().mean(axis=1)
+            interval = stats.bootstrap_interval(
+                means[np.isfinite(means)] if np.isfinite(means).any() else means
+            )
             low, high = interval.low, interval.high
         cells.append(Cell(value, stats.spread(values), low, high))
     ranked = (method, scene) not in index.unfinished and not knows_truth(method)

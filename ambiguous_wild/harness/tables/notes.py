@@ -34,6 +34,7 @@ def notes(
         *_oracles(methods),
         *_fitted(runs),
         *_missing(runs, columns),
+        *_infinite(runs, columns),
         *_not_comparable(runs, columns),
         *_about(runs, methods),
         *time_notes(runs.runs, columns),
@@ -182,6 +183,18 @@ def _missing(runs: Runs, columns: Sequence[Measure]) -> list[str]:
         if silent:
             names = [f"{r.image} ({r.method} on {r.scene})" for r in silent]
             lines.append(f"missing: {column.key}, no reason given, for {shortlist(names)}")
+    return lines
+
+
+def _infinite(runs: Runs, columns: Sequence[Measure]) -> list[str]:
+    """One line a metric, method and scene of whose mean some values are no part."""
+    rows = runs.images[runs.images["metric"].isin([c.key for c in columns])]
+    lines = []
+    for (metric, method, scene), of in rows.groupby(["metric", "method", "scene"]):
+        finite = int(np.isfinite(of["value"].dropna()).sum())
+        if finite < of["value"].notna().sum():
+            count = f"{finite} of {len(of)} values"
+            lines.append(f"{metric} of {method} on {scene}: mean of {count}, the others are not finite")
     return lines
 
 

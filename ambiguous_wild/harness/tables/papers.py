@@ -242,8 +242,8 @@ class Ties:
             if best not in values or other not in values:
                 return False
             a, b = values[best].to_numpy(float), values[other].to_numpy(float)
-            with np.errstate(invalid="ignore"):  # inf less inf: both are perfect
-                differences.append(np.where(a == b, 0.0, a - b))
+            finite = ~(np.isinf(a) | np.isinf(b))  # what enters no mean decides no difference of means
+            differences.append((a - b)[finite])
         low, high = difference_interval(differences)
         return low <= 0.0 <= high
 

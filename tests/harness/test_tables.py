@@ -25,6 +25,7 @@ from ambiguous_wild.harness.tables.plain_formats import (
     to_wide_csv,
 )
 from ambiguous_wild.harness.tables.table import Cell, Table
+from ambiguous_wild.harness.tables.typeset import to_html as html_of
 from ambiguous_wild.harness.tables.typeset import to_latex as latex_of
 from tests.harness.fake_runs import failed, fake_result, save, start
 
@@ -131,6 +132,15 @@ def test_unequal_features_and_protocols_are_named(tmp_path: Path) -> None:
     notes = "\n".join(table[-1].notes)
     assert "not comparable: features differ on yard: a: dino, b: none;" in notes
     assert "not comparable: protocol differ on yard" in notes
+
+
+def test_test_photos_that_may_hold_distractors_are_named_in_every_format(tmp_path: Path) -> None:
+    mixed = {"test_photos": "test photos may hold distractors: every 8th photo tests"}
+    table = table_of(tmp_path, fake_result("a", facts=mixed), fake_result("b", facts=mixed))
+    for render in (to_text, to_markdown, html_of):
+        assert "test photos may hold distractors" in render(table)
+    shown = [line for line in to_latex(table).splitlines() if not line.startswith("%")]
+    assert any("test photos may hold distractors" in line for line in shown)
 
 
 def test_equal_in_print_shares_the_rank(tmp_path: Path) -> None:

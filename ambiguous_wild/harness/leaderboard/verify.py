@@ -24,6 +24,7 @@ from ambiguous_wild.harness.leaderboard.reproduce import (
 )
 from ambiguous_wild.harness.measures import PARTIAL
 from ambiguous_wild.harness.running.cell import config_identity
+from ambiguous_wild.harness.running.choosing import mixed_tests
 from ambiguous_wild.harness.running.regions import find_regions
 from ambiguous_wild.harness.running.result_file import (
     FAILED,
@@ -85,6 +86,11 @@ def verify(run: Path, scenes: Scenes, *, quick: bool = False) -> Verified:
     _check_identity(run, result, config)
     renders = _check_files(run, result, ours=not config["source"])
     scene = scenes.find(run, config)
+    mixed = str(result["facts"].get("test_photos") or ("" if scene is None else mixed_tests(scene)))
+    if mixed:
+        raise AwError(
+            f"{run}: {mixed}; build the scene with clean photos in test/ or --test-list FILE, and bench that"
+        )
     _check_values(run, result, photos=scene is not None)
     if scene is not None:
         half = config.get("protocol", "full") == "half"

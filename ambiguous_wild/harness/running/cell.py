@@ -23,7 +23,7 @@ import ambiguous_wild
 from ambiguous_wild import __version__
 from ambiguous_wild.core import Scene
 from ambiguous_wild.core.config import config_hash, flatten, to_plain
-from ambiguous_wild.harness.running.choosing import Chosen, scene_protocol
+from ambiguous_wild.harness.running.choosing import Chosen, mixed_tests, scene_protocol
 from ambiguous_wild.harness.running.result_file import (
     SCHEMA,
     Cost,
@@ -231,6 +231,7 @@ class Cell:
             facts: of the method, its effects and the watchdog.
             cost: what it took.
         """
+        mixed = mixed_tests(self.scene)
         return {
             "schema": SCHEMA,
             "method": self.method.name,
@@ -242,7 +243,7 @@ class Cell:
             "per_image": list(per_image),
             "missing": dict(missing or {}),
             "masks": masks,
-            "facts": dict(facts or {}),
+            "facts": {**(facts or {}), **({"test_photos": mixed} if mixed else {})},
             "cost": cost or {},
             "config_hash": self.identity,
             "scene_hash": self.scene_id,

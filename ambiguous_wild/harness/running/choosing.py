@@ -47,6 +47,20 @@ def _evaluation(scene: Scene) -> Mapping[str, Any]:
     return known if isinstance(known, dict) else {}
 
 
+MIXED = "test photos may hold distractors"  # begins what results, tables and pages say of such a scene
+
+
+def mixed_tests(scene: Scene) -> str:
+    """What to say of a scene whose test photos nobody chose as clean; empty for every other.
+
+    Where `aw build-scene` is given no test photos, every 8th photo tests, and scene.json says so.
+    """
+    split = str(scene.info.get("split", ""))
+    if not split.startswith("every-"):
+        return ""
+    return f"{MIXED}: every {split.removeprefix('every-')}th photo tests, and what is in it counts as truth"
+
+
 WORDS = ("auto", "none", "all")
 NOT_OURS = "an external program takes none"  # why a method trains without the effects of its bench
 

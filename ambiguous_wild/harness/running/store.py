@@ -24,6 +24,7 @@ MASK_SCORES = ("iou", "precision", "recall")
 TEXT_OF_RUNS = (
     "status", "error", "folder", "device", "version", "config_hash", "scene_hash", "timing", "timing_reason",
     "timing_kernel", "hardware", "effects", "length", "features",
+    "test_photos",
 )  # fmt: skip
 FoundResult = tuple[Path, RunResult]  # of this run folder
 
@@ -45,7 +46,8 @@ class Runs:
     images: one row per run, image and metric: scene, method, seed, image, metric, value (NaN = missing).
     runs: one row per run: scene, method, seed, status, error, folder, images, config_hash, scene_hash,
         version, fit (what was done with test photos, see tables/notes.py), effects, length and features that
-        it was trained with (words; empty features: the method has none), device, the numbers of "cost",
+        it was trained with (words; empty features: the method has none), test_photos (what is wrong with
+        them; empty: nothing that is known), device, the numbers of "cost",
         timing ("alone", "contended", "unknown"), timing_reason, timing_kernel, hardware, and mask_iou,
         mask_precision, mask_recall.
     missing: one row per run and missing metric: scene, method, seed, metric, reason.
@@ -176,6 +178,7 @@ def _run_row(run: Path, result: RunResult) -> dict[str, Any]:
             "fit": _fit(result["facts"]),
             "effects": effects_of(result["facts"]),
             "length": _length(read_config(run)),
+            "test_photos": str(result["facts"].get("test_photos", "")),
             "features": _features(result["options"]),
         }
         | {"folder": str(run), "images": len(result["per_image"])}

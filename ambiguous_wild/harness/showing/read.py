@@ -12,6 +12,7 @@ from typing import Any
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import from_plain
 from ambiguous_wild.core.errors import shortlist, unknown
+from ambiguous_wild.harness.running.choosing import mixed_tests
 from ambiguous_wild.harness.running.result_file import RESULT, metrics_of, read_result
 from ambiguous_wild.harness.running.store import CONFIG, read_config, run_folders
 from ambiguous_wild.io.ply import splat_count
@@ -74,7 +75,9 @@ def read_models(
         )
     if any(f.half for f in found):
         notes.append("PSNR of runs with --protocol half is that of the right half of each test photo")
-    return Shown(open_scene(found[0].run, scene_folder), tuple(f.model for f in found), tuple(notes))
+    opened = open_scene(found[0].run, scene_folder)
+    notes += [mixed] if (mixed := mixed_tests(opened)) else []
+    return Shown(opened, tuple(f.model for f in found), tuple(notes))
 
 
 def find_models(paths: Sequence[Path]) -> tuple[list[Found], list[str]]:

@@ -27,6 +27,7 @@ def notes(
     """One line a fact, the gravest first."""
     return (
         *unequal(runs.runs),
+        *_mixed(runs.runs),
         *_failed(runs),
         *_absent(runs, methods, scenes),
         *(f"incomplete: {i.folder}: {i.reason}" for i in runs.incomplete),
@@ -76,6 +77,12 @@ def unequal(frame: pd.DataFrame) -> list[str]:
             all_of = str(scenes.iloc[0]) if len(each) == 1 else "; ".join(each)
             lines.append(f"all methods trained with effects: {all_of}")
     return lines
+
+
+def _mixed(frame: pd.DataFrame) -> list[str]:
+    """A line for each reason to doubt test photos, with the scenes."""
+    rows = frame[(frame["status"] == "ok") & (frame["test_photos"] != "")]
+    return [f"{reason} ({shortlist(sorted(set(of['scene'])))})" for reason, of in rows.groupby("test_photos")]
 
 
 def _shared(values: pd.Series) -> str:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from html import escape
 
 from ambiguous_wild.harness.measures import Measure
+from ambiguous_wild.harness.running.choosing import MIXED
 from ambiguous_wild.harness.tables.notes import UNEQUAL
 from ambiguous_wild.harness.tables.plain_formats import plain
 from ambiguous_wild.harness.tables.table import TIE, Cell, Row, Table
@@ -79,7 +80,8 @@ def _tabular(table: Table) -> list[str]:
             ]
             before = row.kind
         lines.append(_latex_row(table, row))
-    below = [note for note in table.notes if note.startswith(UNEQUAL)]
+    # the other notes are comments: these say what a printed rank is worth
+    below = [note for note in table.notes if note.startswith((UNEQUAL, MIXED))]
     width = f"\\multicolumn{{{len(table.columns) + 1}}}{{p{{\\linewidth}}}}"
     lines += ["\\bottomrule", *(f"{width}{{\\footnotesize {latex_text(note)}}} \\\\" for note in below)]
     return [*lines, "\\end{tabular}}"]

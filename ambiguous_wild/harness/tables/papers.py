@@ -22,6 +22,12 @@ LPIPS = ("lpips_alex", "lpips_vgg", "lpips_vgg_01")
 MEMORY = ("model_mb",)
 
 
+def in_blocks(runs: Runs, *, metrics: Sequence[str] = (), scenes: Sequence[str] = ()) -> list[Table]:
+    """Tables of `comparison`, a table a scene, with the cells marked that do not differ from the best."""
+    tables = comparison(runs, metrics=metrics, scenes=scenes)
+    return Ties(runs).marked(tables, [table.title for table in tables if table.columns[0].scene])
+
+
 def paper(
     runs: Runs,
     *,

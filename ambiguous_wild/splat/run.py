@@ -275,6 +275,19 @@ class Run(ABC):
         """
         return self.render(camera).image
 
+    def check_taught(self) -> None:
+        """Raise AwError if the loss was 0 in every row of the timeline: nothing was learnt."""
+        rows = self.timeline.rows
+        if rows and all(row["loss"] == 0.0 for row in rows):
+            masked = len(self.skipped)
+            why = (
+                f"{masked} of {len(self.data.scene.train)} train photos are masked all over: mask less, or "
+                "mend masks/train (white is kept)"
+                if masked
+                else "check the masks, poses, focal lengths and points of the scene"
+            )
+            raise AwError(f"the loss stayed 0 over {self.iteration} iterations, so nothing was learnt; {why}")
+
     @property
     def ms_per_iteration(self) -> float:
         return 1e3 * self.clock.now() / max(self.iteration, 1)

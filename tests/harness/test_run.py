@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 
 import cv2
 import numpy as np
@@ -50,6 +51,56 @@ def _methods(monkeypatch):
 def bench(scene, output, *methods, train=SHORT, overwrite="missing", **kw):
     cells = plan_cells(methods, [scene], kw.pop("seeds", [0]), train, **kw)
     return cells, run_cells(cells, output, overwrite=overwrite)
+
+
+class NothingKept(MaskPolicy):
+    """Masks every pixel of every photo."""
+
+    def keep(self, step):
+        return torch.zeros(step.photo.shape[:2])
+
+
+def no_masks(root):
+    register(MethodEntry("nothing-kept", "masks all", lambda options: Parts(mask=NothingKept())))
+    return "nothing-kept"
+
+
+def user_masks(root):
+    (root / "masks/train").mkdir(parents=True)
+    for name in TRAIN:
+        cv2.imwrite(str(root / "masks/train" / name), np.zeros((48, 64), np.uint8))
+    return "3dgs"
+
+
+def points_behind(root):
+    path = root / "sparse/0/points3D.txt"
+    rows = [line.split() for line in path.read_text().splitlines()]
+    path.write_text("".join(" ".join([*r[:3], "-4.0", *r[4:]]) + "\n" for r in rows))
+    return "3dgs"
+
+
+def far_principal_point(root):
+    path = root / "sparse/0/cameras.txt"
+    path.write_text(" ".join([*path.read_text().split()[:-2], "1000000", "1000000"]) + "\n")
+    return "3dgs"
+
+
+@pytest.mark.parametrize(
+    ("spoil", "reason"),
+    [
+        (no_masks, "the loss stayed 0 .* 6 of 6 train photos are masked all over"),
+        (user_masks, "the loss stayed 0 .* 6 of 6 train photos are masked all over"),
+        (points_behind, "of one colour: no Gaussian lies in front"),
+        (far_principal_point, "of one colour: no Gaussian lies in front"),
+    ],
+)
+def test_a_run_that_learns_or_shows_nothing_fails_with_the_reason(spoil, reason, tmp_path):
+    root = write_tiny_scene(tmp_path / "scene")
+    method = spoil(root)
+    _, (report,) = bench(root, tmp_path / "runs", method)
+    assert report.outcome == "failed" and re.search(reason, report.error)
+    assert read_result(report.folder / "failed.json")["error"] == report.error
+    assert not (report.folder / "metrics.json").exists()
 
 
 def test_what_to_do_where_a_default_followed_the_weights(scene, tmp_path):

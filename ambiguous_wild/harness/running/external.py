@@ -60,6 +60,7 @@ def run_program(cell: Cell, folder: Path) -> RunResult:
     per_image, missing = evaluate.render_and_measure(
         drawn, truth, folder / "renders" / "test", half=cell.protocol == "half", scene=cell.scene
     )
+    evaluate.refuse_empty(truth, folder / "renders" / "test")
     return cell.result(
         per_image=per_image,
         missing=missing,

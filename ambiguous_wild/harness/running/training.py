@@ -324,6 +324,7 @@ def _train_and_measure(
     except Stopped:
         raise Stopped(_keep_stopped(cell, trainer, truth)) from None
     shutil.rmtree(folder / STOPPED, ignore_errors=True)
+    trainer.check_taught()
     cost = cost_of(cell, trainer)  # now: what follows measures, and is no training
     if first is not None:
         cost = both_passes(first.cost, cost)
@@ -333,6 +334,7 @@ def _train_and_measure(
     per_image, missing = evaluate.render_and_measure(
         trainer, truth, folder / "renders" / "test", half=cell.protocol == "half", scene=cell.scene
     )
+    evaluate.refuse_empty(truth, folder / "renders" / "test")
     masks = evaluate.write_masks(trainer, folder / "masks")
     if recorder is not None:
         pictures_of_training.draw_all(trainer, recorder, folder)

@@ -219,6 +219,12 @@ def test_test_photos_that_may_hold_distractors_are_refused(one: Path, tmp_path: 
     assert done.exit_code == 2 and "test photos may hold distractors" in done.stdout
 
 
+def test_a_model_of_the_same_size_is_told_by_its_hash(one: Path, tmp_path: Path) -> None:
+    change_result(one, lambda r: r.update(model_sha256="ab" * 32))
+    done = add(tmp_path / "board", one)
+    assert done.exit_code == 2 and "is not the model that was measured" in done.stdout
+
+
 def test_test_photos_for_renders_are_refused(one: Path, tmp_path: Path) -> None:
     shutil.copyfile(tmp_path / "wall/images/test_1.png", one / "renders/test/test_1.png")
     ideal = {"psnr": "inf", "ssim": 1.0, "ssim_inria": 1.0}

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+import shutil
 
 import cv2
 import numpy as np
@@ -12,8 +13,9 @@ import yaml
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.running.grid import cell_folder, plan_cells, run_cells
-from ambiguous_wild.harness.running.result_file import read_result
+from ambiguous_wild.harness.running.result_file import check_model, read_result
 from ambiguous_wild.harness.running.run import refuse_other_config
+from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.lock import folder_lock
 from ambiguous_wild.io.ply import read_splat_ply
@@ -165,6 +167,29 @@ def test_another_configuration_is_refused_by_name_and_replaced_on_request(scene,
         bench(scene, tmp_path, "3dgs", train=longer)
     assert bench(scene, tmp_path, "3dgs", train=longer, overwrite="never")[1][0].outcome == "skipped"
     assert bench(scene, tmp_path, "3dgs", train=longer, overwrite="always")[1][0].outcome == "trained"
+
+
+def test_a_checkpoint_of_another_run_is_refused_by_name(scene, tmp_path):
+    longer = dataclasses.replace(SHORT, iterations=61)
+    (cell,), (other,) = bench(scene, tmp_path / "a", "3dgs", train=longer, seeds=[1])
+    (cell,) = plan_cells(["3dgs"], [scene], [0], SHORT)
+    place = cell_folder(tmp_path / "b", cell) / "checkpoint"
+    place.mkdir(parents=True)
+    shutil.copy(other.folder / "checkpoint/last.safetensors", place)
+    written = {**cell.config, "config_hash": cell.identity}
+    (place.parent / "config.yaml").write_text(yaml.safe_dump(json.loads(json.dumps(written))))
+    (report,) = run_cells([cell], tmp_path / "b")
+    assert report.outcome == "failed"
+    assert "is of another run (3dgs on scene, seed 1, 61 iterations" in report.error
+    (same,) = run_cells([dataclasses.replace(cell)], tmp_path / "b", overwrite="always")
+    assert same.outcome == "trained"
+
+
+def test_a_model_has_its_hash_in_the_result(scene, tmp_path):
+    _, (report,) = bench(scene, tmp_path, "3dgs")
+    result = read_result(report.folder / "metrics.json")
+    assert result["model_sha256"] == sha256_file(report.folder / "point_cloud.ply")
+    check_model(report.folder, result)
 
 
 def test_how_often_a_run_is_saved_does_not_make_it_another(scene, tmp_path):

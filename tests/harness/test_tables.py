@@ -10,9 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from ambiguous_wild.cli.table import table_command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.measures import MEASURES, measure
 from ambiguous_wild.harness.running.store import read_runs
@@ -143,27 +141,6 @@ def test_test_photos_that_may_hold_distractors_are_named_in_every_format(tmp_pat
         assert "test photos may hold distractors" in render(table)
     shown = [line for line in to_latex(table).splitlines() if not line.startswith("%")]
     assert any("test photos may hold distractors" in line for line in shown)
-
-
-def test_what_does_not_differ_from_the_best_is_marked_in_every_format(tmp_path: Path) -> None:
-    close, far = (20.0, 22.0, 24.0, 21.0), (10.0, 12.0, 14.0, 11.0)
-    near = tuple(p + d for p, d in zip(close, (0.3, -0.25, 0.2, -0.2)))
-    runs = save(tmp_path, *(fake_result(m, psnr=p) for m, p in zip("abc", (close, near, far))))
-    for style, mark in {
-        "text": "≈",
-        "markdown": "≈",
-        "html": "≈",
-        "latex": r"\approx",
-        "csv": ",yes,",
-    }.items():
-        done = CliRunner().invoke(table_command, [str(runs), "--format", style])
-        assert done.exit_code == 0 and done.stdout.count(mark) >= (1 if style == "csv" else 2), style
-    shown = [line for line in done_latex(runs) if not line.startswith("%")]
-    assert any(r"$\approx$: not significantly different" in line for line in shown)
-
-
-def done_latex(runs: Path) -> list[str]:
-    return CliRunner().invoke(table_command, [str(runs), "--format", "latex"]).stdout.splitlines()
 
 
 def test_equal_in_print_shares_the_rank(tmp_path: Path) -> None:

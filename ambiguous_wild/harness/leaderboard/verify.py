@@ -28,10 +28,12 @@ from ambiguous_wild.harness.running.choosing import mixed_tests
 from ambiguous_wild.harness.running.regions import find_regions
 from ambiguous_wild.harness.running.result_file import (
     FAILED,
+    MODEL,
     RESULT,
     ImageRow,
     RunConfig,
     RunResult,
+    check_model,
     metrics_of,
     read_result,
 )
@@ -42,7 +44,7 @@ from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.metrics import stats
 from ambiguous_wild.metrics.image import FULL_IMAGE, METRICS
 
-PLY = "point_cloud.ply"
+PLY = MODEL
 ENVIRONMENT = "env.json"
 RENDERS = Path("renders") / "test"
 # Lowest and highest value by the first word of a metric's name; PSNR of pictures in [0, 1] is not negative.
@@ -217,6 +219,7 @@ def _check_files(run: Path, result: RunResult, *, ours: bool) -> dict[str, Path]
     unlisted = sorted({p.name for p in set((run / RENDERS).rglob("*.png")) - set(renders.values())})
     if unlisted:
         _partial(run, f"{shortlist(unlisted)} was rendered and {RESULT} does not list it")
+    check_model(run, result)
     model_mb = (run / PLY).stat().st_size / 1e6 if PLY in needed else None
     if model_mb is not None and (size is None or not math.isclose(size, model_mb, abs_tol=1e-6)):
         _changed(run, f"{PLY} is not of the size that {RESULT} says")

@@ -21,7 +21,7 @@ import numpy as np
 
 import ambiguous_wild
 from ambiguous_wild import __version__
-from ambiguous_wild.core import Scene
+from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import config_hash, flatten, to_plain
 from ambiguous_wild.harness.running.choosing import Chosen, mixed_tests, scene_protocol
 from ambiguous_wild.harness.running.result_file import (
@@ -131,6 +131,22 @@ def scene_identity(scene: Scene) -> str:
     if MOTION not in known and (scene.root / MOTION).is_file():
         known[MOTION] = _digest(scene.root / MOTION)
     return config_hash({"files": known, "split": split})
+
+
+def refuse_other_scene(run: Path, scene: Path, now: str, known: str) -> None:
+    """Raise AwError if a scene is not in the state that a run saw.
+
+    Args:
+        run: its folder.
+        scene: the scene's folder.
+        now: `scene_identity` of the scene as it is.
+        known: that of the scene as the run saw it.
+    """
+    if now != known:
+        raise AwError(
+            f"{run} was measured on another state of {scene}: hash {known[:12]}, now {now[:12]}; restore the "
+            "scene, or name the folder of the right one"
+        )
 
 
 def _of_plain(scene: Scene) -> dict[str, Any]:

@@ -296,9 +296,20 @@ def _make_trainer(
     # Frozen inputs, instance masks and identities are part of what a method costs.
     trainer.setup_s = time.perf_counter() - before
     trainer.meter = Meter.of(cell.device)
+    trainer.whose = {
+        "hash": cell.identity,
+        "about": f"{cell.method.name} on {cell.scene.name}, {length(cell)}",
+    }
     if first is not None:
         trainer.timeline.before_s = first.cost["train_s"]
     return trainer
+
+
+def length(cell: Cell) -> str:
+    """Seed and length of a run, in words."""
+    train = cell.train
+    asked = f"{train.iterations} iterations" if train.budget_s is None else f"{train.budget_s:g} s"
+    return f"seed {train.seed}, {asked}"
 
 
 def _train_and_measure(

@@ -27,7 +27,7 @@ from job_queue import Run, exit_code, find_scenes, parser_of, run_all
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.running.cell import Cell, environment
-from ambiguous_wild.harness.running.choosing import PLANNED, chosen_by
+from ambiguous_wild.harness.running.choosing import chosen_by
 from ambiguous_wild.harness.running.grid import Probing, cell_folder, plan_cells
 from ambiguous_wild.harness.running.run import EFFECTS, refuse_other_config
 from ambiguous_wild.harness.running.store import read_runs
@@ -55,7 +55,7 @@ def run_of(cell: Cell, args: argparse.Namespace) -> Run:
     return Run(name, cell_folder(args.out, cell), cell.method.name, tuple(words))
 
 
-def with_recorded_effects(cells: Sequence[Cell], wanted: str, out: Path) -> list[Cell]:
+def with_recorded_effects(cells: Sequence[Cell], out: Path) -> list[Cell]:
     """The cells, each with the effects that a recorded plan gives it; without those that lack a plan.
 
     A plan belongs to the scene: the one in any of its run folders holds for all methods and seeds.
@@ -65,8 +65,11 @@ def with_recorded_effects(cells: Sequence[Cell], wanted: str, out: Path) -> list
         planned = planned_effects(cell_folder(out, cell))
         if planned is not None:
             plans.setdefault(cell.scene.name, planned)
-    chosen = [chosen_by(plans.get(c.scene.name), wanted, c.scene, c.method) for c in cells]
-    return [dataclasses.replace(c, chosen=own) for c, own in zip(cells, chosen) if own is not None]
+    return [
+        dataclasses.replace(c, chosen=chosen_by(plans[c.scene.name], c.scene, c.method))
+        for c in cells
+        if c.scene.name in plans
+    ]
 
 
 def planned_effects(folder: Path) -> tuple[str, ...] | None:
@@ -108,7 +111,7 @@ def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
     parser = parser_of(__doc__, RESULTS, iterations=2000)
     parser.add_argument("--max-gaussians", type=int, default=TrainConfig.max_gaussians)
     parser.add_argument("--methods", nargs="+", default=list(METHODS))
-    parser.add_argument("--effects", default="none", help="as of aw bench; default: what each method chooses")
+    parser.add_argument("--effects", default="none", help="as of aw bench, the same for all methods")
     parser.add_argument("--set", dest="settings", action="append", default=[], metavar="METHOD.KEY=VALUE")
     return parser.parse_args(words)
 
@@ -119,7 +122,7 @@ def measure(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
     refuse_other_captures(scenes_given, args.results)  # before a plan trains probes
     train = TrainConfig(iterations=args.iterations, max_gaussians=args.max_gaussians)
     plans = Probing(train, args.out / ".cache" / "plans", lambda: prepare_cpu(args.jobs, print), print)
-    recorded = args.report_only and args.effects in PLANNED
+    recorded = args.report_only and args.effects == "auto"
     cells = plan_cells(
         args.methods,
         scenes_given,
@@ -130,7 +133,7 @@ def measure(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
         effects="none" if recorded else args.effects,  # a plan trains probes
         probing=plans,
     )
-    known = with_recorded_effects(cells, args.effects, args.out) if recorded else cells
+    known = with_recorded_effects(cells, args.out) if recorded else cells
     refuse_other_configs(known, args.out)  # before anything is trained
     failed = [] if args.report_only else run_all([run_of(cell, args) for cell in cells], args.jobs)
     runs = read_runs(args.out) if any(cell_folder(args.out, cell).is_dir() for cell in cells) else None

@@ -92,9 +92,10 @@ def parse_budget(text: str) -> float:
     "--effects",
     metavar="auto|none|all|LIST",
     multiple=True,
-    default=("default",),
-    help="Optional effects (docs/effects.md); LIST: names with commas. Repeatable: trains each.  "
-    "[default: auto for methods that choose effects (refinesplat), else none]",
+    default=("auto",),
+    show_default=True,
+    help="Optional effects (docs/effects.md), the same for all methods; auto: the plan of the scene; LIST: "
+    "names with commas. Repeatable: trains each.",
 )
 @click.option(
     "--plan",

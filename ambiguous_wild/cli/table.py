@@ -150,11 +150,10 @@ def _blocks(
     color: bool,
     everything: bool,
 ) -> tuple[str, str]:
-    from ambiguous_wild.harness.tables.comparison import comparison
-    from ambiguous_wild.harness.tables.papers import cost_at_the_end
+    from ambiguous_wild.harness.tables.papers import cost_at_the_end, in_blocks
     from ambiguous_wild.harness.tables.plain_formats import fitted, to_wide_csv
 
-    tables = comparison(found, metrics=metrics, scenes=scenes)
+    tables = in_blocks(found, metrics=metrics, scenes=scenes)
     if style == "text" and not metrics and not everything:
         tables = fitted(tables)
     scene_count = sum(bool(table.columns[0].scene) for table in tables)
@@ -195,14 +194,12 @@ def _layouts(
 ) -> list[Table]:
     from ambiguous_wild.harness.ablation.report import ablation
     from ambiguous_wild.harness.tables import papers
-    from ambiguous_wild.harness.tables.comparison import comparison
-    from ambiguous_wild.harness.tables.papers import Ties, datasets_of, read_reported, with_reported
+    from ambiguous_wild.harness.tables.papers import datasets_of, read_reported, with_reported
 
     if found is None:
         return ablation(runs, tuple(metrics))
     if layout == "blocks":
-        tables = comparison(found, metrics=metrics, scenes=scenes)
-        return Ties(found).marked(tables, [table.title for table in tables if table.columns[0].scene])
+        return papers.in_blocks(found, metrics=metrics, scenes=scenes)
     numbers = read_reported(reported_from) if reported or reported_from else []
     if not datasets:
         datasets = datasets_of(numbers or read_reported(), sorted(set(found.runs["scene"])))

@@ -12,6 +12,7 @@ Imports nothing heavy until names and options are checked.
 from __future__ import annotations
 
 import dataclasses
+import math
 import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -61,13 +62,14 @@ class RunReport:
     result: RunResult | None  # as in metrics.json; None = no result that can be read
 
     def mean(self, metric: str) -> float | None:
-        """Mean of an image metric over the test views; None where any value is missing."""
+        """Mean of an image metric over the test views, of the finite values; None where any is missing."""
         from ambiguous_wild.harness.running.result_file import metrics_of
+        from ambiguous_wild.metrics import stats
 
         rows = [] if self.result is None else self.result["per_image"]
         values = [metrics_of(row).get(metric) for row in rows]
-        known = [value for value in values if value is not None]
-        return sum(known) / len(known) if known and len(known) == len(values) else None
+        mean = stats.mean([math.nan if value is None else value for value in values])
+        return None if math.isnan(mean) else mean
 
     def show(self, height: int = 640) -> Viewer:
         """The page of `aw view` for this run; as the last value of a notebook's cell it is shown there.
@@ -129,7 +131,7 @@ def bench(
     seeds: Sequence[int] = (0,),
     iterations: int | None = None,
     budgets_s: Sequence[float] = (),
-    effects: str | Sequence[str] = "default",
+    effects: str | Sequence[str] = "auto",
     plan: Plan | Words | None = None,
     settings: Sequence[str] = (),
     parts: Mapping[Place, str] | None = None,
@@ -156,7 +158,7 @@ def bench(
         seeds: of training.
         iterations: length of a training; None = 30000.
         budgets_s: seconds of training instead; several = every length, each in a group of its own.
-        effects: "none", "all", "auto", "default" (auto where the method allows it), or names with commas;
+        effects: "none", "all", "auto" (the plan of the scene) or names with commas, for all methods alike;
             several = every choice, each in a group of its own.
         plan: of `aw plan`, or its file, for the one scene; None = made where one is needed.
         settings: options of methods, "METHOD.KEY=VALUE".
@@ -300,7 +302,7 @@ def _check_methods(
 def _check_effects(
     choices: Sequence[str], plan: Plan | Words | None, scenes: Sequence[Path], methods: Sequence[str]
 ) -> None:
-    from ambiguous_wild.harness.running.choosing import check_wanted, reads_plan
+    from ambiguous_wild.harness.running.choosing import check_wanted, takes_effects
     from ambiguous_wild.methods.registry import get_method
 
     for wanted in choices:
@@ -310,7 +312,7 @@ def _check_effects(
     name = plan if isinstance(plan, str | Path) else plan.scene
     if len(scenes) > 1:
         raise AwError(f"--plan {name} is of one scene; bench {len(scenes)} scenes one by one, or without it")
-    if not any(reads_plan(c, get_method(m)) for c in choices for m in methods):
+    if "auto" not in choices or not any(takes_effects(get_method(m)) for m in methods):
         raise AwError(
             f"--plan {name} would not be read: {', '.join(methods)} with --effects {', '.join(choices)}; "
             "add --effects auto"
@@ -326,11 +328,14 @@ def _read_plan(plan: Plan | Words | None) -> Plan | None:
 
 
 def _remarks(cells: Sequence[Cell]) -> list[str]:
-    """Effects that are on, warnings of the scenes; each once."""
+    """Effects that are on, who cannot take them, warnings of the scenes; each once."""
+    from ambiguous_wild.harness.running.choosing import NOT_OURS, takes_effects
+
     lines = []
-    for method, name, on in dict.fromkeys((c.method.name, c.scene.name, c.chosen.effects) for c in cells):
-        if on:
-            lines.append(f"{method} on {name}: {', '.join(on)}")
+    on = dict.fromkeys((c.scene.name, c.chosen.effects) for c in cells if c.chosen.effects)
+    lines += [f"{scene}: all methods train with the effects {', '.join(names)}" for scene, names in on]
+    without = {c.method.name: c.method for c in cells if on and not takes_effects(c.method)}
+    lines += [f"{name} trains without effects: {NOT_OURS}" for name in without]
     for scene in {cell.scene.name: cell.scene for cell in cells}.values():
         lines += [f"warning: {scene.name}: {warning}" for warning in scene.info.get("warnings", ())]
     return lines

@@ -15,7 +15,7 @@ from ambiguous_wild import __version__
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.harness.leaderboard.verify import check_photos
-from ambiguous_wild.harness.running.cell import code_hash, config_identity, scene_identity
+from ambiguous_wild.harness.running.cell import code_hash, config_identity, refuse_other_scene, scene_identity
 from ambiguous_wild.harness.running.evaluate import Measures, measures_of
 from ambiguous_wild.harness.running.result_file import (
     RESULT,
@@ -108,11 +108,7 @@ class _Scenes:
             sizes = [(view.camera.height, view.camera.width) for view in scene.test]
             self._open[key] = scene, scene_identity(scene), measures_of(scene, sizes, half=half)
         scene, identity, measures = self._open[key]
-        if identity != result["scene_hash"]:
-            raise AwError(
-                f"{run} was measured on another state of {path}: hash {result['scene_hash'][:12]}, now "
-                f"{identity[:12]}; restore the scene, or name the right one with --scene"
-            )
+        refuse_other_scene(run, Path(path), identity, result["scene_hash"])
         return scene, measures
 
 

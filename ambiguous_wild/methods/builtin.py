@@ -21,7 +21,6 @@ BUILTIN = (
         config="ambiguous_wild.methods.refinesplat.recipe:Config",
         paper="Rectifying Mask via Entropy for Distractor-Free 3DGS in Ambiguous Scenarios",
         ablations="ambiguous_wild.methods.refinesplat.ablations:ABLATIONS",
-        auto_effects=("exposure", "appearance", "antialias", "poses", "skybox", "dense"),
         note="weight-free; ours where the paper's parts measure worse (docs/fidelity.md)",
     ),
     MethodEntry(

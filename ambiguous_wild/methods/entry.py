@@ -36,9 +36,6 @@ class MethodEntry:
     places: tuple[
         tuple[str, str], ...
     ] = ()  # of a graft: the method behind each field of its options, see graft.py
-    # effects that `aw bench` may switch on by itself if a scene needs them; none for a baseline, which stays
-    # as its paper defines it
-    auto_effects: tuple[str, ...] = ()
     # an external program, run instead of parts on our trainer, see methods/external/
     program: Program | None = None
     base: str = ""  # of a method that trains twice: its name without that, which options are given by

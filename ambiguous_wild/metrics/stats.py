@@ -26,9 +26,13 @@ class Interval:
 
 
 def mean(values: Sequence[float] | np.ndarray) -> float:
-    """Arithmetic mean; NaN if any value is NaN or there is none; ``inf`` stays ``inf``."""
+    """Arithmetic mean of the finite values; NaN if any value is NaN or none is finite.
+
+    An infinite PSNR of a few equal pixels would decide every mean that it entered.
+    """
     array = _checked(values)
-    return float(array.mean()) if len(array) and not np.isnan(array).any() else math.nan
+    finite = array[np.isfinite(array)]
+    return float(finite.mean()) if len(finite) and not np.isnan(array).any() else math.nan
 
 
 def spread(values: Sequence[float] | np.ndarray) -> float:

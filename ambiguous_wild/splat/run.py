@@ -91,6 +91,9 @@ class Run(ABC):
         self.meter: Meter | None = None
         self._marks: tuple[int, int] | None = None  # probes and rows that were due after the last step
         self.setup_s = 0.0  # seconds before the first step, of the process that began the run
+        self.whose: dict[
+            str, str
+        ] = {}  # "hash" of the run's configuration and "about", its name; {} = not known
         self.iteration = 0
         self.timeline = Timeline()
         self._skipped: set[int] = set()  # views that were all masked at some step
@@ -124,6 +127,7 @@ class Run(ABC):
         """
         rollbacks = self.watchdog.state_dict()
         return {
+            **({"run": dict(self.whose)} if self.whose else {}),
             "iteration": self.iteration,
             "elapsed_s": self.clock.now(),
             "setup_s": self.setup_s,
@@ -275,6 +279,19 @@ class Run(ABC):
         """
         return self.render(camera).image
 
+    def check_taught(self) -> None:
+        """Raise AwError if the loss was 0 in every row of the timeline: nothing was learnt."""
+        rows = self.timeline.rows
+        if rows and all(row["loss"] == 0.0 for row in rows):
+            masked = len(self.skipped)
+            why = (
+                f"{masked} of {len(self.data.scene.train)} train photos are masked all over: mask less, or "
+                "mend masks/train (white is kept)"
+                if masked
+                else "check the masks, poses, focal lengths and points of the scene"
+            )
+            raise AwError(f"the loss stayed 0 over {self.iteration} iterations, so nothing was learnt; {why}")
+
     @property
     def ms_per_iteration(self) -> float:
         return 1e3 * self.clock.now() / max(self.iteration, 1)
@@ -302,13 +319,21 @@ class Run(ABC):
         """Go on from the last checkpoint, if there is one; returns whether there was.
 
         Raises:
-            AwError: the checkpoint lacks something; names the file.
+            AwError: the checkpoint lacks something, or is of another run; names the file.
         """
         path = self.checkpoint_path
         if not path.exists():
             return False
+        state = checkpoint.load(path)
+        other = state.get("run", self.whose)  # of earlier versions: not known
+        if self.whose and other != self.whose:
+            raise AwError(
+                f"checkpoint {path} is of another run ({other.get('about')}, configuration "
+                f"{str(other.get('hash'))[:12]}), this one is {self.whose['about']}, configuration "
+                f"{self.whose['hash'][:12]}; delete it, or train again with --overwrite always"
+            )
         try:
-            self.load_state(checkpoint.load(path))
+            self.load_state(state)
         except (KeyError, TypeError) as error:
             raise AwError(f"checkpoint {path} lacks {error}; train again with --overwrite always") from None
         if self.sentinel is not None:

@@ -66,8 +66,8 @@ def test_a_file_that_is_no_plan_is_not_replaced(scene, tmp_path):
         (["bench", "--method", "3dgs", "--scene", "SCENE", "--effects", "all,poses"], "stands alone"),
         (["bench", "--method", "refinesplat", "--scene", "SCENE", "--plan", "gone"], "there is no plan gone"),
         (
-            ["bench", "--method", "3dgs", "--scene", "SCENE", "--plan", "plan.json"],
-            "--plan plan.json would not be read: 3dgs with --effects default; add --effects auto",
+            ["bench", "--method", "3dgs", "--scene", "SCENE", "--plan", "plan.json", "--effects", "none"],
+            "--plan plan.json would not be read: 3dgs with --effects none; add --effects auto",
         ),
     ],
 )  # fmt: skip

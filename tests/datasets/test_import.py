@@ -160,11 +160,11 @@ def test_the_test_protocol_comes_with_the_scene(imported, tmp_path):
     """A newcomer gets half photos and fitted appearance on Photo Tourism, and whole photos elsewhere."""
     train = TrainConfig(iterations=5)
     tourism = plan_cells(
-        ["refinesplat", "3dgs"], [imported("photo-tourism")[1].scene], [0], train, effects="default"
+        ["refinesplat", "3dgs"], [imported("photo-tourism")[1].scene], [0], train, effects="auto"
     )
     assert [cell.protocol for cell in tourism] == ["half", "half"]
-    assert "appearance" in tourism[0].chosen.effects and tourism[1].chosen.effects == ()
-    plain = plan_cells(["refinesplat"], [imported("robustnerf")[1].scene], [0], train, effects="default")
+    assert "appearance" in tourism[0].chosen.effects and tourism[1].chosen == tourism[0].chosen
+    plain = plan_cells(["refinesplat"], [imported("robustnerf")[1].scene], [0], train, effects="auto")
     assert plain[0].protocol == "full" and "appearance" not in plain[0].chosen.effects
     asked = plan_cells(["3dgs"], [imported("photo-tourism")[1].scene], [0], train, protocol="full")
     assert asked[0].protocol == "full"

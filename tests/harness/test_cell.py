@@ -42,6 +42,15 @@ def test_a_scene_is_known_by_what_is_trained_and_scored_on(tmp_path):
     assert identity() != identity(**{"images/a.png": {"sha256": "another photo"}})
 
 
+def test_a_result_says_where_test_photos_may_hold_distractors(tmp_path):
+    (cell,) = plan_cells(["3dgs"], [write_tiny_scene(tmp_path / "scene")], [0], TrainConfig(iterations=1))
+    assert "test_photos" not in cell.result()["facts"]
+    mixed = replace(cell, scene=replace(cell.scene, info={**cell.scene.info, "split": "every-8"}))
+    assert "every 8th photo tests" in mixed.result()["facts"]["test_photos"]
+    chosen = replace(cell, scene=replace(cell.scene, info={**cell.scene.info, "split": "list"}))
+    assert "test_photos" not in chosen.result()["facts"]
+
+
 def test_a_plain_scene_is_known_by_its_photos_masks_and_model(tmp_path):
     root = write_tiny_scene(tmp_path / "scene")
     seen = {scene_identity(load_scene(root))}

@@ -298,9 +298,11 @@ def test_a_toml_file_says_the_same(scene, tmp_path):
     )
 
 
-def test_effects_and_budgets_are_refused_where_they_cannot_be_kept(scene, tmp_path):
+def test_effects_are_not_taken_and_budgets_refused(scene, tmp_path):
     _, report = run(describe(tmp_path), scene, tmp_path / "a", effects="exposure")
-    assert "takes no effects" in report.error
+    assert report.outcome == "trained" and report.result["facts"]["no_effects"]
+    (row,) = read_runs(tmp_path / "a").runs.itertuples()
+    assert row.effects == "none: an external program takes none"
     _, report = run(describe(tmp_path), scene, tmp_path / "b", train=TrainConfig(budget_s=5.0))
     assert "give --iterations" in report.error
 

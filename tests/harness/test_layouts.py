@@ -13,9 +13,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ambiguous_wild.cli.table import table_command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.ablation.report import ablation
 from ambiguous_wild.harness.measures import MEASURES
@@ -270,7 +272,7 @@ def test_latex_is_balanced_and_names_stay_text(tmp_path: Path) -> None:
     begun, ended = re.findall(r"\\begin\{(\w+\*?)\}", latex), re.findall(r"\\end\{(\w+\*?)\}", latex)
     assert begun == ended[::-1] and len(begun) == 2
     assert {"\\toprule", "\\midrule", "\\bottomrule"} <= set(code) and "\\cmidrule(lr){2-3}" in code
-    rows = [line for line in code if line.endswith(r"\\")]
+    rows = [line for line in code if line.endswith(r"\\") and not line.startswith(r"\multicolumn")]
     assert {len(re.findall(r"(?<!\\)&", row)) for row in rows[1:]} == {2}
     assert not any("\\input{" in line for line in code) and "\x1b" not in latex
     assert "(U+65E5)" in latex  # no font of pdflatex has it
@@ -290,3 +292,24 @@ def test_every_column_is_under_its_heading_in_text(tmp_path: Path) -> None:
     top, head = lines[1], lines[2]
     assert top.index("two") <= head.index("PSNR", top.index("two")) < top.index("Mean")
     assert len({len(line) for line in lines[3:6]}) == 1
+
+
+def test_what_does_not_differ_from_the_best_is_marked_in_every_format(tmp_path: Path) -> None:
+    close, far = (20.0, 22.0, 24.0, 21.0), (10.0, 12.0, 14.0, 11.0)
+    near = tuple(p + d for p, d in zip(close, (0.3, -0.25, 0.2, -0.2)))
+    runs = save(tmp_path, *(fake_result(m, psnr=p) for m, p in zip("abc", (close, near, far))))
+    for style, mark in {
+        "text": "≈",
+        "markdown": "≈",
+        "html": "≈",
+        "latex": r"\approx",
+        "csv": ",yes,",
+    }.items():
+        done = CliRunner().invoke(table_command, [str(runs), "--format", style])
+        assert done.exit_code == 0 and done.stdout.count(mark) >= (1 if style == "csv" else 2), style
+    shown = [line for line in done_latex(runs) if not line.startswith("%")]
+    assert any(r"$\approx$: not significantly different" in line for line in shown)
+
+
+def done_latex(runs: Path) -> list[str]:
+    return CliRunner().invoke(table_command, [str(runs), "--format", "latex"]).stdout.splitlines()

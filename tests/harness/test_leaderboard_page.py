@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -11,6 +13,8 @@ from click.testing import CliRunner, Result
 
 from ambiguous_wild.cli.leaderboard import command
 from ambiguous_wild.harness.leaderboard import publish as publishing
+from ambiguous_wild.harness.leaderboard.board import read_board
+from ambiguous_wild.harness.leaderboard.page_facts import Reported, facts
 from tests.chromium import Browser, needs_chromium
 from tests.harness.board_page import choose, column, heads, names, ranks, said, tick, type_in
 from tests.harness.board_runs import write_run, write_scene
@@ -161,6 +165,25 @@ def test_the_page_in_a_browser(board: Path, tmp_path: Path) -> None:
             "!document.getElementById('empty').hidden && document.getElementById('compare').hidden"
         )
         assert page.run("document.getElementById('measured').hidden") and page.errors == []
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="needs node")
+def test_an_infinite_value_of_the_shipped_board_enters_no_mean_and_no_rank() -> None:
+    root = Path(publishing.__file__).parent
+    board = facts(read_board(Path(__file__).parents[2] / "leaderboard"), [], Reported(), [])
+    code = (
+        f"const document = {{ getElementById: () => ({{ textContent: {json.dumps(json.dumps(board))} }}) }};"
+        + (root / "page_data.js").read_text(encoding="utf-8")
+        + "state.dataset = 'simulated'; const key = 'psnr_covered', found = groups('simulated');"
+        "const all = found.map((g) => summary(g, key, chosenScenes()));"
+        "const placed = ranks(rankable(found, all, key), key);"
+        "console.log(JSON.stringify(found.map((g, i) => [g.method, all[i].value, placed[i], all[i].cells])));"
+    )
+    done = subprocess.run(["node", "-"], input=code, capture_output=True, text=True, check=True)
+    rows = {method: (value, rank, cells) for method, value, rank, cells in json.loads(done.stdout)}
+    value, rank, cells = rows["robustsplat"]
+    assert 20 < value < 40 and rank != 1 and cells["finite"] == cells["all"] - 1
+    assert rows["refinesplat"][1] == 1
 
 
 def oracles_are_not_ranked(page: Browser) -> None:

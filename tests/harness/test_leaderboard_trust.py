@@ -213,6 +213,18 @@ def test_what_cannot_be_is_refused_even_without_the_scene(
     assert done.exit_code == 2 and why in done.stdout and len(done.stdout.splitlines()) == 1
 
 
+def test_test_photos_that_may_hold_distractors_are_refused(one: Path, tmp_path: Path) -> None:
+    change_result(one, lambda r: r["facts"].update(test_photos="test photos may hold distractors: every 8th"))
+    done = add(tmp_path / "board", one)
+    assert done.exit_code == 2 and "test photos may hold distractors" in done.stdout
+
+
+def test_a_model_of_the_same_size_is_told_by_its_hash(one: Path, tmp_path: Path) -> None:
+    change_result(one, lambda r: r.update(model_sha256="ab" * 32))
+    done = add(tmp_path / "board", one)
+    assert done.exit_code == 2 and "is not the model that was measured" in done.stdout
+
+
 def test_test_photos_for_renders_are_refused(one: Path, tmp_path: Path) -> None:
     shutil.copyfile(tmp_path / "wall/images/test_1.png", one / "renders/test/test_1.png")
     ideal = {"psnr": "inf", "ssim": 1.0, "ssim_inria": 1.0}

@@ -122,7 +122,7 @@ def test_few_photos_call_for_a_dense_start(photos, answer):
     assert [d.decision for d in plan.decisions if d.effect == "dense start"] == [answer]
     assert plan.effects() == (("dense",) if answer == "on" else ())
     assert (
-        choose("default", synthetic()[0], [get_method("refinesplat")], plan)["refinesplat"].effects
+        choose("auto", synthetic()[0], [get_method("refinesplat")], plan)["refinesplat"].effects
         == plan.effects()
     )
 
@@ -141,7 +141,7 @@ def test_what_lies_behind_the_scene_calls_for_a_skybox(uncovered, skybox):
     plan = decide("dots", dataclasses.replace(measured(), uncovered=uncovered))
     assert [d.decision for d in plan.decisions if d.effect == "skybox"] == [skybox]
     assert plan.effects() == (("skybox",) if skybox == "on" else ())
-    chosen = choose("default", synthetic()[0], [get_method("refinesplat")], plan)["refinesplat"]
+    chosen = choose("auto", synthetic()[0], [get_method("refinesplat")], plan)["refinesplat"]
     assert chosen.effects == plan.effects()
 
 
@@ -322,16 +322,16 @@ def test_words_and_lists():
             check_wanted(wrong)
 
 
-def test_a_baseline_stays_what_its_paper_defines_unless_asked():
+def test_every_method_that_can_takes_the_effects_of_the_scene():
     scene, _ = synthetic()
     plan = decide("dots", measured(zoom=3.0, exposure=0.15))
     methods = [get_method(name) for name in ("3dgs", "refinesplat", "refinesplat@mask=truth")]
-    by_default = choose("default", scene, methods, plan)
-    assert by_default["3dgs"].effects == by_default["refinesplat@mask=truth"].effects == ()
-    assert not by_default["3dgs"].asked  # and its folder says nothing
-    assert by_default["refinesplat"].effects == ("exposure", "antialias")
-    assert choose("auto", scene, methods, plan)["3dgs"].effects == ("exposure", "antialias")
-    assert choose("none", scene, methods, plan)["refinesplat"].effects == ()
+    program = dataclasses.replace(get_method("3dgs"), name="theirs", program=object())
+    chosen = choose("auto", scene, [*methods, program], plan)
+    assert {chosen[m.name].effects for m in methods} == {("exposure", "antialias")}
+    assert chosen["theirs"].effects == () and not chosen["theirs"].asked
+    assert choose("poses", scene, [*methods, program], plan)["theirs"].effects == ()
+    assert {c.effects for c in choose("none", scene, methods, plan).values()} == {()}
     with pytest.raises(AwError, match="of scene dots, not of other"):
         choose("auto", dataclasses.replace(scene, name="other"), methods, plan)
 
@@ -348,10 +348,10 @@ def test_a_scene_that_calls_for_nothing_keeps_the_identity_of_its_runs(tiny, mon
     monkeypatch.setattr(decide_module, "LEAST_PHOTOS", 1000)
     monkeypatch.setattr(decide_module, "OUTWARD", -1.0)
     (none,) = plan_cells(["refinesplat"], [tiny], [0], SHORT)
-    (default,) = plan_cells(["refinesplat"], [tiny], [0], SHORT, effects="default")
+    (auto,) = plan_cells(["refinesplat"], [tiny], [0], SHORT, effects="auto")
     (listed,) = plan_cells(["refinesplat"], [tiny], [0], SHORT, effects="poses")
-    assert none.identity == default.identity != listed.identity
-    assert none.config == default.config
+    assert none.identity == auto.identity != listed.identity
+    assert none.config == auto.config
 
 
 def test_a_run_says_what_was_on_and_why_and_ships_the_filtered_model(tiny, tmp_path):
@@ -376,5 +376,5 @@ def test_options_are_checked_before_a_plan_is_made(tmp_path, monkeypatch):
     with pytest.raises(AwError, match="most is at least 0, got -1"):
         plan_cells(
             ["refinesplat"], [scene], [0], TrainConfig(),
-            settings=["refinesplat.first_look.most=-1"], effects="default",
+            settings=["refinesplat.first_look.most=-1"], effects="auto",
         )  # fmt: skip

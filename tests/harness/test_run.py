@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import re
+import shutil
 
 import cv2
 import numpy as np
@@ -11,8 +13,9 @@ import yaml
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.running.grid import cell_folder, plan_cells, run_cells
-from ambiguous_wild.harness.running.result_file import read_result
+from ambiguous_wild.harness.running.result_file import check_model, read_result
 from ambiguous_wild.harness.running.run import refuse_other_config
+from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.lock import folder_lock
 from ambiguous_wild.io.ply import read_splat_ply
@@ -50,6 +53,56 @@ def _methods(monkeypatch):
 def bench(scene, output, *methods, train=SHORT, overwrite="missing", **kw):
     cells = plan_cells(methods, [scene], kw.pop("seeds", [0]), train, **kw)
     return cells, run_cells(cells, output, overwrite=overwrite)
+
+
+class NothingKept(MaskPolicy):
+    """Masks every pixel of every photo."""
+
+    def keep(self, step):
+        return torch.zeros(step.photo.shape[:2])
+
+
+def no_masks(root):
+    register(MethodEntry("nothing-kept", "masks all", lambda options: Parts(mask=NothingKept())))
+    return "nothing-kept"
+
+
+def user_masks(root):
+    (root / "masks/train").mkdir(parents=True)
+    for name in TRAIN:
+        cv2.imwrite(str(root / "masks/train" / name), np.zeros((48, 64), np.uint8))
+    return "3dgs"
+
+
+def points_behind(root):
+    path = root / "sparse/0/points3D.txt"
+    rows = [line.split() for line in path.read_text().splitlines()]
+    path.write_text("".join(" ".join([*r[:3], "-4.0", *r[4:]]) + "\n" for r in rows))
+    return "3dgs"
+
+
+def far_principal_point(root):
+    path = root / "sparse/0/cameras.txt"
+    path.write_text(" ".join([*path.read_text().split()[:-2], "1000000", "1000000"]) + "\n")
+    return "3dgs"
+
+
+@pytest.mark.parametrize(
+    ("spoil", "reason"),
+    [
+        (no_masks, "the loss stayed 0 .* 6 of 6 train photos are masked all over"),
+        (user_masks, "the loss stayed 0 .* 6 of 6 train photos are masked all over"),
+        (points_behind, "of one colour: no Gaussian lies in front"),
+        (far_principal_point, "of one colour: no Gaussian lies in front"),
+    ],
+)
+def test_a_run_that_learns_or_shows_nothing_fails_with_the_reason(spoil, reason, tmp_path):
+    root = write_tiny_scene(tmp_path / "scene")
+    method = spoil(root)
+    _, (report,) = bench(root, tmp_path / "runs", method)
+    assert report.outcome == "failed" and re.search(reason, report.error)
+    assert read_result(report.folder / "failed.json")["error"] == report.error
+    assert not (report.folder / "metrics.json").exists()
 
 
 def test_what_to_do_where_a_default_followed_the_weights(scene, tmp_path):
@@ -114,6 +167,29 @@ def test_another_configuration_is_refused_by_name_and_replaced_on_request(scene,
         bench(scene, tmp_path, "3dgs", train=longer)
     assert bench(scene, tmp_path, "3dgs", train=longer, overwrite="never")[1][0].outcome == "skipped"
     assert bench(scene, tmp_path, "3dgs", train=longer, overwrite="always")[1][0].outcome == "trained"
+
+
+def test_a_checkpoint_of_another_run_is_refused_by_name(scene, tmp_path):
+    longer = dataclasses.replace(SHORT, iterations=61)
+    (cell,), (other,) = bench(scene, tmp_path / "a", "3dgs", train=longer, seeds=[1])
+    (cell,) = plan_cells(["3dgs"], [scene], [0], SHORT)
+    place = cell_folder(tmp_path / "b", cell) / "checkpoint"
+    place.mkdir(parents=True)
+    shutil.copy(other.folder / "checkpoint/last.safetensors", place)
+    written = {**cell.config, "config_hash": cell.identity}
+    (place.parent / "config.yaml").write_text(yaml.safe_dump(json.loads(json.dumps(written))))
+    (report,) = run_cells([cell], tmp_path / "b")
+    assert report.outcome == "failed"
+    assert "is of another run (3dgs on scene, seed 1, 61 iterations" in report.error
+    (same,) = run_cells([dataclasses.replace(cell)], tmp_path / "b", overwrite="always")
+    assert same.outcome == "trained"
+
+
+def test_a_model_has_its_hash_in_the_result(scene, tmp_path):
+    _, (report,) = bench(scene, tmp_path, "3dgs")
+    result = read_result(report.folder / "metrics.json")
+    assert result["model_sha256"] == sha256_file(report.folder / "point_cloud.ply")
+    check_model(report.folder, result)
 
 
 def test_how_often_a_run_is_saved_does_not_make_it_another(scene, tmp_path):

@@ -25,6 +25,7 @@ from ambiguous_wild.harness.tables.plain_formats import (
     to_wide_csv,
 )
 from ambiguous_wild.harness.tables.table import Cell, Table
+from ambiguous_wild.harness.tables.typeset import to_html as html_of
 from ambiguous_wild.harness.tables.typeset import to_latex as latex_of
 from tests.harness.fake_runs import failed, fake_result, save, start
 
@@ -106,6 +107,42 @@ def test_first_second_third_follow_the_direction_of_merit(key: str, order: str, 
     assert ranks == {m: (order.index(m) + 1 if m in order[:3] else None) for m in psnr}
 
 
+def test_unequal_effects_are_a_column_and_a_note_of_every_format(tmp_path: Path) -> None:
+    on = {"effects": ["exposure", "skybox"]}
+    unequal = table_of(tmp_path / "u", fake_result("a", facts=on), fake_result("b"))
+    for name, render in RENDERERS.items():
+        text = render(unequal)
+        assert "exposure, skybox" in text and ("not comparable: effects" in text or name == "csv"), name
+    shown = [line for line in to_latex(unequal).splitlines() if not line.startswith("%")]
+    assert any("not comparable: effects" in line for line in shown)
+    equal = table_of(tmp_path / "e", fake_result("a", facts=on), fake_result("b", facts=on))
+    assert "effects" not in keys(equal)
+    assert "all methods trained with effects: exposure, skybox" in to_text(equal)
+    assert not any("not comparable" in note for note in equal[-1].notes)
+
+
+def test_unequal_features_and_protocols_are_named(tmp_path: Path) -> None:
+    half = {"protocol": "half", "fitted": {"steps": 0}}
+    table = table_of(
+        tmp_path,
+        fake_result("a", options={"masks": {"features": "dino"}}),
+        fake_result("b", options={"features": "none"}, facts=half),
+        fake_result("c"),
+    )
+    notes = "\n".join(table[-1].notes)
+    assert "not comparable: features differ on yard: a: dino, b: none;" in notes
+    assert "not comparable: protocol differ on yard" in notes
+
+
+def test_test_photos_that_may_hold_distractors_are_named_in_every_format(tmp_path: Path) -> None:
+    mixed = {"test_photos": "test photos may hold distractors: every 8th photo tests"}
+    table = table_of(tmp_path, fake_result("a", facts=mixed), fake_result("b", facts=mixed))
+    for render in (to_text, to_markdown, html_of):
+        assert "test photos may hold distractors" in render(table)
+    shown = [line for line in to_latex(table).splitlines() if not line.startswith("%")]
+    assert any("test photos may hold distractors" in line for line in shown)
+
+
 def test_equal_in_print_shares_the_rank(tmp_path: Path) -> None:
     table = table_of(
         tmp_path,
@@ -119,7 +156,7 @@ def test_equal_in_print_shares_the_rank(tmp_path: Path) -> None:
     assert [cell(table, m, "gaussians").rank for m in "abc"] == [None] * 3
 
 
-def test_infinite_psnr_stays_visible_everywhere(tmp_path: Path) -> None:
+def test_an_infinite_psnr_enters_no_mean_and_no_rank(tmp_path: Path) -> None:
     table = table_of(
         tmp_path,
         fake_result("a", "one", psnr=(math.inf, 20.0)),
@@ -127,11 +164,11 @@ def test_infinite_psnr_stays_visible_everywhere(tmp_path: Path) -> None:
         fake_result("a", "two", psnr=(20.0,)),
         fake_result("b", "two", psnr=(20.0,)),
     )
-    assert cell(table, "a", "psnr").value == math.inf and cell(table, "a", "psnr").rank == 1
-    assert "inf (1)" in to_text(table)
-    assert "**inf** (1)" in to_markdown(table)
-    assert r"$\infty$" in to_latex(table)
-    assert next(csv.DictReader(io.StringIO(to_wide_csv(table))))["psnr"] == "inf"
+    assert cell(table, "a", "psnr").value == 20.0 and cell(table, "a", "psnr").rank == 2
+    assert cell(table, "b", "psnr").value == 22.5 and cell(table, "b", "psnr").rank == 1
+    assert "psnr of a on one: mean of 1 of 2 values, the others are not finite" in to_text(table)
+    only = table_of(tmp_path / "only", fake_result("a", psnr=(math.inf,)), fake_result("b", psnr=(20.0,)))
+    assert cell(only, "a", "psnr").state == "missing" and cell(only, "b", "psnr").rank is None
 
 
 def test_a_mean_over_a_missing_scene_is_missing_and_said(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ def test_a_mean_over_a_missing_cell_is_missing() -> None:
     assert mean([1.0, 2.0, 4.5]) == 2.5
     assert math.isnan(mean([1.0, NAN])) and math.isnan(mean([1.0, None]))  # type: ignore[list-item]
     assert math.isnan(mean([]))
-    assert mean([1.0, INF]) == INF
+    assert mean([1.0, INF]) == 1.0 and math.isnan(mean([INF])) and math.isnan(mean([INF, NAN]))
 
 
 def test_spread_is_the_sample_deviation() -> None:

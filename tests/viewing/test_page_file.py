@@ -16,6 +16,7 @@ import pytest
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.showing.read import Viewer, read_look, view_runs
+from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import write_png
 from ambiguous_wild.io.motion_points import FILE, MotionPoints, write_motion_points
 from ambiguous_wild.io.scene_folder import load_scene
@@ -24,6 +25,7 @@ from ambiguous_wild.viewing import page_file
 from ambiguous_wild.viewing.model import Look
 from ambiguous_wild.viewing.page_file import importance, reduced
 from tests.command_line import aw
+from tests.harness.board_runs import change_result
 from tests.tiny_scene import TEST, TRAIN, write_tiny_scene
 from tests.viewing.wall_runs import wall_model, write_shown_run
 
@@ -164,6 +166,24 @@ def test_what_cannot_be_shown_is_one_line(runs: Path, tmp_path: Path) -> None:
         done = aw("view", *words, "-o", tmp_path / "out")
         assert done.returncode == 2 and told in done.stderr, done.stderr
         assert not (tmp_path / "out").exists() or not any((tmp_path / "out").iterdir())
+
+
+def test_another_model_or_another_state_of_the_scene_is_refused(tmp_path: Path) -> None:
+    scene = write_tiny_scene(tmp_path / "porch")
+    run = write_shown_run(tmp_path / "runs", scene)
+    change_result(run, lambda r: r.update(model_sha256="ab" * 32))
+    with pytest.raises(AwError, match="is not the model that was measured"):
+        view_runs([run], tmp_path / "out")
+    change_result(run, lambda r: r.update(model_sha256=sha256_file(run / "point_cloud.ply")))
+    view_runs([run], tmp_path / "out")
+    poses = scene / "sparse/0/images.txt"
+    poses.write_text(poses.read_text().replace(" 0 0 1 test_0.png", " 0.5 0 1 test_0.png"))
+    with pytest.raises(AwError, match="was measured on another state of"):
+        view_runs([run], tmp_path / "out")
+    done = aw("export", run, "--format", "spz")
+    assert "loss not measured" in done.stderr and "another state of" in done.stderr
+    done = aw("video", run, "-o", tmp_path / "v.mp4")
+    assert done.returncode == 2 and "another state of" in done.stderr and done.stderr.count("\n") == 1
 
 
 def test_runs_of_two_scenes_need_a_choice(runs: Path, tmp_path: Path) -> None:

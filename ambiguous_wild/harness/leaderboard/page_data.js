@@ -26,14 +26,19 @@ function svg(name, attributes = {}, ...children) {
 const number = (value) => (value === "inf" ? Infinity : value === "-inf" ? -Infinity : value ?? NaN);
 const unique = (values) => [...new Set(values)];
 const byName = (a, b) => a.localeCompare(b, "en", { numeric: true, sensitivity: "base" }) || (a < b ? -1 : a > b ? 1 : 0);
-const mean = (values) => (values.length ? values.reduce((a, b) => a + b, 0) / values.length : NaN);
+/** Mean of the finite values; missing where a value is missing or none is finite. */
+function mean(values) {
+  const finite = values.filter(Number.isFinite);
+  return finite.length && !values.some(Number.isNaN) ? finite.reduce((a, b) => a + b, 0) / finite.length : NaN;
+}
 const groupKey = (run) => JSON.stringify([run.method, run.setting, run.options]);
 const measure = (key) => (Object.hasOwn(DATA.measures, key) ? DATA.measures[key] : { label: key, better: null, digits: 3 });
 const isTime = (key) => DATA.times.includes(key);
 
-/** Sample deviation; NaN for one value, or where one is not finite. */
-function spread(values) {
-  if (values.length < 2 || !values.every(Number.isFinite)) return NaN;
+/** Sample deviation of the finite values; NaN for fewer than two. */
+function spread(all) {
+  const values = all.filter(Number.isFinite);
+  if (values.length < 2) return NaN;
   const m = mean(values);
   return Math.sqrt(values.reduce((a, v) => a + (v - m) ** 2, 0) / (values.length - 1));
 }
@@ -77,11 +82,12 @@ function definedScenes(key, scenes) {
   return scenes.filter((s) => runs.some((r) => r.scene === s && !Number.isNaN(valueOf(r, key))));
 }
 
-/** Mean over seeds, then over scenes: {value, spread, seeds, low, high, comparable}; missing where a scene or a value is. */
+/** Mean over seeds, then over scenes: {value, spread, seeds, low, high, comparable, cells}; missing where a scene or a value is. */
 function summary(group, key, all) {
   const scenes = definedScenes(key, all);
   const runs = scenes.map((scene) => group.runs.filter((r) => r.scene === scene).sort((a, b) => a.seed - b.seed));
   const values = runs.map((of) => of.map((r) => valueOf(r, key)));
+  const flat = values.flat(), cells = { all: flat.length, finite: flat.filter(Number.isFinite).length };
   const value = mean(values.map(mean));
   const seeds = runs[0]?.map((r) => r.seed) ?? [];
   // Seed by seed, so that the spread is that of the number shown: needs the same seeds in every scene.
@@ -89,7 +95,7 @@ function summary(group, key, all) {
   const bySeed = same && !Number.isNaN(value) ? seeds.map((_, i) => mean(runs.map((of) => valueOf(of[i], key)))) : [];
   const comparable = !isTime(key) || runs.flat().every((r) => r.alone === true);
   const low = mean(values.map((v) => Math.min(...v))), high = mean(values.map((v) => Math.max(...v)));
-  return { value, spread: spread(bySeed), seeds: bySeed, comparable, low, high };
+  return { value, spread: spread(bySeed), seeds: bySeed, comparable, low, high, cells };
 }
 
 /** Whether a method is given exact masks or clean photos: such an oracle is not ranked. */
@@ -107,7 +113,7 @@ function rankable(found, summaries, key) {
 /** Rank 1, 2, 3 of each value, or null; equal in print is equal in rank. */
 function ranks(values, key) {
   const { better, digits } = measure(key);
-  const printed = values.map((v) => (Number.isFinite(v) ? Number(v.toFixed(digits)) : v));
+  const printed = values.map((v) => (Number.isFinite(v) ? Number(v.toFixed(digits)) : NaN));
   const known = printed.filter((v) => !Number.isNaN(v));
   if (!better || new Set(known).size < 2) return values.map(() => null);
   return printed.map((v) => {

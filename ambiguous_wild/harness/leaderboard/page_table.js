@@ -160,6 +160,13 @@ function drawNotes(runs, found, scenes, empty, columns) {
     const lacking = scenes.filter((s) => !g.runs.some((r) => r.scene === s));
     if (lacking.length) notes.push(`${g.method} (${g.about}) has no run on ${lacking.join(", ")}: no mean.`);
   }
+  for (const c of columns) {
+    for (const g of found) {
+      const { cells, value } = summary(g, c.key, scenes);
+      if (!Number.isNaN(value) && cells.finite < cells.all) notes.push(`${c.label} of ${g.method} (${g.about}): mean of ${cells.finite} of ${cells.all} runs, the others are not finite.`);
+    }
+  }
+  if (unique(found.map((g) => g.setting)).length > 1) notes.push("Entries differ in length, effects or protocol (under each name): a rank may be due to this and not to the method.");
   const timed = columns.filter((c) => isTime(c.key)).map((c) => c.label).join(", ");
   const shared = runs.filter((r) => r.alone === false).length, unknown = runs.filter((r) => r.alone === null).length;
   if (timed && (shared || unknown)) {

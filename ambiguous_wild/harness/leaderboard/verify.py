@@ -24,13 +24,16 @@ from ambiguous_wild.harness.leaderboard.reproduce import (
 )
 from ambiguous_wild.harness.measures import PARTIAL
 from ambiguous_wild.harness.running.cell import config_identity
+from ambiguous_wild.harness.running.choosing import mixed_tests
 from ambiguous_wild.harness.running.regions import find_regions
 from ambiguous_wild.harness.running.result_file import (
     FAILED,
+    MODEL,
     RESULT,
     ImageRow,
     RunConfig,
     RunResult,
+    check_model,
     metrics_of,
     read_result,
 )
@@ -41,7 +44,7 @@ from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.metrics import stats
 from ambiguous_wild.metrics.image import FULL_IMAGE, METRICS
 
-PLY = "point_cloud.ply"
+PLY = MODEL
 ENVIRONMENT = "env.json"
 RENDERS = Path("renders") / "test"
 # Lowest and highest value by the first word of a metric's name; PSNR of pictures in [0, 1] is not negative.
@@ -85,6 +88,11 @@ def verify(run: Path, scenes: Scenes, *, quick: bool = False) -> Verified:
     _check_identity(run, result, config)
     renders = _check_files(run, result, ours=not config["source"])
     scene = scenes.find(run, config)
+    mixed = str(result["facts"].get("test_photos") or ("" if scene is None else mixed_tests(scene)))
+    if mixed:
+        raise AwError(
+            f"{run}: {mixed}; build the scene with clean photos in test/ or --test-list FILE, and bench that"
+        )
     _check_values(run, result, photos=scene is not None)
     if scene is not None:
         half = config.get("protocol", "full") == "half"
@@ -211,6 +219,7 @@ def _check_files(run: Path, result: RunResult, *, ours: bool) -> dict[str, Path]
     unlisted = sorted({p.name for p in set((run / RENDERS).rglob("*.png")) - set(renders.values())})
     if unlisted:
         _partial(run, f"{shortlist(unlisted)} was rendered and {RESULT} does not list it")
+    check_model(run, result)
     model_mb = (run / PLY).stat().st_size / 1e6 if PLY in needed else None
     if model_mb is not None and (size is None or not math.isclose(size, model_mb, abs_tol=1e-6)):
         _changed(run, f"{PLY} is not of the size that {RESULT} says")

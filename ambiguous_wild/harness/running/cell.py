@@ -21,9 +21,9 @@ import numpy as np
 
 import ambiguous_wild
 from ambiguous_wild import __version__
-from ambiguous_wild.core import Scene
+from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import config_hash, flatten, to_plain
-from ambiguous_wild.harness.running.choosing import Chosen, scene_protocol
+from ambiguous_wild.harness.running.choosing import Chosen, mixed_tests, scene_protocol
 from ambiguous_wild.harness.running.result_file import (
     SCHEMA,
     Cost,
@@ -133,6 +133,22 @@ def scene_identity(scene: Scene) -> str:
     return config_hash({"files": known, "split": split})
 
 
+def refuse_other_scene(run: Path, scene: Path, now: str, known: str) -> None:
+    """Raise AwError if a scene is not in the state that a run saw.
+
+    Args:
+        run: its folder.
+        scene: the scene's folder.
+        now: `scene_identity` of the scene as it is.
+        known: that of the scene as the run saw it.
+    """
+    if now != known:
+        raise AwError(
+            f"{run} was measured on another state of {scene}: hash {known[:12]}, now {now[:12]}; restore the "
+            "scene, or name the folder of the right one"
+        )
+
+
 def _of_plain(scene: Scene) -> dict[str, Any]:
     """What stands for a plain COLMAP scene, which lists no hashes: cameras, points and photos."""
     cameras = [v.camera for v in scene.views]
@@ -231,6 +247,7 @@ class Cell:
             facts: of the method, its effects and the watchdog.
             cost: what it took.
         """
+        mixed = mixed_tests(self.scene)
         return {
             "schema": SCHEMA,
             "method": self.method.name,
@@ -242,7 +259,7 @@ class Cell:
             "per_image": list(per_image),
             "missing": dict(missing or {}),
             "masks": masks,
-            "facts": dict(facts or {}),
+            "facts": {**(facts or {}), **({"test_photos": mixed} if mixed else {})},
             "cost": cost or {},
             "config_hash": self.identity,
             "scene_hash": self.scene_id,

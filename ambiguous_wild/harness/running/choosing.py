@@ -47,8 +47,22 @@ def _evaluation(scene: Scene) -> Mapping[str, Any]:
     return known if isinstance(known, dict) else {}
 
 
-WORDS = ("default", "auto", "none", "all")
-PLANNED = ("default", "auto")  # the plan of the scene decides
+MIXED = "test photos may hold distractors"  # begins what results, tables and pages say of such a scene
+
+
+def mixed_tests(scene: Scene) -> str:
+    """What to say of a scene whose test photos nobody chose as clean; empty for every other.
+
+    Where `aw build-scene` is given no test photos, every 8th photo tests, and scene.json says so.
+    """
+    split = str(scene.info.get("split", ""))
+    if not split.startswith("every-"):
+        return ""
+    return f"{MIXED}: every {split.removeprefix('every-')}th photo tests, and what is in it counts as truth"
+
+
+WORDS = ("auto", "none", "all")
+NOT_OURS = "an external program takes none"  # why a method trains without the effects of its bench
 
 
 @dataclass(frozen=True)
@@ -86,39 +100,25 @@ def check_wanted(wanted: str) -> tuple[str, ...]:
     return check_effects(names)
 
 
-def chosen_by(planned: Sequence[str] | None, wanted: str, scene: Scene, method: MethodEntry) -> Chosen | None:
-    """What one method trains with where a plan decides; nothing is planned.
+def chosen_by(planned: Sequence[str], scene: Scene, method: MethodEntry) -> Chosen:
+    """What one method trains with under `--effects auto`: the same for all that can take effects.
 
     Args:
-        planned: effects that the plan of the scene calls for; None = there is no plan.
-        wanted: one of `PLANNED`.
+        planned: effects that the plan of the scene calls for.
         scene: the scene.
         method: the method.
-
-    Returns:
-        None where the method needs a plan and there is none.
 
     Raises:
         AwError: unknown effect.
     """
-    among = _allowed(wanted, method)
-    if among == ():
+    if not takes_effects(method):
         return Chosen()
-    if planned is None:
-        return None
-    found = [*planned, *published_effects(scene)]
-    return Chosen(check_effects(e for e in found if among is None or e in among), "auto")
+    return Chosen(check_effects([*planned, *published_effects(scene)]), "auto")
 
 
-def reads_plan(wanted: str, method: MethodEntry) -> bool:
-    """Whether a plan decides about anything where `--effects` says this."""
-    return wanted in PLANNED and _allowed(wanted, method) != ()
-
-
-def _allowed(wanted: str, method: MethodEntry) -> tuple[str, ...] | None:
-    """The effects among which a plan chooses; None = all."""
-    # a graft takes none: its name says all that it is made of
-    return None if wanted == "auto" else method.auto_effects
+def takes_effects(method: MethodEntry) -> bool:
+    """Whether the method trains on our trainer: effects are parts of that, and a program has its own."""
+    return method.program is None
 
 
 def describe(effects: Sequence[str]) -> str:

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 import torch
 
-from ambiguous_wild.core import Camera, Scene, View
+from ambiguous_wild.core import AwError, Camera, Scene, View
 from ambiguous_wild.harness.running.regions import Regions, find_regions, true_distractor
 from ambiguous_wild.harness.running.result_file import Cost, ImageRow, MaskScores, image_row
 from ambiguous_wild.io.atomic import atomic_dir
@@ -118,6 +118,23 @@ def render_and_measure(
             write_png(path, to_uint8(image.cpu().numpy()))
             rows.append(image_row(t.view.name, measures(t.view.name, read_png_rgb(path), t.photo, half=half)))
     return rows, measures.missing
+
+
+def refuse_empty(truth: Sequence[TestPhoto], folder: Path) -> None:
+    """Raise AwError if every render is of one colour and some photo is not: the model shows nothing.
+
+    Args:
+        truth: the test photos.
+        folder: of the renders.
+    """
+    renders = (read_png_rgb(folder / Path(t.view.name).with_suffix(".png")) for t in truth)
+    if any(np.ptp(t.photo, axis=(0, 1)).any() for t in truth) and not any(
+        np.ptp(render, axis=(0, 1)).any() for render in renders
+    ):
+        raise AwError(
+            f"all {len(truth)} test renders are of one colour: no Gaussian lies in front of the test "
+            "cameras; check poses, focal lengths, principal points and points of the scene"
+        )
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ import torch
 from ambiguous_wild.core import AwError, Camera, Scene, View
 from ambiguous_wild.harness.running import evaluate
 from ambiguous_wild.harness.running.cell import Cell
+from ambiguous_wild.harness.running.choosing import NOT_OURS
 from ambiguous_wild.harness.running.meter import Meter, cores, own_s
 from ambiguous_wild.harness.running.result_file import Cost, MaskScores, RunResult
 from ambiguous_wild.io.atomic import atomic_path
@@ -36,8 +37,6 @@ def run_program(cell: Cell, folder: Path) -> RunResult:
     program = cell.method.program
     if program is None:
         raise AwError(f"{cell.method.name} is no external method")
-    if cell.chosen.effects:
-        raise AwError(f"{cell.method.name} is an external program and takes no effects: use --effects none")
     check_program(cell)
     (folder / WORK).mkdir(exist_ok=True)
     task = Task(
@@ -61,11 +60,13 @@ def run_program(cell: Cell, folder: Path) -> RunResult:
     per_image, missing = evaluate.render_and_measure(
         drawn, truth, folder / "renders" / "test", half=cell.protocol == "half", scene=cell.scene
     )
+    evaluate.refuse_empty(truth, folder / "renders" / "test")
     return cell.result(
         per_image=per_image,
         missing=missing,
         masks=_masks(cell.scene, produced.masks, folder / "masks"),
         facts=dict(produced.facts)
+        | {"no_effects": NOT_OURS}
         | ({"drawn_by": "ambiguous_wild"} if produced.drawn_by_us else {})
         | ({} if cell.protocol == "full" else {"protocol": cell.protocol}),
         cost=cast(Cost, {"device": cell.device, **produced.cost, **time_cost, **_model(produced, folder)}),

@@ -20,12 +20,11 @@ from ambiguous_wild.harness.running.cell import (
     scene_identity,
 )
 from ambiguous_wild.harness.running.choosing import (
-    PLANNED,
     Chosen,
     check_wanted,
     chosen_by,
-    reads_plan,
     scene_protocol,
+    takes_effects,
 )
 from ambiguous_wild.harness.running.run import (
     left_alone,
@@ -101,7 +100,7 @@ def plan_cells(
         settings: "method.key=value" strings.
         device: "cpu" or "cuda".
         factor: which images_N; None = what the scene was built for.
-        effects: "none", "all", "auto", "default" (auto where the method lets it), or names of effects.
+        effects: "none", "all", "auto" or names of effects; the same for all methods that can take them.
         plan: of the one scene, where it was made before; None = made where one is needed.
         protocol: "full" measures whole test photos, "half" the right half; None = what scene.json says.
         probing: for plans that are made; None = the limits decide alone.
@@ -287,7 +286,7 @@ def choose(
     """What every method trains with on this scene, by its name.
 
     Args:
-        wanted: as `--effects` takes it; "default" is auto for the methods that allow effects, of those alone.
+        wanted: as `--effects` takes it; for all methods but external programs, which take no effects.
         scene: the scene.
         methods: the methods.
         plan: made before; None = made now if any method needs it.
@@ -299,13 +298,13 @@ def choose(
     named = check_wanted(wanted)
     if plan is not None and plan.scene != scene.name:
         raise AwError(f"the plan is of scene {plan.scene}, not of {scene.name}: run 'aw plan {scene.root}'")
-    if wanted not in PLANNED:
-        effects = ALL if wanted == "all" else named
-        return {m.name: Chosen(effects, "" if wanted == "none" else wanted) for m in methods}
-    if plan is None and any(reads_plan(wanted, method) for method in methods):
+    if wanted != "auto":
+        asked = Chosen(ALL if wanted == "all" else named, "" if wanted == "none" else wanted)
+        return {m.name: asked if takes_effects(m) else Chosen() for m in methods}
+    if plan is None and any(map(takes_effects, methods)):
         plan = _make_plan(scene, probing)
-    found = None if plan is None else plan.effects()
-    chosen = {m.name: chosen_by(found, wanted, scene, m) or Chosen() for m in methods}
+    found = () if plan is None else plan.effects()
+    chosen = {m.name: chosen_by(found, scene, m) for m in methods}
     return {name: dataclasses.replace(c, plan=plan if c.asked else None) for name, c in chosen.items()}
 
 

@@ -20,6 +20,7 @@ from msgspec import Meta
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.atomic import write_json
+from ambiguous_wild.io.hashing import sha256_file
 
 Status = Literal["ok", "failed"]
 NotNegative = Annotated[float, Meta(ge=0.0)]
@@ -159,6 +160,7 @@ class RunResult(TypedDict):
     code_hash: NotRequired[str]
     reproduce: NotRequired[str]
     rescored: NotRequired[list[Rescore]]
+    model_sha256: NotRequired[str]  # of point_cloud.ply; also absent where the run has none
 
 
 class SceneConfig(TypedDict):
@@ -228,6 +230,24 @@ def read_result(path: Path | str) -> RunResult:
     except (OSError, ValueError, RecursionError) as error:
         raise AwError(f"{path} is damaged ({error}); run 'aw bench' again to replace it") from None
     return _checked(data, str(path))
+
+
+MODEL = "point_cloud.ply"
+
+
+def model_hash(run: Path) -> dict[str, str]:
+    """`model_sha256` of a run's folder; empty where it has no model."""
+    return {"model_sha256": sha256_file(run / MODEL)} if (run / MODEL).is_file() else {}
+
+
+def check_model(run: Path, result: RunResult) -> None:
+    """Raise AwError if the run's model is not the one that was measured; earlier versions kept no hash."""
+    known = result.get("model_sha256")
+    if known is not None and model_hash(run).get("model_sha256") != known:
+        raise AwError(
+            f"{run / MODEL} is not the model that was measured (another hash than in {RESULT}): restore it, "
+            "or train again with --overwrite always"
+        )
 
 
 def _checked(data: Any, where: str) -> RunResult:

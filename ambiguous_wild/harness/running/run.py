@@ -23,7 +23,7 @@ from ambiguous_wild.harness.running.cell import (
     provenance,
 )
 from ambiguous_wild.harness.running.external import run_program
-from ambiguous_wild.harness.running.result_file import FAILED, RESULT, read_result, write_result
+from ambiguous_wild.harness.running.result_file import FAILED, RESULT, model_hash, read_result, write_result
 from ambiguous_wild.harness.running.training import Tick, train_and_measure
 from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.atomic import sweep, write_json, write_text
@@ -167,7 +167,7 @@ def _run(cell: Cell, folder: Path, options: RunOptions, tick: Tick | None) -> Ce
                 result = run_program(cell, folder)
             else:
                 result = train_and_measure(cell, folder, options, tick)
-            write_result(folder / RESULT, {**result, **provenance(cell)})
+            write_result(folder / RESULT, {**result, **model_hash(folder), **provenance(cell)})
         except Exception as error:
             record_failure(cell, folder, error)
             raise

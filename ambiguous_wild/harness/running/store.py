@@ -12,6 +12,7 @@ from typing import Any
 import pandas as pd
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.core.config import flatten
 from ambiguous_wild.harness.measures import PARTIAL
 from ambiguous_wild.harness.running.result_file import FAILED, RESULT, RunResult, metrics_of, read_result
 from ambiguous_wild.harness.running.timing import timing_of
@@ -22,7 +23,8 @@ MASK_SCORES = ("iou", "precision", "recall")
 # Columns of `Runs.runs` that hold words, beside scene and method.
 TEXT_OF_RUNS = (
     "status", "error", "folder", "device", "version", "config_hash", "scene_hash", "timing", "timing_reason",
-    "timing_kernel", "hardware",
+    "timing_kernel", "hardware", "effects", "length", "features",
+    "test_photos",
 )  # fmt: skip
 FoundResult = tuple[Path, RunResult]  # of this run folder
 
@@ -43,7 +45,9 @@ class Runs:
 
     images: one row per run, image and metric: scene, method, seed, image, metric, value (NaN = missing).
     runs: one row per run: scene, method, seed, status, error, folder, images, config_hash, scene_hash,
-        version, fit (what was done with test photos, see tables/notes.py), device, the numbers of "cost",
+        version, fit (what was done with test photos, see tables/notes.py), effects, length and features that
+        it was trained with (words; empty features: the method has none), test_photos (what is wrong with
+        them; empty: nothing that is known), device, the numbers of "cost",
         timing ("alone", "contended", "unknown"), timing_reason, timing_kernel, hardware, and mask_iou,
         mask_precision, mask_recall.
     missing: one row per run and missing metric: scene, method, seed, metric, reason.
@@ -172,6 +176,10 @@ def _run_row(run: Path, result: RunResult) -> dict[str, Any]:
             "scene_hash": result["scene_hash"],
             "version": result["version"],
             "fit": _fit(result["facts"]),
+            "effects": effects_of(result["facts"]),
+            "length": _length(read_config(run)),
+            "test_photos": str(result["facts"].get("test_photos", "")),
+            "features": _features(result["options"]),
         }
         | {"folder": str(run), "images": len(result["per_image"])}
         | cost
@@ -179,6 +187,29 @@ def _run_row(run: Path, result: RunResult) -> dict[str, Any]:
         | {"hardware": _hardware(result)}
         | {f"mask_{k}": math.nan if masks.get(k) is None else masks[k] for k in MASK_SCORES}
     )
+
+
+def effects_of(facts: Mapping[str, Any]) -> str:
+    """The effects that a run was trained with, in words."""
+    names = facts.get("effects")
+    if facts.get("no_effects"):
+        return f"none: {facts['no_effects']}"
+    return ", ".join(map(str, names)) if isinstance(names, list) and names else "none"
+
+
+def _length(config: Mapping[str, Any]) -> str:
+    """What the run was asked for, "60 s" or "2000 iterations"; empty where no config.yaml says it."""
+    train = config.get("train")
+    known = train if isinstance(train, dict) else {}
+    if known.get("budget_s") is not None:
+        return f"{known['budget_s']:g} s"
+    return f"{known['iterations']} iterations" if "iterations" in known else ""
+
+
+def _features(options: Mapping[str, Any]) -> str:
+    """Options that are called `features`, whichever part of the method has them."""
+    known = {str(v) for key, v in flatten(options).items() if key.rpartition(".")[2] == "features"}
+    return ", ".join(sorted(known))
 
 
 def _hardware(result: RunResult) -> str:

@@ -296,9 +296,20 @@ def _make_trainer(
     # Frozen inputs, instance masks and identities are part of what a method costs.
     trainer.setup_s = time.perf_counter() - before
     trainer.meter = Meter.of(cell.device)
+    trainer.whose = {
+        "hash": cell.identity,
+        "about": f"{cell.method.name} on {cell.scene.name}, {length(cell)}",
+    }
     if first is not None:
         trainer.timeline.before_s = first.cost["train_s"]
     return trainer
+
+
+def length(cell: Cell) -> str:
+    """Seed and length of a run, in words."""
+    train = cell.train
+    asked = f"{train.iterations} iterations" if train.budget_s is None else f"{train.budget_s:g} s"
+    return f"seed {train.seed}, {asked}"
 
 
 def _train_and_measure(
@@ -324,6 +335,7 @@ def _train_and_measure(
     except Stopped:
         raise Stopped(_keep_stopped(cell, trainer, truth)) from None
     shutil.rmtree(folder / STOPPED, ignore_errors=True)
+    trainer.check_taught()
     cost = cost_of(cell, trainer)  # now: what follows measures, and is no training
     if first is not None:
         cost = both_passes(first.cost, cost)
@@ -333,6 +345,7 @@ def _train_and_measure(
     per_image, missing = evaluate.render_and_measure(
         trainer, truth, folder / "renders" / "test", half=cell.protocol == "half", scene=cell.scene
     )
+    evaluate.refuse_empty(truth, folder / "renders" / "test")
     masks = evaluate.write_masks(trainer, folder / "masks")
     if recorder is not None:
         pictures_of_training.draw_all(trainer, recorder, folder)

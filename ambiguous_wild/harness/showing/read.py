@@ -12,7 +12,9 @@ from typing import Any
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import from_plain
 from ambiguous_wild.core.errors import shortlist, unknown
-from ambiguous_wild.harness.running.result_file import RESULT, metrics_of, read_result
+from ambiguous_wild.harness.running.cell import refuse_other_scene, scene_identity
+from ambiguous_wild.harness.running.choosing import mixed_tests
+from ambiguous_wild.harness.running.result_file import MODEL, RESULT, check_model, metrics_of, read_result
 from ambiguous_wild.harness.running.store import CONFIG, read_config, run_folders
 from ambiguous_wild.io.ply import splat_count
 from ambiguous_wild.io.scene_folder import load_scene
@@ -21,7 +23,6 @@ from ambiguous_wild.methods.registry import get_method
 from ambiguous_wild.viewing.model import Look, Model
 from ambiguous_wild.viewing.page_file import MOST_GAUSSIANS, Page, check_page_folder, page_text, write_page
 
-PLY = "point_cloud.ply"
 MASKS = "masks"
 
 
@@ -74,7 +75,9 @@ def read_models(
         )
     if any(f.half for f in found):
         notes.append("PSNR of runs with --protocol half is that of the right half of each test photo")
-    return Shown(open_scene(found[0].run, scene_folder), tuple(f.model for f in found), tuple(notes))
+    opened = open_scene(found[0].run, scene_folder)
+    notes += [mixed] if (mixed := mixed_tests(opened)) else []
+    return Shown(opened, tuple(f.model for f in found), tuple(notes))
 
 
 def find_models(paths: Sequence[Path]) -> tuple[list[Found], list[str]]:
@@ -104,7 +107,7 @@ def find_models(paths: Sequence[Path]) -> tuple[list[Found], list[str]]:
                 notes.append(found[-1].note)
     if not found:
         why = f" ({notes[0]})" if notes else ""
-        raise AwError(f"no finished run with a {PLY} below {shortlist(map(str, paths))}{why}")
+        raise AwError(f"no finished run with a {MODEL} below {shortlist(map(str, paths))}{why}")
     return _with_labels(found), notes
 
 
@@ -114,10 +117,10 @@ def open_scene(run: Path, folder: Path | None = None, *, verify: bool = True) ->
     Args:
         run: its folder.
         folder: where the scene lies; None = where the run says.
-        verify: whether its files are compared with their hashes.
+        verify: whether its files are compared with their hashes, and the scene with the one that the run saw.
 
     Raises:
-        AwError: it is not there, or damaged.
+        AwError: it is not there, damaged, or another state of the scene than the run saw.
     """
     asked = read_config(run).get("scene")
     if not isinstance(asked, dict):
@@ -129,17 +132,21 @@ def open_scene(run: Path, folder: Path | None = None, *, verify: bool = True) ->
             "('aw view', 'aw video' and 'aw export' take its folder: --scene-folder)"
         )
     factor = asked.get("factor")
-    return load_scene(path, factor=factor if isinstance(factor, int) else None, verify=verify)
+    scene = load_scene(path, factor=factor if isinstance(factor, int) else None, verify=verify)
+    if verify:
+        refuse_other_scene(run, path, scene_identity(scene), str(asked.get("sha256")))
+    return scene
 
 
 def _found(run: Path) -> Found:
     result = read_result(run / RESULT)
     if result["status"] != "ok":
         raise AwError(f"{run} failed: {result['error']}")
-    ply = run / PLY
+    ply = run / MODEL
     if not ply.is_file():
-        raise AwError(f"{run} has no {PLY}: an external program may keep its model elsewhere")
+        raise AwError(f"{run} has no {MODEL}: an external program may keep its model elsewhere")
     splat_count(ply)
+    check_model(run, result)
     config = read_config(run)
     look, note = read_look(config)
     psnr = {row["name"]: metrics_of(row).get("psnr") for row in result["per_image"]}

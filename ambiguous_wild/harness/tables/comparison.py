@@ -80,10 +80,28 @@ def comparison(
         )
         for scene, of in rows.items()
     ]
+    tables = [_with_effects(table, runs.runs) for table in tables]
     tables[-1] = replace(tables[-1], continued=False).with_notes(
         *notes(runs, columns, methods, chosen), *_undefined(columns, chosen, defined)
     )
     return _without_empty(tables) if drop_empty or (drop_empty is None and not metrics) else tables
+
+
+EFFECTS = Measure("effects", "effects", None, 0, per_image=False)
+
+
+def _with_effects(table: Table, frame: pd.DataFrame) -> Table:
+    """The table with a column of what each row was trained with, where the rows of a scene differ in that."""
+    done = frame[frame["status"] == "ok"]
+    if not any(of["effects"].nunique() > 1 for _, of in done.groupby("scene")):
+        return table
+    here = done[done["scene"] == table.columns[0].scene] if table.columns[0].scene else done
+    rows = []
+    for row in table.rows:
+        names = " or ".join(dict.fromkeys(here[here["method"] == row.name]["effects"]))
+        rows.append(replace(row, cells=(*row.cells, Cell(printed=names) if names else Cell(state="missing"))))
+    column = Column("", EFFECTS, table.columns[0].scene, words=True)
+    return replace(table, columns=(*table.columns, column), rows=tuple(rows))
 
 
 def _without_empty(tables: list[Table]) -> list[Table]:
@@ -184,7 +202,10 @@ def _scene_row(index: _Index, method: str, scene: str, columns: tuple[Measure, .
             images = index.images[method, scene, column.key].pivot_table(
                 index="image", columns="seed", values="value", aggfunc="mean", dropna=False
             )
-            interval = stats.bootstrap_interval(images.to_numpy().mean(axis=1))
+            means = images.to_numpy().mean(axis=1)
+            interval = stats.bootstrap_interval(
+                means[np.isfinite(means)] if np.isfinite(means).any() else means
+            )
             low, high = interval.low, interval.high
         cells.append(Cell(value, stats.spread(values), low, high))
     ranked = (method, scene) not in index.unfinished and not knows_truth(method)
@@ -248,10 +269,12 @@ def _why_unranked(row: Row) -> str:
     return "knows the truth, not ranked" if knows_truth(row.name) else "unfinished, not ranked"
 
 
-COLUMNS = ("scene", "method", "seed", "image", "metric", "value", "better", "reason", "config_hash")
+COLUMNS = ("scene", "method", "seed", "image", "metric", "value", "better", "reason", "config_hash",
+           "effects", "length")  # fmt: skip
 _KEYS = ["scene", "method", "seed"]
+_OF_RUN = ["config_hash", "effects", "length"]
 _NO_NUMBER = {*_KEYS, "images", *TEXT_OF_RUNS}
-_TEXT = ("scene", "method", "image", "metric", "better", "reason", "config_hash")
+_TEXT = ("scene", "method", "image", "metric", "better", "reason", *_OF_RUN)
 
 
 def tidy(runs: Runs, *, metrics: Sequence[str] = (), scenes: Sequence[str] = ()) -> pd.DataFrame:
@@ -274,7 +297,7 @@ def tidy(runs: Runs, *, metrics: Sequence[str] = (), scenes: Sequence[str] = ())
     frame = _only(_only(frame, "metric", metrics), "scene", scenes)
     frame["better"] = frame["metric"].map(lambda key: measure(str(key)).better or "")
     if len(runs.runs):  # no finished run: there are neither rows nor hashes
-        frame = frame.merge(runs.runs[[*_KEYS, "config_hash"]], on=_KEYS, how="left")
+        frame = frame.merge(runs.runs[[*_KEYS, *_OF_RUN]], on=_KEYS, how="left")
     frame = frame.reindex(columns=list(COLUMNS)).fillna(dict.fromkeys(_TEXT, ""))
     return frame.sort_values([*_KEYS, "image"], kind="stable", ignore_index=True)
 

@@ -26,6 +26,8 @@ def notes(
 ) -> tuple[str, ...]:
     """One line a fact, the gravest first."""
     return (
+        *unequal(runs.runs),
+        *_mixed(runs.runs),
         *_failed(runs),
         *_absent(runs, methods, scenes),
         *(f"incomplete: {i.folder}: {i.reason}" for i in runs.incomplete),
@@ -33,10 +35,58 @@ def notes(
         *_oracles(methods),
         *_fitted(runs),
         *_missing(runs, columns),
+        *_infinite(runs, columns),
         *_not_comparable(runs, columns),
         *_about(runs, methods),
         *time_notes(runs.runs, columns),
     )
+
+
+UNEQUAL = "not comparable"  # begins a note that every format shows where it shows ranks
+CONDITIONS = {
+    "effects": "effects",
+    "length": "length",
+    "fit": "protocol",
+    "features": "features",
+}
+
+
+def unequal(frame: pd.DataFrame) -> list[str]:
+    """A line for each condition that differs between the methods of a scene, and one for what all share.
+
+    Args:
+        frame: `Runs.runs`.
+    """
+    done = frame[frame["status"] == "ok"]
+    lines = []
+    for column, what in CONDITIONS.items():
+        if column not in done:
+            continue
+        known = done[done[column].astype(str) != ""]  # a method without features is not another condition
+        apart = [scene for scene, of in known.groupby("scene") if of[column].astype(str).nunique() > 1]
+        if apart:
+            rows = known[known["scene"].isin(apart)].groupby("method")[column]
+            each = [f"{method}: {_shared(values)}" for method, values in rows]
+            lines.append(
+                f"{UNEQUAL}: {what} differ on {shortlist(map(str, apart))}: {shortlist(each, limit=12)}; a "
+                "rank may be due to this and not to the method"
+            )
+        elif column == "effects" and len(known):
+            scenes = known.groupby("scene")[column].first()
+            each = [f"{names} ({shortlist(of.index)})" for names, of in scenes.groupby(scenes)]
+            all_of = str(scenes.iloc[0]) if len(each) == 1 else "; ".join(each)
+            lines.append(f"all methods trained with effects: {all_of}")
+    return lines
+
+
+def _mixed(frame: pd.DataFrame) -> list[str]:
+    """A line for each reason to doubt test photos, with the scenes."""
+    rows = frame[(frame["status"] == "ok") & (frame["test_photos"] != "")]
+    return [f"{reason} ({shortlist(sorted(set(of['scene'])))})" for reason, of in rows.groupby("test_photos")]
+
+
+def _shared(values: pd.Series) -> str:
+    return " or ".join(dict.fromkeys(map(str, values)))
 
 
 def _failed(runs: Runs) -> list[str]:
@@ -143,18 +193,30 @@ def _missing(runs: Runs, columns: Sequence[Measure]) -> list[str]:
     return lines
 
 
+def _infinite(runs: Runs, columns: Sequence[Measure]) -> list[str]:
+    """One line a metric, method and scene of whose mean some values are no part."""
+    rows = runs.images[runs.images["metric"].isin([c.key for c in columns])]
+    lines = []
+    for (metric, method, scene), of in rows.groupby(["metric", "method", "scene"]):
+        finite = int(np.isfinite(of["value"].dropna()).sum())
+        if finite < of["value"].notna().sum():
+            count = f"{finite} of {len(of)} values"
+            lines.append(f"{metric} of {method} on {scene}: mean of {count}, the others are not finite")
+    return lines
+
+
 def _not_comparable(runs: Runs, columns: Sequence[Measure]) -> list[str]:
     lines = []
     ok = runs.runs[runs.runs["status"] == "ok"]
     for scene, group in ok.groupby("scene"):
         if group["scene_hash"].nunique() > 1:
             lines.append(
-                f"not comparable: results for {scene} come from {group['scene_hash'].nunique()} versions of "
+                f"{UNEQUAL}: results for {scene} come from {group['scene_hash'].nunique()} versions of "
                 "the scene (scene_hash differs); run them again on one"
             )
         images = runs.images[runs.images["scene"] == scene].groupby(["method", "seed"])["image"]
         if len({frozenset(names) for _, names in images}) > 1:
-            lines.append(f"not comparable: methods were measured on different test images of {scene}")
+            lines.append(f"{UNEQUAL}: methods were measured on different test images of {scene}")
     if "iterations" in ok:
         lengths = ok["iterations"].astype(float)
         longest = lengths[np.isfinite(lengths)].groupby(ok["method"]).max()

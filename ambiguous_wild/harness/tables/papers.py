@@ -22,6 +22,12 @@ LPIPS = ("lpips_alex", "lpips_vgg", "lpips_vgg_01")
 MEMORY = ("model_mb",)
 
 
+def in_blocks(runs: Runs, *, metrics: Sequence[str] = (), scenes: Sequence[str] = ()) -> list[Table]:
+    """Tables of `comparison`, a table a scene, with the cells marked that do not differ from the best."""
+    tables = comparison(runs, metrics=metrics, scenes=scenes)
+    return Ties(runs).marked(tables, [table.title for table in tables if table.columns[0].scene])
+
+
 def paper(
     runs: Runs,
     *,
@@ -95,8 +101,17 @@ def side_by_side(title: str, tables: Sequence[tuple[str, Table]], *, dataset: st
         tables: (heading of its columns, table), from the left; their notes are left out.
         dataset: that the scenes belong to.
     """
-    columns = [replace(c, group=group, dataset=dataset) for group, table in tables for c in table.columns]
-    rows = []
+    shown, rows = [], []
+    for number, (group, table) in enumerate(tables, start=1):
+        # words about a row stand once, at its end
+        own = [i for i, c in enumerate(table.columns) if not c.words or number == len(tables)]
+        shown.append((group, table.picked(own)))
+    tables = shown
+    columns = [
+        replace(c, group="" if c.words else group, dataset=dataset)
+        for group, table in tables
+        for c in table.columns
+    ]
     for same in zip(*(table.rows for _, table in tables)):
         note = next((row.note for row in same if row.note), "")
         rows.append(Row(same[0].name, tuple(cell for row in same for cell in row.cells), note=note))
@@ -233,8 +248,8 @@ class Ties:
             if best not in values or other not in values:
                 return False
             a, b = values[best].to_numpy(float), values[other].to_numpy(float)
-            with np.errstate(invalid="ignore"):  # inf less inf: both are perfect
-                differences.append(np.where(a == b, 0.0, a - b))
+            finite = ~(np.isinf(a) | np.isinf(b))  # what enters no mean decides no difference of means
+            differences.append((a - b)[finite])
         low, high = difference_interval(differences)
         return low <= 0.0 <= high
 

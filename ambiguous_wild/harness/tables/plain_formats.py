@@ -269,13 +269,21 @@ def to_long_csv(tables: Sequence[Table]) -> str:
 def to_wide_csv(tables: Sequence[Table]) -> str:
     """One row a scene and method; the mean has an empty scene. The tables have the same columns.
 
-    For every column: the mean, `_std` over seeds, and for image metrics of one scene `_low` and `_high`,
-    the 95 % bootstrap interval over its test images.
+    For every column: the mean, `_std` over seeds, and for image metrics `_low` and `_high`, the 95 %
+    bootstrap interval over the test images of one scene, and `_tied`, yes where not told from the best.
     """
     head = ["scene", "method", "status", "runs"]
     for column in tables[0].columns:
         key = column.measure.key
-        head += [key, f"{key}_std", *([f"{key}_low", f"{key}_high"] if column.measure.per_image else [])]
+        head += (
+            [key]
+            if column.words
+            else [
+                key,
+                f"{key}_std",
+                *([f"{key}_low", f"{key}_high", f"{key}_tied"] if column.measure.per_image else []),
+            ]
+        )
     rows = (
         [table.columns[0].scene, row.name, _status(row), row.runs, *_wide_values(table, row)]
         for table in tables
@@ -284,9 +292,16 @@ def to_wide_csv(tables: Sequence[Table]) -> str:
     return to_csv(head, rows, number=shortest)
 
 
-def _wide_values(table: Table, row: Row) -> Iterator[float]:
+def _wide_values(table: Table, row: Row) -> Iterator[float | str]:
     for column, cell in zip(table.columns, row.cells):
-        yield from (cell.value, cell.spread, *((cell.low, cell.high) if column.measure.per_image else ()))
+        if column.words:
+            yield cell.printed
+            continue
+        yield from (
+            cell.value,
+            cell.spread,
+            *((cell.low, cell.high, "yes" if cell.tie else "") if column.measure.per_image else ()),
+        )
 
 
 def _status(row: Row) -> str:
@@ -297,8 +312,8 @@ def _status(row: Row) -> str:
 WIDTH = 100
 # What is shown first; what is not listed comes after, in the order of the table.
 FIRST = (
-    "psnr", "lpips_alex", "train_s", "ssim", "mask_iou", "psnr_covered", "gaussians", "lpips_vgg", "flip",
-    "fps", "model_mb",
+    "psnr", "effects", "lpips_alex", "train_s", "ssim", "mask_iou", "psnr_covered", "gaussians", "lpips_vgg",
+    "flip", "fps", "model_mb",
 )  # fmt: skip
 
 

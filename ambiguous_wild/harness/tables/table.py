@@ -163,8 +163,8 @@ def text_table(
 
 
 def ranks(values: Sequence[float], measure: Measure) -> list[int | None]:
-    """First, second and third of a column; equal in print = equal rank; NaN has none."""
-    shown = [math.nan if math.isnan(v) else round(v, measure.digits) for v in values]
+    """First, second and third of a column; equal in print = equal rank; what is not finite has none."""
+    shown = [round(v, measure.digits) if math.isfinite(v) else math.nan for v in values]
     known = [v for v in shown if not math.isnan(v)]
     if measure.better is None or len(set(known)) < 2:
         return [None] * len(values)

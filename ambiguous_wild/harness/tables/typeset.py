@@ -6,11 +6,14 @@ from collections.abc import Sequence
 from html import escape
 
 from ambiguous_wild.harness.measures import Measure
+from ambiguous_wild.harness.running.choosing import MIXED
+from ambiguous_wild.harness.tables.notes import UNEQUAL
 from ambiguous_wild.harness.tables.plain_formats import plain
 from ambiguous_wild.harness.tables.table import TIE, Cell, Row, Table
 
 NEEDS = "% needs \\usepackage{booktabs,graphicx} and \\usepackage[table]{xcolor}"
 COLORS = (("awfirst", "1,0.75,0.75"), ("awsecond", "1,0.87,0.72"), ("awthird", "1,0.98,0.72"))
+APPROX = r"$\approx$"
 WIDE = 3  # a table of more columns spans both columns of text
 FIT = (
     "\\resizebox{\\ifdim\\width>\\linewidth\\linewidth\\else\\width\\fi}{!}{%"  # shrunk only where it must be
@@ -78,7 +81,19 @@ def _tabular(table: Table) -> list[str]:
             ]
             before = row.kind
         lines.append(_latex_row(table, row))
-    return [*lines, "\\bottomrule", "\\end{tabular}}"]
+    # the other notes are comments: these say what a printed rank is worth
+    below = [note for note in table.notes if note.startswith((UNEQUAL, MIXED))]
+    if not table.title and any(cell.tie for cell in table.cells):  # there is no caption that says it
+        below.append(f"{TIE}: not significantly different from the best (paired bootstrap, 95 %).")
+    width = f"\\multicolumn{{{len(table.columns) + 1}}}{{p{{\\linewidth}}}}"
+    lines += [
+        "\\bottomrule",
+        *(
+            f"{width}{{\\footnotesize {latex_text(note).replace(latex_text(TIE), APPROX)}}} \\\\"
+            for note in below
+        ),
+    ]
+    return [*lines, "\\end{tabular}}"]
 
 
 def _caption(table: Table) -> str:

@@ -91,9 +91,8 @@ class Run(ABC):
         self.meter: Meter | None = None
         self._marks: tuple[int, int] | None = None  # probes and rows that were due after the last step
         self.setup_s = 0.0  # seconds before the first step, of the process that began the run
-        self.whose: dict[
-            str, str
-        ] = {}  # "hash" of the run's configuration and "about", its name; {} = not known
+        # "hash" of the run's configuration and "about", its name; empty = not known
+        self.whose: dict[str, str] = {}
         self.iteration = 0
         self.timeline = Timeline()
         self._skipped: set[int] = set()  # views that were all masked at some step

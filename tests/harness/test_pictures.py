@@ -14,7 +14,6 @@ from ambiguous_wild.harness.pictures.training import (
     CELL,
     MOMENTS,
     ROWS,
-    VIEWS,
     Recorder,
     draw_all,
     draw_density,
@@ -84,7 +83,6 @@ def test_every_picture_is_there_a_row_a_moment(watched):
     picture = read_png_rgb(folder / "pictures" / "training_train_0.png")
     row = sheets.BAR + sheets.GAP + round(HEIGHT * CELL / WIDTH)
     assert picture.shape == (len(MOMENTS) * row, 8 * (CELL + sheets.GAP), 3)
-    assert VIEWS == 3
 
 
 def test_a_run_that_stopped_has_the_pictures_of_one_that_did_not(scene, watched, tmp_path):

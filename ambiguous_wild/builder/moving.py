@@ -32,6 +32,7 @@ LEAST_FITTING = 0.25  # of a photo's partners must share a motion that fits its 
 AROUND, THROUGH, BEHIND = 12, 0.02, 1.2
 LEAST_THROUGH = 2  # photos that see through a point
 NEIGHBOURS = 0.05  # of the longer side: points that are seen through and lie as near are of one thing
+LEAST_OF_THING = 3  # points
 
 
 @dataclass
@@ -144,13 +145,10 @@ def motion_points(
     voters = {k: names[name] for k, name in enumerate(matched.names) if name in names}
     rays, found = matched.rays(), {}
     for photo, votes in count_votes(matched, poses, voters).items():
-        behind = through.get(photo, np.zeros_like(votes.moving))
-        gone = np.flatnonzero(behind >= LEAST_THROUGH)
-        votes.moving[gone] += behind[gone]
         reach = NEIGHBOURS * max(matched.cameras[photo].width, matched.cameras[photo].height)
-        if len(gone):
-            together = cKDTree(matched.features[photo][gone]).query_pairs(reach, output_type="ndarray")
-            votes.motions += list(gone[together])
+        for thing in _things(matched.features[photo], through.get(photo, np.zeros(0)), reach):
+            votes.moving[thing] += through[photo][thing]
+            votes.motions.append(thing)
         camera = pinholes[voters[photo]]
         fx, fy, cx, cy = camera.pinhole()
         xy = (rays[photo] * [fx, fy] + [cx, cy]) / [camera.width, camera.height]
@@ -166,6 +164,23 @@ def motion_points(
             xy[some].astype(np.float32), static[some], moving[some], motion[some]
         )
     return found
+
+
+def _things(features: np.ndarray, through: np.ndarray, reach: float) -> list[np.ndarray]:
+    """Features of each thing that photos see through; a single one is rather a point at a wrong depth.
+
+    Args:
+        features: [N, 2] px.
+        through: [N] photos, of `seen_through`; empty = nothing is known.
+        reach: px between neighbours of one thing.
+    """
+    gone = np.flatnonzero(through >= LEAST_THROUGH)
+    if not len(gone):
+        return []
+    links = cKDTree(features[gone]).query_pairs(reach, output_type="ndarray").T
+    graph = coo_matrix((np.ones(links.shape[1]), links), (len(gone), len(gone)))
+    group = connected_components(graph, directed=False)[1]
+    return [gone[group == k] for k in np.flatnonzero(np.bincount(group) >= LEAST_OF_THING)]
 
 
 def write_motion(

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from ambiguous_wild import __version__
-from ambiguous_wild.cli.main import COMMANDS
+from ambiguous_wild.cli.main import COMMANDS, SECTIONS
 from tests.command_line import aw
 
 
@@ -27,6 +27,18 @@ def test_help_lists_every_command_and_version_prints() -> None:
     assert __version__ in typed("--version").stdout
     wrong = typed("tabel")
     assert wrong.returncode == 2 and wrong.stderr.startswith("error: ") and wrong.stdout == ""
+
+
+def test_every_command_is_in_one_section() -> None:
+    assert sorted(name for names in SECTIONS.values() for name in names) == sorted(COMMANDS)
+
+
+@pytest.mark.parametrize("words", [(), ("study",), ("leaderboard",), ("weights",)])
+def test_a_group_alone_prints_its_help(words: tuple[str, ...]) -> None:
+    done = typed(*words)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout == typed(*words, "--help").stdout
+    assert done.stdout.count("\n") > 5
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -53,7 +53,7 @@ def test_every_command_has_help(name: str) -> None:
     ("words", "expected"),
     [
         (["tabel"], "did you mean 'table'?"),
-        (["table"], "Missing argument 'RUNS'"),
+        (["table"], "Missing argument 'RUNS...'"),
         (["table", "nowhere"], "no folder of runs nowhere"),
         (["table", ".", "--format", "pdf"], "pdf"),
         (["methods", "--plugin", "mine.py"], "no plugin file mine.py"),

@@ -51,6 +51,19 @@ COMMANDS = {
     "methods": ("methods", "List the methods; with a name, show one in full."),
 }
 
+# Heading of `aw --help` -> its commands, in the order of the work.
+SECTIONS = {
+    "Photos": (
+        "simulate", "composite", "capture", "screen", "build-scene", "import", "fetch", "export-scene",
+        "ambiguity-report",
+    ),
+    "Train": ("plan", "bench", "ablate", "methods", "weights", "doctor"),
+    "Compare": ("table", "cost", "study"),
+    "Look": ("view", "video", "export"),
+    "Publish": ("leaderboard", "package"),
+    "For maintainers": ("stress", "rescore", "audit", "verify"),
+}  # fmt: skip
+
 
 class _LazyGroup(click.Group):
     def list_commands(self, ctx: click.Context) -> list[str]:
@@ -69,8 +82,9 @@ class _LazyGroup(click.Group):
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        with formatter.section("Commands"):
-            formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
+        for heading, names in SECTIONS.items():
+            with formatter.section(heading):
+                formatter.write_dl([(name, COMMANDS[name][1]) for name in names])
 
 
 @click.command(
@@ -94,6 +108,8 @@ def main() -> None:
         cli.main(standalone_mode=False)
     except AwError as error:
         _fail(str(error))
+    except click.exceptions.NoArgsIsHelpError as error:  # `aw`, `aw study`: a question, not a mistake
+        click.echo(error.format_message())
     except click.ClickException as error:
         _fail(_click_message(error))
     except (click.Abort, KeyboardInterrupt) as interrupt:

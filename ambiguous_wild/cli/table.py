@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import shlex
+import shutil
 import sys
 from collections import Counter
 from collections.abc import Sequence
@@ -21,13 +22,19 @@ if TYPE_CHECKING:
     from ambiguous_wild.harness.tables.table import Table
 
 STYLES = ("text", "markdown", "csv", "latex", "html", "tidy")
+# Suffix of -o -> format.
+SUFFIXES = {
+    ".txt": "text", ".md": "markdown", ".csv": "csv", ".tex": "latex", ".html": "html", "": "text"
+}  # fmt: skip
 SHEETS = (".png", ".jpg")
 LAYOUTS = ("blocks", "paper", "means", "memory", "ablation")
 
 
 @click.command(name="table")
-@click.argument("runs", type=PathName())
-@click.option("--format", "style", type=click.Choice(STYLES), default="text", show_default=True)
+@click.argument("runs", nargs=-1, required=True, type=PathName())
+@click.option(
+    "--format", "style", type=click.Choice(STYLES), help="[default: by the suffix of -o, else text]"
+)
 @click.option(
     "--layout", type=click.Choice(LAYOUTS), default="blocks", show_default=True,
     help="blocks: a table per scene; paper: scenes side by side; means: datasets side by side; "
@@ -54,8 +61,8 @@ LAYOUTS = ("blocks", "paper", "means", "memory", "ablation")
     help="Also write this PNG or JPG: test renders side by side, and what each method masks.",
 )
 def table_command(
-    runs: Path,
-    style: str,
+    runs: tuple[Path, ...],
+    style: str | None,
     layout: str,
     output: Path | None,
     metrics: tuple[str, ...],
@@ -66,17 +73,20 @@ def table_command(
     reported_from: Path | None,
     sheet: Path | None,
 ) -> None:
-    """Compare the runs below the folder RUNS: quality, cost and masks, method by method.
+    """Compare the runs below the folders RUNS: quality, cost and masks, method by method.
 
     Means are over images, then seeds, then scenes. What is missing, failed or not comparable is named below
-    the table (for CSV: on standard error).
+    the table (for CSV: on standard error). Where several folders hold runs of one method, scene and seed, the
+    rows of this method name their folder.
 
     \b
     aw table runs
-    aw table runs --layout paper --format latex -o table.tex
-    aw table runs --layout means --format html --reported -o means.html
+    aw table runs runs-masked                     several folders in one table
+    aw table runs --layout paper -o table.tex
+    aw table runs --layout means --reported -o means.html
     aw table runs --format tidy -o results.csv    one row per method, scene, seed, image and metric
     """
+    style = style or _style_of(output)
     if sheet is not None and sheet.suffix.lower() not in SHEETS:
         raise AwError(f"--sheet {sheet}: it is a picture, give a name that ends in .png or .jpg")
     if style == "tidy":
@@ -89,6 +99,8 @@ def table_command(
     if layout in ("blocks", "ablation"):
         refused = {"--dataset": datasets, "--reported": reported or reported_from}
         if layout == "ablation":
+            if len(runs) > 1:
+                raise AwError("--layout ablation shows one folder, the output of 'aw ablate': give RUNS once")
             refused |= {"--scene": scenes, "--sheet": sheet}
         for flag, value in refused.items():
             if value:
@@ -107,11 +119,12 @@ def table_command(
         runs, style, metrics, scenes, layout, datasets, reported, reported_from
     )
     color = style == "text" and output is None and sys.stdout.isatty()
+    width = _width(everything, output)
     if found is not None and layout == "blocks" and style != "html":
-        text, told = _blocks(found, style, metrics, scenes, made_by, color, everything)
+        text, told = _blocks(found, style, metrics, scenes, made_by, color, width)
     else:
-        made = _layouts(found, runs, layout, metrics, scenes, _named(datasets), reported, reported_from)
-        text, told = _laid_out(made, style, made_by, color, everything)
+        made = _layouts(found, runs[0], layout, metrics, scenes, _named(datasets), reported, reported_from)
+        text, told = _laid_out(made, style, made_by, color, width)
     if output is None:
         click.echo(text, nl=False)
         return
@@ -119,10 +132,29 @@ def table_command(
     click.echo(f"wrote {output}: {told}", err=True)
 
 
-def _read(runs: Path) -> Runs:
+def _read(runs: Sequence[Path]) -> Runs:
     from ambiguous_wild.harness.running.store import read_runs
 
-    return read_runs(runs)
+    return read_runs(*runs)
+
+
+def _style_of(output: Path | None) -> str:
+    suffix = output.suffix.lower() if output is not None else ""
+    if suffix not in SUFFIXES:
+        known = ", ".join(s for s in SUFFIXES if s)
+        raise AwError(
+            f"-o {output}: no format is known for {suffix}: end the name in {known}, or give --format"
+        )
+    return SUFFIXES[suffix]
+
+
+def _width(everything: bool, output: Path | None) -> int | None:
+    """Characters that a row of a text table may have; None: any number."""
+    from ambiguous_wild.harness.tables.plain_formats import WIDTH
+
+    if everything:
+        return None
+    return WIDTH if output is not None else shutil.get_terminal_size((WIDTH, 0)).columns
 
 
 def _write_tidy(found: Runs, output: Path | None, metrics: Sequence[str], scenes: Sequence[str]) -> None:
@@ -148,14 +180,14 @@ def _blocks(
     scenes: Sequence[str],
     made_by: str,
     color: bool,
-    everything: bool,
+    width: int | None,
 ) -> tuple[str, str]:
     from ambiguous_wild.harness.tables.papers import cost_at_the_end, in_blocks
     from ambiguous_wild.harness.tables.plain_formats import fitted, to_wide_csv
 
     tables = in_blocks(found, metrics=metrics, scenes=scenes)
-    if style == "text" and not metrics and not everything:
-        tables = fitted(tables)
+    if style == "text" and not metrics and width is not None:
+        tables = fitted(tables, width)
     scene_count = sum(bool(table.columns[0].scene) for table in tables)
     counts = {"method": len(tables[0].rows), "scene": scene_count, "column": len(tables[0].columns)}
     told = ", ".join(f"{n} {what}{'' if n == 1 else 's'}" for what, n in counts.items())
@@ -213,7 +245,7 @@ def _layouts(
     return [with_reported(one, numbers) for one in made] if numbers else made
 
 
-def _laid_out(made: list[Table], style: str, made_by: str, color: bool, everything: bool) -> tuple[str, str]:
+def _laid_out(made: list[Table], style: str, made_by: str, color: bool, width: int | None) -> tuple[str, str]:
     from ambiguous_wild.harness.tables.plain_formats import divided, to_long_csv
 
     told = f"{len(made)} table{'' if len(made) == 1 else 's'}"
@@ -221,8 +253,8 @@ def _laid_out(made: list[Table], style: str, made_by: str, color: bool, everythi
         _echo_notes(made, made_by)
         return to_long_csv(made), told
     made = [one.with_notes(made_by) for one in made]
-    if style == "text" and not everything:
-        made = [part for one in made for part in divided(one)]
+    if style == "text" and width is not None:
+        made = [part for one in made for part in divided(one, width)]
     return _written(made, style, color), told
 
 
@@ -238,7 +270,7 @@ def _named(datasets: Sequence[str]) -> dict[str, list[str]]:
 
 
 def command_line(
-    runs: Path,
+    runs: Sequence[Path],
     style: str,
     metrics: Sequence[str],
     scenes: Sequence[str],
@@ -248,7 +280,7 @@ def command_line(
     reported_from: Path | None = None,
 ) -> str:
     """The command that makes this table again."""
-    words = ["aw", "table", str(runs)]
+    words = ["aw", "table", *map(str, runs)]
     words += ["--format", style] if style != "text" else []
     words += ["--layout", layout] if layout != "blocks" else []
     for flag, values in (("--metric", metrics), ("--scene", scenes), ("--dataset", datasets)):

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from ambiguous_wild import __version__
-from ambiguous_wild.cli.main import COMMANDS
+from ambiguous_wild.cli.main import COMMANDS, SECTIONS
 from tests.command_line import aw
 
 
@@ -29,6 +29,18 @@ def test_help_lists_every_command_and_version_prints() -> None:
     assert wrong.returncode == 2 and wrong.stderr.startswith("error: ") and wrong.stdout == ""
 
 
+def test_every_command_is_in_one_section() -> None:
+    assert sorted(name for names in SECTIONS.values() for name in names) == sorted(COMMANDS)
+
+
+@pytest.mark.parametrize("words", [(), ("study",), ("leaderboard",), ("weights",)])
+def test_a_group_alone_prints_its_help(words: tuple[str, ...]) -> None:
+    done = typed(*words)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout == typed(*words, "--help").stdout
+    assert done.stdout.count("\n") > 5
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_has_help(name: str) -> None:
     done = aw(name, "--help")
@@ -41,7 +53,7 @@ def test_every_command_has_help(name: str) -> None:
     ("words", "expected"),
     [
         (["tabel"], "did you mean 'table'?"),
-        (["table"], "Missing argument 'RUNS'"),
+        (["table"], "Missing argument 'RUNS...'"),
         (["table", "nowhere"], "no folder of runs nowhere"),
         (["table", ".", "--format", "pdf"], "pdf"),
         (["methods", "--plugin", "mine.py"], "no plugin file mine.py"),

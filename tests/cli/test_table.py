@@ -40,6 +40,37 @@ def test_output_file_holds_what_would_be_printed(style: str, tmp_path: Path) -> 
     assert target.read_text() == out
 
 
+@pytest.mark.parametrize(
+    ("name", "style"), [("t.csv", "csv"), ("t.tex", "latex"), ("t.html", "html"), ("t.MD", "markdown")]
+)
+def test_the_suffix_of_the_output_is_its_format(name: str, style: str, tmp_path: Path) -> None:
+    runs = save(tmp_path / "runs", fake_result("3dgs"), fake_result("b", psnr=(23.0,)))
+    aw_table(runs, "-o", tmp_path / name)
+    assert (tmp_path / name).read_text() == aw_table(runs, "--format", style)[0]
+    error = CliRunner().invoke(command, [str(runs), "-o", str(tmp_path / "t.pdf")]).exception
+    assert isinstance(error, AwError) and "end the name in .txt, .md" in str(error)
+
+
+def test_several_folders_make_one_table(tmp_path: Path) -> None:
+    one = save(tmp_path / "one", fake_result("3dgs", psnr=(20.0,)), fake_result("b", psnr=(23.0,)))
+    two = save(tmp_path / "two", fake_result("3dgs", psnr=(21.0,)))
+    out, _ = aw_table(one, two, "--metric", "psnr")
+    rows = {line.split("  ")[0].strip(): line for line in out.splitlines()}
+    assert "20.00" in rows[f"3dgs in {one}"] and "21.00" in rows[f"3dgs in {two}"] and "23.00" in rows["b"]
+    assert f"command: aw table {one} {two} --metric psnr" in out
+    assert "3dgs in" not in aw_table(one, f"{one}/../one")[0]
+
+
+@pytest.mark.parametrize("width", [60, 160])
+def test_rows_fit_the_terminal(width: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    runs = save(tmp_path / "runs", fake_result("3dgs"), fake_result("b", psnr=(23.0,)))
+    monkeypatch.setenv("COLUMNS", str(width))
+    out, _ = aw_table(runs)
+    rows = [line for line in out.splitlines() if line.startswith(("3dgs ", "b ", "─"))]
+    assert len(rows) >= 3 and max(map(len, rows)) <= width
+    assert (f"to fit {width} columns" in out) == (width == 60)
+
+
 def test_csv_is_clean_and_notes_go_to_standard_error(tmp_path: Path) -> None:
     save(tmp_path, fake_result("3dgs", psnr=(20.0, 21.0)), failed("c"))
     out, err = aw_table(tmp_path, "--format", "csv", "--metric", "psnr", "--scene", "yard")

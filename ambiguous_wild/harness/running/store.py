@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -59,20 +60,44 @@ class Runs:
     incomplete: tuple[Incomplete, ...] = ()
 
 
-def read_runs(folder: Path | str) -> Runs:
-    """Every result below a folder of runs, at any depth.
+def read_runs(*folders: Path | str) -> Runs:
+    """Every result below folders of runs, at any depth.
 
     A run is a folder with config.yaml, metrics.json or failed.json in it. One without a result (still
-    running, or stopped) and a damaged result are listed under `incomplete`, not dropped.
+    running, or stopped) and a damaged result are listed under `incomplete`, not dropped. A method that two
+    folders have for one scene and seed is called "METHOD in FOLDER".
 
     Raises:
-        AwError: no such folder, no run in it, or two results for the same method, scene and seed.
+        AwError: no such folder, no run in it, or two results in it for the same method, scene and seed.
     """
-    root = Path(folder)
+    incomplete: list[Incomplete] = []
+    roots = list({Path(folder).resolve(): Path(folder) for folder in folders}.values())
+    of_root = [_read_folder(root, incomplete) for root in roots]
+    owners = Counter((r["scene"], r["method"], r["seed"]) for found in of_root for _, r in found)
+    shared = {method for (_, method, _), count in owners.items() if count > 1}
+    results: list[FoundResult] = []
+    for root, found in zip(roots, of_root):
+        for run, result in found:
+            if result["method"] in shared:
+                result["method"] = f"{result['method']} in {root}"
+            results.append((run, result))
+    return Runs(
+        images=_frame(_image_rows(results), ["scene", "method", "seed", "image", "metric", "value"]),
+        runs=_frame(
+            (_run_row(run, result) for run, result in results),
+            ["scene", "method", "seed", "status", "error", "folder", "images"],
+        ),
+        missing=_frame(_missing_rows(results), ["scene", "method", "seed", "metric", "reason"]),
+        incomplete=tuple(incomplete),
+    )
+
+
+def _read_folder(root: Path, incomplete: list[Incomplete]) -> list[FoundResult]:
+    """The results below one folder; runs without one are added to `incomplete`."""
     if not root.is_dir():
         raise AwError(f"no folder of runs {root}: give the folder that 'aw bench -o' wrote")
     results: list[FoundResult] = []
-    incomplete: list[Incomplete] = []
+    before = len(incomplete)
     for run in run_folders(root):
         paths = [run / name for name in (RESULT, FAILED) if (run / name).exists()]
         try:
@@ -83,18 +108,10 @@ def read_runs(folder: Path | str) -> Runs:
             results.append((run, read_result(paths[0])))
         except AwError as error:
             incomplete.append(Incomplete(run, str(error), *_method_and_scene(run)))
-    if not results and not incomplete:
+    if not results and len(incomplete) == before:
         raise AwError(f"no run in {root}: 'aw bench --method NAME --scene SCENE -o {root}' makes one")
     _refuse_duplicates(results)
-    return Runs(
-        images=_frame(_image_rows(results), ["scene", "method", "seed", "image", "metric", "value"]),
-        runs=_frame(
-            (_run_row(run, result) for run, result in results),
-            ["scene", "method", "seed", "status", "error", "folder", "images"],
-        ),
-        missing=_frame(_missing_rows(results), ["scene", "method", "seed", "metric", "reason"]),
-        incomplete=tuple(incomplete),
-    )
+    return results
 
 
 def run_folders(root: Path) -> Iterator[Path]:

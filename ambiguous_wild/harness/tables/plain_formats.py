@@ -323,7 +323,8 @@ def fitted(tables: Sequence[Table], width: int = WIDTH) -> list[Table]:
     A note below the last table names the others. At least one column is kept, however long the names are.
     """
     columns = tables[0].columns
-    left = width - max(display_width(row_name(row)) for table in tables for row in table.rows)
+    names = [tables[0].head, *(row_name(row) for table in tables for row in table.rows)]  # with their head
+    left = width - max(map(display_width, names))
     order = sorted(range(len(columns)), key=lambda i: (_importance(columns[i].measure), i))
     kept: list[int] = []
     for i in order:
@@ -346,7 +347,7 @@ def _importance(column: Measure) -> int:
 
 def divided(table: Table, width: int = WIDTH) -> list[Table]:
     """The table as tables that fit: columns of one heading stay together where they can."""
-    room = width - max((display_width(row_name(row)) for row in table.rows), default=0)
+    room = width - max(map(display_width, [table.head, *map(row_name, table.rows)]))
     parts: list[list[int]] = [[]]
     left, at = room, 0
     for title, count in table.groups:

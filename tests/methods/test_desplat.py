@@ -50,13 +50,6 @@ def test_a_layer_covers_the_frame_of_its_photo_just_in_front_of_it(starts):
     assert not torch.equal(found[str(0)].gaussians.sh0, found[str(1)].gaussians.sh0)
 
 
-def test_learning_rates_are_the_released_ones_times_the_speed(starts):
-    rates = starts[1][str(0)].rates(0.2)
-    assert rates["means"] == pytest.approx(0.6)  # of the static field, decay included
-    assert rates["sh0"] * 0.28209479 == pytest.approx(0.05)
-    assert (rates["opacity_logits"], rates["log_scales"], rates["quats"]) == (0.1, 0.1, 0.02)
-
-
 def test_the_composite_by_hand():
     layers = Layers(DeSplatConfig())
     frames = {STATIC: frame(0.8, 0.9), str(0): frame(0.3, 0.4)}

@@ -216,15 +216,6 @@ def test_a_methods_own_mask_changes_no_bit(scene, tmp_path):
     assert bits(trained(scene, tmp_path / "second", second, 60)) == bits(own)
 
 
-def test_refinesplat_over_refinesplat_is_refinesplat(scene, tmp_path):
-    options = {"min_mask_start": "20", "mask_start": "0"}
-    own = trained(scene, tmp_path / "own", parts_of("refinesplat", **options), 60)
-    grown = {f"{place}.{k}": v for place in ("host", "mask", "density") for k, v in options.items()}
-    name = "refinesplat@mask=refinesplat,density=refinesplat"
-    assert bits(trained(scene, tmp_path / "graft", parts_of(name, **grown), 60)) == bits(own)
-    assert bits(trained(scene, tmp_path / "plain", Parts(), 60)) != bits(own)
-
-
 def test_a_regulariser_that_adds_nothing_is_told(scene):
     (off, on, none) = (
         plan_cells([f"3dgs@regulariser={donor}"], [scene], [0], TrainConfig(iterations=5), settings=settings)[

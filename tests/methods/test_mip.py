@@ -76,14 +76,6 @@ def test_matched_growth_takes_as_many_by_the_absolute_gradient():
     assert rows == [*range(10), *range(90, 100)]
 
 
-def test_options_decide_the_growth():
-    assert parts_of("mip-splatting", growth="absolute").density.needs == {"absolute"}
-    with pytest.raises(AwError, match="growth"):
-        parts_of("mip-splatting", growth="both")
-    with pytest.raises(AwError, match=r"mip-splatting\.kernel"):
-        parts_of("mip-splatting", kernel="0")
-
-
 # -- UAD ------------------------------------------------------------------------------------------
 
 

@@ -18,7 +18,7 @@ from ambiguous_wild.methods.refinesplat.multiview import (
     nearest_views,
 )
 from ambiguous_wild.methods.refinesplat.pixels import PixelEvidence
-from ambiguous_wild.methods.refinesplat.ranks import Ranks, agree, agreement_weight, common_offset
+from ambiguous_wild.methods.refinesplat.ranks import agree, agreement_weight, common_offset
 from ambiguous_wild.methods.refinesplat.structure import correlation, structure_residual, unrelated_residual
 from tests.methods.on_device import noise, number, tensor
 
@@ -123,18 +123,6 @@ def test_a_surface_at_another_depth_or_outside_says_nothing():
     store(far, 0, np.ones((H, W)), np.full((H, W), PLANE))
     store(far, 1, np.ones((H, W)), np.full((H, W), PLANE))
     assert np.isnan(asked(far, 0).evidence).all()
-
-
-def test_quantiles_are_numpys_without_what_is_missing():
-    stack = noise(4, 7, 5, 6)
-    stack[noise(5, 7, 5, 6) < 0.4] = np.nan
-    stack[:, 0, 0] = np.nan
-    there = tensor((~np.isnan(stack)).sum(axis=0))
-    for quantile in (0.0, 0.25, 0.5, 0.8, 1.0):
-        with pytest.warns(RuntimeWarning):
-            expected = np.nanquantile(stack, quantile, axis=0)
-        found = Ranks(7, quantile, "cpu").quantile_of(tensor(stack), there)
-        assert np.allclose(found, expected, equal_nan=True, atol=1e-6)
 
 
 def test_discount_by_hand():

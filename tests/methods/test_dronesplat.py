@@ -14,12 +14,6 @@ from ambiguous_wild.methods.dronesplat import (
 )
 from ambiguous_wild.splat.step import TrainData
 from tests.methods.baselines import data_of, step_of
-from tests.tiny_scene import write_tiny_scene
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 def test_instances_take_the_mean_of_their_pixels():

@@ -26,14 +26,8 @@ from ambiguous_wild.splat.effects.colour import AffineExposure
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.parts import MaskPolicy, Parts
 from tests.methods.baselines import bits, parts_of, trained
-from tests.tiny_scene import write_tiny_scene
 
 TRUE_3DGS = "3dgs@mask=truth"
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 def run(command, *arguments):

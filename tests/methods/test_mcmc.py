@@ -14,15 +14,9 @@ from ambiguous_wild.splat.render import render
 from ambiguous_wild.splat.rendered import Gradients
 from tests.methods.baselines import parts_of, trained
 from tests.splat.scenes import camera, gaussians
-from tests.tiny_scene import write_tiny_scene
 
 NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh0", "sh_rest", "tag")
 ROUND = McmcConfig(start=1.0, every=1.0, min_every=1, noise=0.0, apart=0.0)  # as released
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 def some(n=40):

@@ -21,12 +21,6 @@ from ambiguous_wild.splat.effects.smoothing import SmoothingFilter, filter_sizes
 from ambiguous_wild.splat.rendered import GSPLAT_SUMS, check_needs
 from tests.methods.baselines import bits, data_of, parts_of, trained, trainer_of
 from tests.splat.scenes import camera, gaussians
-from tests.tiny_scene import write_tiny_scene
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 def test_both_filters_reach_the_renderer(scene, tmp_path):

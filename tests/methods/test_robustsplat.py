@@ -14,11 +14,10 @@ from ambiguous_wild.methods.robustsplat import supervision
 from ambiguous_wild.methods.robustsplat.config import RobustSplatConfig
 from ambiguous_wild.methods.robustsplat.net import MaskNet
 from ambiguous_wild.methods.robustsplat.policy import RobustSplatMask, _fit, coarse_spec
-from ambiguous_wild.methods.robustsplat.recipe import build
 from ambiguous_wild.vision import backends
 from ambiguous_wild.vision.labhog import LabHog
 from tests.methods.baselines import data_of, parts_of, step_of, trained
-from tests.tiny_scene import SQUARE, TRAIN, wall_colour, write_tiny_scene
+from tests.tiny_scene import SQUARE, TRAIN, wall_colour
 
 EARLY = {"min_mask_start": "20"}
 
@@ -30,11 +29,6 @@ def _one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 def clean_photo(view: int) -> torch.Tensor:
@@ -280,14 +274,6 @@ def test_options_that_cannot_be_are_refused(wrong):
 
 
 # -- the recipe ---------------------------------------------------------------------------------------
-
-
-def test_the_recipe_delays_growth_and_masks_both_pictures():
-    parts = build(RobustSplatConfig())
-    assert (parts.density_config.start, parts.density_config.stop) == (10_000.0, 20_000.0)
-    assert parts.density_config.resets == (15_000.0, 18_000.0)
-    assert parts.schedule.lr_opacity == 0.025
-    assert parts.weighting == "images"
 
 
 def test_the_seed_decides(scene, tmp_path):

@@ -8,7 +8,6 @@ from ambiguous_wild.splat.cpu.render import render_cpu
 from ambiguous_wild.splat.gpu import gsplat_seam
 from ambiguous_wild.splat.reference import render_reference
 from ambiguous_wild.splat.render import render
-from ambiguous_wild.splat.rendered import Cotangents
 from ambiguous_wild.stress.case import agree
 
 from . import fake_gsplat
@@ -96,26 +95,6 @@ def test_without_a_graph_there_is_no_backward_pass_and_the_same_picture(fake):
     assert not rendered.image.requires_grad
     with pytest.raises(RuntimeError, match="no_grad"):
         rendered.backward(torch.ones_like(rendered.image))
-
-
-def test_a_second_cotangent_comes_back_once_more_through_the_pixels_alone(fake, monkeypatch):
-    calls = {"project": 0, "blend": 0}
-    for name in calls:
-        original = getattr(gsplat_seam, name)
-
-        def counted(*a, _name=name, _original=original, **k):
-            calls[_name] += 1
-            return _original(*a, **k)
-
-        monkeypatch.setattr(gsplat_seam, name, counted)
-    g, cam = gaussians(8), camera()
-    d = cotangents(cam.height, cam.width)
-    rendered = render(g, cam)
-    rendered.backward(Cotangents(d["d_image"], d["d_image_extra"]))
-    assert calls == {"project": 1, "blend": 1}  # no depth, no second drawing unless asked for
-    assert rendered.depth.shape == (cam.height, cam.width)
-    assert calls == {"project": 1, "blend": 2}
-    assert rendered.depth is rendered.depth
 
 
 def test_nothing_to_draw(fake):

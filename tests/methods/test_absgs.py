@@ -12,14 +12,8 @@ from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.rendered import Gradients
 from tests.methods.baselines import parts_of, trained
 from tests.splat.scenes import gaussians
-from tests.tiny_scene import write_tiny_scene
 
 CONFIG = AbsGsConfig(start=1.0, every=1.0, min_every=1, resets=(), clamp_every=2.0, min_clamp_every=2)
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 def four():

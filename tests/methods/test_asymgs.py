@@ -11,12 +11,6 @@ from ambiguous_wild.splat.effects.slow import SlowAverage, SlowDensity, slow, sl
 from ambiguous_wild.vision.mask_ops import standing, unsupported
 from tests.methods.baselines import data_of, parts_of, step_of, trained, trainer_of
 from tests.splat.scenes import gaussians
-from tests.tiny_scene import write_tiny_scene
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 @pytest.fixture(scope="module")

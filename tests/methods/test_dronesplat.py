@@ -10,17 +10,10 @@ from ambiguous_wild.methods.dronesplat import (
     DroneSplatMask,
     combined_residual,
     heat_map,
-    nearest,
     threshold,
 )
 from ambiguous_wild.splat.step import TrainData
 from tests.methods.baselines import data_of, step_of
-from tests.tiny_scene import write_tiny_scene
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 def test_instances_take_the_mean_of_their_pixels():
@@ -116,9 +109,3 @@ def test_masks_begin_when_the_render_means_something(scene, tmp_path):
     policy, data = policy_on(scene, tmp_path)
     for kw in ({"nominal": 499.0}, {"iteration": 299}):
         assert policy.keep(step_of(data, 0, data.photos[1], **kw)) is None
-
-
-def test_smaller_labels_are_those_at_pixel_centres():
-    labels = torch.arange(48).reshape(6, 8)
-    assert nearest(labels, 3, 4).tolist() == labels[1::2, 1::2].tolist()
-    assert nearest(labels, 6, 8) is labels

@@ -14,7 +14,7 @@ from tests.host_reads import moved, no_transfers
 from tests.methods.baselines import parts_of, same, trained, trainer_of
 from tests.splat import fake_gsplat
 from tests.splat.test_whole_step import late
-from tests.tiny_scene import with_points, write_tiny_scene
+from tests.tiny_scene import with_points
 
 # method: options that make it small; growth often, in a run of 120 iterations
 GROWTH = {"density.every": "2000", "density.min_every": "10"}
@@ -62,11 +62,6 @@ RESUMED: dict[str, dict[str, str]] = {
     },
 }
 CPU_ALONE = {"uad": "count"}
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 @pytest.fixture(scope="module")

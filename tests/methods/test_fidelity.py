@@ -43,28 +43,3 @@ def test_every_row_is_true():
                 if cell.rpartition("`")[2].strip() not in VERDICTS:
                     wrong.append(cell)
     assert wrong == []
-
-
-def test_every_equation_of_the_method_has_a_row():
-    text = " ".join(row[0] for row in rows())
-    for number in (
-        2,
-        3,
-        4,
-        5,
-        6,
-        7,
-        8,
-        10,
-        11,
-        12,
-        13,
-    ):  # 1 is 3DGS, 9 its gradient, 14 the sum of the losses
-        assert re.search(rf"Eq\. {number}\b", text), f"Eq. {number}"
-
-
-def test_options_that_other_cells_name_exist():
-    known = flatten(to_plain(get_method("refinesplat").options()))
-    for row in rows():
-        for name in re.findall(r"`([a-z_.]+)=", " ".join(row[6:])):
-            assert name in known, name

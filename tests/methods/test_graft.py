@@ -26,14 +26,8 @@ from ambiguous_wild.splat.effects.colour import AffineExposure
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.parts import MaskPolicy, Parts
 from tests.methods.baselines import bits, parts_of, trained
-from tests.tiny_scene import write_tiny_scene
 
 TRUE_3DGS = "3dgs@mask=truth"
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 def run(command, *arguments):
@@ -214,15 +208,6 @@ def test_a_methods_own_mask_changes_no_bit(scene, tmp_path):
     parts = parts_of("robustsplat", **options)
     second = Parts(**{**vars(parts), "mask": GraftedPolicy(RobustSplatMask(parts.mask.config), None)})
     assert bits(trained(scene, tmp_path / "second", second, 60)) == bits(own)
-
-
-def test_refinesplat_over_refinesplat_is_refinesplat(scene, tmp_path):
-    options = {"min_mask_start": "20", "mask_start": "0"}
-    own = trained(scene, tmp_path / "own", parts_of("refinesplat", **options), 60)
-    grown = {f"{place}.{k}": v for place in ("host", "mask", "density") for k, v in options.items()}
-    name = "refinesplat@mask=refinesplat,density=refinesplat"
-    assert bits(trained(scene, tmp_path / "graft", parts_of(name, **grown), 60)) == bits(own)
-    assert bits(trained(scene, tmp_path / "plain", Parts(), 60)) != bits(own)
 
 
 def test_a_regulariser_that_adds_nothing_is_told(scene):

@@ -12,17 +12,11 @@ from ambiguous_wild.methods.mcmc import McmcConfig, McmcDensity, divided
 from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.render import render
 from ambiguous_wild.splat.rendered import Gradients
-from tests.methods.baselines import data_of, parts_of, trained
+from tests.methods.baselines import parts_of, trained
 from tests.splat.scenes import camera, gaussians
-from tests.tiny_scene import write_tiny_scene
 
 NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh0", "sh_rest", "tag")
 ROUND = McmcConfig(start=1.0, every=1.0, min_every=1, noise=0.0, apart=0.0)  # as released
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 def some(n=40):
@@ -154,19 +148,6 @@ def test_noise_has_the_covariance_of_its_gaussian_and_spares_opaque_ones():
     # at 0.005 the gate is 1/2: deviations 0.5 * 10 * 0.02 * scale^2
     assert g.means[:2000].std(dim=0).tolist() == pytest.approx([0.1, 0.4, 0.025], rel=0.06)
     assert float(g.means[2000:].abs().max()) < 1e-12
-
-
-def test_it_starts_opaque_and_small(scene, tmp_path):
-    data = data_of(scene, tmp_path)
-    plain, ours = (
-        parts_of("3dgs").first_gaussians(data),
-        parts_of("mcmc", start_scale="0.1").first_gaussians(data),
-    )
-    assert torch.sigmoid(ours.opacity_logits).tolist() == pytest.approx([0.5] * len(ours))
-    assert torch.allclose(ours.log_scales.exp(), 0.1 * plain.log_scales.exp())
-    grafted = parts_of("3dgs@density=mcmc").first_gaussians(data)
-    assert torch.equal(grafted.log_scales, plain.log_scales)
-    assert torch.sigmoid(grafted.opacity_logits).tolist() == pytest.approx([0.5] * len(ours))
 
 
 def test_it_trains_to_its_ceiling(scene, tmp_path):

@@ -21,12 +21,6 @@ from ambiguous_wild.splat.effects.smoothing import SmoothingFilter, filter_sizes
 from ambiguous_wild.splat.rendered import GSPLAT_SUMS, check_needs
 from tests.methods.baselines import bits, data_of, parts_of, trained, trainer_of
 from tests.splat.scenes import camera, gaussians
-from tests.tiny_scene import write_tiny_scene
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 def test_both_filters_reach_the_renderer(scene, tmp_path):
@@ -74,14 +68,6 @@ def test_matched_growth_takes_as_many_by_the_absolute_gradient():
     growth = density.choose(SimpleNamespace(ceiling=1000), g)
     rows = torch.cat([growth.clones, growth.splits]).sort().values.tolist()
     assert rows == [*range(10), *range(90, 100)]
-
-
-def test_options_decide_the_growth():
-    assert parts_of("mip-splatting", growth="absolute").density.needs == {"absolute"}
-    with pytest.raises(AwError, match="growth"):
-        parts_of("mip-splatting", growth="both")
-    with pytest.raises(AwError, match=r"mip-splatting\.kernel"):
-        parts_of("mip-splatting", kernel="0")
 
 
 # -- UAD ------------------------------------------------------------------------------------------

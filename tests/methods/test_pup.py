@@ -11,12 +11,6 @@ from ambiguous_wild.methods.pup import PupConfig, PupDensity, log_det, removed
 from ambiguous_wild.splat.render import render
 from tests.methods.baselines import parts_of, trainer_of
 from tests.splat.scenes import camera, gaussians
-from tests.tiny_scene import write_tiny_scene
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 def test_the_score_by_hand():

@@ -5,7 +5,6 @@ import pytest
 from ambiguous_wild.core import AwError
 from ambiguous_wild.methods import registry
 from ambiguous_wild.methods.graft import graft_name
-from ambiguous_wild.methods.references import is_reference, reference_file, with_file
 
 CODE = r'''
 from dataclasses import dataclass
@@ -118,14 +117,3 @@ def test_a_file_that_is_not_there_or_is_broken(recipe, tmp_path):
     recipe.write_text("x = (")
     with pytest.raises(AwError, match=r"recipe.py, line 1"):
         registry.get_method(f"{recipe}:plain")
-
-
-def test_what_is_a_reference(tmp_path):
-    assert not is_reference("3dgs") and not is_reference("3dgs@mask=refinesplat")
-    assert not is_reference("recipe.py") and not is_reference("a.py:x@mask=truth")
-    assert reference_file("dir/a.py:x").name == "a.py"
-    assert reference_file("nerfbaselines:x") is None and is_reference("nerfbaselines:x")
-    assert with_file("dir/a.py:x", tmp_path / "b.py") == f"{tmp_path}/b.py:x"
-    assert with_file("external:dir/a.yaml", tmp_path / "b.yaml") == f"external:{tmp_path}/b.yaml"
-    # an @ in a path is part of the path
-    assert graft_name("external:/a@b/x.yaml", {"mask": None}) == "external:/a@b/x.yaml"

@@ -315,13 +315,6 @@ def test_gaps_are_not_filled_where_nearly_all_would_be_masked():
     assert np.array_equal(grown(np.ones((40, 40), bool), config, evidence), lines)
 
 
-def test_dilation_is_a_square():
-    mask = torch.zeros(15, 15, dtype=torch.bool)
-    mask[7, 7] = True
-    assert regions.dilate(mask, 5).sum() == 25
-    assert regions.dilate(mask, 1) is mask
-
-
 def test_hysteresis_keeps_weak_pixels_that_touch_strong_ones():
     values = torch.zeros(6, 12)
     values[1:4, 1:5], values[2, 2], values[1:4, 8:11] = 5.0, 9.0, 5.0

@@ -10,12 +10,9 @@ import pytest
 import torch
 
 from ambiguous_wild.core import Camera, Points, Scene, View
-from ambiguous_wild.core.config import from_plain, to_plain
 from ambiguous_wild.methods.refinesplat.config import MaskConfig, RefineSplatConfig
-from ambiguous_wild.methods.refinesplat.density import EntropyAwareDensity
 from ambiguous_wild.methods.refinesplat.identity import PsiConfig
 from ambiguous_wild.methods.refinesplat.policy import RefineSplatMask
-from ambiguous_wild.methods.refinesplat.recipe import build
 from ambiguous_wild.splat.checkpoint import load, save
 from ambiguous_wild.splat.step import Step, TrainData
 
@@ -373,16 +370,6 @@ def test_cotangent_comes_every_kth_iteration_and_weighs_k_times(scene):
         off = policy.cotangent(step_of(scene.data, 0, blurred(scene.clean[0], 0), iteration=103), None)
         assert (off is None) == (k == 3)
     assert torch.allclose(every[3], 3 * every[1])
-
-
-def test_recipe_and_config_round_trip():
-    parts = build(RefineSplatConfig())
-    assert isinstance(parts.mask, RefineSplatMask)
-    assert parts.density is EntropyAwareDensity
-    assert parts.density_config.start == 10_000.0
-    assert parts.density_config.resets == (15_000.0, 18_000.0)
-    config = RefineSplatConfig(mask=MaskConfig(statistic="entropy", w2=0.5))
-    assert from_plain(RefineSplatConfig, to_plain(config)) == config
 
 
 def test_features_that_learn_from_the_scene_are_given_its_tracks(scene):

@@ -14,12 +14,7 @@ from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.vision.segments import ward_clusters
 from tests.methods.baselines import data_of, parts_of, step_of, trained
 from tests.splat.scenes import gaussians
-from tests.tiny_scene import TRAIN, write_tiny_scene
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
+from tests.tiny_scene import TRAIN
 
 
 def brute_force(grid, count):

@@ -16,7 +16,7 @@ from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
 from ambiguous_wild.io.scene_folder import load_scene, read_scene_json
 from ambiguous_wild.simulate.composite.composite_scene import composite
-from ambiguous_wild.simulate.composite.cutouts import blobs, project, read_cutouts
+from ambiguous_wild.simulate.composite.cutouts import project, read_cutouts
 from ambiguous_wild.simulate.composite.placement import (
     CompositeConfig,
     local_colours,
@@ -227,17 +227,6 @@ def test_patches_go_where_the_photo_is_like_them(base: Path) -> None:
         assert len(sides) > 8 and np.mean(np.array(sides) == right) > 0.9
 
 
-def test_local_colours_are_means_around_a_place() -> None:
-    """A grey photo with one bright stripe: grey far from it, between the two beside it."""
-    photo = np.full((48, 128, 3), 100, np.uint8)
-    photo[:, 60:64] = 255
-    lab = local_colours(photo)
-    grey = cv2.cvtColor(np.full((1, 1, 3), 100 / 255, np.float32), cv2.COLOR_RGB2LAB)[0, 0]
-    assert lab.shape == (24, 64, 3)
-    np.testing.assert_allclose(lab[:, 5], np.broadcast_to(grey, (24, 3)), atol=0.1)
-    assert (lab[:, 31, 0] > grey[0] + 5).all() and (lab[:, 31, 0] < 90).all()
-
-
 def test_a_patch_is_never_put_back_where_it_is_from(base: Path) -> None:
     scene = load_scene(base)
     places, spread = visible_points(scene), scene_spread(scene)
@@ -253,17 +242,6 @@ def test_a_patch_is_never_put_back_where_it_is_from(base: Path) -> None:
                 off = site.xyz - site.view.camera.center
                 along = off @ ray / np.linalg.norm(off, axis=1) / np.linalg.norm(ray)
                 assert np.linalg.norm(site.xyz[along.argmax()] - origin) >= 0.08 * spread
-
-
-def test_blobs_are_round_shapes_of_their_own() -> None:
-    shapes = blobs(np.random.default_rng(0))
-    assert len(shapes) >= 3
-    for shape in shapes:
-        alpha = shape.light[..., 3]
-        assert (
-            0.2 < alpha.mean() < 0.8 and alpha[0].max() == 0 and alpha[len(alpha) // 2, len(alpha) // 2] == 1
-        )
-    assert len({round(s.filled, 6) for s in shapes}) == len(shapes)
 
 
 def test_a_plain_scene_of_jpeg_photos_gets_png_train_photos(cutouts: Path, tmp_path: Path) -> None:

@@ -119,12 +119,3 @@ def test_every_size_of_the_run_is_compiled_before_it_starts(scene, tmp_path, fak
     trainer_for(scene, tmp_path, iterations=30, probes=0, resolution="coarse-to-fine")
     assert len(seen) == before  # once a process
     kernels.prepare.cache_clear()
-
-
-def test_photos_of_several_sizes_are_all_counted(scene, tmp_path):
-    from ambiguous_wild.splat.data import Pyramid
-
-    trainer = trainer_for(scene, tmp_path, iterations=2, probes=0)
-    cameras = [c.resized(40, 30) if i % 2 else c for i, c in enumerate(trainer.data.cameras)]
-    pyramid = Pyramid(replace(trainer.data, cameras=cameras))
-    assert pyramid.sizes((1, 2)) == {(48, 64), (24, 32), (30, 40), (15, 20)}

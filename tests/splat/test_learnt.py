@@ -130,20 +130,6 @@ def test_a_photo_that_was_not_trained_on(scene, tmp_path):
     assert all(torch.equal(tensor, before[name]) for name, tensor in trainer.gaussians.rows())
 
 
-def test_only_what_a_recipe_writes_is_called(scene, tmp_path):
-    class Tint(Learnt):
-        name = "tint"
-
-        def leaves(self, data, rng):
-            return {"tint": Leaf(torch.zeros(len(data.photos), 3), rate=0.01, per_photo=True)}
-
-        def tone(self, image, alpha, leaf, shot):
-            return image * (1 + leaf["tint"])
-
-    chain = trainer_for(scene, tmp_path, Tint()).effects
-    assert [len(chain._with(hook)) for hook in ("model", "shade", "image", "rows")] == [0, 0, 1, 0]
-
-
 def test_names_are_told_apart(scene, tmp_path):
     class Twice(Everything):
         def leaves(self, data, rng):

@@ -7,7 +7,7 @@ import torch
 from ambiguous_wild.io.images import load_image_float, write_png
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat import data as data_module
-from ambiguous_wild.splat.data import READY, CudaCopies, Photos, fit, load_train_data
+from ambiguous_wild.splat.data import READY, Photos, fit, load_train_data
 from tests.tiny_scene import write_tiny_scene
 
 CPU = torch.device("cpu")
@@ -125,54 +125,3 @@ def test_a_share_of_the_free_memory_decides(monkeypatch):
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (1000, 8000))
     assert fit(250, torch.device("cuda")) and not fit(251, torch.device("cuda"))
     assert fit(10**15, CPU)
-
-
-class Stream:
-    """Notes what a stream is asked for."""
-
-    def __init__(self, log, name):
-        self.log, self.name = log, name
-
-    def record_event(self):
-        self.log.append(f"{self.name} records")
-        return "event"
-
-    def wait_event(self, event):
-        self.log.append(f"{self.name} waits for {event}")
-
-    def synchronize(self):
-        self.log.append("the host waits")
-
-    def __enter__(self):
-        self.log.append(f"on {self.name}")
-
-    def __exit__(self, *error):
-        self.log.append(f"off {self.name}")
-
-
-class There:
-    """A tensor of a GPU."""
-
-    def __init__(self, log):
-        self.log = log
-
-    def to(self, device, non_blocking):
-        self.log.append(f"copies to {device}, host waits: {not non_blocking}")
-        return self
-
-    def record_stream(self, stream):
-        self.log.append(f"used by {stream.name}")
-
-
-def test_copies_on_a_stream_of_their_own_make_the_device_wait_and_not_the_host(monkeypatch):
-    log = []
-    monkeypatch.setattr(torch.cuda, "Stream", lambda device: Stream(log, "side"))
-    monkeypatch.setattr(torch.cuda, "stream", lambda stream: stream)
-    monkeypatch.setattr(torch.cuda, "current_stream", lambda device: Stream(log, "main"))
-    copies = CudaCopies(torch.device("cuda:1"))
-    sent = copies.begin(There(log))
-    assert log == ["on side", "copies to cuda:1, host waits: False", "off side", "side records"]
-    log.clear()
-    copies.finish(sent)
-    assert log == ["main waits for event", "used by main"]
-    assert copies.hold(torch.ones(2)).tolist() == [1.0, 1.0]  # nothing to pin it for: it stays as it is

@@ -175,13 +175,6 @@ def test_any_cotangent_may_be_missing(fake, asked, needs):
     agree(found, expected)
 
 
-def test_what_effects_found_on_the_way_comes_along(fake):
-    g, cam = gaussians(3), camera()
-    own = {"exposure": {"row": torch.ones(3)}}
-    found = render_cuda(g, cam, **OPTIONS).backward(Cotangents(torch.ones(cam.height, cam.width, 3), own=own))
-    assert found.own["exposure"]["row"].tolist() == [1.0, 1.0, 1.0]
-
-
 def test_a_second_backward_pass_of_a_picture_is_refused(fake):
     rendered = render_cuda(gaussians(3), camera(), **OPTIONS)
     rendered.backward(torch.ones_like(rendered.image))

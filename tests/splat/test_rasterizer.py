@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from ambiguous_wild.core import AwError, Camera
-from ambiguous_wild.splat.calibration import warm_up
 from ambiguous_wild.splat.cpu.render import render_cpu
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.reference import render_reference
@@ -324,20 +323,6 @@ def test_wrong_shapes_and_degrees_are_named():
         rendered.backward(torch.zeros(3, 3, 3))
     with pytest.raises(AwError, match="d_depth must be"):
         rendered.backward(Cotangents(depth=torch.zeros(2, 2)))
-
-
-def test_warming_up_says_so_only_where_kernels_are_missing(tmp_path):
-    warm_up()
-    said = []
-    warm_up(said.append)
-    assert said == []
-    done = subprocess.run(
-        [sys.executable, "-c", "from ambiguous_wild.splat.calibration import _cached; print(_cached())"],
-        env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)},
-        capture_output=True,
-        text=True,
-    )
-    assert done.stdout.strip() == "False", done.stderr
 
 
 @pytest.mark.parametrize("far", [1e18, 1e20, 1e30, 1e38])

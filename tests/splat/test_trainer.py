@@ -207,12 +207,6 @@ class _Counting(MaskPolicy):
         self.calls["predict"] += 1
 
 
-def test_each_place_is_called_once_an_iteration_and_never_otherwise(scene, tmp_path):
-    policy = _Counting()
-    trained(scene, tmp_path, parts=Parts(mask=policy), iterations=30)
-    assert policy.calls == {"keep": 30, "predict": 0}
-
-
 def test_a_users_mask_is_obeyed(scene, tmp_path):
     trainer = trainer_for(scene, tmp_path)
     user = torch.ones(trainer.data.photos[0].shape[:2])

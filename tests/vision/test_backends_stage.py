@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.vision.backends import DINO, SAM, SAM_VIDEO, make_features, make_instances, parse
+from ambiguous_wild.vision.backends import DINO, SAM, SAM_VIDEO, make_features, make_instances
 from ambiguous_wild.vision.dino import DinoConfig, DinoFeatures
 from ambiguous_wild.vision.grounded import GroundedInstances
 from ambiguous_wild.vision.label_maps import LabelMaps, SceneLabelMaps
@@ -13,20 +13,6 @@ from ambiguous_wild.vision.protocols import NamedInstances, SceneInstances, term
 from ambiguous_wild.vision.sam import SamInstances
 from ambiguous_wild.vision.sam_video import SamVideoInstances
 from ambiguous_wild.vision.segments import GraphSegments, SegmentConfig
-
-
-def test_specs_are_taken_apart():
-    spec = parse("dinov2-small@252,blocks=6, normalise=raw")
-    assert (spec.name, spec.size, spec.argument) == ("dinov2-small", 252, "")
-    assert spec.options == {"blocks": "6", "normalise": "raw"}
-    spec = parse("grounded:a person, red car. dog,least_score=0.3")
-    assert (spec.argument, spec.options) == ("a person, red car. dog", {"least_score": "0.3"})
-    assert parse("labels:/some/where, else").argument == "/some/where, else"
-    assert parse(r"labels:C:\maps").argument == r"C:\maps"
-    with pytest.raises(AwError, match="is not a size"):
-        parse("sam2@big")
-    with pytest.raises(AwError, match="is given twice"):
-        parse("sam2,grid=3,grid=4")
 
 
 def test_features_by_name(checkpoint):

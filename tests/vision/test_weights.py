@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import importlib.util
 import json
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -18,7 +17,6 @@ from safetensors.torch import load_file
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.hashing import sha256_file
-from ambiguous_wild.metrics import lpips
 from ambiguous_wild.vision import fetch, weights
 from ambiguous_wild.vision.dino import DinoFeatures
 from ambiguous_wild.vision.pretrained import locate
@@ -37,28 +35,6 @@ def left_in(folder: Path) -> list[str]:
 
 
 # -- the registry -----------------------------------------------------------------------------------
-
-
-def test_every_entry_says_how_large_it_is_whose_and_from_where() -> None:
-    every = weights.KNOWN + weights.OTHER_SIZES
-    assert len({w.name for w in every}) == len(every)
-    for w in every:
-        assert w.size_mb > 0 and w.licence and w.used_for and w.source
-        assert (w.kind == "hub") == bool(w.hub_id) == (w.package is None)
-        if w.package is not None:
-            assert re.fullmatch(r"[0-9a-f]{64}", w.package.sha256) and re.fullmatch(
-                r"[0-9a-f]{64}", w.tensors
-            )
-            assert w.package.version in w.package.archive and w.files[0].endswith(".safetensors")
-    for members in weights.GROUPS.values():
-        assert {w.name for w in every} >= set(members)
-
-
-def test_lpips_and_the_registry_name_the_same_files() -> None:
-    for backbone, _ in lpips.VARIANTS.values():
-        for name, files in lpips._files(backbone):
-            assert weights.named(name).files == files
-    assert [w.name for w in weights.chosen(["lpips", "alexnet"])] == list(weights.GROUPS["lpips"])
 
 
 def test_weights_are_found_where_they_are(own: Path, tmp_path: Path) -> None:

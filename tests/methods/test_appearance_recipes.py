@@ -15,16 +15,24 @@ from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.effects.learnt import Visible
 from ambiguous_wild.splat.effects.placing import (
     directions,
+    frequencies,
     harmonics,
     in_picture,
     mean_of_seen,
     projected,
     ray_directions,
+    with_penalty,
 )
 from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.step import Shot
 from tests.methods.baselines import data_of, parts_of, step_of, trainer_of
 from tests.splat.scenes import camera, gaussians
+from tests.tiny_scene import write_tiny_scene
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 def random(*shape, seed=0):
@@ -45,11 +53,48 @@ def test_harmonics_up_to_degree_four_are_orthonormal():
     assert gram == pytest.approx(np.eye(25), abs=1e-6)
 
 
+def test_places_are_those_of_the_camera():
+    view, means = camera(), gaussians(n=20, rest=3).means
+    local = means.double().numpy() @ view.cam_from_world[:3, :3].T + view.cam_from_world[:3, 3]
+    pixels, z = projected(means, view)
+    front = local[:, 2] > 0.1
+    want = local[:, :2] / local[:, 2:] * [view.fx, view.fy] + [view.cx, view.cy]
+    assert pixels.numpy()[front] == pytest.approx(want[front], abs=1e-3)
+    assert z.numpy() == pytest.approx(local[:, 2], abs=1e-5)
+    towards = means.double().numpy() - view.center
+    assert directions(means, view).numpy() == pytest.approx(
+        towards / np.linalg.norm(towards, axis=1, keepdims=True), abs=1e-5
+    )
+    inside = front & (want >= 0).all(1) & (want <= [view.width, view.height]).all(1)
+    assert in_picture(means, view, margin=0.0).numpy().tolist() == inside.tolist()
+
+
 def test_rays_point_where_pixels_come_from():
     view = camera()
     rays = ray_directions(view, view.height, view.width, torch.zeros(1)).reshape(view.height, view.width, 3)
     point = torch.tensor(view.center, dtype=torch.float32) + 2.5 * rays[7, 11]
     assert projected(point[None], view)[0][0].tolist() == pytest.approx([11.5, 7.5], abs=1e-3)
+
+
+def test_frequencies_and_penalty_by_hand():
+    found = frequencies(torch.tensor([[0.5, -1.0]]), 2)[0]
+    want = [
+        0.5,
+        -1.0,
+        np.sin(0.5),
+        np.sin(-1),
+        np.cos(0.5),
+        np.cos(1),
+        np.sin(1),
+        np.sin(-2),
+        np.cos(1),
+        np.cos(2),
+    ]
+    assert found.tolist() == pytest.approx(want)
+    x = torch.tensor([1.0, 2.0], requires_grad=True)
+    same = with_penalty(3.0 * x, 0.5 * x.square().sum())
+    (same * torch.tensor([1.0, 10.0])).sum().backward()
+    assert same.tolist() == [3.0, 6.0] and x.grad.tolist() == [3.0 + 1.0, 30.0 + 2.0]
 
 
 def test_the_gradient_of_a_keep_map_is_that_of_the_loss():
@@ -73,6 +118,12 @@ def gsw(scene, tmp_path_factory):
     effect = GswAppearance(GswConfig(side=32, width=4, dropout=0.0))
     effect.setup(data)
     return data, effect
+
+
+def test_a_map_is_sampled_between_its_cells():
+    maps = torch.arange(12.0).reshape(1, 3, 4)
+    at = torch.tensor([[-0.25, 0.0], [5.0, -9.0]])  # column 1, row 1; outside: the corner
+    assert gsw_net.sample(maps, at)[:, 0].tolist() == pytest.approx([5.0, 3.0])
 
 
 def shot_of(data, view=0, **changes):
@@ -162,6 +213,16 @@ def half_black(photo):
     left = photo.clone()
     left[:, photo.shape[1] // 2 :] = 0.0
     return left
+
+
+def test_intrinsic_features_start_as_harmonics_and_places_in_the_box(gsw):
+    g = gaussians(n=30, rest=3)
+    rows = gsw[1].rows(g)
+    assert (
+        torch.equal(rows["gsw_intrinsic"].values[:, :3], g.sh0)
+        and not rows["gsw_intrinsic"].values[:, 3:].any()
+    )
+    assert rows["gsw_places"].values.abs().max() <= 1 and rows["gsw_places"].at(1.0) == pytest.approx(0.01)
 
 
 def test_a_test_photo_shows_its_left_half_and_nothing_is_fitted(gsw):

@@ -11,6 +11,12 @@ from ambiguous_wild.splat.fields import STATIC, frames_of
 from ambiguous_wild.splat.rendered import Cotangents, Frame
 from ambiguous_wild.splat.step import Shot
 from tests.methods.baselines import data_of, parts_of, trained, trainer_of
+from tests.tiny_scene import write_tiny_scene
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 @pytest.fixture(scope="module")
@@ -42,6 +48,13 @@ def test_a_layer_covers_the_frame_of_its_photo_just_in_front_of_it(starts):
         assert g.sh_degree == 0 and len(g) == 300
         assert torch.sigmoid(g.opacity_logits).tolist() == pytest.approx([0.1] * 300)
     assert not torch.equal(found[str(0)].gaussians.sh0, found[str(1)].gaussians.sh0)
+
+
+def test_learning_rates_are_the_released_ones_times_the_speed(starts):
+    rates = starts[1][str(0)].rates(0.2)
+    assert rates["means"] == pytest.approx(0.6)  # of the static field, decay included
+    assert rates["sh0"] * 0.28209479 == pytest.approx(0.05)
+    assert (rates["opacity_logits"], rates["log_scales"], rates["quats"]) == (0.1, 0.1, 0.02)
 
 
 def test_the_composite_by_hand():

@@ -7,14 +7,16 @@ import numpy as np
 import pytest
 import torch
 
+from ambiguous_wild.methods import dronesplat
 from ambiguous_wild.methods.robustsplat import policy as robustsplat
 from ambiguous_wild.methods.robustsplat import supervision
 from ambiguous_wild.methods.robustsplat.config import RobustSplatConfig
+from ambiguous_wild.methods.robustsplat.net import MaskNet, adam_of, adam_state, enlarged, load_adam_state
 from ambiguous_wild.splat import checkpoint, device
 from ambiguous_wild.splat.step import Step
 from tests.host_reads import READ, moved, no_transfers
 from tests.methods.baselines import data_of, parts_of, same, step_of
-from tests.tiny_scene import TRAIN
+from tests.tiny_scene import TRAIN, write_tiny_scene
 
 STEPS = 8
 
@@ -25,6 +27,11 @@ def _one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 @pytest.fixture
@@ -132,6 +139,19 @@ def test_the_coarse_render_meets_a_camera_again(scene, cache, drawn):
     assert drawn[4] is not drawn[0]  # another camera of the same view, as a learnt pose has it
 
 
+def test_instance_means_are_the_cpus(monkeypatch):
+    rng = np.random.default_rng(0)
+    labels = torch.from_numpy(rng.integers(0, 6, (31, 43)))
+    residual = torch.from_numpy(rng.random((31, 43), dtype=np.float32))
+    cpu = dronesplat.heat_map(residual, labels)
+    on_accelerator(monkeypatch)
+    for count in (6, 9):  # above the largest label there may be room
+        found = dronesplat.heat_map(residual, labels, count)
+        torch.testing.assert_close(found, cpu, rtol=0, atol=1e-13)  # sums in another order, in float64
+    flat = dronesplat.heat_map(torch.full((31, 43), 0.3), torch.zeros_like(labels), 6)
+    assert not flat.any()
+
+
 def test_dronesplat_masks_what_it_masks_on_the_cpu(scene, cache, monkeypatch):
     runs = []
     for yes in (False, True):
@@ -145,6 +165,14 @@ def test_dronesplat_masks_what_it_masks_on_the_cpu(scene, cache, monkeypatch):
     # an instance whose heat is within rounding of the threshold would go as a whole; none is here
     assert torch.equal(keeps, keeps_there)
     assert there.facts() == cpu.facts()
+
+
+def test_enlarging_copies_its_weights_once():
+    grid = torch.randn(5, 6, 3, generator=torch.Generator().manual_seed(0))
+    for dtype, tolerance in ((torch.float32, 1e-6), (torch.float64, 1e-6)):
+        chw = grid.to(dtype).permute(2, 0, 1)[None]
+        want = torch.nn.functional.interpolate(chw, size=(17, 13), mode="bilinear")[0].permute(1, 2, 0)
+        torch.testing.assert_close(enlarged(grid.to(dtype), 17, 13), want, rtol=0, atol=tolerance)
 
 
 # -- state ----------------------------------------------------------------------------------------
@@ -179,6 +207,21 @@ def test_the_state_goes_from_an_accelerator_to_a_cpu_and_back(scene, cache, monk
         assert torch.equal(one, whole)
         torch.testing.assert_close(other, whole, rtol=1e-4, atol=1e-6)
     assert second.facts() == first.facts()
+
+
+@pytest.mark.parametrize("there, place", [(True, "meta"), (False, "cpu")])
+def test_adams_count_of_steps_is_loaded_to_where_adam_reads_it(monkeypatch, there, place):
+    on_accelerator(monkeypatch, there)
+    net = MaskNet(torch.zeros(4), torch.ones(4), 3, seed=0)
+    optimiser = adam_of(net, 1e-3, torch.device("cpu"))
+    net(torch.ones(2, 2, 4), 2, 2).sum().backward()
+    optimiser.step()
+    rows = adam_state(optimiser)
+    net, optimiser = moved((net, optimiser))
+    load_adam_state(optimiser, rows)
+    states = [optimiser.state[p] for p in net.parameters()]
+    assert [s["step"].device.type for s in states] == [place] * 4
+    assert {s["exp_avg"].device.type for s in states} == {"meta"}
 
 
 def test_dronesplats_state_holds_numbers(scene, cache, monkeypatch, tmp_path):

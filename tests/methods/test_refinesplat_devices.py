@@ -194,6 +194,18 @@ def test_components_are_opencvs_at_the_size_of_a_photo(shape, accelerated):
         assert np.array_equal(found > 0, mask)
 
 
+def test_too_few_rounds_leave_a_maze_in_parts(monkeypatch, accelerated):
+    mask = maze(2, 378, 504)
+    monkeypatch.setattr(regions, "rounds_for", lambda pixels: 4)
+    found = regions.components(tensor(mask)[None], 4).numpy()
+    assert len(np.unique(found)) > 2
+    assert regions.rounds_for(10**9) == 4
+
+
+def test_larger_photos_get_more_rounds_and_small_ones_no_fewer():
+    assert [regions.rounds_for(n) for n in (1, 504 * 378, 4 * 504 * 378, 17 * 504 * 378)] == [8, 8, 9, 11]
+
+
 @pytest.mark.parametrize("seed", range(2))
 def test_hysteresis_and_filled_gaps_are_the_cpus(seed, monkeypatch):
     values = cv2.GaussianBlur(noise(seed, 60, 83), (0, 0), 1.0 + seed).astype(np.float64)

@@ -2,12 +2,15 @@
 
 import dataclasses
 import math
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
+from ambiguous_wild.core.config import flatten, from_plain, to_plain, with_options
+from ambiguous_wild.methods import get_method
 from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.identity import PsiConfig
 from ambiguous_wild.methods.refinesplat.inputs import untracked
@@ -197,6 +200,41 @@ def test_ssim_by_map_and_by_images_differ_next_to_a_mask():
     by_map = photometric(render, photo, keep, lambda_dssim=1.0, weighting="map")
     by_images = photometric(render, photo, keep, lambda_dssim=1.0, weighting="images")
     assert float(by_images.dssim) == pytest.approx(0.0, abs=1e-6) and float(by_map.dssim) > 0.01
+
+
+def test_the_papers_parts_are_on_and_ours_are_off():
+    plain, own, printed = RefineSplatConfig(), PaperConfig(), PrintedConfig()
+    assert (plain.lambda_id, plain.lambda_cr, plain.mask.statistic) == (0.0, 0.0, "structure")
+    for config in (own, printed):
+        assert (config.lambda_id, config.lambda_cr) == (1.0, 0.2)
+        assert (config.mask.statistic, config.mask.combine, config.mask.box) == ("entropy", "union", 3)
+        assert config.mask.w2 is None and config.mask.dilation == 5 and config.mask.use_local
+        assert config.density.decides == "total" and config.density.merge_every > 0
+        assert not config.first_look.on and config.density.support.least_share == 0
+    assert (own.entropy_limit, printed.entropy_limit) == (0.1, 0.0)
+    assert (own.mask.threshold, own.mask.spread, own.density.merge.form) == ("kapur", "std", "normalised")
+    assert (printed.mask.threshold, printed.mask.spread, printed.density.merge.form) == (
+        "literal", "var", "literal",
+    )  # fmt: skip
+    assert (printed.mask.most, printed.mask_every, printed.entropy_every) == (1.0, 1, 1)
+    for config in (own, printed):
+        assert from_plain(type(config), to_plain(config)) == config
+    other = with_options(
+        get_method("refinesplat-paper").options(), {"features": "sceneconv", "mask.most": "1"}
+    )
+    assert other.features == "sceneconv" and other.mask.threshold == "kapur"
+
+
+def test_what_is_not_stated_is_as_in_refinesplat():
+    """-paper and -printed differ in nothing that docs/fidelity.md does not list."""
+    plain, own, printed = (
+        flatten(to_plain(c)) for c in (RefineSplatConfig(), PaperConfig(), PrintedConfig())
+    )
+    assert plain.keys() == own.keys() == printed.keys()
+    page = (Path(__file__).parents[2] / "docs" / "fidelity.md").read_text()
+    for key in plain:
+        if not plain[key] == own[key] == printed[key]:
+            assert f"`{key}`" in page, f"{key} differs and docs/fidelity.md does not say so"
 
 
 def test_the_papers_networks_are_the_default_where_their_weights_are(tmp_path, monkeypatch):

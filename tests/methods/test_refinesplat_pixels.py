@@ -18,7 +18,7 @@ from ambiguous_wild.methods.refinesplat.multiview import (
     nearest_views,
 )
 from ambiguous_wild.methods.refinesplat.pixels import PixelEvidence
-from ambiguous_wild.methods.refinesplat.ranks import agree, common_offset
+from ambiguous_wild.methods.refinesplat.ranks import Ranks, agree, agreement_weight, common_offset
 from ambiguous_wild.methods.refinesplat.structure import correlation, structure_residual, unrelated_residual
 from tests.methods.on_device import noise, number, tensor
 
@@ -125,6 +125,18 @@ def test_a_surface_at_another_depth_or_outside_says_nothing():
     assert np.isnan(asked(far, 0).evidence).all()
 
 
+def test_quantiles_are_numpys_without_what_is_missing():
+    stack = noise(4, 7, 5, 6)
+    stack[noise(5, 7, 5, 6) < 0.4] = np.nan
+    stack[:, 0, 0] = np.nan
+    there = tensor((~np.isnan(stack)).sum(axis=0))
+    for quantile in (0.0, 0.25, 0.5, 0.8, 1.0):
+        with pytest.warns(RuntimeWarning):
+            expected = np.nanquantile(stack, quantile, axis=0)
+        found = Ranks(7, quantile, "cpu").quantile_of(tensor(stack), there)
+        assert np.allclose(found, expected, equal_nan=True, atol=1e-6)
+
+
 def test_discount_by_hand():
     config = MultiViewConfig(strength=2.0, free=2.0)
     evidence = torch.full((4, 6), 10.0)
@@ -160,6 +172,13 @@ def test_views_that_show_another_colour_have_no_word():
     for view in range(7):
         store(never, view, np.ones((H, W)), np.full((H, W), PLANE))
     assert (asked(never, 0).weight == 1.0).all()
+
+
+def test_weight_is_the_share_of_those_who_see_it_and_few_are_always_heard():
+    seen, agreeing = torch.tensor([4, 4, 2]), torch.tensor([1, 0, 0])
+    few = seen < 3
+    assert agreement_weight(seen, agreeing, 0.5, few).tolist() == [0.5, 0.0, 1.0]
+    assert agreement_weight(seen, agreeing, 0.5, ~few).tolist() == [1.0, 1.0, 0.0]
 
 
 def test_exposure_and_white_balance_are_no_other_content():

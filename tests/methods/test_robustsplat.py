@@ -14,10 +14,11 @@ from ambiguous_wild.methods.robustsplat import supervision
 from ambiguous_wild.methods.robustsplat.config import RobustSplatConfig
 from ambiguous_wild.methods.robustsplat.net import MaskNet
 from ambiguous_wild.methods.robustsplat.policy import RobustSplatMask, _fit, coarse_spec
+from ambiguous_wild.methods.robustsplat.recipe import build
 from ambiguous_wild.vision import backends
 from ambiguous_wild.vision.labhog import LabHog
 from tests.methods.baselines import data_of, parts_of, step_of, trained
-from tests.tiny_scene import SQUARE, TRAIN, wall_colour
+from tests.tiny_scene import SQUARE, TRAIN, wall_colour, write_tiny_scene
 
 EARLY = {"min_mask_start": "20"}
 
@@ -29,6 +30,11 @@ def _one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 def clean_photo(view: int) -> torch.Tensor:
@@ -59,6 +65,13 @@ def test_percentiles_are_numpys_within_a_bin():
         assert 0 <= supervision.percentile(histogram, share) - exact <= 1e-4 + 1e-6
 
 
+def test_percentile_is_the_smallest_edge_that_holds_the_share():
+    ten = torch.tensor([1.0] * 10, dtype=torch.float64)
+    assert supervision.percentile(ten, 0.6) == pytest.approx(0.6)
+    assert supervision.percentile(ten, 0.61) == pytest.approx(0.7)
+    assert supervision.percentile(torch.zeros(10, dtype=torch.float64), 0.6) == 1.0
+
+
 def test_the_histogram_forgets_as_it_should():
     histogram = torch.zeros(4, dtype=torch.float64)
     for value in (0.1, 0.6, 1.0):
@@ -74,6 +87,11 @@ def test_bounds_against_loops():
         for x in range(13):
             near = inlier[y : y + 3, x : x + 3].sum() / 9
             assert got[y, x] == (inlier[y + 1, x + 1] == 1 or near > 0.5)
+
+
+def test_the_cosine_target_is_the_printed_formula():
+    c = torch.linspace(-1, 1, 41)
+    assert torch.allclose(supervision.cosine_target(c), (2 * c - 1).clamp(0, 1), atol=1e-6)
 
 
 def test_the_calibrated_cosine_is_zero_at_normal_units():
@@ -119,6 +137,14 @@ def test_the_first_layer_before_enlarging_equals_after():
     z = (big[0].permute(1, 2, 0) - net.mean) / net.std
     want = torch.sigmoid(net.last(torch.relu(net.first(z)))).squeeze(2)
     assert torch.allclose(net(phi, 36, 48), want, atol=1e-5)
+
+
+def test_the_net_is_a_function_of_its_seed():
+    mean, std = torch.zeros(5), torch.ones(5)
+    one, same, other = (MaskNet(mean, std, 8, seed) for seed in (1, 1, 2))
+    assert torch.equal(one.first.weight, same.first.weight)
+    assert not torch.equal(one.first.weight, other.first.weight)
+    assert float(one.first.weight.detach().abs().max()) <= 5**-0.5
 
 
 # -- the policy ---------------------------------------------------------------------------------------
@@ -274,6 +300,14 @@ def test_options_that_cannot_be_are_refused(wrong):
 
 
 # -- the recipe ---------------------------------------------------------------------------------------
+
+
+def test_the_recipe_delays_growth_and_masks_both_pictures():
+    parts = build(RobustSplatConfig())
+    assert (parts.density_config.start, parts.density_config.stop) == (10_000.0, 20_000.0)
+    assert parts.density_config.resets == (15_000.0, 18_000.0)
+    assert parts.schedule.lr_opacity == 0.025
+    assert parts.weighting == "images"
 
 
 def test_the_seed_decides(scene, tmp_path):

@@ -11,13 +11,19 @@ from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.methods.forestsplats.nets import fill
 from ambiguous_wild.methods.hybridgs import COVERED, composed, planar_sums
 from ambiguous_wild.methods.nexussplats import GEOMETRY, SHIFT, as_colour, boundary, kept
-from ambiguous_wild.methods.t3dgs import divergence, inverse_depth, likelihood_loss, variation
+from ambiguous_wild.methods.t3dgs import Head, divergence, inverse_depth, likelihood_loss, variation
 from ambiguous_wild.splat.fields import STATIC, frames_of
 from ambiguous_wild.splat.gaussians import SH_C0
 from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.render import render
 from tests.methods.baselines import data_of, masked_more_inside, parts_of, step_of, trained, trainer_of
 from tests.splat.scenes import camera, gaussians
+from tests.tiny_scene import write_tiny_scene
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 def random(*shape, seed=0):
@@ -169,6 +175,15 @@ def test_planar_sums_have_their_gradients():
         assert leaf.grad[at].item() == pytest.approx(want, rel=1e-3, abs=1e-4)
 
 
+def test_the_composite_by_hand():
+    front, mask, back = (
+        torch.full((1, 1, 3), 0.2),
+        torch.full((1, 1), 0.25),
+        torch.tensor([[[0.4, 1.6, -1.0]]]),
+    )
+    assert composed(front, mask, back)[0, 0].tolist() == pytest.approx([0.5, 0.95, 0.2])
+
+
 def test_stages_share_the_loss_as_described(scene, tmp_path):
     trainer = trainer_of(scene, tmp_path, parts_of("hybridgs", points="60"))
     policy, effect = trainer.parts.mask, trainer.effects.effects[0]
@@ -234,6 +249,17 @@ def test_the_divergence_by_hand():
     flat = torch.tensor([0.5, 0.2, 0.0]).reshape(3, 1, 1)
     # as coded: (1 + 1 - 0) / 0.64, where the exact one has 1 + 1
     assert divergence(tilted, flat).item() == pytest.approx(0.5 * (2 / 0.64 - math.log(0.64) - 2))
+
+
+def test_the_head_gives_deviations_and_a_correlation():
+    head = Head(27, 1, seed=0)
+    widths = [27, 9, 4, 2]
+    assert [c.out_channels for c in head.convs] == [27, 9, 9, 4, 4, 2] and head.last.in_channels == widths[3]
+    found = head(torch.randn(2, 12, 16, 27, generator=torch.Generator().manual_seed(0)), 47, 63)
+    assert found.shape == (2, 3, 47, 63)
+    assert found[:, :2].min() > 0 and found[:, 2].abs().max() < 1
+    again = Head(27, 1, seed=0)
+    assert all(torch.equal(a, b) for a, b in zip(head.parameters(), again.parameters()))
 
 
 def test_variation_is_of_the_range():

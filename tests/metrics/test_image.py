@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from skimage.metrics import peak_signal_noise_ratio
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.metrics.image import METRICS, flip, psnr, psnr_affine, ssim, ssim_inria
+from ambiguous_wild.metrics.image import METRICS, flip, flip_map, psnr, psnr_affine, ssim, ssim_inria
 
 
 def pair(
@@ -20,6 +20,18 @@ def pair(
     rng = np.random.default_rng(seed)
     a = rng.random((height, width, 3))
     return a, np.clip(a + noise * rng.standard_normal(a.shape), 0.0, 1.0)
+
+
+def test_zero_padding_raises_ssim_of_a_noisy_picture() -> None:
+    # The reason the variants have two names: windows at the border agree on their zeros.
+    a, b = pair(60, 60)
+    assert 0.0005 < ssim_inria(a, b) - ssim(a, b) < 0.1
+
+
+def test_psnr_of_a_known_error() -> None:
+    a = np.zeros((4, 4, 3))
+    assert psnr(a, a + 0.1) == pytest.approx(20.0, abs=1e-9)
+    assert psnr(a, a + 1.0) == 0.0
 
 
 def test_uint8_and_float_of_the_same_picture_agree() -> None:
@@ -35,6 +47,12 @@ def test_identical_and_constant_pictures(level: float) -> None:
     flat = np.full((20, 20, 3), level)
     assert psnr(flat, flat) == math.inf
     assert ssim(flat, flat) == 1.0 and ssim_inria(flat, flat) == 1.0
+
+
+def test_ssim_of_two_constant_pictures_is_the_luminance_term() -> None:
+    a, b = np.full((15, 15, 3), 0.25), np.full((15, 15, 3), 0.75)
+    expected = (2 * 0.25 * 0.75 + 1e-4) / (0.25**2 + 0.75**2 + 1e-4)
+    assert ssim(a, b) == pytest.approx(expected, abs=1e-9)
 
 
 @given(seed=st.integers(0, 2**32 - 1), noise=st.floats(0.0, 1.0))
@@ -72,6 +90,27 @@ def test_unusable_pictures_are_named(bad: np.ndarray, words: str) -> None:
 
 def codes(seed: int = 0, size: tuple[int, int] = (20, 24)) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (*size, 3), dtype=np.uint8)
+
+
+def test_identity_symmetry_range_and_kinds_of_numbers() -> None:
+    a, b = codes(0), codes(1)
+    assert flip(a, a) == 0.0
+    assert flip(a, b) == pytest.approx(flip(b, a), abs=1e-12)
+    error = flip_map(a, b)
+    assert error.shape == (20, 24) and error.min() >= 0.0 and 0.1 < error.max() <= 1.0
+    assert flip(a / 255.0, b) == pytest.approx(flip(a, b), abs=1e-12)
+
+
+def test_the_error_lies_where_the_pictures_differ_and_grows_with_the_difference() -> None:
+    grey = np.full((60, 60, 3), 128, np.uint8)
+    errors = []
+    for level in (132, 150, 200):
+        changed = grey.copy()
+        changed[25:35, 25:35] = level
+        error = flip_map(grey, changed)
+        assert error[28:32, 28:32].min() > 5 * max(error[:8].max(), 1e-9)
+        errors.append(error.mean())
+    assert errors == sorted(errors)
 
 
 def test_pictures_of_two_sizes_have_no_flip() -> None:
@@ -123,3 +162,8 @@ def test_it_is_never_below_psnr():
     for seed in range(20):
         render, photo = recoloured(seed, (5, 6), noise=0.4)
         assert psnr_affine(render, photo) >= psnr(render, photo)
+
+
+def test_other_sizes_are_refused():
+    with pytest.raises(AwError, match="different size"):
+        psnr_affine(np.zeros((4, 4, 3)), np.zeros((4, 5, 3)))

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.simulate import capture
+from ambiguous_wild.simulate import image_effects as fx
 from ambiguous_wild.simulate.image_effects import PhotoRandom
-from ambiguous_wild.simulate.presets import preset, resized
+from ambiguous_wild.simulate.presets import PRESETS, preset, resized
 from ambiguous_wild.simulate.render import PlannedPhoto, RenderedPhoto, render_photo
 from ambiguous_wild.simulate.spec import KINDS, CaptureSpec, Defocus, Effects
 from ambiguous_wild.simulate.world import World
@@ -37,6 +38,28 @@ def planned() -> tuple[World, list[PlannedPhoto]]:
 def taken(spec: CaptureSpec, k: int, seed: int = 3) -> RenderedPhoto:
     world, shots = planned()
     return render_photo(spec, world, shots[k], PhotoRandom(seed, k, k / 3))
+
+
+@pytest.mark.parametrize("name", [*KINDS, "none", "all"])
+def test_what_is_named_is_computed_and_nothing_else(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    wanted = {"none": [], "all": list(KINDS)}.get(name, [name])
+    of_hand = ("motion_blur", "rolling_shutter")
+    called = set()
+
+    def watch(function: str) -> None:
+        original = getattr(fx, function)
+
+        def watched(*words: object) -> object:
+            called.add(function)
+            return original(*words)
+
+        monkeypatch.setattr(fx, function, watched)
+
+    for function in [*(kind for kind in KINDS if kind not in of_hand), "hand_turns"]:
+        watch(function)
+    made = taken(small(**{kind: getattr(ALL, kind) for kind in wanted}), 1)
+    assert set(made.effects) == set(wanted)
+    assert called == {"hand_turns" if kind in of_hand else kind for kind in wanted}
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -87,3 +110,18 @@ def test_the_same_seed_gives_the_same_bits_and_another_does_not() -> None:
     spec = replace(small(), effects=ALL)
     assert np.array_equal(taken(spec, 1).photo, taken(spec, 1).photo)
     assert not np.array_equal(taken(spec, 1).photo, taken(spec, 1, seed=4).photo)
+
+
+def test_labels_agree_with_what_the_spec_holds() -> None:
+    appearance = ("exposure_drift", "white_balance", "time_of_day")
+    for spec in PRESETS.values():
+        label = spec.designed
+        named = {name for name in KINDS if getattr(spec.effects, name) is not None}
+        someone = bool(spec.distractors) or "moving_shadow" in named
+        assert ("masks" in label.effects) == someone, spec.name
+        assert ("appearance" in label.effects) == bool(named & set(appearance)), spec.name
+        assert ("sh" in label.effects) == ("specular" in named), spec.name
+        assert ("antialiasing" in label.effects) == (spec.zoom != (1.0, 1.0)), spec.name
+        # a shaking hand is in COLMAP's poses: refining them cost 1.8 dB (docs/effects.md)
+        assert "pose" not in label.effects, spec.name
+        assert label.ambiguity != "unstated" and (spec.distractors or label.ambiguity == "neither"), spec.name

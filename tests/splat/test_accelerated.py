@@ -12,9 +12,10 @@ from ambiguous_wild.splat.gpu import kernels
 from ambiguous_wild.splat.gpu.kernels import compiled
 from ambiguous_wild.splat.losses import photometric, ssim_map
 from ambiguous_wild.splat.parts import MaskPolicy, Parts
+from ambiguous_wild.splat.records import SAMPLED, Clock, GpuClock, clock_for
 from ambiguous_wild.splat.reference import photometric_reference, ssim_map_reference
 from ambiguous_wild.splat.rendered import Cotangents
-from ambiguous_wild.splat.watchdog import NonFinite
+from ambiguous_wild.splat.watchdog import NonFinite, Sentinel
 from tests.host_reads import READ, moved, no_transfers
 from tests.tiny_scene import with_points
 
@@ -113,6 +114,22 @@ def test_the_step_that_broke_is_made_again_with_its_own_keep_map(scene, tmp_path
     if where == "keep":
         expected[20, 30] = math.nan
     assert torch.equal(keep.nan_to_num(-1.0), expected.nan_to_num(-1.0))
+
+
+def test_what_weighed_the_broken_step_is_kept_whatever_the_sizes_after_it():
+    sentinel, loss = Sentinel(torch.device("cpu"), 3), torch.tensor(0.5)
+    sound, broken = [torch.ones(2)], [torch.tensor([1.0, math.inf])]
+    sentinel.watch(1, 0, loss, sound, torch.full((4, 5), 0.1))
+    weights = torch.rand(2, 3), Cotangents(image=torch.rand(2, 3, 3), depth=torch.rand(2, 3))
+    sentinel.watch(2, 1, loss, broken, *weights)
+    sentinel.watch(3, 2, loss, broken, torch.full((4, 5), 0.3), torch.full((4, 5, 3), 0.4))
+    found = sentinel.first_broken()
+    assert found.iteration == 2 and torch.equal(found.keep, weights[0])
+    assert torch.equal(found.extra.image, weights[1].image) and found.extra.extra is None
+    assert torch.equal(found.extra.depth, weights[1].depth) and found.extra.alpha is None
+    sentinel.reset()
+    sentinel.watch(4, 0, loss, broken, None)
+    assert sentinel.first_broken().keep is None
 
 
 @pytest.mark.parametrize("mask", [MaskPolicy, OnMeta, Fickle])
@@ -261,3 +278,62 @@ def test_without_a_compiler_the_loss_runs_as_it_stands_and_says_so(monkeypatch):
         assert torch.equal(torch.Tensor(call(argument)), torch.ones(2))
     with warnings.catch_warnings(action="error"):  # it says so once
         assert torch.equal(torch.Tensor(call(argument)), torch.ones(2))
+
+
+def test_the_sentinel_stays_up_and_counts_what_was_sound():
+    sentinel = Sentinel(torch.device("cpu"), 3)
+    sound, broken = [torch.ones(4, 3)], [torch.tensor([1.0, math.inf])]
+    loss = torch.tensor(0.5)
+    assert sentinel.first_broken() is None
+    assert not sentinel.watch(1, 0, loss, sound, None)
+    assert sentinel.first_broken() is None
+    assert not sentinel.watch(2, 1, loss, sound, torch.ones(2, 2))
+    assert sentinel.watch(3, 2, loss, sound, torch.zeros(2, 2))  # nothing kept: off, and nothing broken
+    assert not sentinel.watch(5, 0, loss, sound, None)
+    assert sentinel.watch(6, 0, loss, broken, None)
+    assert sentinel.watch(7, 0, loss, sound, None)  # it stays up
+    assert sentinel.first_broken().iteration == 6
+    assert sentinel.empty_views() == {2}
+    sentinel.reset()
+    assert sentinel.first_broken() is None
+    assert sentinel.watch(8, 0, torch.tensor(math.nan), sound, None)
+    assert sentinel.first_broken().iteration == 8
+    assert torch.equal(sound[0], torch.ones(4, 3))
+
+
+def test_parts_are_timed_by_the_devices_own_events_now_and_then():
+    class Event:
+        now = 0.0
+        waited = 0
+
+        def __init__(self):
+            self.at = None
+
+        def record(self):
+            self.at = Event.now
+
+        def synchronize(self):
+            Event.waited += 1
+
+        def elapsed_time(self, other):
+            return other.at - self.at
+
+    gpu = GpuClock(event=Event)
+    for _ in range(3 * SAMPLED):
+        gpu.start()
+        with gpu.part("render"):
+            Event.now += 2.0  # ms
+        with gpu.part("loss"):
+            Event.now += 0.5
+        gpu.stop()
+        with gpu.part("render"):  # pictures are looked at with the clock stopped
+            Event.now += 100.0
+    assert Event.waited == 0 and gpu.parts_s == {}
+    gpu.settle()
+    assert Event.waited == 1
+    steps = 3 * SAMPLED
+    assert gpu.parts_s == pytest.approx({"render": steps * 2e-3, "loss": steps * 0.5e-3})
+    gpu.settle()
+    assert gpu.parts_s == pytest.approx({"render": steps * 2e-3, "loss": steps * 0.5e-3})
+    assert type(clock_for(torch.device("cpu"))) is Clock
+    assert type(clock_for(torch.device("cuda"))) is GpuClock

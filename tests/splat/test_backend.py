@@ -5,10 +5,20 @@ import math
 import pytest
 import torch
 
-from ambiguous_wild.splat.backend import Backend, GpuBackend
+from ambiguous_wild.core import AwError
+from ambiguous_wild.splat import device
+from ambiguous_wild.splat.backend import Backend, GpuBackend, backend_of
+from ambiguous_wild.splat.rendered import check_needs
 from tests.host_reads import no_transfers
 
 CPU, GPU = Backend(), GpuBackend()
+
+
+def test_a_tensor_has_the_back_end_of_its_device(monkeypatch):
+    assert type(backend_of("cpu")) is Backend
+    assert {type(backend_of(there)) for there in ("cuda:1", torch.device("meta"))} == {GpuBackend}
+    monkeypatch.setattr(device, "accelerated", lambda _: True)  # as tests run the GPU's calls on the CPU
+    assert type(backend_of("cpu")) is GpuBackend
 
 
 @pytest.mark.parametrize("labels", [[0, 2, 2, 5], [], [7] * 200])
@@ -41,6 +51,13 @@ def test_the_nearest_points(points, count):
         assert torch.equal(backend.neighbours(xyz, count), expected)
 
 
+def test_a_number_for_later_is_the_number():
+    value = torch.tensor(0.1, requires_grad=True)
+    kept = GPU.number(value * 1)
+    assert CPU.number(value) == float(value.detach()) == float(kept)
+    assert isinstance(kept, torch.Tensor) and not kept.requires_grad
+
+
 @pytest.mark.parametrize("value", [math.nan, -math.nan, math.inf, -math.inf, 3.4e38, -1e-45, -0.0])
 @pytest.mark.parametrize("at", [0, 17, 2999])
 def test_values_that_are_not_finite_are_found(value, at):
@@ -59,3 +76,13 @@ def test_a_gpu_reads_nothing_on_the_host():
         GPU.mean_of_rows(values, lambda: values > 0)
         GPU.number(values.sum())
         assert GPU.rows(lambda: pytest.fail("looked")) == slice(None)
+
+
+def test_each_says_which_sums_it_offers():
+    check_needs(frozenset({"absolute", "squared", "count"}), CPU.statistics)
+    check_needs(frozenset({"absolute"}), GPU.statistics)
+    with pytest.raises(AwError, match=r"'squared' .* --device cpu"):
+        check_needs(frozenset({"squared"}), GPU.statistics)
+    for backend in (CPU, GPU):
+        with pytest.raises(AwError, match=r"statistic 'sqared'.*squared"):
+            check_needs(frozenset({"sqared"}), backend.statistics)

@@ -1,13 +1,16 @@
 """The accelerator's render call around a stand-in for gsplat: with numbers, and without host reads."""
 
+import numpy as np
 import pytest
 import torch
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.splat.cpu.render import render_cpu
 from ambiguous_wild.splat.gpu import gsplat_seam
+from ambiguous_wild.splat.gpu.render import on_device
 from ambiguous_wild.splat.reference import render_reference
 from ambiguous_wild.splat.render import render
+from ambiguous_wild.splat.rendered import Cotangents
 from ambiguous_wild.stress.case import agree
 
 from . import fake_gsplat
@@ -16,6 +19,7 @@ from .scenes import camera, cotangents, doubles, gaussians, given
 BACKGROUND = (0.1, 0.5, 0.9)
 # plain float32 sums in no favourable order, and a determinant that is a difference: two digits of seven
 TOLERANCE = 3e-5
+NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh0", "sh_rest")
 
 
 def judged(g, cam, d, **options):
@@ -97,6 +101,36 @@ def test_without_a_graph_there_is_no_backward_pass_and_the_same_picture(fake):
         rendered.backward(torch.ones_like(rendered.image))
 
 
+def test_pictures_carry_no_graph_and_gaussians_are_left_alone(fake):
+    g, cam = gaussians(7), camera()
+    before = g.clone()
+    rendered = render(g, cam)
+    rendered.backward(torch.ones_like(rendered.image))
+    assert not rendered.image.requires_grad and not rendered.depth.requires_grad
+    for name, tensor in g.items():
+        assert torch.equal(tensor, getattr(before, name)) and not tensor.requires_grad
+
+
+def test_a_second_cotangent_comes_back_once_more_through_the_pixels_alone(fake, monkeypatch):
+    calls = {"project": 0, "blend": 0}
+    for name in calls:
+        original = getattr(gsplat_seam, name)
+
+        def counted(*a, _name=name, _original=original, **k):
+            calls[_name] += 1
+            return _original(*a, **k)
+
+        monkeypatch.setattr(gsplat_seam, name, counted)
+    g, cam = gaussians(8), camera()
+    d = cotangents(cam.height, cam.width)
+    rendered = render(g, cam)
+    rendered.backward(Cotangents(d["d_image"], d["d_image_extra"]))
+    assert calls == {"project": 1, "blend": 1}  # no depth, no second drawing unless asked for
+    assert rendered.depth.shape == (cam.height, cam.width)
+    assert calls == {"project": 1, "blend": 2}
+    assert rendered.depth is rendered.depth
+
+
 def test_nothing_to_draw(fake):
     cam = camera()
     none = gaussians(0).select(torch.zeros(60, dtype=torch.bool))
@@ -112,6 +146,15 @@ def test_the_adapter_passes_the_bound_that_follows_from_the_problem(fake, seed):
 
     measured = agree(cloud(30, seed), front_camera(), "cpu", "", sh_degree=1)
     assert measured.error <= measured.tolerance
+
+
+def test_a_cameras_matrices_are_copied_once_and_are_its_own():
+    a, b = camera(), camera(angle=0.7)
+    first = on_device(a, torch.device("cpu"))
+    assert on_device(a, torch.device("cpu")) is first
+    other = on_device(b, torch.device("cpu"))
+    assert not torch.equal(other.viewmat, first.viewmat)
+    np.testing.assert_allclose(first.centre.numpy(), a.center, rtol=1e-6)
 
 
 def test_without_gsplat_the_error_names_the_command(monkeypatch):

@@ -33,12 +33,37 @@ def trainer_for(scene, folder, names=(), **config) -> Trainer:
 # -- nothing where none is asked ------------------------------------------------------------------
 
 
+def test_a_run_without_effects_never_calls_one_and_has_the_same_bits(scene, tmp_path, monkeypatch):
+    plain = trainer_for(scene, tmp_path / "plain")
+    plain.train()
+    calls = []
+    for cls in (Effect, Chain, AffineExposure, AppearanceEmbedding, SmoothingFilter, PoseRefinement, RowAdam):
+        for name, value in list(vars(cls).items()):
+            if callable(value):
+                monkeypatch.setattr(cls, name, lambda *a, _n=f"{cls.__name__}.{name}", **k: calls.append(_n))
+    asked = trainer_for(scene, tmp_path / "asked", ())
+    asked.train()
+    assert calls == []
+    assert asked.effects is None and "effects" not in asked.clock.parts_s
+    assert bits(asked) == bits(plain)
+    Chain((AffineExposure(),), plain.data)  # the counters do count
+    assert calls
+
+
 def test_an_effect_that_does_nothing_leaves_the_bits_alone(scene, tmp_path):
     plain = trainer_for(scene, tmp_path / "plain")
     plain.train()
     idle = trainer_of(scene, tmp_path / "idle", parts=Parts(effects=(Effect(),)))
     idle.train()
     assert bits(idle) == bits(plain)
+
+
+def test_only_overridden_hooks_are_called(scene, tmp_path):
+    trainer = trainer_for(scene, tmp_path, ("exposure",))
+    chain = trainer.effects
+    acting = [hook for hook in ("camera", "model", "shade", "pose", "image") if chain._with(hook)]
+    assert acting == ["image"]
+    assert chain._with("image", without=("exposure",)) == ()
 
 
 def test_an_effect_that_the_method_brings_is_applied_once():

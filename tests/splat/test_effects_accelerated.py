@@ -12,6 +12,7 @@ from ambiguous_wild.core import Points, Scene, View
 from ambiguous_wild.splat import device
 from ambiguous_wild.splat.data import shrink_camera
 from ambiguous_wild.splat.effects import ALL, with_effects
+from ambiguous_wild.splat.effects.base import RowAdam
 from ambiguous_wild.splat.effects.chain import Chain
 from ambiguous_wild.splat.effects.posed import PosedCamera
 from ambiguous_wild.splat.effects.poses import PoseRefinement, left_jacobian, turned
@@ -19,7 +20,7 @@ from ambiguous_wild.splat.effects.smoothing import filter_sizes
 from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.rendered import NOTHING, Cotangents, Gradients, as_cotangents
 from ambiguous_wild.splat.step import Shot, TrainData
-from tests.host_reads import moved, no_transfers
+from tests.host_reads import READ, moved, no_transfers
 from tests.splat.scenes import camera as make_camera
 from tests.splat.scenes import disturbed
 from tests.splat.scenes import gaussians as random_gaussians
@@ -189,6 +190,21 @@ def test_filter_sizes_with_nothing_in_sight():
     assert filter_sizes(behind[:0], cameras).shape == (0,)
 
 
+def test_a_step_that_is_called_off_changes_nothing():
+    generator = torch.Generator().manual_seed(0)
+    off, on = torch.ones(1), torch.zeros(1)
+    plain, told = (RowAdam(torch.zeros(2, 3, dtype=torch.float64)) for _ in range(2))
+    for _ in range(5):
+        gradient = torch.randn(3, generator=generator, dtype=torch.float64)
+        plain.step(1, gradient, 0.1)
+        told.step(1, gradient, 0.1, on)
+    same(told.state_dict(), plain.state_dict(), rtol=1e-6, atol=0)
+    before = {name: t.clone() for name, t in tensors(told.state_dict()).items() if name != "steps/"}
+    told.step(1, torch.tensor([np.nan, np.inf, 1.0], dtype=torch.float64), 0.1, off)
+    for name, tensor in before.items():
+        assert torch.equal(tensors(told.state_dict())[name], tensor)
+
+
 def test_a_run_that_is_called_off_stays_where_it_is(monkeypatch):
     on_accelerator(monkeypatch)
     data = data_of()
@@ -265,3 +281,11 @@ def test_a_step_leaves_the_host_alone(monkeypatch, names):
     with no_transfers():
         for one in plan:
             step(*one)
+
+
+def test_the_pose_for_anybody_else_is_read_when_asked_for():
+    camera = replace(make_camera(*SIZE))
+    posed = PosedCamera(camera, torch.eye(4, dtype=torch.float64).to("meta"), torch.eye(3).to("meta"))
+    assert posed.resized(12, 9).width == 12
+    with pytest.raises((RuntimeError, NotImplementedError, TypeError), match=READ):
+        _ = posed.cam_from_world

@@ -149,6 +149,24 @@ def test_copies_are_up_to_date_and_belong_to_no_optimiser(copied):
     assert equal(copy, dense)
 
 
+def test_gaussians_that_were_left_behind_ask_for_no_more_updates():
+    lazy, dense, a, _ = stepped()
+    shared = replace(lazy, extra={"more": torch.zeros(50)})
+    stay = torch.arange(50) >= 10
+    a.select(stay)
+    assert equal(shared, dense)  # brought up to date before the rows went
+    fewer = lazy.select(stay)
+    a.bind(fewer)
+    for step in (12, 13):
+        a.step(*gradients_at(fewer, step))
+    put_off = fewer.sh_rest.clone()
+    shared.settle()
+    render_cpu(shared, camera())
+    assert equal(shared, dense) and torch.equal(fewer.sh_rest, put_off)
+    fewer.settle()
+    assert not torch.equal(fewer.sh_rest, put_off)  # otherwise nothing was put off
+
+
 def test_a_hundred_thousand_steps_without_gradient_stay_finite():
     g = gaussians(3, 3)
     optimiser = SplatAdam(g, RATES)

@@ -177,6 +177,16 @@ def test_what_is_nowhere_is_removed_with_a_skybox_too(data, tmp_path):
 EAGER = {"start": 0.0, "stop": 10_000.0, "every": 1.0, "min_every": 20, "grow_grad": 1e-9}
 
 
+def test_density_control_neither_copies_nor_removes_it(data, tmp_path):
+    parts = Parts(density_config=DensityConfig(**EAGER, prune_opacity=0.2))
+    trainer = trainer_for(data, tmp_path, parts)
+    first, near = far_rows(trainer), len(trainer.gaussians) - far_rows(trainer)
+    assert first == trainer.effects.facts()["skybox"]["points"] > 0
+    trainer.train()
+    assert far_rows(trainer) == first
+    assert len(trainer.gaussians) - first != near  # the others changed
+
+
 @pytest.mark.parametrize("name", ["refinesplat", "mcmc", "pup-3dgs", "spotlesssplats"])
 def test_every_kind_of_density_control_leaves_it_alone(data, tmp_path, name):
     method = get_method(name)

@@ -1,7 +1,7 @@
 """Methods x captures x seeds on captures with ground truth, compared with training on exact masks.
 
     python benchmarks/captures.py --captures DIR... --out DIR [--methods ...] [--seeds 0 1 2]
-        [--iterations 2000] [--max-gaussians N] [--jobs 2] [--effects none|default|LIST]
+        [--iterations 2000] [--max-gaussians N] [--jobs 2] [--effects none|auto|LIST]
         [--set METHOD.KEY=VALUE ...] [--results FILE] [--report-only]
 
 A DIR is a scene folder (`aw build-scene`, `aw composite`, `aw import`) or a folder of them. Each run is an

@@ -106,10 +106,7 @@ def seen_through(model: pycolmap.Reconstruction, photos: Mapping[int, int]) -> d
         asked, size = np.flatnonzero(others), np.array([camera.width, camera.height])
         if not len(own) or not len(asked):
             continue
-        xy, around = (
-            np.asarray(camera.img_from_cam(local[asked])),
-            np.asarray(camera.img_from_cam(local[own])),
-        )
+        xy, around = (np.asarray(camera.img_from_cam(local[which])) for which in (asked, own))
         seen = np.flatnonzero(((xy >= 0) & (xy < size)).all(axis=1))  # NaN: outside of what the lens can show
         asked, xy = asked[seen], xy[seen]
         reach = THROUGH * size.max()

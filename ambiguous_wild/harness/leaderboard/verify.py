@@ -44,7 +44,6 @@ from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.metrics import stats
 from ambiguous_wild.metrics.image import FULL_IMAGE, METRICS
 
-PLY = MODEL
 ENVIRONMENT = "env.json"
 RENDERS = Path("renders") / "test"
 # Lowest and highest value by the first word of a metric's name; PSNR of pictures in [0, 1] is not negative.
@@ -208,7 +207,7 @@ def _check_files(run: Path, result: RunResult, *, ours: bool) -> dict[str, Path]
     """Image name -> render; everything a result rests on is there."""
     # A program of others may have no splats; then its result says no size either.
     size = result["cost"].get("model_mb")
-    needed = (ENVIRONMENT,) if size is None and not ours else (PLY, ENVIRONMENT)
+    needed = (ENVIRONMENT,) if size is None and not ours else (MODEL, ENVIRONMENT)
     lacking = [name for name in needed if not (run / name).is_file()]
     renders = {row["name"]: run / RENDERS / _inside(run, row["name"]) for row in result["per_image"]}
     lacking += [str(path.relative_to(run)) for path in renders.values() if not path.is_file()]
@@ -220,9 +219,9 @@ def _check_files(run: Path, result: RunResult, *, ours: bool) -> dict[str, Path]
     if unlisted:
         _partial(run, f"{shortlist(unlisted)} was rendered and {RESULT} does not list it")
     check_model(run, result)
-    model_mb = (run / PLY).stat().st_size / 1e6 if PLY in needed else None
+    model_mb = (run / MODEL).stat().st_size / 1e6 if MODEL in needed else None
     if model_mb is not None and (size is None or not math.isclose(size, model_mb, abs_tol=1e-6)):
-        _changed(run, f"{PLY} is not of the size that {RESULT} says")
+        _changed(run, f"{MODEL} is not of the size that {RESULT} says")
     for path in renders.values():
         read_png_rgb(path)
     return renders

@@ -133,6 +133,11 @@ def scene_identity(scene: Scene) -> str:
     return config_hash({"files": known, "split": split})
 
 
+def asked_length(train: TrainConfig) -> str:
+    """What a run was asked for, "60 s" or "2000 iterations"."""
+    return f"{train.iterations} iterations" if train.budget_s is None else f"{train.budget_s:g} s"
+
+
 def refuse_other_scene(run: Path, scene: Path, now: str, known: str) -> None:
     """Raise AwError if a scene is not in the state that a run saw.
 
@@ -247,7 +252,9 @@ class Cell:
             facts: of the method, its effects and the watchdog.
             cost: what it took.
         """
-        mixed = mixed_tests(self.scene)
+        known: dict[str, Any] = {**(facts or {}), "length": asked_length(self.train)}
+        if mixed := mixed_tests(self.scene):
+            known["test_photos"] = mixed
         return {
             "schema": SCHEMA,
             "method": self.method.name,
@@ -259,7 +266,7 @@ class Cell:
             "per_image": list(per_image),
             "missing": dict(missing or {}),
             "masks": masks,
-            "facts": {**(facts or {}), **({"test_photos": mixed} if mixed else {})},
+            "facts": known,
             "cost": cost or {},
             "config_hash": self.identity,
             "scene_hash": self.scene_id,

@@ -194,7 +194,7 @@ def _run_row(run: Path, result: RunResult) -> dict[str, Any]:
             "version": result["version"],
             "fit": _fit(result["facts"]),
             "effects": effects_of(result["facts"]),
-            "length": _length(read_config(run)),
+            "length": str(result["facts"].get("length") or _length(read_config(run))),
             "test_photos": str(result["facts"].get("test_photos", "")),
             "features": _features(result["options"]),
         }
@@ -215,7 +215,7 @@ def effects_of(facts: Mapping[str, Any]) -> str:
 
 
 def _length(config: Mapping[str, Any]) -> str:
-    """What the run was asked for, "60 s" or "2000 iterations"; empty where no config.yaml says it."""
+    """`asked_length` of a run whose result does not say it yet; empty where config.yaml does not either."""
     train = config.get("train")
     known = train if isinstance(train, dict) else {}
     if known.get("budget_s") is not None:

@@ -20,7 +20,7 @@ from torch import Tensor
 from ambiguous_wild.core import AwError, Camera
 from ambiguous_wild.harness.pictures import training as pictures_of_training
 from ambiguous_wild.harness.running import evaluate
-from ambiguous_wild.harness.running.cell import Cell, RunOptions
+from ambiguous_wild.harness.running.cell import Cell, RunOptions, asked_length
 from ambiguous_wild.harness.running.meter import Meter
 from ambiguous_wild.harness.running.result_file import Cost, RunResult, TimeRecord
 from ambiguous_wild.io.atomic import atomic_dir, write_json
@@ -298,18 +298,12 @@ def _make_trainer(
     trainer.meter = Meter.of(cell.device)
     trainer.whose = {
         "hash": cell.identity,
-        "about": f"{cell.method.name} on {cell.scene.name}, {length(cell)}",
+        "about": f"{cell.method.name} on {cell.scene.name}, seed {cell.train.seed}, "
+        + asked_length(cell.train),
     }
     if first is not None:
         trainer.timeline.before_s = first.cost["train_s"]
     return trainer
-
-
-def length(cell: Cell) -> str:
-    """Seed and length of a run, in words."""
-    train = cell.train
-    asked = f"{train.iterations} iterations" if train.budget_s is None else f"{train.budget_s:g} s"
-    return f"seed {train.seed}, {asked}"
 
 
 def _train_and_measure(

@@ -275,15 +275,8 @@ def to_wide_csv(tables: Sequence[Table]) -> str:
     head = ["scene", "method", "status", "runs"]
     for column in tables[0].columns:
         key = column.measure.key
-        head += (
-            [key]
-            if column.words
-            else [
-                key,
-                f"{key}_std",
-                *([f"{key}_low", f"{key}_high", f"{key}_tied"] if column.measure.per_image else []),
-            ]
-        )
+        head += [key] if column.words else [key, f"{key}_std"]
+        head += [f"{key}_low", f"{key}_high", f"{key}_tied"] if column.measure.per_image else []
     rows = (
         [table.columns[0].scene, row.name, _status(row), row.runs, *_wide_values(table, row)]
         for table in tables
@@ -294,14 +287,8 @@ def to_wide_csv(tables: Sequence[Table]) -> str:
 
 def _wide_values(table: Table, row: Row) -> Iterator[float | str]:
     for column, cell in zip(table.columns, row.cells):
-        if column.words:
-            yield cell.printed
-            continue
-        yield from (
-            cell.value,
-            cell.spread,
-            *((cell.low, cell.high, "yes" if cell.tie else "") if column.measure.per_image else ()),
-        )
+        yield from (cell.printed,) if column.words else (cell.value, cell.spread)
+        yield from (cell.low, cell.high, "yes" if cell.tie else "") if column.measure.per_image else ()
 
 
 def _status(row: Row) -> str:

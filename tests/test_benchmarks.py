@@ -1,5 +1,6 @@
 """Scripts of benchmarks/: they start; the sums of the table of captures by hand."""
 
+import re
 import runpy
 import sys
 
@@ -65,3 +66,12 @@ def test_a_missing_run_is_missing_and_not_zero(report):
     assert got["best"] == "3dgs"
     assert got["iou_beats_both"] == []
     assert got["gaussians_ratio"]["a"] is None
+
+
+def test_the_tables_of_readme_and_docs_are_those_of_the_result_files():
+    with benchmark("figures") as figures:
+        for page in figures.TABLES:
+            text = (figures.ROOT / page).read_text(encoding="utf-8")
+            assert figures.written(page, text) == text, "run python benchmarks/figures.py"
+            changed, count = re.subn(r"(<!-- figures: .*\n.*\n.*\n\| )", r"\1wrong ", text)
+            assert count == len(figures.TABLES[page]) and figures.written(page, changed) == text

@@ -75,6 +75,7 @@ class Model:
     look: Look = field(default_factory=Look)
     psnr: Mapping[str, float] = field(default_factory=dict)  # dB by name of the test view
     masks: Path | None = None  # folder of keep maps of train views, white = keep
+    reference: bool = False  # it saw exact masks or clean photos, so it is no rival
 
     def read(self) -> dict[str, np.ndarray]:
         """The Gaussians.

@@ -146,6 +146,7 @@ def _model_facts(
     psnr = {v.name: model.psnr[v.name] for v in views if np.isfinite(model.psnr.get(v.name, np.nan))}
     return {
         "label": model.label,
+        "reference": model.reference,
         "element": element,
         "antialias": model.look.antialias,
         "blur": model.look.blur,

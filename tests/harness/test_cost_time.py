@@ -179,7 +179,7 @@ def test_a_scene_that_was_measured_is_judged_by_its_own_runs(tmp_path: Path) -> 
     assert found.own and found.choices[0].method == "fast" and found.choices[0].psnr == 40.0
 
 
-def test_busy_runs_oracles_and_lengths_above_the_budget_do_not_count(tmp_path: Path) -> None:
+def test_busy_runs_references_and_lengths_above_the_budget_do_not_count(tmp_path: Path) -> None:
     cost_run(tmp_path, "slow", psnr=(40.0,), train_s=600.0)
     cost_run(tmp_path, "busy", psnr=(39.0,), train_s=50.0, timing=BUSY)
     cost_run(tmp_path, "3dgs+truth", psnr=(38.0,), train_s=50.0)

@@ -144,8 +144,10 @@ def test_the_page_in_a_browser(board: Path, tmp_path: Path) -> None:
         page.open(site)
         assert page.run("document.querySelector('h1').textContent") == "<b>T & T</b>"
         assert "distractors" in said(page, "about") and "Kerbl" in said(page, "methods")
+        assert page.run("document.querySelector('#table [data-key=train_s]')") is None  # main metrics fit
+        page.run("state.metric = ALL; draw()")
         sorts(page)
-        oracles_are_not_ranked(page)
+        references_are_not_ranked(page)
         the_search_changes_no_rank(page)
         scenes_are_ticked(page)
         rows_open_and_stay_open(page)
@@ -186,17 +188,17 @@ def test_an_infinite_value_of_the_shipped_board_enters_no_mean_and_no_rank() -> 
     assert rows["refinesplat"][1] == 1
 
 
-def oracles_are_not_ranked(page: Browser) -> None:
+def references_are_not_ranked(page: Browser) -> None:
     psnr = "document.querySelector('#table td:nth-child(2)[data-rank=\"1\"]')"
     first = f"{psnr}.parentElement.querySelector('button').textContent"
     assert page.run(first) == "refinesplat"
     assert page.run("document.querySelectorAll('#table .badge').length") == 0
-    page.run("DATA.oracles.push('refinesplat'); drawMeasured()")
+    page.run("DATA.references.push('refinesplat'); drawMeasured()")
     assert page.run(first) == HOSTILE
     assert page.run("document.querySelector('#table .badge').closest('tr').textContent").startswith(
         "refinesplat"
     )
-    page.run("DATA.oracles.pop(); drawMeasured()")
+    page.run("DATA.references.pop(); drawMeasured()")
 
 
 def sorts(page: Browser) -> None:

@@ -229,7 +229,7 @@ def test_who_knows_the_truth_is_not_ranked(tmp_path: Path) -> None:
     table = table_of(tmp_path, *(fake_result(m, psnr=(p,)) for m, p in (best | rest).items()))
     assert [cell(table, m, "psnr").rank for m in best] == [None] * 3
     assert [cell(table, m, "psnr").rank for m in rest] == [1, 2]
-    (note,) = [n for n in table[-1].notes if n.startswith("oracle (not ranked)")]
+    (note,) = [n for n in table[-1].notes if n.startswith("references, not ranked")]
     assert all(m in note for m in best)
 
 

@@ -67,7 +67,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 @pytest.fixture
 def page(runs: Path, browser: Browser) -> Browser:
     browser.open("about:blank#")  # a page with the same address would not load again
-    browser.open((runs / "view" / "index.html").as_uri())
+    browser.open((runs / "view" / "index.html").as_uri() + f"#left=3dgs&right=x&mode=single&view={TEST[0]}")
     settle(browser)
     return browser
 
@@ -268,6 +268,21 @@ def test_a_camera_path_is_saved_for_the_video(page: Browser, runs: Path, tmp_pat
         assert np.allclose(camera.cam_from_world, wanted.cam_from_world, atol=1e-4)
 
 
+def test_it_opens_with_two_models_under_the_slider_the_best_right(page: Browser, runs: Path) -> None:
+    page.open("about:blank#")
+    page.open((runs / "view" / "index.html").as_uri())
+    settle(page)
+    assert page.run("state.mode") == "cut"
+    best = facts(page, "DATA.models[state.right].mean")
+    assert (
+        best
+        == max(facts(page, "DATA.models.map((m) => m.mean)"))
+        > facts(page, "DATA.models[state.left].mean")
+    )
+    psnr = facts(page, "DATA.models[state.right].psnr")
+    assert facts(page, "DATA.views[state.view].name") == max(TEST, key=lambda name: psnr[name])
+
+
 def test_the_address_opens_a_place(page: Browser, runs: Path) -> None:
     page.open("about:blank#")
     page.open(
@@ -303,8 +318,8 @@ def test_nothing_hostile_ran_and_it_fits_a_phone(runs: Path, tmp_path: Path) -> 
         )
         assert page.run("document.documentElement.scrollWidth <= innerWidth")
         assert page.run(
-            "$('stage').clientHeight > 200 && !under.renderer"
-        )  # one renderer until two are compared
+            "!under.renderer && document.querySelector('header').offsetHeight <= 0.15 * innerHeight"
+        )
         x, y, w, h = box(page)
         before = facts(page, "camera.position.toArray()")
         for kind, dx in (("touchStart", 0), ("touchMove", 30), ("touchMove", 70), ("touchEnd", None)):

@@ -155,7 +155,7 @@ class Point:
 def points(curves: Sequence[Curve], scenes: Sequence[str] = (), *, setup: bool = False) -> list[Point]:
     """One point a curve, with those on the Pareto front of training time and PSNR marked.
 
-    Oracles, and curves with a run that was not alone on its machine, are never on the front.
+    References, and curves with a run that was not alone on its machine, are never on the front.
 
     Args:
         curves: from `curves_of`.

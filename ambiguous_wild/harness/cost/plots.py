@@ -117,6 +117,19 @@ def label_right(axes: Any, ends: Sequence[tuple[str, float, float, Any]]) -> Non
         )  # fmt: skip
 
 
+def label_points(axes: Any, points: Sequence[tuple[str, float, float, Any]]) -> None:
+    """Names beside their points, towards the middle of the panel; (name, x, y, colour) each."""
+    low, high = axes.get_ylim()
+    to_axes = axes.transData + axes.transAxes.inverted()
+    heights = spread_out([y for _, _, y, _ in points], 0.062 * (high - low))
+    for (name, x, y, colour), height in zip(points, heights):
+        on_right = to_axes.transform((x, y))[0] > 0.5
+        axes.annotate(
+            plain(name), (x, height), xytext=(-8 if on_right else 8, 0), textcoords="offset points",
+            color=colour, fontsize=8, va="center", ha="right" if on_right else "left", parse_math=False,
+        )  # fmt: skip
+
+
 def ticks_of_time(axes: Any, times: Sequence[float]) -> None:
     """A logarithmic axis with a tick at every one of the few times."""
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
@@ -165,7 +178,8 @@ def draw_timelines(report: CostReport) -> Any | None:
     )
     for panel, (title, scenes) in zip(axes, panels):
         ends = [end for c in curves if (end := _timeline(panel, c, scenes, look[c.name], unit)) is not None]
-        _finish(panel, title, f"training time ({unit.name})", ends)
+        _finish(panel, title, f"training time ({unit.name})")
+        label_right(panel, ends)
         panel.set_xlim(left=0.0)
     return figure
 
@@ -216,7 +230,8 @@ def draw_budgets(report: CostReport) -> Any | None:
             ends_of = _joined(panel, lengths[name], scenes, look[name], unit)
             times += [x for x, _ in ends_of]
             ends += [(name, *ends_of[-1], look[name]["color"])] if ends_of else []
-        _finish(panel, title, f"training time ({unit.name})", ends)
+        _finish(panel, title, f"training time ({unit.name})")
+        label_right(panel, ends)
         if times:
             ticks_of_time(panel, _few(times))
     return figure
@@ -274,11 +289,12 @@ def draw_front(report: CostReport) -> Any | None:
         if key == "minutes":
             label = f"{label}{' and set-up' if report.setup else ''} ({unit.name})"
         over = f"mean over {len(report.scenes)} scenes" if len(report.scenes) > 1 else report.scenes[0]
-        _finish(panel, over, f"{label}, {'less' if less_is_better else 'more'} is better", ends)
-        panel.margins(x=0.08)
+        panel.margins(x=0.08, y=0.1)
+        _finish(panel, over, f"{label}, {'less' if less_is_better else 'more'} is better")
         times = [_x(p, key, unit).mean for p in known]
         if key == "minutes" and max(times) > 5.0 * min(times) > 0.0:
             ticks_of_time(panel, _few(times))
+        label_points(panel, ends)
     return figure
 
 
@@ -333,8 +349,7 @@ def _price(change: Change, unit: Unit) -> str:
     return f"{extra:+.{unit.digits}f} {unit.name}" + (f", {rate} dB a minute" if extra > 0.0 else "")
 
 
-def _finish(axes: Any, title: str, x_label: str, ends: Sequence[tuple[str, float, float, Any]]) -> None:
+def _finish(axes: Any, title: str, x_label: str) -> None:
     text(axes, "title", label=title, fontsize=9, loc="left")
     text(axes, "xlabel", label=x_label, fontsize=8)
     text(axes, "ylabel", label="test PSNR (dB)", fontsize=8)
-    label_right(axes, ends)

@@ -1,7 +1,7 @@
 """How long it takes to reach a given PSNR, and what accuracy costs on a scene, in one line.
 
-The time of a PSNR is that of whichever method is there first, on the mean over its seeds. In the line oracles
-do not count, nor do runs that were not alone where others were.
+The time of a PSNR is that of whichever method is there first, on the mean over its seeds. In the line,
+references do not count, nor do runs that were not alone where others were.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ def first_time(run: CostRun, psnr: float) -> tuple[float, bool]:
 def _level(target: Target, curves: Sequence[Curve], scene: str) -> float:
     if not target.relative:
         return target.db
-    # an oracle sets no target for the other methods
+    # a reference sets no target for the other methods
     rivals = [curve for curve in curves if not all(knows_truth(run.method) for run in curve.runs)]
     ends = [summary(curve, (scene,), lambda run: run.psnr).mean for curve in rivals or curves]
     return max((end for end in ends if math.isfinite(end)), default=math.nan) - target.db

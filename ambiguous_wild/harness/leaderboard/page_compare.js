@@ -12,7 +12,7 @@ let view = ""; // of viewKey
 /** A view where the methods differ most comes first: the range of PSNR over the entries that are ranked. */
 function viewsByDifference(found) {
   const range = (key) => {
-    const values = found.filter((p) => viewKey(p) === key && p.method && !DATA.oracles.includes(p.method)).map((p) => number(p.psnr)).filter(Number.isFinite);
+    const values = found.filter((p) => viewKey(p) === key && p.method && !DATA.references.includes(p.method)).map((p) => number(p.psnr)).filter(Number.isFinite);
     return values.length > 1 ? Math.max(...values) - Math.min(...values) : -1;
   };
   return unique(found.map(viewKey)).sort(byName).map((key) => [key, range(key)]).sort((a, b) => b[1] - a[1]).map(([key]) => key);
@@ -48,8 +48,8 @@ function fillSides() {
   const found = picturesOf(masksShown() ? "train" : "test").filter((p) => viewKey(p) === view);
   const named = new Map(groups(state.dataset).map((g) => [g.key, `${g.method} (${g.about})`]));
   const options = found.filter((p) => p.method).map((p) => [pictureKey(p), named.get(pictureKey(p)) ?? `${p.method} (${p.setting})`]).sort((a, b) => byName(a[1], b[1]));
-  // At first the entries that differ most; an oracle only where nothing else is left.
-  const ranked = [...found].filter((p) => p.method && !DATA.oracles.includes(p.method) && Number.isFinite(number(p.psnr))).sort((a, b) => number(b.psnr) - number(a.psnr));
+  // At first the entries that differ most; a reference only where nothing else is left.
+  const ranked = [...found].filter((p) => p.method && !DATA.references.includes(p.method) && Number.isFinite(number(p.psnr))).sort((a, b) => number(b.psnr) - number(a.psnr));
   const [best, worst] = [ranked[0], ranked.at(-1)].map((p) => (p ? pictureKey(p) : ""));
   if (found.some((p) => !p.method)) options.push([PHOTO, "the photo"]);
   const has = (key) => options.some(([v]) => v === key);

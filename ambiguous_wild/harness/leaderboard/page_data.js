@@ -2,6 +2,8 @@
 // What the page knows, and means that keep what is missing missing.
 const DATA = JSON.parse(document.getElementById("data").textContent);
 const $ = (id) => document.getElementById(id);
+const ALL = "*"; // as a metric: every column
+const MAIN = ["psnr", "ssim", "lpips_alex", "psnr_covered", "mask_iou", "reference_s", "gaussians"]; // columns at first
 const COSTS = ["reference_s", "train_s", "model_mb", "fps", "gaussians"];
 const state = { dataset: "", off: new Set(), metric: "", method: "", reported: true, sort: {}, open: new Set(), cell: null };
 
@@ -53,7 +55,8 @@ const valueOf = (run, key) => number(Object.hasOwn(run.quality, key) ? run.quali
 const runsOf = (dataset) => DATA.runs.filter((r) => r.dataset === dataset);
 const scenesOf = (dataset) => unique(runsOf(dataset).map((r) => r.scene)).sort(byName);
 const chosenScenes = () => scenesOf(state.dataset).filter((s) => !state.off.has(s));
-const measuredDatasets = () => unique(DATA.runs.map((r) => r.dataset)).sort(byName);
+/** The datasets, the one with most runs first. */
+const measuredDatasets = () => unique(DATA.runs.map((r) => r.dataset)).sort((a, b) => runsOf(b).length - runsOf(a).length || byName(a, b));
 
 /** Every group of runs of a dataset that differ in scene and seed alone. No filter: ranks count all of them. */
 function groups(dataset) {
@@ -67,7 +70,8 @@ function groups(dataset) {
   for (const g of all) {
     // Options are named where methods and settings alone do not tell groups apart.
     const twins = all.filter((o) => o.method === g.method && o.setting === g.setting);
-    g.about = twins.length > 1 && g.options ? `${g.setting}, options ${g.options}` : g.setting;
+    const about = twins.length > 1 && g.options ? `${g.setting}, options ${g.options}` : g.setting;
+    g.about = about.replaceAll("+", " + "); // lines break between effects, not inside a word
   }
   return all;
 }
@@ -98,12 +102,12 @@ function summary(group, key, all) {
   return { value, spread: spread(bySeed), seeds: bySeed, comparable, low, high, cells };
 }
 
-/** Whether a method is given exact masks or clean photos: such an oracle is not ranked. */
-const isOracle = (group) => DATA.oracles.includes(group.method);
+/** Whether a method saw exact masks or clean photos: such a reference is not ranked. */
+const isReference = (group) => DATA.references.includes(group.method);
 
-/** What is ranked of summaries: no oracle, no time of a shared machine, no times of different machines. */
+/** What is ranked of summaries: no reference, no time of a shared machine, no times of different machines. */
 function rankable(found, summaries, key) {
-  const open = found.map((g, i) => !isOracle(g) && summaries[i].comparable && !Number.isNaN(summaries[i].value));
+  const open = found.map((g, i) => !isReference(g) && summaries[i].comparable && !Number.isNaN(summaries[i].value));
   const of = (what) => unique(found.filter((_, i) => open[i]).flatMap((g) => g.runs.map((r) => r[what])));
   // Reference seconds compare machines, but not a CPU with a GPU.
   const apart = isTime(key) && of(key === "reference_s" ? "device" : "hardware").length > 1;

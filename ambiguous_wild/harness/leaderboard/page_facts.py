@@ -7,10 +7,12 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from ambiguous_wild import __version__
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.audit.checks import audit
 from ambiguous_wild.harness.audit.table import Finding, Number, read_tables
@@ -77,10 +79,12 @@ def facts(
         label = PRINTED_LABELS.get(n.metric, m.label)
         measures.setdefault(n.metric, {"label": label, "better": m.better, "digits": 3})
     return {
+        "date": datetime.now(UTC).date().isoformat(),
+        "version": __version__,
         "order": order,
         "partial": [*PARTIAL, *MASKS],
         "times": list(TIMES),
-        "oracles": sorted({e.method for e in entries if knows_truth(e.method)}),
+        "references": sorted({e.method for e in entries if knows_truth(e.method)}),
         "methods": {name: _method(name) for name in sorted({e.method for e in entries})},
         "measures": measures,
         "runs": [_run(e) for e in entries],

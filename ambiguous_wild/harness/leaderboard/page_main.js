@@ -8,7 +8,7 @@ function fillFilters() {
   const runs = runsOf(state.dataset);
   const metrics = [...DATA.order.filter((k) => runs.some((r) => Object.hasOwn(r.quality, k)))];
   const costs = ["reference_s", "train_s", "model_mb", "fps", "gaussians", "peak_rss_mb"].filter((k) => runs.some((r) => Object.hasOwn(r.cost, k)));
-  fill($("metric"), [["", "all metrics"], ...[...metrics, ...costs].map((k) => [k, measure(k).label])], state.metric);
+  fill($("metric"), [["", "main metrics"], [ALL, "all metrics"], ...[...metrics, ...costs].map((k) => [k, measure(k).label])], state.metric);
   state.metric = $("metric").value;
   fill($("plot-x"), costs.map((k) => [k, measure(k).label]), $("plot-x").value);
   fill($("plot-y"), metrics.map((k) => [k, measure(k).label]), metrics.includes(state.metric) ? state.metric : $("plot-y").value);
@@ -81,7 +81,8 @@ function start() {
   const counted = (n, what) => `${n} ${what}${n === 1 ? "" : "s"}`;
   const scenes = unique(DATA.runs.map((r) => JSON.stringify([r.dataset, r.scene]))).length;
   $("facts").textContent = `${counted(DATA.runs.length, "measured run")}: ${counted(methods, "method")}, ${counted(scenes, "scene")}`
-    + (DATA.reported.length ? `; ${counted(DATA.reported.length, "reported number")} beside them` : "");
+    + (DATA.reported.length ? `; ${counted(DATA.reported.length, "reported number")} beside them` : "")
+    + `. Published ${DATA.date} with ambiguous_wild ${DATA.version}.`;
   $("empty").hidden = DATA.runs.length > 0;
   $("filters").hidden = !DATA.runs.length && !DATA.reported.length;
   $("about").hidden = $("filters").hidden;

@@ -1,6 +1,6 @@
 // Method by scene for one metric; a cell opens to its seeds, renders and commands.
 
-const matrixKey = () => state.metric || DATA.order.find((k) => runsOf(state.dataset).some((r) => Object.hasOwn(r.quality, k))) || "";
+const matrixKey = () => (state.metric !== ALL && state.metric) || DATA.order.find((k) => runsOf(state.dataset).some((r) => Object.hasOwn(r.quality, k))) || "";
 /** A picture that stands for a scene: a train photo, which shows its distractors, else a test photo. */
 function sceneOf(name) {
   const found = DATA.images.filter((p) => p.dataset === state.dataset && p.scene === name && !p.method && p.kind !== "exact");
@@ -31,7 +31,7 @@ function drawMatrix() {
   const fallback = { key: columns[1]?.key ?? "method", down };
   const listed = sorted(rows.filter((row) => asked(row.group.method)), columns, "matrix", fallback);
   const body = h("tbody", {}, ...listed.map((row) => h("tr", { "data-group": row.group.key },
-    h("th", { scope: "row", class: "name" }, row.group.method, oracleBadge(row.group), h("small", {}, row.group.about)),
+    h("th", { scope: "row", class: "name" }, row.group.method, referenceBadge(row.group), h("small", {}, row.group.about)),
     ...row.cells.map((s, i) => matrixCell(row.group, parts[i], s, key, row.ranks[i])))));
   const focus = focusOf($("matrix"));
   $("matrix").replaceChildren(head(columns, "matrix", fallback, drawMatrix), body);
@@ -58,8 +58,8 @@ function matrixCell(group, of, s, key, rank) {
 }
 
 function matrixCsv(rows, names, key) {
-  return [["dataset", "metric", "method", "setting", "options", "oracle", ...names],
-    ...rows.map((row) => [state.dataset, key, row.group.method, row.group.setting, row.group.options, isOracle(row.group) ? "yes" : "", ...row.cells.map((s) => plainNumber(s.value))])];
+  return [["dataset", "metric", "method", "setting", "options", "reference", ...names],
+    ...rows.map((row) => [state.dataset, key, row.group.method, row.group.setting, row.group.options, isReference(row.group) ? "yes" : "", ...row.cells.map((s) => plainNumber(s.value))])];
 }
 
 /** What stands behind a cell: every seed, the renders, and the way into the comparison. */

@@ -57,7 +57,8 @@ function cell(s, key, rank, low, high) {
 
 function measuredColumns(runs, scenes) {
   const present = (key) => runs.some((r) => !Number.isNaN(valueOf(r, key)));
-  const keys = [...DATA.order.filter((k) => runs.some((r) => Object.hasOwn(r.quality, k))), ...COSTS.filter(present)];
+  const all = [...DATA.order.filter((k) => runs.some((r) => Object.hasOwn(r.quality, k))), ...COSTS.filter(present)];
+  const keys = state.metric === ALL ? all : all.filter((k) => MAIN.includes(k) || k === state.metric);
   return keys.map((key) => {
     const over = definedScenes(key, scenes).length;
     return { key, label: measure(key).label, arrow: arrow(key), down: measure(key).better === "higher", small: over && over < scenes.length ? `${over} of ${scenes.length} scenes` : "" };
@@ -120,18 +121,18 @@ function focusOf(table) {
 }
 
 function csvRows(rows, columns, scenes) {
-  const head = ["dataset", "scenes", "method", "setting", "options", "oracle", "seeds"];
+  const head = ["dataset", "scenes", "method", "setting", "options", "reference", "seeds"];
   for (const c of columns) head.push(c.key, ...(isTime(c.key) ? [`${c.key}_low`, `${c.key}_high`, `${c.key}_comparable`] : [`${c.key}_std`]), `${c.key}_rank`);
   return [head, ...rows.map((row) => {
     const g = row.group;
-    const line = [state.dataset, scenes.join(" "), g.method, g.setting, g.options, isOracle(g) ? "yes" : "", unique(g.runs.map((r) => r.seed)).length];
+    const line = [state.dataset, scenes.join(" "), g.method, g.setting, g.options, isReference(g) ? "yes" : "", unique(g.runs.map((r) => r.seed)).length];
     row.cells.forEach((s, i) => line.push(plainNumber(s.value), ...(isTime(columns[i].key) ? [plainNumber(s.low), plainNumber(s.high), s.comparable ? "yes" : "no"] : [plainNumber(s.spread)]), row.ranks[i] ?? ""));
     return line;
   })];
 }
 
-function oracleBadge(group) {
-  return isOracle(group) ? h("span", { class: "badge", title: "given exact masks or clean photos" }, "oracle (not ranked)") : null;
+function referenceBadge(group) {
+  return isReference(group) ? h("span", { class: "badge", title: "saw exact masks or clean photos" }, "reference, not ranked") : null;
 }
 
 function nameCell(group) {
@@ -142,7 +143,7 @@ function nameCell(group) {
     drawMeasured();
   };
   const open = h("button", { type: "button", class: "open", "data-key": "open", "aria-expanded": String(isOpen), title: "Runs, hashes, commands", onclick: press }, group.method);
-  return h("th", { scope: "row", class: "name" }, open, oracleBadge(group), h("small", {}, group.about));
+  return h("th", { scope: "row", class: "name" }, open, referenceBadge(group), h("small", {}, group.about));
 }
 
 function drawNotes(runs, found, scenes, empty, columns) {

@@ -19,7 +19,7 @@ from ambiguous_wild.harness.running.store import CONFIG, read_config, run_folder
 from ambiguous_wild.io.ply import splat_count
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.references import is_reference
-from ambiguous_wild.methods.registry import get_method
+from ambiguous_wild.methods.registry import get_method, knows_truth
 from ambiguous_wild.viewing.model import Look, Model
 from ambiguous_wild.viewing.page_file import MOST_GAUSSIANS, Page, check_page_folder, page_text, write_page
 
@@ -156,6 +156,7 @@ def _found(run: Path) -> Found:
         look=look,
         psnr={name: float(value) for name, value in psnr.items() if value is not None},
         masks=run / MASKS if (run / MASKS).is_dir() else None,
+        reference=knows_truth(result["method"]),
     )
     half = config.get("protocol") == "half"
     return Found(run, result["scene"], result["scene_hash"], model, half, note)
@@ -185,11 +186,13 @@ def read_look(config: Mapping[str, Any]) -> tuple[Look, str]:
 
 
 def _with_labels(found: list[Found]) -> list[Found]:
+    """Labels that are one model's each among those of its scene: by seed where need be, then by folder."""
     labels = [f.model.label for f in found]
-    if len(set(labels)) < len(labels):
-        labels = [f"{f.model.label}, {f.run.name}" for f in found]
-    twice = {label for label, count in Counter(labels).items() if count > 1}
-    labels = [str(f.run) if label in twice else label for f, label in zip(found, labels)]
+    for names in ([f"{f.model.label}, {f.run.name}" for f in found], [str(f.run) for f in found]):
+        count = Counter((f.scene, label) for f, label in zip(found, labels))
+        labels = [
+            name if count[f.scene, label] > 1 else label for f, label, name in zip(found, labels, names)
+        ]
     return [replace(f, model=replace(f.model, label=label)) for f, label in zip(found, labels)]
 
 

@@ -32,7 +32,7 @@ def notes(
         *_absent(runs, methods, scenes),
         *(f"incomplete: {i.folder}: {i.reason}" for i in runs.incomplete),
         *_not_ranked(runs),
-        *_oracles(methods),
+        *_references(methods),
         *_fitted(runs),
         *_missing(runs, columns),
         *_infinite(runs, columns),
@@ -117,9 +117,9 @@ def _not_ranked(runs: Runs) -> list[str]:
     ]
 
 
-def _oracles(methods: Sequence[str]) -> list[str]:
+def _references(methods: Sequence[str]) -> list[str]:
     known = [method for method in methods if knows_truth(method)]
-    return [f"oracle (not ranked): {shortlist(known)}: shown exact masks or clean photos"] if known else []
+    return [f"references, not ranked: {shortlist(known)} (exact masks or clean photos)"] if known else []
 
 
 FITTED = {

@@ -2,7 +2,24 @@
 const DATA = JSON.parse(document.getElementById("data").textContent);
 const $ = (id) => document.getElementById(id);
 const PHOTO = "photo";
-const state = { left: 0, right: DATA.models.length > 1 ? 1 : PHOTO, mode: "single", view: null, masks: true, frusta: false, cut: 50, path: [] };
+const state = { ...opening(), view: null, masks: true, frusta: false, cut: 50, path: [] };
+
+/** Two models or more open under the slider, the best on the right, references last; a phone draws one at first. */
+function opening() {
+  const means = DATA.models.map((m) => (m.reference ? -1000 : 0) + (m.mean ?? -100));
+  if (means.length < 2) return { left: 0, right: PHOTO, mode: "single" };
+  const best = means.indexOf(Math.max(...means));
+  const other = best ? 0 : 1;
+  if (matchMedia("(pointer: coarse)").matches) return { left: best, right: other, mode: "single" };
+  return { left: other, right: best, mode: "cut" };
+}
+
+/** The camera to open at: the test photo that the model drawn best knows best. */
+function firstView() {
+  const tests = DATA.views.flatMap((v, i) => (v.split === "test" ? [i] : []));
+  const psnr = (i) => Math.max(...DATA.models.map((m) => m.psnr[DATA.views[i].name] ?? -Infinity));
+  return tests.length ? tests.reduce((a, b) => (psnr(b) > psnr(a) ? b : a)) : DATA.views.length ? 0 : null;
+}
 
 function h(name, attributes = {}, ...children) {
   const element = document.createElement(name);

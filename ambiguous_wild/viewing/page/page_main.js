@@ -242,8 +242,7 @@ async function start() {
   over = new Pane(R, $("over"), dirty);
   under = new Pane(R, $("under"), dirty);
   listen();
-  const first = DATA.views.findIndex((v) => v.split === "test");
-  state.view = first >= 0 ? first : DATA.views.length ? 0 : null;
+  state.view = firstView();
   await recall();
   requestAnimationFrame(loop);
 }

@@ -182,7 +182,8 @@ def test_in_the_paper_it_finds_what_people_found() -> None:
 
 
 def test_a_method_weak_everywhere_is_not_called_exchanged() -> None:
-    assert not [f for f in reported() if f.kind == "swapped" and "Ha-NeRF" in f.text]
+    swapped = [f for f in reported() if f.kind == "swapped"]
+    assert swapped and not [f for f in swapped if "Ha-NeRF" in f.text]
 
 
 def test_the_transcription_is_what_was_printed() -> None:

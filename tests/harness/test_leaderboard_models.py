@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
 
 import pytest
 from click.testing import CliRunner, Result
@@ -78,7 +79,7 @@ def test_the_link_opens_the_model(root: Path, tmp_path: Path) -> None:
         href = page.run("document.querySelector('.run a').href")
         page.open(href)
         page.until("document.getElementById('busy').textContent === '' && Boolean(over.mesh)")
-        assert page.run("DATA.models[state.left].label") == "3dgs (100 iterations)" or HOSTILE in page.run(
-            "DATA.models[state.left].label"
-        )
+        wanted = parse_qs(urlsplit(href).fragment)["left"][0]
+        assert page.run("DATA.models[state.left].label") == wanted
+        assert page.run("state.left !== state.right")
         assert page.errors == []

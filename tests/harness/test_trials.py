@@ -275,6 +275,7 @@ class Counted:
 
 
 def test_a_plan_goes_on_where_it_was_interrupted(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(Counted, "trained", ())
     monkeypatch.setattr(probed.trials, "Trials", Counted)
     monkeypatch.setattr(probed, "plan_without_training", lambda _: plan_of(sampling=3.0, exposure=0.2))
     monkeypatch.setattr(probed, "step_costs", lambda data, names, folder: dict.fromkeys(names, 2.0))
@@ -305,6 +306,7 @@ def test_a_plan_goes_on_where_it_was_interrupted(scene, tmp_path, monkeypatch):
 
 
 def test_kept_probes_of_fewer_effects_are_completed(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(Counted, "trained", ())
     timed = []
 
     def costs(data, names, folder):
@@ -325,7 +327,6 @@ def test_kept_probes_of_fewer_effects_are_completed(scene, tmp_path, monkeypatch
 
 
 def test_a_run_under_a_budget_goes_on_with_the_probes_it_began(scene, tmp_path, monkeypatch):
-    Counted.trained = ()
     monkeypatch.setattr(probed.trials, "Trials", Counted)
     monkeypatch.setattr(probed, "plan_without_training", lambda _: plan_of(exposure=0.2))
     monkeypatch.setattr(probed, "step_costs", lambda data, names, folder: dict.fromkeys(names, 2.0))

@@ -248,7 +248,7 @@ def test_masks_over_visits_are_the_cpus(scene, monkeypatch, config):
         assert np.allclose(there.shares[step.view], cpu.shares[step.view], rtol=1e-3, atol=MOST)
     assert changed > 0.02 * 3 * sum(t.size for t in scene.truths)
     assert there.w2 == pytest.approx(cpu.w2, abs=1e-3)
-    assert (cpu.w2 != 0.5) == (config.mask.w2 is None) or config.mask.w2 == cpu.w2
+    assert cpu.w2 == config.mask.w2 if config.mask.w2 is not None else cpu.w2 != 0.5
     for name, value in cpu.facts().items():
         assert there.facts()[name] == (value if value is None else pytest.approx(value, rel=1e-2)), name
     for view, judged in cpu.judged.items():

@@ -52,7 +52,6 @@ def test_ssim_equals_scikit_image_and_torchmetrics(pair: Pair) -> None:
     a, b = pair
     settings = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
     expected = structural_similarity(a / 255.0, b / 255.0, data_range=1.0, channel_axis=2, **settings)
-    assert ssim(a, b) == pytest.approx(expected, abs=1e-4)
     assert ssim(a, b) == pytest.approx(expected, abs=1e-9)  # both are float64
     # 1.9 averages over a border of reflected pixels too: its map is cut to the windows inside the picture
     _, full = torchmetrics_ssim(as_tensor(a), as_tensor(b), data_range=1.0, sigma=1.5, return_full_image=True)

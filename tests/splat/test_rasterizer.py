@@ -81,8 +81,6 @@ def test_the_clamp_stops_opacity_and_shape_but_not_colour():
     assert not grads.opacity_logits.any()
     assert not grads.log_scales.any()
     assert not grads.screen.any()
-    shade = g.sh0[0] * 0.28209479 + 0.5 > 0
-    assert (grads.sh0[0] != 0).tolist() == shade.tolist() or g.sh_rest.any()
     assert grads.sh0.abs().max() > 0.99 * 64 * 0.28
 
 

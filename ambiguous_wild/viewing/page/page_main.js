@@ -220,6 +220,7 @@ function recall() {
     if (index >= 0) changes[side] = index;
     else if (words.get(side) === PHOTO) changes[side] = PHOTO;
   }
+  if (changes.left === state.right && changes.right === undefined) changes.right = state.left; // never one beside itself
   if (["single", "beside", "cut"].includes(words.get("mode"))) changes.mode = words.get("mode");
   const view = DATA.views.findIndex((v) => v.name === words.get("view"));
   if (view >= 0) changes.view = view;

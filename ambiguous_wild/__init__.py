@@ -14,12 +14,24 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 __version__ = "0.1.0"
 
+# imported when they are asked for: the package itself stays quick to import
+_OFFERED = {
+    "Metric": "harness.measures",
+    "bench": "harness.bench",
+    "build_scene": "builder.pipeline",
+    "plan": "harness.planning.decide",
+    "read_runs": "harness.running.store",
+    "table": "harness.tables.comparison",
+}
+__all__ = ["Metric", "bench", "build_scene", "plan", "read_runs", "table"]
+
 if TYPE_CHECKING:
     from ambiguous_wild.harness.bench import bench as bench
+    from ambiguous_wild.harness.measures import Metric as Metric
 
 
 def __getattr__(name: str) -> Any:
-    """`bench`, imported when it is asked for: the package itself stays quick to import."""
-    if name == "bench":
-        return importlib.import_module("ambiguous_wild.harness.bench").bench
+    """One of `__all__`."""
+    if name in _OFFERED:
+        return getattr(importlib.import_module(f"ambiguous_wild.{_OFFERED[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -11,6 +11,7 @@ from subprocess import CompletedProcess
 import pytest
 
 from ambiguous_wild.cli import main
+from ambiguous_wild.harness import measures
 from ambiguous_wild.methods import registry
 
 ROOT = Path(__file__).parents[1]
@@ -23,6 +24,7 @@ def aw(*words: object, cwd: Path = ROOT) -> CompletedProcess[str]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", line)
         patch.setattr(registry, "_registered", {})
+        patch.setattr(measures, "_own", {})
         patch.chdir(cwd)
         try:
             with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ambiguous_wild.cli.options import PathName, engine_options, say, training_options
+from ambiguous_wild.cli.options import PathName, engine_options, metric_file_option, say, training_options
 from ambiguous_wild.cli.progress import Progress, finish
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.harness.bench import bench
@@ -109,6 +109,7 @@ def parse_budget(text: str) -> float:
     help="full: measure whole test photos; half: fit colours on the left half, measure the right (NeRF-W).  "
     "[default: as scene.json says, else full]",
 )
+@metric_file_option
 @click.option("-o", "--output", type=PathName(), default=Path("runs"), show_default=True)
 @click.option(
     "--probes",

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ambiguous_wild.cli.options import PathName
+from ambiguous_wild.cli.options import PathName, metric_file_option
 from ambiguous_wild.core.errors import AwError
 
 if TYPE_CHECKING:
@@ -298,8 +298,11 @@ def command_line(
     type=PathName(file_okay=False),
     help="Scene folder, if it was moved.  [default: as each run says]",
 )
+@metric_file_option
 @click.option("--json", "as_json", is_flag=True, help="Print what became of every run as JSON.")
-def rescore_command(runs: tuple[Path, ...], scene: Path | None, as_json: bool) -> None:
+def rescore_command(
+    runs: tuple[Path, ...], scene: Path | None, metrics: tuple[Path, ...], as_json: bool
+) -> None:
     """Add metrics that were missing when the runs below RUNS ended, e.g. LPIPS before its weights were there.
 
     Nothing is trained: the saved renders are compared with the scene's test photos. First every number of a
@@ -310,8 +313,11 @@ def rescore_command(runs: tuple[Path, ...], scene: Path | None, as_json: bool) -
     aw rescore runs
     aw table runs
     """
+    from ambiguous_wild.harness.measures import load_metrics
     from ambiguous_wild.harness.rescore import rescore
 
+    for file in metrics:
+        load_metrics(file)
     found = rescore(runs, scene=scene)
     if as_json:
         click.echo(json.dumps([dataclasses.asdict(r) | {"run": str(r.run)} for r in found], indent=2))

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypedDict
 
 from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.harness.measures import load_metrics, try_own
 from ambiguous_wild.harness.running.callbacks import Callbacks as Callbacks
 from ambiguous_wild.harness.running.callbacks import Engine as Engine
 from ambiguous_wild.harness.running.callbacks import Lines as Lines
@@ -63,12 +64,9 @@ class RunReport:
 
     def mean(self, metric: str) -> float | None:
         """Mean of an image metric over the test views, of the finite values; None where any is missing."""
-        from ambiguous_wild.harness.running.result_file import metrics_of
-        from ambiguous_wild.metrics import stats
+        from ambiguous_wild.harness.running.result_file import metric_mean
 
-        rows = [] if self.result is None else self.result["per_image"]
-        values = [metrics_of(row).get(metric) for row in rows]
-        mean = stats.mean([math.nan if value is None else value for value in values])
+        mean = metric_mean(self.result, metric)
         return None if math.isnan(mean) else mean
 
     def show(self, height: int = 640) -> Viewer:
@@ -138,6 +136,7 @@ def bench(
     passes: int = 1,
     train: TrainSettings | None = None,
     plugins: Sequence[Words] = (),
+    metrics: Sequence[Words] = (),
     device: Literal["auto", "cpu", "cuda"] = "auto",
     threads: int | None = None,
     jobs: int | None = None,
@@ -166,6 +165,7 @@ def bench(
         passes: 2 = train again from the start with the final masks; the runs are called METHOD+2passes.
         train: other settings of training.
         plugins: Python files that register methods.
+        metrics: Python files with metrics of your own, see docs/metrics.md.
         device: where to train; "auto" = the GPU where it can be used.
         threads: of the CPU kernels; None = all cores. The result does not depend on it.
         jobs: cells at a time on this machine; None = what `engine` says.
@@ -190,6 +190,8 @@ def bench(
     where = Engine() if engine is None else engine
     where = where if jobs is None else dataclasses.replace(where, jobs=jobs)
     where.check()
+    for file in metrics:
+        load_metrics(Path(file))
     names = _check_methods([methods] if isinstance(methods, str) else methods, plugins, parts or {}, passes)
     folders = [Path(scenes)] if isinstance(scenes, str | Path) else [Path(scene) for scene in scenes]
     choices = [effects] if isinstance(effects, str) else list(effects)
@@ -199,6 +201,7 @@ def bench(
     out = Path(output)
     with Session(where, threads, told) as session:
         from ambiguous_wild.harness.running.cell import RunOptions
+        from ambiguous_wild.harness.running.engines.job import read_sources
         from ambiguous_wild.harness.running.external import check_program
         from ambiguous_wild.harness.running.grid import (
             Probing,
@@ -252,6 +255,8 @@ def bench(
             check_program(cell)
         to_train = [cell for cell in to_run if cell.method.program is None]
         try_recipes(to_train)
+        for cell in {cell.scene_id: cell for cell in to_run}.values():
+            try_own(cell.scene)
         check_output(out / "run")  # before half a minute of compiling
         if chosen == "cpu" and not where.remote and any(cell.method.program is None for cell in cells):
             prepare_cpu(threads, told.say)
@@ -271,10 +276,10 @@ def bench(
                 on_end=told.ended,
             )
         else:
-            files = [Path(plugin) for plugin in plugins]
-            reports = session.run(cells, out, RunOptions(place, overwrite, pictures), files, names)
+            sources = read_sources(plugins, names, metrics)
+            reports = session.run(cells, out, RunOptions(place, overwrite, pictures), sources)
     made = BenchReport(out, tuple(_run_report(cell, report) for cell, report in zip(cells, reports)))
-    if said := _rescorable(made):
+    if said := _rescorable(made, metrics):
         told.say(said)
     return made
 
@@ -341,15 +346,15 @@ def _remarks(cells: Sequence[Cell]) -> list[str]:
     return lines
 
 
-def _rescorable(made: BenchReport) -> str:
+def _rescorable(made: BenchReport, metrics: Sequence[Words] = ()) -> str:
     """What `aw rescore` could add to runs that were kept; empty where it could add nothing."""
     kept = [run.result for run in made.runs if run.outcome in ("kept", "skipped") and run.result is not None]
-    if not any(result["missing"] for result in kept):
+    if not metrics and not any(result["missing"] for result in kept):
         return ""
     from ambiguous_wild.harness.rescore import could_be_measured
 
     names = could_be_measured(kept)
-    command = f"aw rescore {shlex.quote(str(made.output))}"
+    command = shlex.join(["aw", "rescore", str(made.output), *(f"--metric={file}" for file in metrics)])
     return (
         f"runs that were kept lack {', '.join(names)}, which can be measured now: {command}" if names else ""
     )

@@ -1,9 +1,33 @@
-"""The columns a table can have: label, digits and which way is better, as data."""
+"""What can be measured of a run, as data: metrics of test images, built in or of one's own, masks and cost.
+
+A metric of one's own is a `Metric` in a file (`--metric my_metric.py`), of an installed package (entry points
+`ambiguous_wild.metrics`) or given to `register`. Its record is kept in each result, so that tables need
+neither.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+import hashlib
+import importlib.metadata
+import math
+import re
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypedDict
+
+import numpy as np
+
+from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.io.images import read_png_rgb
+from ambiguous_wild.methods.entry import resolve
+from ambiguous_wild.methods.plugin_file import import_file, place_of
+
+if TYPE_CHECKING:
+    from ambiguous_wild.core import Scene
+
+Better = Literal["higher", "lower", None]  # None: not ranked
+ENTRY_POINTS = "ambiguous_wild.metrics"
 
 
 @dataclass(frozen=True)
@@ -12,8 +36,8 @@ class Measure:
 
     key: str  # as in the result file
     label: str
-    better: Literal["higher", "lower", None]  # None: not ranked
-    digits: int
+    better: Better
+    digits: int = 3
     per_image: bool = True  # else one number a run
     timed: bool = False  # a busy machine changes it: ranked only between runs that were alone
 
@@ -23,21 +47,73 @@ class Measure:
         return self.per_image or self.key.startswith("mask_")
 
 
+@dataclass(frozen=True, kw_only=True)
+class Metric(Measure):
+    """A measure of a test image, with the function that computes it.
+
+    `function` gets the render and what `needs` names, in that order, and returns a number. Pictures are
+    [H, W, 3] uint8. NaN = this image has none. An AwError says why no image has one, e.g. missing weights.
+    """
+
+    function: str | Callable[..., float]  # "module:function" for ours
+    needs: tuple[Literal["photo", "view", "scene"], ...] = ("photo",)  # () = judges the render alone
+    unit: str = ""  # stands behind the label
+    low: float = -math.inf  # of its range
+    high: float = math.inf
+    infinite: bool = False  # inf for equal pictures is right
+    partial: bool = False  # of some pixels: an image without such has no value, and is no gap in a mean
+    # by which a value may differ when it is computed again; None: it is not, as that takes a network
+    tolerance: float | None = 1e-6
+    source: str = ""  # sha256 of its file
+
+    def value(self, render: np.ndarray, given: Mapping[str, Any]) -> float:
+        """Of one image; `given`: its photo, view and scene.
+
+        Raises:
+            AwError: this image cannot have it, or a function of one's own fails; names the line.
+        """
+        try:
+            return float(resolve(self.function)(render, *(given[name] for name in self.needs)))
+        except Exception as error:
+            if isinstance(self.function, str) or isinstance(error, AwError):
+                raise
+            raise AwError(f"{type(error).__name__}: {error}{place_of(error)}") from error
+
+
+def _psnr(key: str, label: str, function: str, **more: Any) -> Metric:
+    return Metric(key, label, "higher", 2, function=function, low=0.0, infinite=True, **more)
+
+
+def _region(key: str, label: str, tolerance: float = 1e-6) -> Metric:
+    function = f"ambiguous_wild.harness.running.regions:{key}"
+    return _psnr(key, label, function, needs=("photo", "view", "scene"), partial=True, tolerance=tolerance)
+
+
+def _lpips(key: str, label: str) -> Metric:
+    function = f"ambiguous_wild.metrics.lpips:{key}"
+    return Metric(key, label, "lower", function=function, low=0.0, tolerance=None)
+
+
+_IMAGE = "ambiguous_wild.metrics.image:"
+# Which pixels are covered is itself computed: where rounding moves a pixel over the threshold, the mean over
+# thousands of them moves a little.
+_REGION_DB = 1e-2
+
 MEASURES: dict[str, Measure] = {
     m.key: m
     for m in (
-        Measure("psnr", "PSNR", "higher", 2),
-        Measure("ssim", "SSIM", "higher", 3),
-        Measure("lpips_alex", "LPIPS alex", "lower", 3),
-        Measure("ssim_inria", "SSIM Inria", "higher", 3),
-        Measure("lpips_vgg", "LPIPS vgg", "lower", 3),
-        Measure("lpips_vgg_01", "LPIPS vgg 01", "lower", 3),
-        Measure("flip", "FLIP", "lower", 3),
-        Measure("psnr_affine", "PSNR affine", "higher", 2),
-        Measure("psnr_valid", "PSNR valid", "higher", 2),
-        Measure("psnr_covered", "PSNR covered", "higher", 2),
-        Measure("psnr_uncovered", "PSNR uncovered", "higher", 2),
-        Measure("psnr_supported", "PSNR supported", "higher", 2),
+        _psnr("psnr", "PSNR", f"{_IMAGE}psnr"),
+        Metric("ssim", "SSIM", "higher", function=f"{_IMAGE}ssim", low=-1.0, high=1.0),
+        _lpips("lpips_alex", "LPIPS alex"),
+        Metric("ssim_inria", "SSIM Inria", "higher", function=f"{_IMAGE}ssim_inria", low=-1.0, high=1.0),
+        _lpips("lpips_vgg", "LPIPS vgg"),
+        _lpips("lpips_vgg_01", "LPIPS vgg 01"),
+        Metric("flip", "FLIP", "lower", function=f"{_IMAGE}flip", low=0.0, high=1.0),
+        _psnr("psnr_affine", "PSNR affine", f"{_IMAGE}psnr_affine"),
+        _region("psnr_valid", "PSNR valid"),
+        _region("psnr_covered", "PSNR covered", _REGION_DB),
+        _region("psnr_uncovered", "PSNR uncovered", _REGION_DB),
+        _region("psnr_supported", "PSNR supported", _REGION_DB),
         Measure("mask_iou", "mask IoU", "higher", 3, per_image=False),
         Measure("mask_precision", "mask precision", "higher", 3, per_image=False),
         Measure("mask_recall", "mask recall", "higher", 3, per_image=False),
@@ -56,23 +132,152 @@ MEASURES: dict[str, Measure] = {
         Measure("peak_cuda_mb", "peak CUDA MB", "lower", 0, per_image=False),
     )
 }
-# Measured on part of a picture: one without such a pixel has no value, and is no gap in a mean.
-PARTIAL = ("psnr_valid", "psnr_covered", "psnr_uncovered", "psnr_supported")
 ALWAYS = ("psnr", "ssim", "lpips_alex")  # shown even where missing: the reason stands below the table
 COST = ("train_s", "reference_s", "ms_per_iteration", "fps", "gaussians", "model_mb")
-# A metric that is not listed takes its direction from its family: psnr_distractor is a PSNR.
-FAMILIES: tuple[tuple[str, Literal["higher", "lower"], int], ...] = (
-    ("psnr", "higher", 2),
-    ("ssim", "higher", 3),
-    ("lpips", "lower", 3),
-)
+# A metric that is not known takes everything but its name from its family: psnr_distractor is a PSNR.
+FAMILIES = {"psnr": "psnr", "ssim": "ssim", "lpips": "lpips_alex"}
+
+_own: dict[str, Metric] = {}  # registered; without a function: as a result that was read describes it
+
+
+def metrics() -> dict[str, Metric]:
+    """Every metric that can be computed, by key: built in, registered, installed as entry points."""
+    for point in importlib.metadata.entry_points(group=ENTRY_POINTS):
+        if point.name not in _own:
+            register(point.load())
+    return {k: m for k, m in (MEASURES | _own).items() if isinstance(m, Metric) and m.function}
+
+
+def partial(key: str) -> bool:
+    """Whether an image may lack this metric without being a gap in its mean."""
+    found = measure(key)
+    return isinstance(found, Metric) and found.partial
 
 
 def measure(key: str) -> Measure:
-    """The column of that key; one that is not listed takes direction and digits from its family."""
-    if key in MEASURES:
-        return MEASURES[key]
-    for family, better, digits in FAMILIES:
-        if key == family or key.startswith(family + "_"):
-            return Measure(key, key, better, digits)
-    return Measure(key, key, None, 3)
+    """The column of that key; of one that is not known what its family tells."""
+    if key not in MEASURES and key not in _own:
+        metrics()  # an installed package may have it
+    if key in MEASURES or key in _own:
+        return MEASURES.get(key) or _own[key]
+    family = FAMILIES.get(key.partition("_")[0])
+    return replace(MEASURES[family], key=key, label=key) if family else Measure(key, key, None)
+
+
+def register(metric: Metric) -> Metric:
+    """Add a metric; a later one of the same key replaces the earlier.
+
+    Raises:
+        AwError: its key cannot stand in a table, or is that of a measure of ours.
+    """
+    if not isinstance(metric, Metric):
+        raise AwError(f"{metric!r} is no Metric: see 'Your own metric' in docs/metrics.md")
+    if not re.fullmatch(r"[a-z][a-z0-9_.]{0,60}", metric.key) or metric.key.startswith("cost_"):
+        raise AwError(f"{metric.key[:60]!a} cannot name a metric: lower case, digits, '_' and '.'")
+    if metric.key in MEASURES:
+        raise AwError(f"metric {metric.key!r} is one of ours: give yours another key")
+    _own[metric.key] = replace(metric, label=f"{metric.label} {metric.unit}".strip(), unit="")
+    return metric
+
+
+def load_metrics(path: Path) -> None:
+    """Register every `Metric` of a Python file.
+
+    Raises:
+        AwError: no such file, none in it, or one that `register` refuses.
+    """
+    if not path.is_file():
+        raise AwError(f"no file {path} for --metric: give the path of a .py file with a Metric in it")
+    found = [value for value in vars(import_file(path)).values() if isinstance(value, Metric)]
+    if not found:
+        raise AwError(f"{path} holds no Metric: see 'Your own metric' in docs/metrics.md")
+    for metric in found:
+        register(replace(metric, source=hashlib.sha256(path.read_bytes()).hexdigest()))
+
+
+def own() -> dict[str, Metric]:
+    """Metrics that can be computed here and are not of this package."""
+    return {key: m for key, m in metrics().items() if key not in MEASURES}
+
+
+def try_own(scene: Scene) -> None:
+    """Measure a test photo against itself: a metric of one's own that fails is found before training.
+
+    Raises:
+        AwError: one fails; names the line.
+    """
+    for view in scene.test[:1] if (mine := own()) else ():
+        photo = read_png_rgb(view.image_path)
+        for key, why in measure_images([(view.name, photo, photo)], mine.values(), scene)[1].items():
+            raise AwError(f"metric {key}: {why}")
+
+
+class MetricRecord(TypedDict):
+    """What a result keeps of a metric that is not of this package."""
+
+    label: str
+    better: Better
+    digits: int
+    partial: bool
+    source: str  # sha256 of its file; empty for a package's
+
+
+def records(keys: Iterable[str]) -> dict[str, MetricRecord]:
+    """Of the own metrics among these."""
+    return {
+        key: MetricRecord(label=m.label, better=m.better, digits=m.digits, partial=m.partial, source=m.source)
+        for key, m in own().items()
+        if key in keys
+    }
+
+
+def remember(known: Mapping[str, MetricRecord]) -> None:
+    """Name the columns of a result's metrics as the run that measured them did."""
+    for key, record in known.items():
+        if key not in MEASURES and not _own.get(key):
+            _own[key] = Metric(key, function="", **record)
+
+
+def measure_images(
+    pictures: Iterable[tuple[str, np.ndarray, np.ndarray]],
+    metrics: Collection[Metric],
+    scene: Scene,
+    *,
+    half: bool = False,
+) -> tuple[list[dict[str, Any]], dict[str, str]]:
+    """Metrics of test images.
+
+    A metric that one image is refused by is missing for all: a mean is over every image or none.
+
+    Args:
+        pictures: name of the test view, render and photo, [H, W, 3] uint8.
+        metrics: which.
+        scene: of the views.
+        half: of the right half of each picture alone.
+
+    Returns:
+        An `ImageRow` for each picture, and for each metric that is missing the reason.
+
+    Raises:
+        AwError: a render that is not of its photo's size.
+    """
+    views = {view.name: view for view in scene.test}
+    rows: list[dict[str, Any]] = []
+    missing: dict[str, str] = {}
+    for name, render, photo in pictures:
+        if render.shape != photo.shape:
+            raise AwError(f"the render of {name} is not of its photo's size: render at the photo's size")
+        if half:
+            right = slice(photo.shape[1] // 2, None)
+            render, photo = (np.ascontiguousarray(picture[:, right]) for picture in (render, photo))
+        given = {"photo": photo, "view": views[name], "scene": scene}
+        rows.append({"name": name})
+        for metric in metrics:
+            try:
+                value = math.nan if metric.key in missing else metric.value(render, given)
+            except AwError as error:
+                missing[metric.key] = str(error)
+            else:
+                if not (metric.partial and math.isnan(value)):
+                    rows[-1][metric.key] = value
+    return [{k: v for k, v in row.items() if k not in missing} for row in rows], missing

@@ -9,14 +9,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Literal, cast
+from typing import Any, Literal, cast
 
 from ambiguous_wild import __version__
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.harness.leaderboard.verify import check_photos
+from ambiguous_wild.harness.measures import Metric, metrics, own, records
 from ambiguous_wild.harness.running.cell import code_hash, config_identity, refuse_other_scene, scene_identity
-from ambiguous_wild.harness.running.evaluate import Measures, measures_of
+from ambiguous_wild.harness.running.evaluate import measure
 from ambiguous_wild.harness.running.result_file import (
     RESULT,
     ImageRow,
@@ -79,22 +80,31 @@ def rescore(
 
 
 def could_be_measured(results: Iterable[RunResult]) -> list[str]:
-    """Metrics that these results lack and that can be measured now: weights that have come since."""
-    now = {name for name, reason in lpips.available().items() if reason is None}
-    lacking = {
-        name for result in results for name, why in result["missing"].items() if lpips.TOO_SMALL not in why
-    }
+    """Metrics that these results lack and that can be measured now, as weights have come; and own ones."""
+    now = {name for name, reason in lpips.available().items() if reason is None} | set(own())
+    lacking: set[str] = set()
+    for result in results:
+        lacking |= {name for name, why in result["missing"].items() if lpips.TOO_SMALL not in why}
+        lacking |= {name for name in own() if _lacks(result, name)}
     return sorted(lacking & now)
 
 
+def _lacks(result: RunResult, metric: str) -> bool:
+    """Whether it is not measured there, or by another state of its file."""
+    known, mine = result.get("metrics", {}).get(metric), own().get(metric)
+    if mine is not None and known is not None and known["source"] != mine.source:
+        return True
+    return all(metrics_of(row).get(metric) is None for row in result["per_image"])
+
+
 class _Scenes:
-    """Scenes that were opened, each with its metrics: networks are loaded once."""
+    """Scenes that were opened."""
 
     def __init__(self, given: Path | None) -> None:
         self.given = given
-        self._open: dict[tuple[str, int | None, bool], tuple[Scene, str, Measures]] = {}
+        self._open: dict[tuple[str, int | None], tuple[Scene, str]] = {}
 
-    def find(self, run: Path, result: RunResult, settings: object, *, half: bool) -> tuple[Scene, Measures]:
+    def find(self, run: Path, result: RunResult, settings: object) -> Scene:
         """The run's scene, as it was when it was measured."""
         known = settings if isinstance(settings, dict) else {}
         path, factor = str(self.given or known.get("path") or ""), known.get("factor")
@@ -102,14 +112,13 @@ class _Scenes:
             raise AwError(
                 f"{run}: its scene {path or 'is not named in config.yaml'} is not there: name it with --scene"
             )
-        key = path, factor if isinstance(factor, int) else None, half
+        key = path, factor if isinstance(factor, int) else None
         if key not in self._open:
             scene = load_scene(path, factor=key[1])
-            sizes = [(view.camera.height, view.camera.width) for view in scene.test]
-            self._open[key] = scene, scene_identity(scene), measures_of(scene, sizes, half=half)
-        scene, identity, measures = self._open[key]
+            self._open[key] = scene, scene_identity(scene)
+        scene, identity = self._open[key]
         refuse_other_scene(run, Path(path), identity, result["scene_hash"])
-        return scene, measures
+        return scene
 
 
 def _rescore(run: Path, scenes: _Scenes) -> Rescored:
@@ -126,10 +135,14 @@ def _rescore(run: Path, scenes: _Scenes) -> Rescored:
         if not result["per_image"]:
             return Rescored(run, "complete", missing=tuple(sorted(result["missing"])))
         half = config.get("protocol", "full") == "half"
-        scene, measures = scenes.find(run, result, config.get("scene"), half=half)
+        scene = scenes.find(run, result, config.get("scene"))
         renders = _renders(run, result)
+        wanted = [metric for key, metric in metrics().items() if _lacks(result, key)]
+        for row in result["per_image"]:
+            for metric in wanted:
+                cast(dict[str, Any], row).pop(metric.key, None)  # of another state of its file
         check_photos(run, scene, result["per_image"], renders, half=half)
-        added = _add(result, scene, measures, renders, half=half)
+        added = _add(result, scene, wanted, renders, half=half)
         missing = tuple(sorted(result["missing"]))
         if not added:
             return Rescored(run, "complete", missing=missing)
@@ -154,26 +167,15 @@ def _renders(run: Path, result: RunResult) -> dict[str, Path]:
 
 
 def _add(
-    result: RunResult, scene: Scene, measures: Measures, renders: dict[str, Path], *, half: bool
+    result: RunResult, scene: Scene, wanted: Sequence[Metric], renders: dict[str, Path], *, half: bool
 ) -> tuple[str, ...]:
     """Put the metrics that the result lacks into it; those that no image has a value of stay missing."""
     photos = {view.name: view.image_path for view in scene.test}
-    known = {
-        metric
-        for row in result["per_image"]
-        for metric, value in metrics_of(row).items()
-        if value is not None
-    }
-    wanted = {*measures.networks, *measures.regions.pixels} - known
-    if not wanted:
-        return ()
-    rows, added = [], set()
-    for row in result["per_image"]:
-        name = row["name"]
-        values = measures(name, read_png_rgb(renders[name]), read_png_rgb(photos[name]), half=half)
-        new = {metric: value for metric, value in values.items() if metric in wanted}
-        added |= set(new)
-        rows.append(cast(ImageRow, {**row, **new}))
-    result["per_image"] = rows
-    result["missing"] = {name: why for name, why in result["missing"].items() if name not in added}
+    pictures = ((name, read_png_rgb(path), read_png_rgb(photos[name])) for name, path in renders.items())
+    rows, missing = measure(pictures, wanted, scene, half=half)
+    result["per_image"] = [cast(ImageRow, {**old, **new}) for old, new in zip(result["per_image"], rows)]
+    added = {key for row in rows for key in metrics_of(row)}
+    result["missing"] = {key: why for key, why in (result["missing"] | missing).items() if key not in added}
+    if new := records(added):
+        result["metrics"] = {**result.get("metrics", {}), **new}
     return tuple(sorted(added))

@@ -10,6 +10,8 @@ from types import ModuleType
 
 from ambiguous_wild.core.errors import AwError
 
+_loaded: set[str] = set()  # paths as tracebacks have them
+
 
 def import_file(path: Path) -> ModuleType:
     """The module of a Python file, run anew.
@@ -23,6 +25,7 @@ def import_file(path: Path) -> ModuleType:
         raise AwError(f"plugin {path} is no Python file: its name must end in .py")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
+    _loaded.add(str(spec.origin))
     try:
         spec.loader.exec_module(module)
     except AwError:
@@ -30,16 +33,12 @@ def import_file(path: Path) -> ModuleType:
     except SyntaxError as error:
         raise AwError(f"plugin {path}, line {error.lineno}: {error.msg}") from None
     except (Exception, SystemExit) as error:
-        line = _line_in(error, path)
-        raise AwError(
-            f"plugin {path}{line} fails when it is loaded: {type(error).__name__}: {error}"
-        ) from error
+        why = f"{type(error).__name__}: {error}{place_of(error)}"
+        raise AwError(f"plugin {path} fails when it is loaded: {why}") from error
     return module
 
 
-def _line_in(error: BaseException, path: Path) -> str:
-    """ ", line 7" of the file, where the error passed through it."""
-    lines = [
-        frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)
-    ]
-    return f", line {lines[-1]}," if lines else ""
+def place_of(error: BaseException) -> str:
+    """Such as " (my_method.py, line 7)": where the error last was in a loaded file; empty if in none."""
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename in _loaded]
+    return f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""

@@ -7,7 +7,6 @@ variant is part of the name, and all metrics are computed from the same saved 8-
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 from scipy.ndimage import correlate1d
@@ -101,14 +100,6 @@ def ssim_inria(a: np.ndarray, b: np.ndarray) -> float:
         AwError: see `checked_pair`.
     """
     return float(_ssim_map(*checked_pair(a, b)).mean())
-
-
-# Measured on every test photo; higher is better for all.
-METRICS: dict[str, Callable[[np.ndarray, np.ndarray], float]] = {
-    "psnr": psnr,
-    "ssim": ssim,
-    "ssim_inria": ssim_inria,
-}
 
 
 def window() -> np.ndarray:
@@ -331,6 +322,3 @@ def _separable(image: np.ndarray, down: np.ndarray, across: np.ndarray) -> np.nd
     """Filter along both axes; border pixels are repeated."""
     rows = correlate1d(image, down, axis=0, mode="nearest")
     return correlate1d(rows, across, axis=1, mode="nearest")
-
-
-FULL_IMAGE = METRICS | {"psnr_affine": psnr_affine, "flip": flip}

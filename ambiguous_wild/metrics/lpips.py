@@ -120,7 +120,7 @@ def load(name: str) -> Metric:
     backbone, centred = VARIANTS[name]
     reason = _reason(backbone)
     if reason is not None:
-        raise AwError(f"{name}: {reason}")
+        raise AwError(reason)
     paths = [find_file(*pair) for pair in _files(backbone)]
     stamps = tuple((str(p), p.stat().st_mtime_ns) for p in paths if p is not None)
     stack, heads = _network(backbone, stamps)
@@ -133,6 +133,21 @@ def load(name: str) -> Metric:
         return _distance(backbone, stack, heads, left, right, centred)
 
     return measure
+
+
+def lpips_alex(render: np.ndarray, photo: np.ndarray) -> float:
+    """LPIPS of AlexNet; like the next two of images [H, W, 3], with the errors of `load` and its metric."""
+    return load("lpips_alex")(render, photo)
+
+
+def lpips_vgg(render: np.ndarray, photo: np.ndarray) -> float:
+    """LPIPS of VGG-16."""
+    return load("lpips_vgg")(render, photo)
+
+
+def lpips_vgg_01(render: np.ndarray, photo: np.ndarray) -> float:
+    """LPIPS of VGG-16 that gets [0, 1], not [-1, 1]."""
+    return load("lpips_vgg_01")(render, photo)
 
 
 def _distance(

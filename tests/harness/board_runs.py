@@ -84,7 +84,7 @@ def write_run(
         path.parent.mkdir(parents=True, exist_ok=True)
         write_png(path, np.clip(drawn, 0, 255).round().astype(np.uint8))
         render = read_png_rgb(path)
-        rows.append({"name": view.name} | {m: image_metrics.METRICS[m](render, photo) for m in METRICS})
+        rows.append({"name": view.name} | {m: getattr(image_metrics, m)(render, photo) for m in METRICS})
     result = {
         "schema": 1, "method": method, "scene": opened.name, "seed": seed, "status": "ok", "error": None,
         "options": config["options"], "per_image": rows,

@@ -128,7 +128,7 @@ def test_the_session_hands_the_gpus_on_and_warns_where_they_are_shared(four_gpus
     monkeypatch.setattr("ambiguous_wild.harness.running.grid.checked_folders", lambda *made: [None] * 9)
     used = Session(Engine(jobs=jobs), None, Lines(said.append))
     used.in_process(cells)
-    used.run(cells, Path(), None, (), ())
+    used.run(cells, Path(), None)
     assert given[1] == jobs and given[-1] == ["4", "5", "6", "7"]
     begins = f"warning: {jobs} cells at a time share 4 GPUs"
     assert any(line.startswith(begins) for line in said) is warned

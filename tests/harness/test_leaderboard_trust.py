@@ -21,11 +21,11 @@ from ambiguous_wild.harness.leaderboard.board import read_board, write_board
 from ambiguous_wild.harness.leaderboard.edit import check, remove
 from ambiguous_wild.harness.leaderboard.publish import publish
 from ambiguous_wild.harness.leaderboard.reproduce import command as command_of
+from ambiguous_wild.harness.measures import measure_images, metrics
 from ambiguous_wild.harness.running.cell import config_identity
-from ambiguous_wild.harness.running.regions import find_regions
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.io.scene_folder import load_scene
-from ambiguous_wild.metrics.image import flip, psnr_affine
+from ambiguous_wild.metrics import lpips
 from tests.harness.board_runs import change_result, write_run, write_scene
 
 
@@ -119,14 +119,14 @@ def test_all_csv_that_is_gone_is_written_again(board: Path, one: Path) -> None:
 def measure_everything(run: Path, scene: Path) -> set[str]:
     """Give the run FLIP and the metrics of regions, right ones; their names."""
     opened = load_scene(scene)
-    regions, photos = find_regions(opened), {v.name: v.image_path for v in opened.test}
+    photos = {v.name: v.image_path for v in opened.test}
+    asked = [m for key, m in metrics().items() if key not in lpips.VARIANTS]
 
     def more(result: dict) -> None:
         for row in result["per_image"]:
             render = read_png_rgb((run / "renders/test" / row["name"]).with_suffix(".png"))
             photo = read_png_rgb(photos[row["name"]])
-            row |= {"flip": flip(render, photo), "psnr_affine": psnr_affine(render, photo)}
-            row |= regions.psnr(row["name"], render, photo)
+            row |= measure_images([(row["name"], render, photo)], asked, opened)[0][0]
 
     change_result(run, more)
     return {k for row in json.loads((run / "metrics.json").read_text())["per_image"] for k in row}

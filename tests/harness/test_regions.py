@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import AwError, Camera
+from ambiguous_wild.harness.measures import measure_images, metrics
 from ambiguous_wild.harness.running.regions import find_regions
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.metrics.masks import psnr_valid
@@ -87,12 +88,14 @@ def test_a_users_mask_of_a_test_photo_is_what_psnr_valid_measures(tmp_path: Path
     keep = np.zeros((HEIGHT, WIDTH), np.uint8)
     keep[:10, 40:] = 255
     cv2.imwrite(str(root / "masks" / "test" / TEST[0]), keep)
-    regions = find_regions(load_scene(root))
+    scene = load_scene(root)
     a, b = np.random.default_rng(0).integers(0, 256, (2, HEIGHT, WIDTH, 3), dtype=np.uint8)
-    assert regions.psnr(TEST[0], a, b)["psnr_valid"] == psnr_valid(a, b, keep)
-    assert "psnr_valid" not in regions.psnr(TEST[1], a, b)  # it has no mask, and no value to invent
+    pictures, metric = [(name, a, b) for name in TEST], [metrics()["psnr_valid"]]
+    rows, _ = measure_images(pictures, metric, scene)
+    assert rows[0]["psnr_valid"] == psnr_valid(a, b, keep)
+    assert "psnr_valid" not in rows[1]  # it has no mask, and no value to invent
     right = slice(WIDTH // 2, None)
-    half = regions.psnr(TEST[0], a[:, right], b[:, right])
+    (half, *_), _ = measure_images(pictures, metric, scene, half=True)
     assert half["psnr_valid"] == psnr_valid(a[:, right], b[:, right], keep[:, right])
     cv2.imwrite(str(root / "masks" / "test" / TEST[0]), keep[:-1])
     with pytest.raises(AwError, match="its photo is 64x48"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,10 +15,10 @@ from ambiguous_wild.cli.table import rescore_command as command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness import bench as bench_module
 from ambiguous_wild.harness.bench import Callbacks, bench
+from ambiguous_wild.harness.measures import metrics
 from ambiguous_wild.harness.rescore import could_be_measured, rescore
 from ambiguous_wild.harness.running import evaluate
-from ambiguous_wild.harness.running.evaluate import measures_of
-from ambiguous_wild.harness.running.result_file import read_result
+from ambiguous_wild.harness.running.result_file import ImageRow, metrics_of, read_result
 from ambiguous_wild.io.images import read_png_rgb, write_png
 from ambiguous_wild.metrics import lpips
 from tests.harness.board_runs import write_run, write_scene
@@ -26,8 +27,14 @@ from tests.harness.board_runs import write_run, write_scene
 @pytest.fixture
 def weights(monkeypatch: pytest.MonkeyPatch) -> None:
     """Weights that came later: a network of the test's own stands in for AlexNet."""
+
+    def load(name: str) -> lpips.Metric:
+        if name != "lpips_alex":
+            raise AwError("no weights")
+        return lambda a, b: float(np.abs(a.astype(float) - b).mean())
+
     monkeypatch.setattr(lpips, "available", lambda: {"lpips_alex": None, "lpips_vgg": "no weights"})
-    monkeypatch.setattr(lpips, "load", lambda name: lambda a, b: float(np.abs(a.astype(float) - b).mean()))
+    monkeypatch.setattr(lpips, "load", load)
 
 
 @pytest.fixture
@@ -60,7 +67,7 @@ def test_what_was_missing_is_measured_from_the_pictures(tmp_path: Path, scene: P
 def test_without_weights_nothing_is_written(
     tmp_path: Path, scene: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(lpips, "available", lambda: {"lpips_alex": "weights missing"})
+    monkeypatch.setattr(lpips, "_reason", lambda backbone: "weights missing")
     run = write_run(tmp_path / "runs", scene)
     rescore([run])  # the regions of the scene are added
     text = (run / "metrics.json").read_bytes()
@@ -174,15 +181,24 @@ def test_bench_says_that_kept_runs_could_be_rescored(
     assert bench_module._rescorable(report)
 
 
+def measured_lpips(sizes: list[tuple[int, int]], half: bool = False) -> tuple[list[ImageRow], dict[str, str]]:
+    """LPIPS of pictures of these sizes."""
+    pictures = [(str(k), np.zeros((h, w, 3), np.uint8)) for k, (h, w) in enumerate(sizes)]
+    scene = SimpleNamespace(test=[SimpleNamespace(name=name) for name, _ in pictures])
+    asked = [metric for key, metric in metrics().items() if key in lpips.VARIANTS]
+    return evaluate.measure([(name, image, image) for name, image in pictures], asked, scene, half=half)
+
+
 def test_photos_too_small_for_a_network_leave_it_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lpips, "available", lambda: dict.fromkeys(lpips.VARIANTS))
-    monkeypatch.setattr(lpips, "load", lambda name: lambda a, b: 0.5)
-    small = measures_of(None, [(40, 40), (12, 20)])
-    assert not small.networks and set(small.missing) == set(lpips.VARIANTS)
-    assert all(lpips.TOO_SMALL in why and "20x12 px" in why for why in small.missing.values())
-    whole, half = measures_of(None, [(40, 41)]), measures_of(None, [(40, 41)], half=True)
-    assert set(whole.networks) == set(lpips.VARIANTS)
-    assert set(half.networks) == {"lpips_vgg", "lpips_vgg_01"} and "21x40 px" in half.missing["lpips_alex"]
+    monkeypatch.setattr(lpips, "_reason", lambda backbone: None)
+    monkeypatch.setattr(lpips, "_network", lambda backbone, stamps: (None, None))
+    monkeypatch.setattr(lpips, "_distance", lambda *given: 0.5)
+    rows, missing = measured_lpips([(40, 40), (12, 20)])
+    assert [set(row) for row in rows] == [{"name"}, {"name"}] and set(missing) == set(lpips.VARIANTS)
+    assert all(lpips.TOO_SMALL in why and "20x12 px" in why for why in missing.values())
+    assert set(measured_lpips([(40, 41)])[0][0]) == {"name", *lpips.VARIANTS}
+    rows, missing = measured_lpips([(40, 41)], half=True)
+    assert set(rows[0]) == {"name", "lpips_vgg", "lpips_vgg_01"} and "21x40 px" in missing["lpips_alex"]
 
 
 def test_what_is_too_small_is_no_case_for_rescore(tmp_path: Path, scene: Path, weights: None) -> None:
@@ -196,14 +212,12 @@ def test_networks_use_the_threads_of_the_kernels_and_give_them_back(monkeypatch:
     import torch
 
     used: list[int] = []
-    monkeypatch.setattr(lpips, "available", lambda: {"lpips_alex": None})
     monkeypatch.setattr(lpips, "load", lambda name: lambda a, b: used.append(torch.get_num_threads()) or 0.5)
     monkeypatch.setattr(evaluate, "threads", lambda: 2)
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        image = np.zeros((40, 40, 3), np.uint8)
-        assert measures_of(None, [(40, 40)])("a", image, image)["lpips_alex"] == 0.5
-        assert used == [2] and torch.get_num_threads() == 1
+        assert metrics_of(measured_lpips([(40, 40)])[0][0])["lpips_alex"] == 0.5
+        assert used == [2, 2, 2] and torch.get_num_threads() == 1
     finally:
         torch.set_num_threads(before)

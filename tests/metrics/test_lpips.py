@@ -154,7 +154,7 @@ def test_without_weights_every_variant_says_which_command_downloads_them() -> No
     for name, reason in reasons.items():
         with pytest.raises(AwError) as error:
             lpips.load(name)
-        assert str(error.value) == f"{name}: {reason}"
+        assert str(error.value) == reason
     with pytest.raises(AwError, match="lpips_alex"):
         lpips.load("lpips_alexnet")
 

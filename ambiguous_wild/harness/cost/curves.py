@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ambiguous_wild.harness.cost.read import NUMBERS, CostRun, Length, why_unranked
+from ambiguous_wild.harness.cost.read import CostRun, Length, why_unranked
 from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.metrics import stats
 
@@ -145,7 +145,7 @@ class Point:
     psnr: Summary  # dB
     minutes: Summary  # of training; with the set-up before it where `setup` is set
     setup_s: Summary
-    numbers: dict[str, Summary]  # ms an iteration, Gaussians, MB, frames a second
+    numbers: dict[str, Summary]  # ms an iteration, Gaussians, MB, frames a second, own metrics
     unranked: str = ""  # why its time is not ranked
     low: float = math.nan  # minutes of its fastest and its slowest run, shown where it is not ranked
     high: float = math.nan
@@ -163,7 +163,8 @@ def points(curves: Sequence[Curve], scenes: Sequence[str] = (), *, setup: bool =
         setup: count what comes before the first step as time too.
     """
     scenes = tuple(scenes) or scenes_of(curves)
-    made = [_point(curve, scenes, setup) for curve in curves]
+    names = dict.fromkeys(name for curve in curves for run in curve.runs for name in run.numbers)
+    made = [_point(curve, scenes, setup, names) for curve in curves]
     best = {id(p) for p in pareto([p for p in made if not knows_truth(p.method) and not p.unranked])}
     return [replace(p, front=id(p) in best) for p in made]
 
@@ -178,12 +179,12 @@ def pareto(among: Sequence[Point]) -> list[Point]:
     return front
 
 
-def _point(curve: Curve, scenes: Sequence[str], setup: bool) -> Point:
+def _point(curve: Curve, scenes: Sequence[str], setup: bool, names: Iterable[str]) -> Point:
     def minutes(run: CostRun) -> float:
         return (run.train_s + (run.setup_s if setup else 0.0)) / 60.0
 
     def number(name: str) -> Summary:
-        return summary(curve, scenes, lambda run: run.numbers[name])
+        return summary(curve, scenes, lambda run: run.numbers.get(name, math.nan))
 
     runs = [run for run in curve.runs if run.scene in scenes]
     known = [m for m in map(minutes, runs) if math.isfinite(m)]
@@ -195,7 +196,7 @@ def _point(curve: Curve, scenes: Sequence[str], setup: bool) -> Point:
         summary(curve, scenes, lambda run: run.psnr),
         summary(curve, scenes, minutes),
         summary(curve, scenes, lambda run: run.setup_s),
-        {name: number(name) for name in NUMBERS},
+        {name: number(name) for name in names},
         why_unranked(runs),
         min(known, default=math.nan),
         max(known, default=math.nan),

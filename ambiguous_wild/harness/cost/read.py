@@ -18,7 +18,14 @@ import numpy as np
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash, flatten
-from ambiguous_wild.harness.running.result_file import FAILED, RESULT, Cost, RunResult, read_result
+from ambiguous_wild.harness.running.result_file import (
+    FAILED,
+    RESULT,
+    Cost,
+    RunResult,
+    metric_mean,
+    read_result,
+)
 from ambiguous_wild.harness.running.store import read_config, run_folders
 from ambiguous_wild.harness.running.timing import Timing, in_reference_seconds, timing_of
 from ambiguous_wild.metrics import stats
@@ -63,7 +70,7 @@ class CostRun:
     images: dict[str, float]  # PSNR by test image
     train_s: float
     setup_s: float  # features and masks before the first step; short where a cache held them
-    numbers: dict[str, float]  # see NUMBERS; NaN where not measured
+    numbers: dict[str, float]  # see NUMBERS, and metrics of one's own; NaN where not measured
     points: tuple[tuple[float, float], ...]  # (seconds of training, PSNR in dB), in order of time
     timing: Timing
     samples: tuple[tuple[float, float], ...] = ()  # (wall seconds of training, seconds of the calibration)
@@ -206,7 +213,8 @@ def _run(folder: Path, result: RunResult) -> CostRun:
         images=images,
         train_s=train_s,
         setup_s=_number(cost.get("setup_s")),
-        numbers={name: _number(cost.get(name)) for name in NUMBERS},
+        numbers={name: _number(cost.get(name)) for name in NUMBERS}
+        | {key: metric_mean(result, key) for key in result.get("metrics", {})},
         points=points,
         timing=timing_of(cost),
         samples=tuple((float(at), float(kernel)) for at, kernel in record.get("samples", ())),

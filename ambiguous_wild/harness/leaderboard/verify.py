@@ -22,10 +22,9 @@ from ambiguous_wild.harness.leaderboard.reproduce import (
     preparation,
     setting,
 )
-from ambiguous_wild.harness.measures import PARTIAL
+from ambiguous_wild.harness.measures import Metric, measure, measure_images, metrics
 from ambiguous_wild.harness.running.cell import config_identity
 from ambiguous_wild.harness.running.choosing import mixed_tests
-from ambiguous_wild.harness.running.regions import find_regions
 from ambiguous_wild.harness.running.result_file import (
     FAILED,
     MODEL,
@@ -34,6 +33,7 @@ from ambiguous_wild.harness.running.result_file import (
     RunConfig,
     RunResult,
     check_model,
+    metric_mean,
     metrics_of,
     read_result,
 )
@@ -41,18 +41,10 @@ from ambiguous_wild.harness.running.store import MASK_SCORES, read_config
 from ambiguous_wild.harness.running.timing import timing_of
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import read_png_rgb
-from ambiguous_wild.metrics import stats
-from ambiguous_wild.metrics.image import FULL_IMAGE, METRICS
 
 ENVIRONMENT = "env.json"
 RENDERS = Path("renders") / "test"
-# Lowest and highest value by the first word of a metric's name; PSNR of pictures in [0, 1] is not negative.
-RANGES = {
-    "psnr": (0.0, math.inf),
-    "ssim": (-1.0, 1.0),
-    "flip": (0.0, 1.0),
-    "lpips": (0.0, math.inf),
-}
+REQUIRED = ("psnr", "ssim", "ssim_inria")  # no reason excuses it: they need nothing but the two pictures
 ROUNDING = 1e-9  # by which a share computed in floats may leave its range
 
 
@@ -240,22 +232,21 @@ def _check_values(run: Path, result: RunResult, *, photos: bool) -> None:
     `photos`: the test photos are at hand, and tell whether an infinite PSNR is right.
     """
     rows = result["per_image"]
-    for metric in METRICS:
-        # No reason excuses it: these need nothing but the two pictures.
+    for metric in REQUIRED:
         lacking = [row["name"] for row in rows if metrics_of(row).get(metric) is None]
         if lacking:
             _partial(run, f"no {metric} of {shortlist(lacking)}, which every run measures")
     for row in rows:
         for metric, value in metrics_of(row).items():
-            family = metric.partition("_")[0]
-            low, high = RANGES.get(family, (-math.inf, math.inf))
-            if value is None:
+            about = measure(metric)
+            if value is None or not isinstance(about, Metric):
                 continue
-            if not low - ROUNDING <= value <= high + ROUNDING:
-                _impossible(run, f"{metric} of {row['name']}", value, f"lies between {low:g} and {high:g}")
-            if math.isinf(value) and not (family == "psnr" and photos):
+            if not about.low - ROUNDING <= value <= about.high + ROUNDING:
+                why = f"lies between {about.low:g} and {about.high:g}"
+                _impossible(run, f"{metric} of {row['name']}", value, why)
+            if math.isinf(value) and not (about.infinite and photos):
                 why = "is infinite only where picture and photo are equal, and the photos are not at hand: "
-                why = f"{why}name them with --scenes" if family == "psnr" else "is finite"
+                why = f"{why}name them with --scenes" if about.infinite else "is finite"
                 _impossible(run, f"{metric} of {row['name']}", value, why)
     masks: Mapping[str, Any] = result["masks"] or {}
     for name in MASK_SCORES:
@@ -281,10 +272,7 @@ def _qualities(run: Path, result: RunResult) -> tuple[dict[str, float], tuple[st
             or name.startswith(COST)
         ):
             raise AwError(f"{run}: {name[:60]!a} cannot name a metric: lower case, digits, '_' and '.'")
-    means = {
-        name: stats.mean([_known(row.get(name)) for row in rows if name in row or name not in PARTIAL])
-        for name in names
-    }
+    means = {name: metric_mean(result, name) for name in names}
     masks: Mapping[str, Any] = result["masks"] or {}
     means |= {f"mask_{k}": float(masks[k]) for k in MASK_SCORES if masks.get(k) is not None}
     missing = tuple(sorted(k for k, v in means.items() if math.isnan(v)))
@@ -295,11 +283,7 @@ def _known(value: float | None) -> float:
     return math.nan if value is None else value
 
 
-TOLERANCE = 1e-6  # the same arithmetic on the same 8-bit pixels; another CPU may round otherwise
 RESTORE = "restore the files, or run it again with 'aw bench --overwrite always'"
-# dB. Which pixels are covered is itself computed: where rounding moves a pixel over the threshold, the mean
-# over thousands of them moves a little.
-REGION_TOLERANCE = {"psnr_covered": 1e-2, "psnr_uncovered": 1e-2, "psnr_supported": 1e-2}
 
 
 def check_photos(
@@ -332,31 +316,19 @@ def check_photos(
             f"{run} is partial: measured are {len(renders)} images, scene {scene.root} has {len(views)} test "
             f"photos ({shortlist(odd)} in one of them only); a mean over a part is no result"
         )
-    known = ("psnr",) if quick else tuple(FULL_IMAGE)
-    for metric in known:
-        lacking = [row["name"] for row in rows if metric not in row]
-        if lacking and len(lacking) < len(rows):
-            raise AwError(f"{run} is partial: no {metric} of {shortlist(lacking)}, but of the other images")
-    said = {metric for metric in PARTIAL if any(metric in row for row in rows)}
-    regions = None if quick or not said else find_regions(scene)
+    known = [m for m in metrics().values() if m.tolerance is not None and any(m.key in row for row in rows)]
+    known = [m for m in known if m.key == "psnr" or not quick]
     copies = []
     for row in rows:
         name = row["name"]
         render, photo = read_png_rgb(renders[name]), read_png_rgb(views[name].image_path)
         if render.shape != photo.shape:
             raise AwError(f"{renders[name]} is not of the size of {views[name].image_path}: it was changed")
-        if half:
-            right = slice(photo.shape[1] // 2, None)
-            render, photo = (np.ascontiguousarray(picture[:, right]) for picture in (render, photo))
-        values = metrics_of(row)
+        (computed,), _ = measure_images([(name, render, photo)], known, scene, half=half)
         for metric in known:
-            if metric in values:
-                _compare(run, name, metric, values[metric], FULL_IMAGE[metric](render, photo))
-        if regions is not None:
-            # A run of before a metric was kept has it of no image; one that has it, has it of all.
-            computed = regions.psnr(name, render, photo)
-            _compare_regions(run, row, {k: v for k, v in computed.items() if k in said})
-        if np.array_equal(render, photo):
+            _compare(run, row, metric, metrics_of(cast(ImageRow, computed)))
+        right = slice(photo.shape[1] // 2 if half else 0, None)
+        if np.array_equal(render[:, right], photo[:, right]):
             copies.append(name)
     if copies:
         raise AwError(
@@ -365,31 +337,23 @@ def check_photos(
         )
 
 
-def _compare_regions(run: Path, row: ImageRow, computed: dict[str, float]) -> None:
-    """PSNR on parts of a picture: there where the scene has such pixels, and nowhere else."""
-    name, values = row["name"], metrics_of(row)
-    for metric in PARTIAL:
-        if metric in values and metric not in computed:
-            raise AwError(
-                f"{run} was changed: {metric} of {name} is in metrics.json, and its scene has no such pixel "
-                f"in that picture; {RESTORE}"
-            )
-        if metric in computed and metric not in values:
-            raise AwError(
-                f"{run} is partial: no {metric} of {name}, though its scene has such pixels there; {RESTORE}"
-            )
-        if metric in values:
-            tolerance = REGION_TOLERANCE.get(metric, TOLERANCE)
-            _compare(run, name, metric, values[metric], computed[metric], tolerance)
-
-
-def _compare(
-    run: Path, name: str, metric: str, said: float | None, computed: float, tolerance: float = TOLERANCE
-) -> None:
-    value = math.nan if said is None else float(said)
-    both_missing = math.isnan(value) and math.isnan(computed)
-    if not (value == computed or abs(value - computed) <= tolerance or both_missing):
+def _compare(run: Path, row: ImageRow, metric: Metric, computed: Mapping[str, float | None]) -> None:
+    """A value is there where the picture has one, and nowhere else; a run may lack a metric as a whole."""
+    key, name, values = metric.key, row["name"], metrics_of(row)
+    if key in values and key not in computed:
         raise AwError(
-            f"{run} was changed: {metric} of {name} is {value:.6f} in metrics.json, render and photo give "
-            f"{computed:.6f}; {RESTORE}"
+            f"{run} was changed: {key} of {name} is in metrics.json, and its scene has no such pixel in that "
+            f"picture; {RESTORE}"
+        )
+    if key in computed and key not in values:
+        there = "though its scene has such pixels there" if metric.partial else "but of the other images"
+        raise AwError(f"{run} is partial: no {key} of {name}, {there}; {RESTORE}")
+    if key not in values:
+        return
+    value, again = _known(values[key]), _known(computed[key])
+    both_missing = math.isnan(value) and math.isnan(again)
+    if not (value == again or abs(value - again) <= (metric.tolerance or 0.0) or both_missing):
+        raise AwError(
+            f"{run} was changed: {key} of {name} is {value:.6f} in metrics.json, render and photo give "
+            f"{again:.6f}; {RESTORE}"
         )

@@ -23,6 +23,7 @@ import ambiguous_wild
 from ambiguous_wild import __version__
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import config_hash, flatten, to_plain
+from ambiguous_wild.harness.measures import records
 from ambiguous_wild.harness.running.choosing import Chosen, mixed_tests, scene_protocol
 from ambiguous_wild.harness.running.result_file import (
     SCHEMA,
@@ -34,6 +35,7 @@ from ambiguous_wild.harness.running.result_file import (
     RunConfig,
     RunResult,
     UnusualConfig,
+    metrics_of,
 )
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.motion_points import FILE as MOTION
@@ -255,7 +257,10 @@ class Cell:
         known: dict[str, Any] = {**(facts or {}), "length": asked_length(self.train)}
         if mixed := mixed_tests(self.scene):
             known["test_photos"] = mixed
+        mine = records({key for row in per_image for key in metrics_of(row)})
+        more: Any = {"metrics": mine} if mine else {}
         return {
+            **more,
             "schema": SCHEMA,
             "method": self.method.name,
             "scene": self.scene.name,

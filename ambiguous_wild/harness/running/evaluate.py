@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, cast
 
 import numpy as np
 import torch
 
 from ambiguous_wild.core import AwError, Camera, Scene, View
-from ambiguous_wild.harness.running.regions import Regions, find_regions, true_distractor
-from ambiguous_wild.harness.running.result_file import Cost, ImageRow, MaskScores, image_row
+from ambiguous_wild.harness.measures import Metric, measure_images, metrics
+from ambiguous_wild.harness.running.regions import true_distractor
+from ambiguous_wild.harness.running.result_file import Cost, ImageRow, MaskScores
 from ambiguous_wild.io.atomic import atomic_dir
 from ambiguous_wild.io.images import read_png_rgb, to_uint8, write_png
 from ambiguous_wild.metrics import image as image_metrics
-from ambiguous_wild.metrics import lpips
 from ambiguous_wild.metrics import masks as mask_metrics
-from ambiguous_wild.metrics.image import FULL_IMAGE
 from ambiguous_wild.splat import device
 from ambiguous_wild.splat.cpu.compile import threads
 from ambiguous_wild.splat.trainer import Trainer
@@ -104,20 +102,18 @@ def render_and_measure(
         Per-image metrics, and for each metric that is missing the reason.
     """
     if not truth:
-        missing = {name: reason for name, reason in lpips.available().items() if reason is not None}
-        missing |= dict.fromkeys(FULL_IMAGE, "the scene has no test views")
-        return [], missing
-    sizes = [t.photo.shape[:2] for t in truth]
-    measures = measures_of(scene, sizes, half=half)
-    rows: list[ImageRow] = []
-    with atomic_dir(folder) as temporary:
+        return [], dict.fromkeys(metrics(), "the scene has no test views")
+
+    def pictures() -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
         for t in truth:
             path = temporary / Path(t.view.name).with_suffix(".png")
             path.parent.mkdir(parents=True, exist_ok=True)
             image = _fitted(model, t) if half else model.render(t.view.camera).image
             write_png(path, to_uint8(image.cpu().numpy()))
-            rows.append(image_row(t.view.name, measures(t.view.name, read_png_rgb(path), t.photo, half=half)))
-    return rows, measures.missing
+            yield t.view.name, read_png_rgb(path), t.photo
+
+    with atomic_dir(folder) as temporary:
+        return measure(pictures(), list(metrics().values()), scene, half=half)
 
 
 def refuse_empty(truth: Sequence[TestPhoto], folder: Path) -> None:
@@ -137,62 +133,27 @@ def refuse_empty(truth: Sequence[TestPhoto], folder: Path) -> None:
         )
 
 
-@dataclass(frozen=True)
-class Measures:
-    """Every metric of a test image that can be measured here, and why the others cannot."""
-
-    networks: dict[str, lpips.Metric]
-    regions: Regions
-    missing: dict[str, str]  # metric -> reason
-
-    def __call__(
-        self,
-        name: str,  # of the test view
-        drawn: np.ndarray,  # [H, W, 3] uint8
-        photo: np.ndarray,  # [H, W, 3] uint8
-        *,
-        half: bool = False,  # of the right half alone
-    ) -> dict[str, float]:
-        """The metrics of one image."""
-        if half:
-            right = slice(photo.shape[1] // 2, None)
-            drawn, photo = (np.ascontiguousarray(picture[:, right]) for picture in (drawn, photo))
-        values = {name: metric(drawn, photo) for name, metric in FULL_IMAGE.items()}
-        values |= self.regions.psnr(name, drawn, photo)
-        with _kernel_threads():
-            return values | {name: network(drawn, photo) for name, network in self.networks.items()}
-
-
-@contextmanager
-def _kernel_threads() -> Iterator[None]:
-    """Let torch use as many threads as the CPU kernels; training keeps it to one."""
+def measure(
+    pictures: Iterable[tuple[str, np.ndarray, np.ndarray]],
+    metrics: Collection[Metric],
+    scene: Scene,
+    *,
+    half: bool,
+) -> tuple[list[ImageRow], dict[str, str]]:
+    """`measure_images` with as many threads of torch as the CPU kernels have; drawing keeps those it had."""
     before = torch.get_num_threads()
-    torch.set_num_threads(threads())
+
+    def drawn() -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+        for picture in pictures:
+            torch.set_num_threads(threads())
+            yield picture
+            torch.set_num_threads(before)
+
     try:
-        yield
+        rows, missing = measure_images(drawn(), metrics, scene, half=half)
     finally:
         torch.set_num_threads(before)
-
-
-def measures_of(scene: Scene | None, sizes: Iterable[tuple[int, int]], *, half: bool = False) -> Measures:
-    """The metrics of a scene's test images; without a scene, those of whole images.
-
-    A network is left out for all images if one is too small for it: a mean is over every image or none.
-
-    Args:
-        scene: None = no metrics of regions.
-        sizes: (height, width) of each test image in px.
-        half: the right half of each image is measured alone.
-    """
-    regions = Regions({}, {}) if scene is None else find_regions(scene)
-    measured = {(h, w - w // 2 if half else w) for h, w in sizes}
-    reasons = {
-        name: reason or next((why for h, w in sorted(measured) if (why := lpips.too_small(name, h, w))), None)
-        for name, reason in lpips.available().items()
-    }
-    missing = {name: reason for name, reason in reasons.items() if reason is not None} | regions.missing
-    networks = {name: lpips.load(name) for name in reasons if name not in missing}
-    return Measures(networks, regions, missing)
+    return cast(list[ImageRow], rows), missing
 
 
 def _fitted(model: Renderable, test: TestPhoto) -> torch.Tensor:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -20,7 +21,7 @@ import numpy as np
 
 from ambiguous_wild.core import AwError, Camera, Scene, View
 from ambiguous_wild.io.images import read_gray, read_keep_map
-from ambiguous_wild.metrics.masks import psnr_valid
+from ambiguous_wild.metrics import masks
 from ambiguous_wild.vision.sparse_surface import (
     BEHIND,
     in_map,
@@ -142,25 +143,21 @@ class Regions:
     pixels: dict[str, dict[str, np.ndarray]]  # metric -> name of a test view -> [H, W] bool
     missing: dict[str, str]  # metric -> why it is missing for the whole scene
 
-    def psnr(
-        self,
-        name: str,  # of the test view
-        drawn: np.ndarray,  # [H, W, 3] uint8
-        photo: np.ndarray,  # [H, W, 3] uint8
-    ) -> dict[str, float]:
-        """The region metrics of one view in dB; one that has no pixel in the view is left out.
 
-        Pictures narrower than the view are its right part (the half-image protocol).
-        """
-        values = {}
-        for metric, views in self.pixels.items():
-            if name not in views:
-                continue
-            value = psnr_valid(drawn, photo, views[name][:, -photo.shape[1] :])
-            if not math.isnan(value):
-                values[metric] = value
-        return values
+def _psnr(metric: str, drawn: np.ndarray, photo: np.ndarray, view: View, scene: Scene) -> float:
+    """In dB, of [H, W, 3] uint8; NaN where the view has no such pixel. AwError: no view of the scene has.
 
+    Pictures narrower than the view are its right part (the half-image protocol).
+    """
+    regions = find_regions(scene)
+    if metric in regions.missing:
+        raise AwError(regions.missing[metric])
+    pixels = regions.pixels[metric].get(view.name)
+    return math.nan if pixels is None else masks.psnr_valid(drawn, photo, pixels[:, -photo.shape[1] :])
+
+
+psnr_covered, psnr_uncovered = partial(_psnr, COVERED), partial(_psnr, UNCOVERED)
+psnr_supported, psnr_valid = partial(_psnr, SUPPORTED), partial(_psnr, VALID)
 
 _last: list[tuple[Scene, Regions]] = []  # of the scene that was asked about last
 

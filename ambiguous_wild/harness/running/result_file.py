@@ -19,8 +19,10 @@ import numpy as np
 from msgspec import Meta
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.measures import MetricRecord, partial, remember
 from ambiguous_wild.io.atomic import write_json
 from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.metrics import stats
 
 Status = Literal["ok", "failed"]
 NotNegative = Annotated[float, Meta(ge=0.0)]
@@ -30,31 +32,22 @@ Name = Annotated[str, Meta(pattern=r"\S")]
 
 
 class ImageRow(TypedDict, total=False):
-    """Metrics of one test image; None = undefined there. A plugin or later version may add others."""
+    """Metrics of one test image, PSNR and others (see `metrics_of`); None = undefined there."""
 
     name: Required[str]  # of the test view
     psnr: float | None
-    ssim: float | None
-    ssim_inria: float | None
-    flip: float | None
-    psnr_affine: float | None
-    lpips_alex: float | None
-    lpips_vgg: float | None
-    lpips_vgg_01: float | None
-    psnr_valid: float | None  # this and the next three: absent where the image has no such pixel
-    psnr_covered: float | None
-    psnr_uncovered: float | None
-    psnr_supported: float | None
-
-
-def image_row(name: str, metrics: dict[str, float]) -> ImageRow:
-    """The row of one test image."""
-    return cast(ImageRow, {"name": name, **metrics})
 
 
 def metrics_of(row: ImageRow) -> dict[str, float | None]:
     """Every metric of the row, by name."""
     return {key: cast("float | None", value) for key, value in row.items() if key != "name"}
+
+
+def metric_mean(result: RunResult | None, metric: str) -> float:
+    """Mean of an image metric over the test views, of the finite values; NaN where any is missing."""
+    rows = [] if result is None else [metrics_of(row) for row in result["per_image"]]
+    values = [row.get(metric) for row in rows if metric in row or not partial(metric)]
+    return stats.mean([math.nan if value is None else value for value in values])
 
 
 class MaskScores(TypedDict, total=False):
@@ -160,6 +153,7 @@ class RunResult(TypedDict):
     code_hash: NotRequired[str]
     reproduce: NotRequired[str]
     rescored: NotRequired[list[Rescore]]
+    metrics: NotRequired[dict[str, MetricRecord]]  # that are not of this package
     model_sha256: NotRequired[str]  # of point_cloud.ply; also absent where the run has none
 
 
@@ -272,6 +266,7 @@ def _checked(data: Any, where: str) -> RunResult:
         msgspec.convert(rows, dict[str, dict[str, float | None]])  # metrics of plugins and later versions too
         if any(kernel <= 0.0 for _, kernel in known["cost"].get("timing", {}).get("samples", ())):
             raise msgspec.ValidationError("a calibration took no time - at `$.cost.timing.samples`")
+        remember(data.get("metrics", {}))
         if data["status"] == "failed" and not data["error"]:
             raise msgspec.ValidationError("a failed run must say its error")
     except (msgspec.ValidationError, RecursionError) as error:

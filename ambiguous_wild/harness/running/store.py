@@ -14,7 +14,7 @@ import pandas as pd
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import flatten
-from ambiguous_wild.harness.measures import PARTIAL
+from ambiguous_wild.harness.measures import partial
 from ambiguous_wild.harness.running.result_file import FAILED, RESULT, RunResult, metrics_of, read_result
 from ambiguous_wild.harness.running.timing import timing_of
 from ambiguous_wild.io import plain_yaml
@@ -170,7 +170,7 @@ def _image_rows(results: list[FoundResult]) -> Iterator[dict[str, Any]]:
         metrics |= dict.fromkeys(result["missing"])
         for name, values in measured:
             for metric in metrics:
-                if metric in PARTIAL and metric not in values:
+                if metric not in values and partial(metric):
                     continue
                 value = values.get(metric)
                 yield _key(result) | {

@@ -17,7 +17,7 @@ import pandas as pd
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist, unknown
-from ambiguous_wild.harness.measures import ALWAYS, COST, MEASURES, PARTIAL, Measure, measure
+from ambiguous_wild.harness.measures import ALWAYS, COST, MEASURES, Measure, measure, partial
 from ambiguous_wild.harness.running.store import TEXT_OF_RUNS, Runs
 from ambiguous_wild.harness.tables.notes import incomparable, notes, untimed
 from ambiguous_wild.harness.tables.table import Cell, Column, Row, State, Table, ranks
@@ -25,7 +25,6 @@ from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.metrics import stats
 
 MASK_COLUMNS = ("mask_iou", "mask_precision")
-UNDEFINED_ON_SOME = (*PARTIAL, *MASK_COLUMNS, "mask_recall")
 
 
 def comparison(
@@ -152,7 +151,7 @@ class _Index:
 
     def can_have(self, scene: str, column: Measure, methods: Sequence[str]) -> bool:
         """Whether the measure is defined on the scene: some method has a value, or it always is."""
-        if column.key not in UNDEFINED_ON_SOME:
+        if not partial(column.key) and column.key not in (*MASK_COLUMNS, "mask_recall"):
             return True
         return any(
             (m, scene) in self.runs and bool(self.seeds(m, scene, column).notna().any()) for m in methods

@@ -15,9 +15,11 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import from_plain
+from ambiguous_wild.harness.measures import load_metrics
 from ambiguous_wild.harness.running.cell import Cell, CellReport, RunOptions, code_hash, scene_identity
 from ambiguous_wild.harness.running.choosing import Chosen
 from ambiguous_wild.harness.running.result_file import FAILED, RESULT, RunConfig, write_result
@@ -36,10 +38,10 @@ LOCK_WAIT_S = 150.0
 
 @dataclass(frozen=True)
 class Source:
-    """Code that a method comes from: a plugin, or a reference such as ``recipe.py:my_recipe``."""
+    """Code that a run needs: a plugin, metrics, or a reference such as ``recipe.py:my_recipe``."""
 
-    text: str  # the reference as typed, or the plugin's path
-    plugin: bool
+    text: str  # the reference as typed, or the file's path
+    kind: Literal["plugin", "metric", "method"]
     path: str = ""  # absolute path of its file, if it has one
     content: bytes = b""
 
@@ -60,22 +62,25 @@ class Job:
     token: str = ""  # a file that the runner must see, see `check_storage`
 
 
-def read_sources(plugins: Sequence[Path], methods: Sequence[str]) -> tuple[Source, ...]:
-    """The code of plugins and of methods given as files; names of `aw methods` need none."""
-    sources = [_source(str(path), True, path) for path in plugins]
+def read_sources(
+    plugins: Sequence[str | Path], methods: Sequence[str], metrics: Sequence[str | Path] = ()
+) -> tuple[Source, ...]:
+    """The code of plugins, and of methods and metrics given as files; names of `aw methods` need none."""
+    sources = [_source(str(path), "plugin", Path(path)) for path in plugins]
+    sources += [_source(str(path), "metric", Path(path)) for path in metrics]
     for name in methods:
         # A graft may have a reference as its host.
         host, _ = split_graft(trained_once(name))
         file = reference_file(host)
         if file is not None:
-            sources.append(_source(host, False, file))
+            sources.append(_source(host, "method", file))
         elif host.startswith("nerfbaselines:"):
-            sources.append(Source(host, False))
+            sources.append(Source(host, "method"))
     return tuple(sources)
 
 
-def _source(text: str, plugin: bool, path: Path) -> Source:
-    return Source(text, plugin, str(path.resolve()), path.read_bytes())
+def _source(text: str, kind: Literal["plugin", "metric", "method"], path: Path) -> Source:
+    return Source(text, kind, str(path.resolve()), path.read_bytes())
 
 
 def make_job(
@@ -178,8 +183,10 @@ def _load(source: Source) -> None:
         load_reference(source.text)
         return
     path = _present(source)
-    if source.plugin:
+    if source.kind == "plugin":
         load_plugin(path)
+    elif source.kind == "metric":
+        load_metrics(path)
     else:
         load_reference(with_file(source.text, path), given_as=with_file(source.text, Path(source.path)))
 

@@ -18,7 +18,7 @@ from ambiguous_wild.harness.running.callbacks import Callbacks, Engine
 
 if TYPE_CHECKING:
     from ambiguous_wild.harness.running.cell import Cell, CellReport, RunOptions
-    from ambiguous_wild.harness.running.engines.job import Job
+    from ambiguous_wild.harness.running.engines.job import Job, Source
     from ambiguous_wild.harness.running.engines.ray_cluster import RayCluster
 
 VISIBLE = "CUDA_VISIBLE_DEVICES"
@@ -80,11 +80,10 @@ class Session:
         cells: Sequence[Cell],
         output: Path,
         options: RunOptions,
-        plugins: Sequence[Path],
-        methods: Sequence[str],  # as they were typed
+        sources: tuple[Source, ...] = (),  # code that the runs need
     ) -> list[CellReport]:
         """Run the cells in processes of this machine or on the cluster; reports in their order."""
-        from ambiguous_wild.harness.running.engines.job import make_job, read_sources, record_lost
+        from ambiguous_wild.harness.running.engines.job import make_job, record_lost
         from ambiguous_wild.harness.running.grid import checked_folders
 
         engine, say = self.engine, self.callbacks.say
@@ -92,7 +91,6 @@ class Session:
         threads = self.threads or (
             max(1, int(engine.cpus_per_cell or 1)) if cluster else max(1, _cores() // (engine.jobs or 1))
         )
-        sources = read_sources(plugins, methods)
         folders = checked_folders(cells, output, options)
         jobs = [make_job(cell, folder, options, sources, threads) for cell, folder in zip(cells, folders)]
 

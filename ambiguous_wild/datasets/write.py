@@ -92,7 +92,7 @@ def import_scene(
         foreign = dataclasses.replace(foreign, factor=settings.factor)
     plans = plan_photos(foreign)
     key = _key(foreign, plans, settings, name)
-    check_output(target)
+    target = check_output(target)
     with build_lock(target):
         known = _existing(target, key, overwrite)
         if known is not None:

@@ -6,14 +6,15 @@ Both are refused here, by name. White = keep, black = ignore, as in COLMAP.
 
 from __future__ import annotations
 
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 
 from ambiguous_wild.builder.records import MaskResult, ScreenedPhoto
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.io.hashing import sha256_file
-from ambiguous_wild.io.images import read_gray, write_png
+from ambiguous_wild.io.images import read_mask, write_png
+from ambiguous_wild.io.scene_folder import find_masks as by_name
 
 LITTLE_KEPT = 0.3  # share of a photo; distractors rarely cover more than the rest
 
@@ -21,7 +22,7 @@ LITTLE_KEPT = 0.3  # share of a photo; distractors rarely cover more than the re
 def find_masks(folder: Path, facts: list[ScreenedPhoto], missing: str) -> dict[str, Path]:
     """Mask file of each photo, by stem.
 
-    Names: `a.jpg.png` (COLMAP's) or `a.png`, under the photo's path in the capture or directly in `folder`.
+    Names: see `io.scene_folder.find_masks`; paths are those in the capture.
 
     Args:
         folder: the user's mask folder.
@@ -29,19 +30,21 @@ def find_masks(folder: Path, facts: list[ScreenedPhoto], missing: str) -> dict[s
         missing: "error", or "keep": a photo without a mask is used whole.
 
     Raises:
-        AwError: no such folder, photos without a mask, masks of another size.
+        AwError: no such folder, photos without a mask, masks of another size, or what is no mask.
     """
     if not folder.is_dir():
         what = "is a file; give the folder that holds the masks" if folder.exists() else "does not exist"
         raise AwError(f"mask folder {folder} {what}")
     found: dict[str, Path] = {}
     unmasked, misfits = [], []
+    sources = [fact["source"] for fact in facts]
+    named = by_name(folder, sources) or by_name(folder, (s.removeprefix("images/") for s in sources))
     for fact in facts:
-        path = _candidate(folder, fact["source"])
+        path = named.get(fact["source"]) or named.get(fact["source"].removeprefix("images/"))
         if path is None:
             unmasked.append(fact["source"])
             continue
-        height, width = read_gray(path).shape
+        height, width = read_mask(path).shape
         if (width, height) != (fact["width"], fact["height"]):
             misfits.append(f"{path.name} is {width}x{height} but its photo {fact['width']}x{fact['height']}")
         found[fact["stem"]] = path
@@ -67,7 +70,7 @@ def lay_out_masks(folder: Path, found: dict[str, Path], facts: list[ScreenedPhot
         if path is None:
             mask = np.full((fact["height"], fact["width"]), 255, np.uint8)
         else:
-            mask = np.where(read_gray(path) >= 128, 255, 0).astype(np.uint8)
+            mask = read_mask(path)
             shares[fact["stem"]] = round(float((mask > 0).mean()), 4)
         write_png(folder / "masks" / f"{fact['work_name']}.png", mask)
     return {"kept_share": shares}
@@ -87,13 +90,3 @@ def mask_warnings(facts: MaskResult | None) -> list[str]:
 def mask_hashes(found: dict[str, Path]) -> dict[str, str]:
     """sha256 of each mask file, by stem."""
     return {stem: sha256_file(path) for stem, path in sorted(found.items())}
-
-
-def _candidate(folder: Path, source: str) -> Path | None:
-    relative = PurePosixPath(source)
-    inner = PurePosixPath(*relative.parts[1:]) if relative.parts[0] == "images" else relative
-    for base in dict.fromkeys((relative, inner, PurePosixPath(relative.name))):
-        for path in (folder / f"{base}.png", folder / base.with_suffix(".png")):
-            if path.is_file():
-                return path
-    return None

@@ -81,7 +81,7 @@ def build_scene(
     _check_paths(raw, target)
     count = jobs or os.cpu_count() or 1
     capture = collect(raw, count)
-    check_output(target)
+    target = check_output(target)
     with build_lock(target):
         stages = Stages(
             capture,

@@ -35,6 +35,10 @@ KINDS = (
     help="Drop points that only test photos see: they leak clean geometry. Published code keeps them.",
 )
 @click.option("--motion", is_flag=True, help="Match the photos to find what moves, for masks (motion.npz).")
+@click.option(
+    "--masks/--no-masks", default=True, show_default=True,
+    help="Use keep masks: those that the layout names, masks/ beside the photos, the photos' alpha.",
+)  # fmt: skip
 @click.option("--jobs", type=click.IntRange(min=1), help="Threads; the result does not depend on it.")
 @click.option(
     "--seed",
@@ -55,6 +59,7 @@ def import_command(
     dataset: str,
     drop_test_only_points: bool,
     motion: bool,
+    masks: bool,
     jobs: int | None,
     seed: int,
     overwrite: bool,
@@ -68,7 +73,9 @@ def import_command(
     """
     from ambiguous_wild.datasets.write import ImportSettings, import_scene
 
-    settings = ImportSettings(kind, factor, name, license_, dataset, drop_test_only_points, seed, motion)
+    settings = ImportSettings(
+        kind, factor, name, license_, dataset, drop_test_only_points, seed, motion, masks
+    )
     done = import_scene(source, output, settings, overwrite=overwrite, jobs=jobs, progress=not as_json)
     info = done.info
     if as_json:

@@ -119,7 +119,8 @@ def make_command(
     if same:
         raise AwError(f"--scene {same[0]} is given twice, so its photos would count twice; give it once")
     key = out.with_suffix(".key.json")
-    check_output(out)
+    for wanted in (out, key):
+        check_output(wanted)
     there = [str(p) for p in (out, key) if p.exists()]
     if there and not force:
         raise AwError(
@@ -162,7 +163,7 @@ def make_command(
 @click.option("--json", "as_json", is_flag=True, help="Print the scores as JSON.")
 def score_command(answers: tuple[Path, ...], key: Path, out: Path | None, seed: int, as_json: bool) -> None:
     """Score ANSWERS: files (JSON or CSV) saved by raters, or folders of them."""
-    from ambiguous_wild.io.atomic import check_output
+    from ambiguous_wild.io.atomic import check_output, is_record, refuse_files_there
     from ambiguous_wild.io.atomic import refuse_foreign_files as refuse_strangers
     from ambiguous_wild.study.answers import read_answers, read_key
     from ambiguous_wild.study.report import SCORE_FILES, markdown_of, write_scores
@@ -173,6 +174,8 @@ def score_command(answers: tuple[Path, ...], key: Path, out: Path | None, seed: 
     folder = out or key.with_name(key.name.removesuffix(".json").removesuffix(".key") + "-scores")
     if folder.is_dir():
         refuse_strangers(folder, SCORE_FILES)
+        if not is_record(folder / "scores.json", "raters"):
+            refuse_files_there(folder, SCORE_FILES)
     check_output(folder)
     scores = score(known, raters, seed)
     write_scores(scores, folder)

@@ -213,6 +213,7 @@ FORMATS = ("compressed-ply", "spz", "sog", "gltf")
     "-o", "--output", type=PathName(file_okay=False),
     help="Folder for the files, as LABEL.spz and so on.  [default: RUN/export]",
 )  # fmt: skip
+@click.option("--overwrite", is_flag=True, help="Replace files of these names in the folder of -o.")
 @click.option(
     "--loss/--no-loss", default=True, show_default=True, help="Render the test views to measure the loss."
 )
@@ -224,6 +225,7 @@ def export_command(
     runs: tuple[Path, ...],
     formats: tuple[str, ...],
     output: Path | None,
+    overwrite: bool,
     loss: bool,
     scene_folder: Path | None,
     plugins: tuple[Path, ...],
@@ -246,8 +248,9 @@ def export_command(
         load_plugin(plugin)
 
     reports = export_runs(
-        runs, formats, output, loss=loss, scene_folder=scene_folder, threads=threads, say=say
-    )
+        runs, formats, output, loss=loss, scene_folder=scene_folder, threads=threads, overwrite=overwrite,
+        say=say,
+    )  # fmt: skip
     if as_json:
         rows = [
             {k: _plain(v) for k, v in {"label": label, **dataclasses.asdict(e)}.items()}

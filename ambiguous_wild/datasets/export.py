@@ -19,7 +19,7 @@ from ambiguous_wild.io import motion_points
 from ambiguous_wild.io.atomic import atomic_dir, check_output
 from ambiguous_wild.io.colmap_model import read_model, write_model
 from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage
-from ambiguous_wild.io.images import read_gray, write_png
+from ambiguous_wild.io.images import read_mask, write_png
 from ambiguous_wild.io.ply import write_point_ply
 from ambiguous_wild.io.scene_folder import load_scene, model_folder
 
@@ -115,18 +115,21 @@ def _write_lists(scene: Scene, folder: Path) -> None:
         (folder / f"{side}_list.txt").write_text(text, encoding="utf-8")
 
 
-def _colmap(scene: Scene, folder: Path, place: Place) -> list[str]:
-    """images/, sparse/0, and lists that some readers know."""
+def _colmap(scene: Scene, folder: Path, place: Place, masks: bool = True) -> list[str]:
+    """images/, sparse/0, lists that some readers know, and keep masks under COLMAP's names."""
     for view in scene.views:
         place(view.image_path, folder / "images" / _stored(view))
     write_model(folder / "sparse" / "0", _sized_model(scene))
     _write_lists(scene, folder)
-    return ["keep masks"] if any(v.keep_path for v in scene.train) else []
+    for view in scene.train if masks else ():
+        if view.keep_path is not None:
+            _write_mask(view, folder / "masks" / f"{_stored(view)}.png")
+    return []
 
 
 def _nerfbaselines(scene: Scene, folder: Path, place: Place) -> list[str]:
-    """As COLMAP, with nb-info.json and keep masks of training photos."""
-    _colmap(scene, folder, place)
+    """As COLMAP, with nb-info.json and keep masks of training photos under its own names."""
+    _colmap(scene, folder, place, masks=False)
     masked = [view for view in scene.train if view.keep_path is not None]
     for view in masked:
         _write_mask(view, folder / "masks" / f"{without_suffix(view.name)}.png")
@@ -232,7 +235,7 @@ def _write_mask(view: View, target: Path) -> None:
     if view.keep_path is None:
         pixels = np.full((view.camera.height, view.camera.width), 255, np.uint8)
     else:
-        pixels = np.where(read_gray(view.keep_path) >= 128, 255, 0).astype(np.uint8)
+        pixels = read_mask(view.keep_path)
     write_png(target, pixels)
 
 

@@ -17,7 +17,7 @@ from ambiguous_wild.builder.undistort import Lens, make_lens
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.datasets.foreign import ForeignScene, find_photo, without_suffix
 from ambiguous_wild.io.colmap_records import ModelCamera, ModelImage
-from ambiguous_wild.io.images import MAX_PIXELS, header_size, read_gray, read_png_rgb, write_png
+from ambiguous_wild.io.images import MAX_PIXELS, header_size, read_alpha, read_mask, read_png_rgb, write_png
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
@@ -256,16 +256,22 @@ def _reduce(pixels: np.ndarray, path: Path, factor: int) -> None:
     write_png(path, downsample_photo(pixels, width, height))
 
 
-def place_mask(plan: PhotoPlan, placed: PlacedPhoto, scene: ForeignScene, mask: Path, folder: Path) -> None:
-    """Write the keep mask of a training photo at the size that is trained on.
+def place_mask(plan: PhotoPlan, placed: PlacedPhoto, scene: ForeignScene, folder: Path) -> bool:
+    """Write the keep mask of a photo, its file times its alpha, at the size that is trained on.
+
+    Returns:
+        Whether the photo's alpha hides something.
 
     Raises:
-        AwError: it has another size than its photo.
+        AwError: it has another size than its photo, or is no mask.
     """
-    target = folder / "masks" / "train" / f"{without_suffix(placed.image.name)}.png"
-    if target.is_file():
-        return
-    pixels = read_gray(mask)
+    mask = scene.masks.get(plan.image.name)
+    alpha = read_alpha(plan.source) if scene.background is None else None
+    side = scene.split[plan.image.name]
+    target = folder / "masks" / side / f"{without_suffix(placed.image.name)}.png"
+    if target.is_file() or (mask is None and alpha is None):
+        return alpha is not None
+    pixels = read_mask(mask) if mask is not None else np.asarray(alpha)
     height, width = pixels.shape
     size = header_size(plan.source) or (plan.camera.width, plan.camera.height)
     final = (placed.camera.width, placed.camera.height)
@@ -277,13 +283,16 @@ def place_mask(plan: PhotoPlan, placed: PlacedPhoto, scene: ForeignScene, mask: 
         flat = pixels
     else:
         raise AwError(
-            f"{mask} is {width}x{height} but its photo {plan.source.name} {size[0]}x{size[1]}: it is "
-            "the mask "
-            "of another size or photo"
+            f"{mask} is {width}x{height} but its photo {plan.source.name} {size[0]}x{size[1]}: it is the "
+            "mask of another size or photo; correct it, or pass --no-masks"
         )
+    if mask is not None and alpha is not None:
+        hidden = lens_of(plan.camera).remap(alpha, nearest=True) if plan.convert else alpha
+        flat = np.minimum(flat, cv2.resize(hidden, flat.shape[::-1], interpolation=cv2.INTER_NEAREST))
     if (flat.shape[1], flat.shape[0]) != final:
         flat = downsample_mask(flat, *final)
     write_png(target, np.where(flat >= 128, 255, 0).astype(np.uint8))
+    return alpha is not None
 
 
 def link_file(source: Path, target: Path) -> None:

@@ -28,6 +28,8 @@ from ambiguous_wild.io.colmap_model import write_model
 from ambiguous_wild.io.colmap_records import Model
 from ambiguous_wild.io.scene_folder import SCENE_SCHEMA, read_scene_json, verify_files
 
+HIDDEN = "alpha hides pixels"
+
 
 @dataclass(frozen=True)
 class ImportSettings:
@@ -41,6 +43,7 @@ class ImportSettings:
     drop_test_only_points: bool = False  # points that no training photo sees leak the test photos
     seed: int = 0  # of matching and of random points
     motion: bool = False  # match the photos and keep what moves
+    masks: bool = True  # use keep masks, the photos' alpha among them
 
 
 @dataclass(frozen=True)
@@ -88,11 +91,21 @@ def import_scene(
             f"{target} and the dataset {root} lie inside each other; choose a folder outside for -o"
         )
     foreign, why = read_foreign(root, settings.kind)
+    if not settings.masks:
+        foreign = dataclasses.replace(foreign, masks={})
+    elif foreign.masks:
+        folders = sorted({mask.parent.relative_to(root).as_posix() for mask in foreign.masks.values()})
+        trained = sum(side == "train" for side in foreign.split.values())
+        told = (
+            f"keep masks of {len(foreign.masks)} of {trained} training photos in {shortlist(folders)} are "
+            "used; --no-masks leaves them out"
+        )
+        foreign = dataclasses.replace(foreign, notes=(*foreign.notes, told))
     if settings.factor is not None:
         foreign = dataclasses.replace(foreign, factor=settings.factor)
     plans = plan_photos(foreign)
     key = _key(foreign, plans, settings, name)
-    check_output(target)
+    target = check_output(target)
     with build_lock(target):
         known = _existing(target, key, overwrite)
         if known is not None:
@@ -178,15 +191,19 @@ def _fill(
 
     def one(plan: PhotoPlan) -> PlacedPhoto:
         placed = place_photo(plan, foreign, folder)
-        mask = foreign.masks.get(plan.image.name)
-        if mask is not None:
-            place_mask(plan, placed, foreign, mask, folder)
+        if settings.masks and place_mask(plan, placed, foreign, folder):
+            placed = dataclasses.replace(placed, notes=(*placed.notes, HIDDEN))
         bar.step()
         return placed
 
     with ThreadPoolExecutor(jobs) as pool:
         placed = list(pool.map(one, plans))
     bar.finish()
+    if hidden := sum(HIDDEN in p.notes for p in placed):
+        notes.append(
+            f"alpha of {counted(hidden, 'photo')} hides pixels: they are not learnt from, and psnr_valid of "
+            "test photos leaves them out"
+        )
     sides = {p.image.name: foreign.split[plan.image.name] for plan, p in zip(plans, placed)}
     scene_model = _write_model(folder, model, placed)
     if settings.motion:

@@ -1,13 +1,19 @@
-"""Atomic writes: files and folders appear under their name complete or not at all, and replace ours only."""
+"""Atomic writes: files and folders appear under their name complete or not at all, and replace ours only.
+
+`place_of` decides for all commands what may lie where an output goes: nothing, a file, or a link to one.
+Devices and pipes are written into, everything else is refused.
+"""
 
 from __future__ import annotations
 
+import errno
 import glob
 import json
 import os
 import shutil
+import stat
 import tempfile
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -15,21 +21,44 @@ from typing import Any
 from ambiguous_wild.core.errors import AwError
 
 
+def place_of(path: Path | str) -> tuple[Path, bool]:
+    """Where an output called `path` goes, links followed, and whether it is written into what is there.
+
+    Into it: character devices and pipes. All else is replaced whole; the caller tells a file from a folder.
+
+    Raises:
+        AwError: a link to nowhere, a disk or a socket.
+    """
+    if not os.path.exists(path):
+        if os.path.islink(path):
+            raise AwError(f"cannot write {path}: it is a link to nowhere; remove it or choose another -o")
+        return Path(path), False
+    kind = os.stat(path).st_mode
+    if stat.S_ISCHR(kind) or stat.S_ISFIFO(kind):
+        return Path(path), True  # not its real path: that of a pipe behind /dev/stdout is no path
+    if not (stat.S_ISREG(kind) or stat.S_ISDIR(kind)):
+        raise AwError(f"cannot write {path}: a disk or a socket lies there; choose another -o")
+    return Path(os.path.realpath(path) if os.path.islink(path) else path), False
+
+
 @contextmanager
 def atomic_path(path: Path | str) -> Iterator[Path]:
     """Yield a temporary path beside `path` with the same suffix; rename it to `path` on success.
 
-    After an error the temporary file is removed and `path` is unchanged.
+    After an error the temporary file is removed and `path` is unchanged. A link's target is replaced, not
+    the link; a device or a pipe gets the bytes.
 
     Raises:
+        AwError: a folder, a link to nowhere, a disk, a socket or a pipe that nobody reads lies there.
         OSError: it cannot be written; names `path`, not the temporary file.
     """
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
+    target, into = place_of(path)
+    if target.is_dir():
+        raise AwError(f"cannot write the file {path}: a folder lies there; choose another -o")
+    folder = Path(tempfile.gettempdir()) if into else target.parent
+    folder.mkdir(parents=True, exist_ok=True)
     try:
-        handle, name = tempfile.mkstemp(
-            prefix=f".{target.stem}.", suffix=f".tmp{target.suffix}", dir=target.parent
-        )
+        handle, name = tempfile.mkstemp(prefix=f".{target.stem}.", suffix=f".tmp{target.suffix}", dir=folder)
     except OSError as error:
         raise _named(error, target) from None
     os.close(handle)
@@ -42,12 +71,32 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         umask = os.umask(0)
         os.umask(umask)
         os.chmod(temporary, 0o666 & ~umask)
-        os.replace(temporary, target)
+        if into:
+            _pour(temporary, target)
+            temporary.unlink()
+        else:
+            os.replace(temporary, target)
     except BaseException as error:
         temporary.unlink(missing_ok=True)
         if isinstance(error, OSError) and error.filename in (name, temporary):
             raise _named(error, target) from error
         raise
+
+
+def _pour(source: Path, target: Path) -> None:
+    """Write the bytes of a file into a device or a pipe."""
+    try:
+        handle = os.open(target, os.O_WRONLY | os.O_NONBLOCK)  # a pipe without a reader would block for ever
+    except OSError as error:
+        if error.errno != errno.ENXIO:
+            raise
+        raise AwError(f"cannot write {target}: nobody reads this pipe; choose another -o") from None
+    os.set_blocking(handle, True)
+    try:
+        with open(source, "rb") as f, open(handle, "wb", buffering=0) as out:
+            shutil.copyfileobj(f, out)
+    except OSError as error:
+        raise _named(error, target) from error
 
 
 def _named(error: OSError, target: Path) -> OSError:
@@ -62,9 +111,9 @@ def atomic_dir(path: Path | str) -> Iterator[Path]:
     If `path` is a link, its target is replaced, not the link.
 
     Raises:
-        AwError: `path` is a file.
+        AwError: `path` is a file or a link to nowhere.
     """
-    target = Path(os.path.realpath(path))
+    target = Path(os.path.realpath(place_of(path)[0]))
     refuse_file(path)
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}.tmp-", dir=target.parent))
@@ -109,15 +158,19 @@ def sweep_siblings(path: Path | str) -> None:
             shutil.rmtree(left, ignore_errors=True)
 
 
-def check_output(path: Path | str) -> None:
+def check_output(path: Path | str) -> Path:
     """Check, before long work, that `path` can be written; its parent folders are made.
 
+    Returns:
+        The absolute path that will be written: the target of a link.
+
     Raises:
-        AwError: a parent is a file, or the folder is not writable.
+        AwError: a parent is a file, the folder is not writable, or `place_of` refuses what is there.
     """
-    if os.path.islink(path) and not os.path.exists(path):
-        raise AwError(f"cannot write {path}: it is a link to nowhere; remove it or choose another -o")
-    folder = Path(os.path.abspath(path)).parent
+    target, into = place_of(path)
+    if into:
+        return target
+    folder = Path(os.path.abspath(target)).parent
     for part in (folder, *folder.parents):
         if part.exists() and not part.is_dir():
             raise AwError(f"cannot write {path}: {part} is a file, not a folder; choose another -o")
@@ -129,6 +182,7 @@ def check_output(path: Path | str) -> None:
             f"cannot write in {folder}: {error.strerror or error}; choose another -o, or change the "
             "permissions"
         ) from error
+    return Path(os.path.abspath(target))
 
 
 def list_names(folder: Path) -> list[str]:
@@ -145,6 +199,25 @@ def refuse_foreign_files(folder: Path, ours: Collection[str]) -> None:
                 f"{folder} also holds {name}, which this command did not write and would remove: "
                 "move it to another folder, or choose another -o"
             )
+
+
+def refuse_files_there(folder: Path, names: Iterable[str], flag: str = "") -> None:
+    """Raise AwError where one of these files, which a command is to write, is in the folder already.
+
+    `flag` is the option that replaces it.
+    """
+    for name in names:
+        if os.path.lexists(folder / name):
+            how = f"; replace it with {flag}, or choose another -o" if flag else "; choose another -o"
+            raise AwError(f"{folder / name} exists, and this command would replace it{how}")
+
+
+def is_record(path: Path, key: str) -> bool:
+    """Whether a file is a JSON object with this key: the mark of what a command wrote before."""
+    try:
+        return key in json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, TypeError, RecursionError):
+        return False
 
 
 def write_text(path: Path | str, text: str) -> None:

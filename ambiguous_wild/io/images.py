@@ -85,12 +85,104 @@ def to_uint8(image: np.ndarray) -> np.ndarray:
 def read_keep_map(
     path: Path | str,
 ) -> np.ndarray:  # [H, W] float32 in {0, 1}, 1 = static
-    """Read a keep mask: white (128 and above) is kept.
+    """Read a keep mask, see `read_mask`.
+
+    Raises:
+        AwError: the file is missing or does not decode, or is no mask.
+    """
+    return (read_mask(path) > 0).astype(np.float32)
+
+
+def read_mask(
+    path: Path | str,
+) -> np.ndarray:  # [H, W] uint8 in {0, 255}
+    """Read a mask by its values: black and white, with the grey edges of smoothing and JPEG, or 0 and 1.
+
+    Alpha is the mask where it varies and the colours do not tell another one; else it is left out.
+
+    Raises:
+        AwError: the file does not decode, or holds other values: a label map, a photo.
+    """
+    image = _decode(path, "whole")
+    if image.dtype == np.float32 and np.isfinite(image).all():
+        image = np.clip(image * (255 if image.max(initial=0) <= 1 else 1), 0, 255).astype(np.uint8)
+    if image.dtype == np.uint16:
+        image = (image // 257 if image.max(initial=0) > 255 else image).astype(np.uint8)
+    if image.dtype != np.uint8:
+        raise AwError(f"{path}: pixels of type {image.dtype} are no mask; save it as an 8-bit PNG")
+    colour = image[..., :3] if image.ndim == 3 else image[..., None]
+    grey = colour[..., 0]
+    alike = bool((np.ptp(colour, axis=2) <= _SLACK["JPEG"]).all())
+    shown = _black_and_white(grey, _SLACK.get(_form(path), 2)) if alike else None
+    alpha = _varying_alpha(image)
+    if alpha is not None:
+        if shown is None or shown.min() == shown.max() or np.array_equal(shown, alpha):
+            return alpha
+        raise AwError(f"{path}: its colours and its alpha are two different masks; save the right one alone")
+    if shown is None:
+        values, counts = np.unique(
+            grey.ravel() if alike else colour.reshape(-1, 3), axis=0, return_counts=True
+        )
+        most = [
+            (values[k].tolist(), 100 * counts[k] / counts.sum())
+            for k in np.argsort(-counts, kind="stable")[:5]
+        ]
+        told = ", ".join(f"{value} ({share:.2g} %)" for value, share in most)
+        raise AwError(
+            f"{path} is no mask of black and white, or of 0 and 1: it holds {len(values)} values, {told}; "
+            "write 255 where the photo is kept and 0 elsewhere, or leave the masks out"
+        )
+    return shown
+
+
+_SLACK = {"JPEG": 8}  # of black and white; 2 in formats without losses
+
+
+def _black_and_white(grey: np.ndarray, slack: int) -> np.ndarray | None:
+    """[H, W] uint8 to {0, 255}; None where other values than black, white and their edges are there."""
+    import cv2
+
+    top = grey.max(initial=0)
+    if top <= 1:
+        return grey * np.uint8(255)
+    if top >= 128 and not ((grey > slack) & (grey < top)).any():  # a light grey alone is a white
+        return np.where(grey == top, 255, 0).astype(np.uint8)
+    between = (grey > slack) & (grey < 255 - slack)
+    # The grey of edges is thin and uneven; labels are areas of one value.
+    ring = np.ones((3, 3), np.uint8)
+    areas = between & (cv2.erode(grey, ring) == cv2.dilate(grey, ring))
+    if top < 255 - slack or between.mean() > 0.5 or areas.mean() > 0.001:
+        return None
+    return np.where(grey >= 128, 255, 0).astype(np.uint8)
+
+
+def _varying_alpha(image: np.ndarray) -> np.ndarray | None:
+    if image.ndim != 3 or image.shape[2] != 4 or image[..., 3].min() == image[..., 3].max():
+        return None
+    return np.where(image[..., 3] >= 128, 255, 0).astype(np.uint8)
+
+
+def read_alpha(
+    path: Path | str,
+) -> np.ndarray | None:  # [H, W] uint8 in {0, 255}
+    """What a photo's alpha keeps; None without alpha, or where it is the same everywhere.
 
     Raises:
         AwError: the file is missing or does not decode.
     """
-    return (read_gray(path) >= 128).astype(np.float32)
+    try:
+        with pillow().open(path, formats=_FORMATS) as image:
+            if "A" not in image.getbands() and "transparency" not in image.info:
+                return None
+    except Exception:  # as in `header_size`; who reads the pixels says what is wrong
+        return None
+    pixels = _decode(path, "whole")
+    return _varying_alpha(pixels // 257 if pixels.dtype == np.uint16 else pixels)
+
+
+def _form(path: Path | str) -> str:
+    with open(path, "rb") as f:
+        return "JPEG" if f.read(2) == b"\xff\xd8" else ""
 
 
 def image_size(path: Path | str) -> tuple[int, int]:
@@ -193,7 +285,8 @@ def _sound(data: np.ndarray, where: str) -> bool:
 
 def _decode(
     path: Path | str,
-    kind: Literal["rgb", "grey", "deep"],  # 8-bit colour, 8-bit grey, colour at the file's own depth
+    # 8-bit colour, 8-bit grey, colour at the file's own depth, all channels at this depth
+    kind: Literal["rgb", "grey", "deep", "whole"],
 ) -> np.ndarray:
     import cv2
 
@@ -206,6 +299,7 @@ def _decode(
         "rgb": cv2.IMREAD_COLOR_RGB,
         "grey": cv2.IMREAD_GRAYSCALE,
         "deep": cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH,
+        "whole": cv2.IMREAD_UNCHANGED,
     }
     image = decode(data, flags[kind] | cv2.IMREAD_IGNORE_ORIENTATION, str(path))
     if image is None:

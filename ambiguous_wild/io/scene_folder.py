@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, TypeGuard, cast
@@ -21,6 +23,9 @@ from ambiguous_wild.io.images import image_size
 SCENE_SCHEMA = 1  # of scene.json; raised when a reader of the old one would be wrong
 MOST_FACTOR = 1000  # of downsampling; the builder allows 64
 TEST_EVERY = 8  # test photos of scenes without lists, as in 3DGS and gsplat
+
+MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
+OWN_MASKS = "masks.json"  # beside it lie instances of a segmentation, not keep masks
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
 
@@ -70,8 +75,16 @@ def load_scene(
         for side, names in missing.items()
         if names
     ]
+    masks: dict[str, Path] = {}
+    if read is None and not (root / "masks" / OWN_MASKS).is_file():
+        masks = find_masks(root / "masks", [name for name, side in split.items() if side == "train"])
+    if masks:
+        info["warnings"].append(
+            f"keep masks of {len(masks)} train photos in {root / 'masks'} are used; "
+            "'aw import --no-masks' makes a scene without"
+        )
     views = tuple(
-        _view(root, folder, model, image, split[image.name])
+        _view(root, folder, model, image, split[image.name], masks.get(image.name))
         for image in sorted(model.images.values(), key=lambda i: i.name)
         if image.name in split
     )
@@ -182,6 +195,29 @@ def _inside(name: str, root: Path) -> str:
     return name
 
 
+def find_masks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
+    """Mask files by photo's name; photos without one are absent.
+
+    Names: `a.jpg.png` (COLMAP's) or `a.png`, in any format and case, under the photo's path or, where no
+    other photo has this base name, directly in `folder`.
+    """
+    there: dict[str, Path] = {}
+    for path in sorted(folder.rglob("*")):
+        if path.suffix.lower() in MASK_SUFFIXES and path.is_file():
+            there.setdefault(path.relative_to(folder).as_posix().casefold(), path)
+    known = [PurePosixPath(name) for name in names]
+    bases = Counter(pure.name for pure in known)
+    found: dict[str, Path] = {}
+    for pure in known if there else ():
+        spellings = [str(pure), str(pure.with_suffix(""))]
+        spellings += [pure.name, pure.stem] if bases[pure.name] == 1 else []
+        for key in (f"{spelling}{suffix}".casefold() for spelling in spellings for suffix in MASK_SUFFIXES):
+            if key in there:
+                found[str(pure)] = there[key]
+                break
+    return found
+
+
 def model_folder(root: Path) -> Path:
     """Where the scene's COLMAP model lies.
 
@@ -258,7 +294,7 @@ def _refuse_same_stems(root: Path, views: tuple[View, ...]) -> None:
         seen[key] = view.name
 
 
-def _view(root: Path, folder: Path, model: Model, image: ModelImage, side: Split) -> View:
+def _view(root: Path, folder: Path, model: Model, image: ModelImage, side: Split, mask: Path | None) -> View:
     path = _image_path(folder, _inside(image.name, root))
     width, height = image_size(path)
     full = model.cameras[image.camera_id]
@@ -271,7 +307,7 @@ def _view(root: Path, folder: Path, model: Model, image: ModelImage, side: Split
     camera = Camera(full.width, full.height, fx, fy, cx, cy, image.cam_from_world()).resized(width, height)
     stem = str(PurePosixPath(image.name).with_suffix(""))
     keep = root / "masks" / "train" / f"{stem}.png"
-    keep_path = keep if side == "train" and keep.is_file() else None
+    keep_path = keep if side == "train" and keep.is_file() else mask
     return View(image.name, path, camera, side, keep_path, image.image_id)
 
 

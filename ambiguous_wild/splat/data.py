@@ -11,12 +11,13 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, overload
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError, Camera, Scene, View
-from ambiguous_wild.io.images import as_float, load_image_codes, read_keep_map
+from ambiguous_wild.io.images import as_float, load_image_codes, read_alpha, read_keep_map
 from ambiguous_wild.splat.step import TrainData
 
 
@@ -40,8 +41,8 @@ def load_train_data(scene: Scene, *, device: torch.device, seed: int, cache_dir:
         else:
             small = codes if codes.dtype == np.uint8 else as_float(codes)
             photos.append(copies.hold(torch.from_numpy(small)))
-        size = (view.camera.height, view.camera.width)
-        keeps.append(None if view.keep_path is None else _load_keep(view.keep_path, size).to(device))
+        keep = load_keep(view, with_alpha="files" not in scene.info)
+        keeps.append(None if keep is None else torch.from_numpy(keep).to(device))
     return TrainData(
         scene=scene,
         photos=photos if copies is None else Photos(photos, device, copies),
@@ -64,14 +65,30 @@ def _load_photo(view: View) -> np.ndarray:
     return codes
 
 
-def _load_keep(path: Path, size: tuple[int, int]) -> Tensor:
-    keep = read_keep_map(path)
+def load_keep(
+    view: View, *, with_alpha: bool = True
+) -> np.ndarray | None:  # [H, W] float32 in {0, 1}, 1 = static
+    """What a photo's keep mask and its alpha keep, None without both; a mask of the full photo is reduced.
+
+    Args:
+        with_alpha: not in scene folders of ours, whose masks hold what the import kept of alpha.
+
+    Raises:
+        AwError: a mask of another shape than its photo.
+    """
+    size = (view.camera.height, view.camera.width)
+    alpha = read_alpha(view.image_path) if with_alpha else None
+    if view.keep_path is None:
+        return None if alpha is None else (alpha > 0).astype(np.float32)
+    keep = read_keep_map(view.keep_path)
+    if keep.shape[0] > size[0] and abs(keep.shape[0] * size[1] - keep.shape[1] * size[0]) <= 2 * max(size):
+        keep = (cv2.resize(keep, size[::-1], interpolation=cv2.INTER_AREA) >= 0.5).astype(np.float32)
     if keep.shape != size:
         raise AwError(
-            f"mask {path} is {keep.shape[1]}x{keep.shape[0]} px, its photo is {size[1]}x{size[0]} px; "
-            "build the scene again with 'aw build-scene --masks'"
+            f"mask {view.keep_path} is {keep.shape[1]}x{keep.shape[0]} px, its photo is {size[1]}x{size[0]} "
+            "px; correct it, or build the scene again with 'aw build-scene --masks'"
         )
-    return torch.from_numpy(keep)
+    return keep if alpha is None else np.where(alpha > 0, keep, np.float32(0))
 
 
 def shrink(image: Tensor, divisor: int) -> Tensor:

@@ -68,3 +68,13 @@ def test_without_runs_nothing_is_left_behind(tmp_path: Path) -> None:
     done = CliRunner().invoke(command, [str(tmp_path / "nowhere"), "-o", str(tmp_path / "out")])
     assert "no folder of runs" in str(done.exception)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_files_of_the_user_under_a_report_s_names_stay(tmp_path: Path) -> None:
+    cost_run(tmp_path / "runs", "a", psnr=(20.0,), train_s=300.0, probes=[(100.0, 15.0), (200.0, 19.0)])
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "changes.csv").write_text("mine")
+    words = [str(tmp_path / "runs"), "-o", str(tmp_path / "out"), "--no-plots"]
+    error = CliRunner().invoke(command, words).exception
+    assert isinstance(error, AwError) and "changes.csv exists" in str(error)
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["changes.csv"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 from pathlib import Path
 
 import pandas as pd
@@ -137,3 +138,10 @@ def test_what_does_not_go_together_is_refused(tmp_path: Path) -> None:
     ):
         error = CliRunner().invoke(command, [str(tmp_path), *words]).exception
         assert isinstance(error, AwError) and expected in str(error)
+
+
+def test_a_pipe_is_no_file_to_replace(tmp_path: Path) -> None:
+    runs, pipe = save(tmp_path / "runs", fake_result("3dgs")), tmp_path / "p"
+    os.mkfifo(pipe)
+    done = CliRunner().invoke(command, [str(runs), "-o", str(pipe)])
+    assert isinstance(done.exception, AwError) and "nobody reads" in str(done.exception) and pipe.is_fifo()

@@ -41,10 +41,9 @@ def test_read_back_it_is_the_same_scene(form, scene, tmp_path):
     for a, b in zip(back.views, native.views):
         assert np.array_equal(read_png_rgb(a.image_path), read_png_rgb(b.image_path))
     assert np.allclose(back.points.xyz, native.points.xyz, atol=1e-5)
-    if form != "colmap":
-        assert np.array_equal(read_gray(back.train[0].keep_path), read_gray(native.train[0].keep_path))
-    else:
-        assert done.left_out == ("keep masks",)
+    assert np.array_equal(read_gray(back.train[0].keep_path), read_gray(native.train[0].keep_path))
+    if form == "colmap":
+        assert [p.name for p in (tmp_path / "out" / "masks").iterdir()] == [f"{native.train[0].name}.png"]
 
 
 def test_on_the_go_keeps_full_size_and_split(scene, tmp_path):

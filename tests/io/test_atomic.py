@@ -1,14 +1,20 @@
 """Nothing half-written stays behind."""
 
+import contextlib
 import fcntl
 import json
+import os
+import select
+import socket
+import stat
 import subprocess
 import sys
+import threading
 
 import pytest
 
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.io.atomic import atomic_dir, atomic_path, sweep, write_json, write_text
+from ambiguous_wild.io.atomic import atomic_dir, atomic_path, check_output, sweep, write_json, write_text
 from ambiguous_wild.io.lock import folder_lock
 
 
@@ -123,3 +129,66 @@ def test_a_file_where_a_folder_is_to_be_made_stays(tmp_path):
         (folder / "a").write_text("b")
     assert (tmp_path / "thesis.txt").read_text() == "mine"
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+def test_a_link_stays_and_its_target_is_written(tmp_path):
+    (tmp_path / "there").mkdir()
+    (tmp_path / "there" / "real.txt").write_text("old")
+    (tmp_path / "link.txt").symlink_to(tmp_path / "there" / "real.txt")
+    (tmp_path / "folder").symlink_to(tmp_path / "there")
+    assert check_output(tmp_path / "link.txt") == tmp_path / "there" / "real.txt"
+    write_text(tmp_path / "link.txt", "new")
+    assert (tmp_path / "link.txt").is_symlink() and (tmp_path / "there" / "real.txt").read_text() == "new"
+    with atomic_dir(tmp_path / "folder") as made:
+        (made / "a").write_text("a")
+    assert (tmp_path / "folder").is_symlink() and os.listdir(tmp_path / "there") == ["a"]
+
+
+def test_a_pipe_gets_the_bytes_and_stays(tmp_path):
+    pipe, got = tmp_path / "p", []
+    os.mkfifo(pipe)
+    for write in (lambda: write_text(pipe, "x"), lambda: write_text(pipe, "y" * 300_000)):
+        with pytest.raises(AwError, match="nobody reads"):
+            write()
+        reading = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+        os.set_blocking(reading, True)
+        writer = threading.Thread(target=write)
+        writer.start()
+        while not (ready := select.select([reading], [], [], 20)[0]) or (part := os.read(reading, 1 << 16)):
+            assert ready, "nothing came"
+            got.append(part)
+        writer.join()
+        os.close(reading)
+    assert b"".join(got) == b"x" + b"y" * 300_000
+    assert stat.S_ISFIFO(pipe.stat().st_mode) and os.listdir(tmp_path) == ["p"]
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root makes device nodes")
+def test_a_device_gets_the_bytes_and_stays(tmp_path):
+    os.mknod(tmp_path / "n", stat.S_IFCHR | 0o666, os.makedev(1, 3))
+    os.mknod(tmp_path / "full", stat.S_IFCHR | 0o666, os.makedev(1, 7))
+    try:
+        write_text(tmp_path / "n", "gone")
+    except PermissionError:
+        pytest.skip("device nodes do not open on this file system")
+    with pytest.raises(OSError, match="No space left") as raised:
+        write_text(tmp_path / "full", "too much")
+    assert raised.value.filename == str(tmp_path / "full")
+    assert all(stat.S_ISCHR(path.stat().st_mode) for path in tmp_path.iterdir())
+    assert sorted(os.listdir(tmp_path)) == ["full", "n"]
+
+
+def test_what_is_neither_file_nor_pipe_is_refused_and_stays(tmp_path):
+    (tmp_path / "d").mkdir()
+    (tmp_path / "gone").symlink_to(tmp_path / "nowhere")
+    with socket.socket(socket.AF_UNIX) as s:
+        s.bind(str(tmp_path / "s"))
+    before = {p.name: p.lstat().st_mode for p in tmp_path.iterdir()}
+    for name, why in (("d", "a folder lies there"), ("gone", "link to nowhere"), ("s", "socket")):
+        with pytest.raises(AwError, match=why):
+            write_text(tmp_path / name, "x")
+        with pytest.raises(AwError) if name != "d" else contextlib.nullcontext():
+            check_output(tmp_path / name)
+        with pytest.raises(AwError) if name != "d" else contextlib.nullcontext(), atomic_dir(tmp_path / name):
+            pass
+    assert {p.name: p.lstat().st_mode for p in tmp_path.iterdir()} == before

@@ -1,8 +1,12 @@
+import io
+import re
+
 import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.images import (
@@ -10,6 +14,7 @@ from ambiguous_wild.io.images import (
     load_image_float,
     read_gray,
     read_keep_map,
+    read_mask,
     read_png_rgb,
     write_png,
 )
@@ -87,3 +92,64 @@ def test_what_is_no_image_is_refused(tmp_path, bad):
     with pytest.raises(AwError, match="PNG"):
         write_png(tmp_path / "x.png", bad)
     assert not (tmp_path / "x.png").exists()
+
+
+LEFT = np.arange(64)[None].repeat(48, 0) < 20  # what every mask below leaves out
+
+
+def _mask(values, **options):
+    return cv2.imencode(options.get("suffix", ".png"), values, options.get("flags", []))[1].tobytes()
+
+
+def _rgba(colour, alpha):
+    colour = np.broadcast_to(np.asarray(colour)[..., None], (48, 64, 3)).astype(np.uint8)
+    return np.dstack([colour, np.where(LEFT, 0, alpha).astype(np.uint8)])
+
+
+def _palette():
+    picture = Image.fromarray(np.where(LEFT, 0, 1).astype(np.uint8), "P")
+    picture.putpalette([0, 0, 0, 255, 255, 255])
+    picture.save(data := io.BytesIO(), "PNG")
+    return data.getvalue()
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        _mask(np.where(LEFT, 0, 255).astype(np.uint8)),
+        _mask(np.where(LEFT, 0, 1).astype(np.uint8)),
+        _mask(np.where(LEFT, 0, 1).astype(np.uint16)),
+        _mask(np.where(LEFT, 0, 65535).astype(np.uint16)),
+        _mask(np.where(LEFT, 0, 1).astype(np.float32), suffix=".tiff"),
+        _mask(np.where(LEFT, 0, 1).astype(np.uint8)[..., None].repeat(3, 2)),
+        _mask(np.where(LEFT, 0, 255).astype(np.uint8), suffix=".jpg", flags=[cv2.IMWRITE_JPEG_QUALITY, 60]),
+        _mask(cv2.GaussianBlur(np.where(LEFT, 0, 255).astype(np.uint8), (3, 3), 0)),
+        _mask(_rgba(np.where(LEFT, 0, 255), 255)),
+        _mask(_rgba(255, 255)),
+        _mask(_rgba(np.random.default_rng(0).integers(0, 256, (48, 64)), 255)),
+        _mask(np.where(LEFT[..., None], [0, 0, 0, 7], [255, 255, 255, 7]).astype(np.uint8)),
+        _palette(),
+    ],
+    ids="255 01 01-16 16-bit 01-float 01-rgb jpeg smooth rgba alpha cut-out same-alpha palette".split(),
+)  # fmt: skip
+def test_a_mask_is_read_by_its_values(data, tmp_path):
+    (tmp_path / "m").write_bytes(data)
+    assert np.array_equal(read_mask(tmp_path / "m"), np.where(LEFT, 0, 255))
+
+
+@pytest.mark.parametrize(
+    ("values", "seen"),
+    [
+        (np.where(LEFT, 0, 3), "2 values, 3 (69 %), 0 (31 %)"),
+        (np.where(LEFT, 0, 7) + (np.arange(48) > 40)[:, None], "8 "),
+        (np.where(LEFT, 0, 255) - 155 * (np.arange(48) > 44)[:, None] * ~LEFT, "100 ("),
+        (np.random.default_rng(0).integers(0, 256, (48, 64)), "256 values"),
+        (np.where(LEFT[..., None], 0, [0, 0, 255]), "[0, 0, 255] (69 %)"),
+        (_rgba(np.where(LEFT, 255, 0), 255), "two different masks"),
+    ],
+    ids=["label", "labels", "label-and-white", "photo", "red", "colours-against-alpha"],
+)
+def test_what_is_no_mask_is_refused_with_its_values(values, seen, tmp_path):
+    (tmp_path / "m.png").write_bytes(_mask(values.astype(np.uint8)))
+    with pytest.raises(AwError, match=re.escape(seen)):
+        read_mask(tmp_path / "m.png")

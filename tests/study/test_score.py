@@ -292,3 +292,11 @@ def test_what_a_folder_of_answers_holds_besides_is_named(
     done = CliRunner().invoke(command, words, catch_exceptions=False)
     assert f"{len(files)} raters" in done.stdout
     assert "ignored answers-anna.json.txt, bob" in done.stderr
+
+
+def test_files_of_the_user_under_the_scores_names_stay(study: tuple[Path, Path, Any], tmp_path: Path) -> None:
+    key, answers, _ = study
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "scores.csv").write_text("mine")
+    assert "scores.csv exists" in error(answers, "--key", key, "-o", tmp_path / "out")
+    assert (tmp_path / "out" / "scores.csv").read_text() == "mine"

@@ -68,6 +68,15 @@ def test_several_models_have_names_of_their_own(run: Path, tmp_path: Path) -> No
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["3dgs.spz", "odd-name.spz"]
 
 
+def test_files_of_the_user_stay_where_the_folder_was_named(run: Path, tmp_path: Path) -> None:
+    (tmp_path / "3dgs.spz").write_text("mine")
+    words = ("export", run, "--format", "spz", "--no-loss", "-o", tmp_path)
+    done = aw(*words)
+    assert done.returncode == 2 and f"{tmp_path / '3dgs.spz'} exists" in done.stderr
+    assert (tmp_path / "3dgs.spz").read_text() == "mine"
+    assert aw(*words, "--overwrite").returncode == 0 and (tmp_path / "3dgs.spz").stat().st_size > 1000
+
+
 def test_a_model_of_nothing_is_refused(tmp_path: Path) -> None:
     model = wall_model(5)
     model["means"][:] = np.nan

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.datasets.foreign import ForeignScene, plain
 from ambiguous_wild.datasets.readers import colmap, nerfbaselines, on_the_go, phototourism, transforms
 from ambiguous_wild.io.colmap_model import read_model
+from ambiguous_wild.io.scene_folder import OWN_MASKS, find_masks
 
 READERS: dict[str, Callable[[Path], ForeignScene]] = {
     "on-the-go": on_the_go.read_on_the_go,
@@ -110,4 +112,13 @@ def read_foreign(root: Path, kind: str | None = None) -> tuple[ForeignScene, str
         if not root.is_dir():
             raise AwError(f"dataset {root} does not exist or is no folder")
         why = "--as"
-    return READERS[kind](root), why
+    return _with_masks(READERS[kind](root)), why
+
+
+def _with_masks(scene: ForeignScene) -> ForeignScene:
+    """The scene with the keep masks that lie in masks/ beside its photos, where its own files name none."""
+    folder = scene.photos.parent / "masks"
+    if scene.masks or scene.kind in ("drone", "dualsplat", "blender") or (folder / OWN_MASKS).is_file():
+        return scene
+    train = [name for name, side in scene.split.items() if side == "train"]
+    return dataclasses.replace(scene, masks=find_masks(folder, train))

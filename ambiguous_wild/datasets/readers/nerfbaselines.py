@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 
 from ambiguous_wild.core.errors import AwError, unknown
-from ambiguous_wild.datasets.foreign import Evaluation, ForeignScene, inside, without_suffix
+from ambiguous_wild.datasets.foreign import Evaluation, ForeignScene, inside
 from ambiguous_wild.datasets.readers.colmap import read_plain
 from ambiguous_wild.datasets.readers.phototourism import NERF_W
 from ambiguous_wild.datasets.readers.transforms import read_blender, read_json, read_transforms
@@ -39,18 +39,11 @@ def read_nerfbaselines(root: Path) -> ForeignScene:
     options = info.get("loader_kwargs") or {}
     images = options.get("images_path", "images") if isinstance(options, dict) else "images"
     factor = _factor(str(images), info.get("downscale_factor"), root, path)
-    masks = {}
-    if (root / "masks").is_dir() and not scene.masks:
-        for name, side in scene.split.items():
-            mask = root / "masks" / f"{without_suffix(name)}.png"
-            if side == "train" and mask.is_file():
-                masks[name] = mask
     identity = str(info.get("id") or "").lower()
     return dataclasses.replace(
         scene,
         kind="nerfbaselines",
         factor=factor,
-        masks=scene.masks or masks,
         dataset=DATASETS.get(identity, scene.dataset),
         evaluation=PROTOCOLS[protocol],
     )

@@ -11,7 +11,7 @@ import numpy as np
 from ambiguous_wild.core import AwError, Camera, Scene, View
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.io import plain_yaml
-from ambiguous_wild.io.images import load_image_float, read_gray
+from ambiguous_wild.io.images import load_image_float, read_mask
 
 if TYPE_CHECKING:
     from ambiguous_wild.splat.gaussians import Gaussians
@@ -34,7 +34,7 @@ class Masks:
         """True on distractors, at the photo's size.
 
         Raises:
-            AwError: unreadable, or of another shape than the photo.
+            AwError: unreadable, no mask, or of another shape than the photo.
         """
         white = load_mask(self.paths[view.name], view)
         return ~white if self.keep else white
@@ -100,14 +100,14 @@ def _all(scene: Scene, folder: Path, advice: str) -> dict[str, Path]:
 
 
 def load_mask(path: Path, view: View) -> np.ndarray:
-    """White (128 and above) of a mask at the photo's size, [H, W] bool; another size is resampled.
+    """White of a mask, see `read_mask`, at the photo's size, [H, W] bool; another size is resampled.
 
     Raises:
         AwError: unreadable, or of another shape than the photo.
     """
     import cv2
 
-    mask = read_gray(path)
+    mask = read_mask(path)
     width, height = view.camera.width, view.camera.height
     if mask.shape != (height, width):
         if abs(mask.shape[1] * height - mask.shape[0] * width) > 0.02 * mask.shape[1] * height:

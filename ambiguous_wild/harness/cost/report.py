@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
@@ -18,7 +17,7 @@ from ambiguous_wild.harness.running.timing import seconds_range
 from ambiguous_wild.harness.tables import plain_formats
 from ambiguous_wild.harness.tables.plain_formats import plain, to_csv
 from ambiguous_wild.harness.tables.table import Table, text_table
-from ambiguous_wild.io.atomic import write_json, write_text
+from ambiguous_wild.io.atomic import is_record, refuse_files_there, write_json, write_text
 
 PLOTS = ("timelines", "budgets", "front", "changes")
 FILES = ("cost.csv", "time-to-psnr.csv", "changes.csv", "timelines.csv", "cost.json",
@@ -110,7 +109,11 @@ def _blind(runs: Sequence[CostRun]) -> list[str]:
 
 
 def write_report(report: CostReport, folder: Path) -> list[Path]:
-    """cost.json, cost.csv, time-to-psnr.csv, changes.csv and timelines.csv; returns what was written."""
+    """cost.json, cost.csv, time-to-psnr.csv, changes.csv and timelines.csv; returns what was written.
+
+    Raises:
+        AwError: files of these names are there, and no earlier report.
+    """
     _remove_earlier(folder)
     tables = {
         "cost.csv": [_point_row(p) for p in report.points],
@@ -129,13 +132,10 @@ def write_report(report: CostReport, folder: Path) -> list[Path]:
 
 def _remove_earlier(folder: Path) -> None:
     """Remove the files of an earlier report, and nothing else: old plots must not stay beside new tables."""
-    try:
-        ours = "time_to_psnr" in json.loads((folder / "cost.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError, TypeError, RecursionError):
-        return
-    if ours:
-        for name in FILES:
-            (folder / name).unlink(missing_ok=True)
+    if not is_record(folder / "cost.json", "time_to_psnr"):
+        refuse_files_there(folder, FILES)
+    for name in FILES:
+        (folder / name).unlink(missing_ok=True)
 
 
 def plain_data(report: CostReport) -> dict[str, Any]:

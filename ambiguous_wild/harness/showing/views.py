@@ -12,11 +12,11 @@ from ambiguous_wild.core import AwError, Camera, Scene, View
 from ambiguous_wild.harness.bench import BenchReport, bench
 from ambiguous_wild.harness.running.callbacks import Callbacks, outcome_line, run_name
 from ambiguous_wild.harness.showing.read import find_models, open_scene, read_models
-from ambiguous_wild.io.atomic import check_output
+from ambiguous_wild.io.atomic import check_output, refuse_files_there
 from ambiguous_wild.io.page_parts import narrowed
 from ambiguous_wild.splat.calibration import prepare_cpu
 from ambiguous_wild.viewing.live import LiveView
-from ambiguous_wild.viewing.model import Exported, export
+from ambiguous_wild.viewing.model import FORMATS, Exported, export
 from ambiguous_wild.viewing.video import (
     Frame,
     Tick,
@@ -44,6 +44,7 @@ def export_runs(
     loss: bool = True,
     scene_folder: Path | None = None,
     threads: int | None = None,
+    overwrite: bool = False,
     say: Callable[[str], None] = lambda text: None,
 ) -> list[tuple[str, list[Exported]]]:
     """Write the models of runs in other formats.
@@ -56,13 +57,14 @@ def export_runs(
             are reported.
         scene_folder: where the scene lies; None = where the runs say.
         threads: of the kernels; None = all.
+        overwrite: replace files of these names in `output`; those in RUN/export are replaced anyway.
         say: told what is left out, and why.
 
     Returns:
         (label of the model, its files), in the order of the runs' paths.
 
     Raises:
-        AwError: no run with a model, or a folder that cannot be written.
+        AwError: no run with a model, a folder that cannot be written, or files of these names in `output`.
     """
     found, notes = find_models(paths)
     for note in notes:
@@ -70,6 +72,9 @@ def export_runs(
     names = _file_names([f.scene for f in found], [f.model.label for f in found])
     for f in found:
         check_output((f.run / FOLDER if output is None else output) / "file")
+    if output is not None and not overwrite:
+        wanted = [FORMATS[form][0] for form in formats if form in FORMATS]
+        refuse_files_there(output, (name + ending for name in names for ending in wanted), "--overwrite")
     if loss:
         prepare_cpu(threads, say)
     reports = []

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import importlib
 import os
+import re
 import sys
+from pathlib import Path
 
 import click
 
@@ -128,7 +130,18 @@ def main() -> None:
 
 def _click_message(error: click.ClickException) -> str:
     message = error.format_message()
+    for name, words in {
+        "integer range": "whole number",
+        "integer": "whole number",
+        "float range": "number",
+    }.items():
+        message = message.replace(f"is not a valid {name}.", f"is not a {words}.")
     if isinstance(error, click.UsageError) and error.ctx is not None:
+        stray = re.fullmatch(r"Got unexpected extra arguments? \((.*)\)", message)
+        flags = {flag for param in error.ctx.command.params for flag in param.opts}
+        if stray and {"--method", "--scene"} <= flags:
+            folder = Path(stray[1]).is_dir() or "/" in stray[1]
+            message += f": did you mean {'--scene' if folder else '--method'} {stray[1]}?"
         message += f" (see '{error.ctx.command_path} --help')"
     return message
 

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from ambiguous_wild.builder.report import verdict
 from ambiguous_wild.cli.main import main
 from ambiguous_wild.io.scene_folder import load_scene
 from tests.builder.capture_maker import HEIGHT, WIDTH, write_capture
@@ -221,3 +222,14 @@ def test_outputs_that_cannot_be_are_one_line(aw, tmp_path, output):
     (tmp_path / "file").write_text("x")
     fails(aw, "raw", "-o", output)
     assert sorted(os.listdir(tmp_path)) == ["file", "raw"]
+
+
+@pytest.mark.parametrize(
+    ("photos", "word"), [(3, "few photos, about 20 are needed"), (19, "few photos"), (20, "ready")]
+)
+def test_the_verdict_says_whether_the_photos_are_enough(photos, word):
+    counts = {"registered": photos, "photos": photos, "points": 900}
+    line = verdict(
+        {"counts": counts, "lost": [], "reprojection_error_px": 0.5, "factor": 1}, (4, 3), Path("s")
+    )
+    assert word in line and ("ready" in line) == (photos >= 20)

@@ -93,6 +93,15 @@ def test_an_unknown_metric_names_others_and_a_sheet_is_a_picture(tmp_path: Path)
     assert not sheet.exists()
 
 
+@pytest.mark.parametrize(
+    ("file", "message"), [("a.JPG", "holds photos, not runs"), ("scene.json", "is a scene, not runs")]
+)
+def test_a_folder_of_other_things_is_named(file: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / file).write_text("{}")
+    error = CliRunner().invoke(command, [str(tmp_path)]).exception
+    assert isinstance(error, AwError) and message in str(error) and f"-o {tmp_path}" not in str(error)
+
+
 def test_errors_say_what_to_do(tmp_path: Path) -> None:
     runner = CliRunner()
     for words, expected in (

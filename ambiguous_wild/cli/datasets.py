@@ -12,7 +12,7 @@ from typing import Any
 
 import click
 
-from ambiguous_wild.cli.options import PathName
+from ambiguous_wild.cli.options import PathName, threads_option
 from ambiguous_wild.core.errors import AwError, shortlist
 
 KINDS = (
@@ -35,7 +35,7 @@ KINDS = (
     help="Drop points that only test photos see: they leak clean geometry. Published code keeps them.",
 )
 @click.option("--motion", is_flag=True, help="Match the photos to find what moves, for masks (motion.npz).")
-@click.option("--jobs", type=click.IntRange(min=1), help="Threads; the result does not depend on it.")
+@threads_option
 @click.option(
     "--seed",
     type=click.IntRange(0),
@@ -55,7 +55,7 @@ def import_command(
     dataset: str,
     drop_test_only_points: bool,
     motion: bool,
-    jobs: int | None,
+    threads: int | None,
     seed: int,
     overwrite: bool,
     as_json: bool,
@@ -69,7 +69,7 @@ def import_command(
     from ambiguous_wild.datasets.write import ImportSettings, import_scene
 
     settings = ImportSettings(kind, factor, name, license_, dataset, drop_test_only_points, seed, motion)
-    done = import_scene(source, output, settings, overwrite=overwrite, jobs=jobs, progress=not as_json)
+    done = import_scene(source, output, settings, overwrite=overwrite, jobs=threads, progress=not as_json)
     info = done.info
     if as_json:
         facts = {k: v for k, v in info.items() if k not in ("files", "photos", "inputs")}
@@ -191,7 +191,7 @@ def export_scene_command(scene: Path, form: str, output: Path, copy: bool, as_js
     show_default=True,
     help="List photos in which a detector sees a person; it misses most people.",
 )
-@click.option("--jobs", type=click.IntRange(min=1), help="Threads; the result does not depend on it.")
+@threads_option
 @click.option("--json", "as_json", is_flag=True, help="Print the same facts as JSON.")
 def package_command(
     scenes: tuple[Path, ...],
@@ -200,7 +200,7 @@ def package_command(
     template: Path | None,
     keep_metadata: bool,
     people: bool,
-    jobs: int | None,
+    threads: int | None,
     as_json: bool,
 ) -> None:
     """Pack SCENES for release: one zip per scene, croissant.json, a data card, checksums.
@@ -233,7 +233,7 @@ def package_command(
         info,
         keep_metadata=keep_metadata,
         look_for_people=people,
-        jobs=jobs or os.cpu_count() or 1,
+        jobs=threads or os.cpu_count() or 1,
         progress=not as_json,
     )
     if as_json:

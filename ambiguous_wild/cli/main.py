@@ -11,6 +11,7 @@ from pathlib import Path
 import click
 
 from ambiguous_wild import __version__
+from ambiguous_wild.cli.renamed import with_new_names
 from ambiguous_wild.core.errors import AwError, unknown
 
 # command -> (module, one line of help); help is here so that `aw --help` imports no command.
@@ -79,6 +80,7 @@ class _LazyGroup(click.Group):
         return getattr(module, f"{name.replace('-', '_')}_command", None) or module.command
 
     def resolve_command(self, ctx: click.Context, args: list[str]):
+        args = with_new_names(args)
         if args and args[0] not in COMMANDS:
             raise unknown("command", args[0], COMMANDS, "'aw --help' lists them")
         return super().resolve_command(ctx, args)

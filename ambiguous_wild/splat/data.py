@@ -69,7 +69,7 @@ def _load_keep(path: Path, size: tuple[int, int]) -> Tensor:
     if keep.shape != size:
         raise AwError(
             f"mask {path} is {keep.shape[1]}x{keep.shape[0]} px, its photo is {size[1]}x{size[0]} px; "
-            "build the scene again with 'aw build-scene --masks'"
+            "build the scene again with 'aw build-scene --keep-masks'"
         )
     return torch.from_numpy(keep)
 

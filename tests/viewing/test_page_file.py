@@ -158,8 +158,8 @@ def test_what_cannot_be_shown_is_one_line(runs: Path, tmp_path: Path) -> None:
     for words, told in (
         ([tmp_path / "none"], "no folder of runs"),
         ([tmp_path], "no finished run with a point_cloud.ply"),
-        ([runs, "--scene", "hall"], "unknown scene 'hall'"),
-        ([runs, "--scene-folder", tmp_path / "gone"], "take its folder: --scene-folder"),
+        ([runs, "--only", "hall"], "unknown scene 'hall'"),
+        ([runs, "--scene", tmp_path / "gone"], "take its folder: --scene"),
         ([], "no RUNS"),
         ([runs, "--live", runs.parent / "porch"], "leave RUNS out"),
     ):

@@ -255,7 +255,7 @@ def _check_values(run: Path, result: RunResult, *, photos: bool) -> None:
                 _impossible(run, f"{metric} of {row['name']}", value, f"lies between {low:g} and {high:g}")
             if math.isinf(value) and not (family == "psnr" and photos):
                 why = "is infinite only where picture and photo are equal, and the photos are not at hand: "
-                why = f"{why}name them with --scenes" if family == "psnr" else "is finite"
+                why = f"{why}name them with --scene" if family == "psnr" else "is finite"
                 _impossible(run, f"{metric} of {row['name']}", value, why)
     masks: Mapping[str, Any] = result["masks"] or {}
     for name in MASK_SCORES:

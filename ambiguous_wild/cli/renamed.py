@@ -48,10 +48,9 @@ def with_new_names(args: Sequence[str]) -> list[str]:
     words = words[length:]
     while words and words[0] != "--":
         old, equals, value = words.pop(0).partition("=")
-        following = value if equals else words[0] if words else ""
-        if old not in names or (
-            command in _NAMES_OR_FOLDERS and old == "--scene" and Path(following).is_dir()
-        ):
+        following = value or "".join(words[:1])
+        folder = "/" in following or Path(following).is_dir()
+        if old not in names or (command in _NAMES_OR_FOLDERS and old == "--scene" and folder):
             found.append(old + equals + value)
             continue
         new = names[old]

@@ -189,7 +189,7 @@ def test_another_model_or_another_state_of_the_scene_is_refused(tmp_path: Path) 
 def test_runs_of_two_scenes_need_a_choice(runs: Path, tmp_path: Path) -> None:
     other = write_tiny_scene(tmp_path / "yard", distractors=False)
     write_shown_run(tmp_path / "runs", other, "3dgs")
-    with pytest.raises(AwError, match="choose one with --scene"):
+    with pytest.raises(AwError, match="choose one with --only"):
         view_runs([runs, tmp_path / "runs"], tmp_path / "out")
     page = view_runs([runs, tmp_path / "runs"], tmp_path / "out", scene="yard")
     assert len(facts(page.path.read_text())["models"]) == 1

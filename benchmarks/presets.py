@@ -30,10 +30,10 @@ RESULTS = Path(__file__).parent / "results" / "presets.md"
 # per question: what a preset is designed for, and the lines of the plan, any of which answers it
 QUESTIONS = {
     "masks": ("masks", ("masks",)),
-    "colour per photo": ("appearance", ("affine exposure", "appearance embedding")),
-    "antialiasing": ("antialiasing", ("antialiasing",)),
+    "colour per photo": ("appearance", ("exposure", "appearance")),
+    "antialiasing": ("antialiasing", ("antialias",)),
     "SH degree 3": ("sh", ("SH degree",)),
-    "poses": ("pose", ("pose refinement",)),
+    "poses": ("pose", ("poses",)),
 }
 
 

@@ -33,6 +33,7 @@ from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.io.colmap_records import Model
 
 FOCAL_DIFFERENCE = 0.1  # relative; EXIF is rounded to millimetres
+ENOUGH_PHOTOS = 20  # with fewer, most of a place is seen in one or two of them
 LEAST_PARALLAX_DEG = 1.5  # COLMAP's own limit for a point
 SFM_STAGES = ("features", "matches", "mapping")
 
@@ -149,9 +150,11 @@ def verdict(info: SceneRecord, size: tuple[int, int], scene: Path) -> str:
     counts = info["counts"]
     points = f"{counts['points']:,}".replace(",", " ")
     named = f", {len(info['lost'])} left out without a clear place" if info["lost"] else ""
+    few = counts["registered"] < ENOUGH_PHOTOS
+    ready = f"few photos, about {ENOUGH_PHOTOS} are needed for a good model" if few else "ready"
     return (
         f"registered {counts['registered']} of {counts['photos']}{named}, {points} points, "
-        f"{info['reprojection_error_px']:.2f} px, {size[0]}x{size[1]} at factor {info['factor']}: ready; "
+        f"{info['reprojection_error_px']:.2f} px, {size[0]}x{size[1]} at factor {info['factor']}: {ready}; "
         f"next: aw bench --method refinesplat --scene {shlex.quote(str(scene))} -o runs"
     )
 

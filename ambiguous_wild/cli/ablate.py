@@ -63,6 +63,7 @@ def command(
     for plugin in plugins:
         load_plugin(plugin)
     entry = get_method(method)
+    method = method if entry.given_as else entry.name  # as it is written
     chosen = choose_groups(method, entry.ablation_groups(), groups)
     if listing:
         click.echo(json.dumps(_listed(chosen), indent=2) if as_json else _list_text(chosen))

@@ -12,18 +12,16 @@ from ambiguous_wild.cli.options import PathName
 
 @click.command("ambiguity-report")
 @click.argument("scene", type=PathName())
-@click.option("-o", "--out", type=PathName(), help="Folder for the report.  [default: SCENE-ambiguity]")
+@click.option("-o", "--output", type=PathName(), help="Folder for the report.  [default: SCENE-ambiguity]")
 @click.option(
-    "--masks",
-    help="truth, scene (build-scene's masks), run, or a folder of <stem>.png, white = distractor.  "
+    "--distractor-masks",
+    "masks",
+    metavar="truth|scene|run|FOLDER",
+    help="Exact masks, those of the scene, those of --run, or a folder of <stem>.png, white = distractor.  "
     "[default: the first available]",
 )
 @click.option(
-    "--masks-white",
-    type=click.Choice(["distractor", "keep"]),
-    default="distractor",
-    show_default=True,
-    help="Meaning of white in a folder given with --masks.",
+    "--keep-masks", type=PathName(), help="Instead: a folder of <stem>.png, white = keep, black = distractor."
 )
 @click.option(
     "--background",
@@ -53,9 +51,9 @@ from ambiguous_wild.cli.options import PathName
 @click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
 def command(
     scene: Path,
-    out: Path | None,
+    output: Path | None,
     masks: str | None,
-    masks_white: str,
+    keep_masks: Path | None,
     background: str | None,
     run: Path | None,
     features: str,
@@ -78,9 +76,11 @@ def command(
     loaded = load_scene(scene)
     if run is not None:
         sources.check_run(loaded, run)
-    found = sources.find_masks(loaded, masks, run, keep=masks_white == "keep")
+    if masks is not None and keep_masks is not None:
+        raise AwError("--distractor-masks and --keep-masks exclude each other: give one of them")
+    found = sources.find_masks(loaded, masks if keep_masks is None else keep_masks, run)
     behind = sources.find_background(loaded, background, run, found)
-    folder = out or scene.resolve().parent / f"{scene.resolve().name}-ambiguity"
+    folder = output or scene.resolve().parent / f"{scene.resolve().name}-ambiguity"
     if folder.resolve().is_relative_to(scene.resolve()):
         raise AwError(f"{folder} is inside {scene} and would change the scene; choose another -o")
     check_output(folder / "index.html" if folder.is_dir() else folder)

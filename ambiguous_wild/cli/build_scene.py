@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ambiguous_wild.cli.options import PathName
+from ambiguous_wild.cli.options import PathName, threads_option
 
 if TYPE_CHECKING:
     from ambiguous_wild.builder.pipeline import BuildResult
@@ -96,9 +96,10 @@ def _compiled() -> bool:
 )
 @click.option("--max-features", type=int, default=3000, show_default=True, help="SIFT features per photo.")
 @click.option(
-    "--masks",
+    "--keep-masks",
+    "masks",
     type=PathName(),
-    help="Folder of keep masks, white = keep, black = ignore: a.png or a.jpg.png.",
+    help="Folder of masks, white = keep, black = ignore: a.png or a.jpg.png.",
 )
 @click.option(
     "--masks-missing",
@@ -109,7 +110,7 @@ def _compiled() -> bool:
 )
 @click.option("--test-list", type=PathName(), help="File with the names of the test photos, one per line.")
 @click.option("--strict", is_flag=True, help="Refuse the capture if one photo cannot be read.")
-@click.option("--jobs", type=click.IntRange(min=1), help="Threads; the result does not depend on it.")
+@threads_option
 @click.option("--seed", type=int, default=0, show_default=True, help="Seed of COLMAP's random choices.")
 @click.option("--name", help="Name of the scene.  [default: the name of the output folder]")
 @click.option("--license", default="", help="Licence of the photos, recorded in scene.json.")
@@ -121,7 +122,7 @@ def command(
     output: Path,
     masks: Path | None,
     test_list: Path | None,
-    jobs: int | None,
+    threads: int | None,
     name: str | None,
     overwrite: bool,
     keep_work: bool,
@@ -151,7 +152,7 @@ def command(
             test_list=test_list,
             overwrite=overwrite,
             keep_work=keep_work,
-            jobs=jobs,
+            jobs=threads,
             progress=True,
         )
     info = result.info

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ambiguous_wild.cli.options import PathName
+from ambiguous_wild.cli.options import PathName, threads_option
 
 if TYPE_CHECKING:
     from ambiguous_wild.builder.checks import CaptureReport
@@ -36,10 +36,10 @@ BROKEN_BELOW = 0.9  # of the frames in a video's header, which is often wrong by
     show_default=True,
     help="Seconds between photos of a camera.",
 )
-@click.option("--jobs", type=click.IntRange(min=1), help="Threads; the result does not depend on it.")
+@threads_option
 @click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
 def capture_command(
-    source: str, output: Path, frames: int, every: float, jobs: int | None, as_json: bool
+    source: str, output: Path, frames: int, every: float, threads: int | None, as_json: bool
 ) -> None:
     """Take photos from SOURCE: a video (sharp, evenly spaced frames), a folder of photos (copies with
     EXIF), or 'camera' ('camera:1' is the second one)."""
@@ -55,7 +55,7 @@ def capture_command(
     path = Path(source)
     camera = re.fullmatch(r"camera(?::(\d{1,3}))?", source)
     if path.is_dir():
-        facts = capture_photos.photos_from_folder(path, output, jobs=jobs or os.cpu_count() or 1, bar=bar)
+        facts = capture_photos.photos_from_folder(path, output, jobs=threads or os.cpu_count() or 1, bar=bar)
     elif path.is_file():
         facts = capture_photos.photos_from_video(path, output, frames=frames, bar=bar)
     elif camera:
@@ -92,9 +92,9 @@ _WORDS = {"ok": ("ok", "green"), "warning": ("WARNING", "red"), "unknown": ("unk
 @click.command("screen")
 @click.argument("raw", type=PathName())
 @click.option("--strict", is_flag=True, help="Refuse the capture (exit code 2) if a check fails.")
-@click.option("--jobs", type=click.IntRange(min=1), help="Threads; the result does not depend on it.")
+@threads_option
 @click.option("--json", "as_json", is_flag=True, help="Print the same facts as JSON.")
-def screen_command(raw: Path, strict: bool, jobs: int | None, as_json: bool) -> None:
+def screen_command(raw: Path, strict: bool, threads: int | None, as_json: bool) -> None:
     """Check the photos in RAW before building: exposure, white balance, ISO, focus, focal length, blur,
     near-duplicates, overlap, motion. Nothing is written."""
     import os
@@ -102,7 +102,7 @@ def screen_command(raw: Path, strict: bool, jobs: int | None, as_json: bool) -> 
     from ambiguous_wild.builder.checks import check_capture, refuse_failed
     from ambiguous_wild.builder.progress import Bar
 
-    found = check_capture(raw, jobs=jobs or os.cpu_count() or 1, bar=Bar(not as_json))
+    found = check_capture(raw, jobs=threads or os.cpu_count() or 1, bar=Bar(not as_json))
     if as_json:
         facts = {
             "capture": str(found.root),

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ambiguous_wild.cli.options import PathName
+from ambiguous_wild.cli.options import PathName, only_option
 from ambiguous_wild.core.errors import AwError
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     "--target", "targets", multiple=True, type=float, metavar="DB",
     help="A test PSNR to reach; repeatable.  [default: 3, 1 and 0.5 dB below the best of each scene]",
 )  # fmt: skip
-@click.option("--scene", "scenes", multiple=True, help="Only this scene; repeatable.  [default: all]")
+@only_option
 @click.option(
     "--with-setup",
     is_flag=True,

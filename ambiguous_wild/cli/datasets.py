@@ -12,7 +12,7 @@ from typing import Any
 
 import click
 
-from ambiguous_wild.cli.options import PathName
+from ambiguous_wild.cli.options import PathName, threads_option
 from ambiguous_wild.core.errors import AwError, shortlist
 
 KINDS = (
@@ -39,7 +39,7 @@ KINDS = (
     "--masks/--no-masks", default=True, show_default=True,
     help="Use keep masks: those that the layout names, masks/ beside the photos, the photos' alpha.",
 )  # fmt: skip
-@click.option("--jobs", type=click.IntRange(min=1), help="Threads; the result does not depend on it.")
+@threads_option
 @click.option(
     "--seed",
     type=click.IntRange(0),
@@ -60,7 +60,7 @@ def import_command(
     drop_test_only_points: bool,
     motion: bool,
     masks: bool,
-    jobs: int | None,
+    threads: int | None,
     seed: int,
     overwrite: bool,
     as_json: bool,
@@ -76,7 +76,7 @@ def import_command(
     settings = ImportSettings(
         kind, factor, name, license_, dataset, drop_test_only_points, seed, motion, masks
     )
-    done = import_scene(source, output, settings, overwrite=overwrite, jobs=jobs, progress=not as_json)
+    done = import_scene(source, output, settings, overwrite=overwrite, jobs=threads, progress=not as_json)
     info = done.info
     if as_json:
         facts = {k: v for k, v in info.items() if k not in ("files", "photos", "inputs")}
@@ -198,7 +198,7 @@ def export_scene_command(scene: Path, form: str, output: Path, copy: bool, as_js
     show_default=True,
     help="List photos in which a detector sees a person; it misses most people.",
 )
-@click.option("--jobs", type=click.IntRange(min=1), help="Threads; the result does not depend on it.")
+@threads_option
 @click.option("--json", "as_json", is_flag=True, help="Print the same facts as JSON.")
 def package_command(
     scenes: tuple[Path, ...],
@@ -207,7 +207,7 @@ def package_command(
     template: Path | None,
     keep_metadata: bool,
     people: bool,
-    jobs: int | None,
+    threads: int | None,
     as_json: bool,
 ) -> None:
     """Pack SCENES for release: one zip per scene, croissant.json, a data card, checksums.
@@ -240,7 +240,7 @@ def package_command(
         info,
         keep_metadata=keep_metadata,
         look_for_people=people,
-        jobs=jobs or os.cpu_count() or 1,
+        jobs=threads or os.cpu_count() or 1,
         progress=not as_json,
     )
     if as_json:

@@ -44,7 +44,8 @@ def command() -> None:
     "--dataset", help="Dataset of these runs.  [default: as scene.json says; of 'aw simulate': simulated]"
 )
 @click.option(
-    "--scenes",
+    "--scene",
+    "scenes",
     type=PathName(file_okay=False),
     help="Scene folder, or a folder of scenes.  [default: as the runs say]",
 )
@@ -55,7 +56,9 @@ def command() -> None:
     show_default=True,
     help="Copies to keep per scene for the page: N test images and N train photos with masks.",
 )
-@click.option("--replace", is_flag=True, help="Replace a run on the board that has other numbers.")
+@click.option(
+    "--overwrite", "replace", is_flag=True, help="Replace a run on the board that has other numbers."
+)
 @click.option("--quick", is_flag=True, help="Recompute only PSNR.")
 @click.option("--dry-run", is_flag=True, help="Check only; write nothing.")
 @_json
@@ -136,7 +139,7 @@ class _bar:
 @_board
 @click.option("--method", required=True, help="Remove runs of this method.")
 @click.option("--dataset", help="Only runs of this dataset.")
-@click.option("--scene", help="Only runs of this scene.")
+@click.option("--only", "scene", metavar="NAME", help="Only runs of this scene.")
 @click.option("--setting", help="Only runs of this setting, as written on the board.")
 @click.option("--seed", type=click.IntRange(0), help="Only runs of this seed.")
 @click.option("--dry-run", is_flag=True, help="List the runs; remove nothing.")
@@ -160,7 +163,7 @@ def remove_command(
 
 @command.command("publish")
 @_board
-@click.option("-o", "--out", required=True, type=PathName(), help="Folder of the page.")
+@click.option("-o", "--output", required=True, type=PathName(), help="Folder of the page.")
 @click.option("--reported", is_flag=True, help="Also show numbers from papers, in a table of their own.")
 @click.option(
     "--reported-from",
@@ -178,7 +181,7 @@ def remove_command(
 @_json
 def publish_command(
     board: Path,
-    out: Path,
+    output: Path,
     reported: bool,
     reported_from: Path | None,
     title: str,
@@ -195,7 +198,7 @@ def publish_command(
 
     done = publish(
         board,
-        out,
+        output,
         reported=reported,
         reported_from=reported_from,
         title=title,
@@ -209,7 +212,7 @@ def publish_command(
         told += f", {done.model_pages} pages with models"
     if done.reported_from is not None:
         told += f", {done.reported} reported numbers from {done.reported_from}"
-    click.echo(f"wrote {out / 'index.html'}: {told}", err=True)
+    click.echo(f"wrote {output / 'index.html'}: {told}", err=True)
 
 
 @command.command("check")

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import importlib
 import os
+import re
 import sys
+from pathlib import Path
 
 import click
 
 from ambiguous_wild import __version__
+from ambiguous_wild.cli.renamed import with_new_names
 from ambiguous_wild.core.errors import AwError, unknown
 
 # command -> (module, one line of help); help is here so that `aw --help` imports no command.
@@ -77,6 +80,7 @@ class _LazyGroup(click.Group):
         return getattr(module, f"{name.replace('-', '_')}_command", None) or module.command
 
     def resolve_command(self, ctx: click.Context, args: list[str]):
+        args = with_new_names(args)
         if args and args[0] not in COMMANDS:
             raise unknown("command", args[0], COMMANDS, "'aw --help' lists them")
         return super().resolve_command(ctx, args)
@@ -128,7 +132,18 @@ def main() -> None:
 
 def _click_message(error: click.ClickException) -> str:
     message = error.format_message()
+    for name, words in {
+        "integer range": "whole number",
+        "integer": "whole number",
+        "float range": "number",
+    }.items():
+        message = message.replace(f"is not a valid {name}.", f"is not a {words}.")
     if isinstance(error, click.UsageError) and error.ctx is not None:
+        stray = re.fullmatch(r"Got unexpected extra arguments? \((.*)\)", message)
+        flags = {flag for param in error.ctx.command.params for flag in param.opts}
+        if stray and {"--method", "--scene"} <= flags:
+            folder = Path(stray[1]).is_dir() or "/" in stray[1]
+            message += f": did you mean {'--scene' if folder else '--method'} {stray[1]}?"
         message += f" (see '{error.ctx.command_path} --help')"
     return message
 

@@ -38,7 +38,20 @@ metric_file_option = click.option(
     help="A Python file with a metric of your own (docs/metrics.md); repeatable.",
 )
 scene_folder_option = click.option(
-    "--scene-folder", type=PathName(file_okay=False), help="The scene folder.  [default: as the runs say]"
+    "--scene",
+    "scene_folder",
+    type=PathName(file_okay=False),
+    help="The scene folder, if it was moved.  [default: as the runs say]",
+)
+threads_option = click.option(
+    "--threads", type=click.IntRange(1), help="CPU threads; they do not change the result."
+)
+only_option = click.option(
+    "--only",
+    "scenes",
+    multiple=True,
+    metavar="NAME",
+    help="Only the scene of this name; repeatable.  [default: all]",
 )
 
 _TRAINING = (
@@ -59,7 +72,7 @@ _TRAINING = (
         show_default=True,
         help="auto: the GPU if torch and gsplat can use one, else the CPU.",
     ),
-    click.option("--threads", type=click.IntRange(1), help="CPU threads; they do not change the result."),
+    threads_option,
     click.option(
         "--factor",
         type=click.IntRange(1),
@@ -74,9 +87,11 @@ _TRAINING = (
     click.option(
         "--overwrite",
         type=click.Choice(["never", "missing", "always"]),
+        is_flag=False,
+        flag_value="always",
         default="missing",
         show_default=True,
-        help="missing: train what is not finished; never: skip existing folders; always: train again.",
+        help="Alone, or always: train again; missing: what is not finished; never: skip existing folders.",
     ),
     click.option(
         "--cache",

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 MASKS = (
     "masks: no effect to switch on; a method makes them while it trains (aw bench --method refinesplat, or "
-    "another of 'aw methods'), or you give your own (aw build-scene --masks FOLDER)"
+    "another of 'aw methods'), or you give your own (aw build-scene --keep-masks FOLDER)"
 )
 
 
@@ -48,7 +48,7 @@ MASKS = (
     help="Measure the time of each effect on this machine.",
 )
 @click.option(
-    "-o", "--out", type=PathName(dir_okay=False), help="File for the plan.  [default: SCENE-plan.json]"
+    "-o", "--output", type=PathName(dir_okay=False), help="File for the plan.  [default: SCENE-plan.json]"
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the plan as JSON.")
 def command(
@@ -57,7 +57,7 @@ def command(
     probe: bool,
     iterations: int,
     costs: bool,
-    out: Path | None,
+    output: Path | None,
     as_json: bool,
 ) -> None:
     """Measure SCENE and decide which effects it needs: evidence, limit, gain of a probe, decision and cost.
@@ -72,7 +72,7 @@ def command(
     from ambiguous_wild.io.scene_folder import load_scene
 
     loaded = load_scene(scene, factor=factor)
-    path = out or scene.resolve().parent / f"{scene.resolve().name}-plan.json"
+    path = output or scene.resolve().parent / f"{scene.resolve().name}-plan.json"
     if path.resolve().is_relative_to(scene.resolve()):
         raise AwError(f"{path} is inside {scene} and would change the scene; choose another -o")
     check_output(path)

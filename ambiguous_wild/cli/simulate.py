@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @click.command("simulate")
 @click.argument("name", metavar="NAME|SPEC.yaml", required=False)
-@click.option("-o", "--out", type=PathName(file_okay=False), help="Folder to write.")
+@click.option("-o", "--output", type=PathName(file_okay=False), help="Folder to write.")
 @click.option(
     "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of world, walk, distractors."
 )
@@ -29,14 +29,18 @@ if TYPE_CHECKING:
 @click.option("--depth", is_flag=True, help="Also write depth maps of the static scene.")
 @click.option("--overwrite", is_flag=True, help="Replace an earlier capture in this folder.")
 @click.option(
-    "--sheet/--no-sheet", default=True, show_default=True, help="Write truth/sheet.jpg, a contact sheet."
+    "--pictures/--no-pictures",
+    "sheet",
+    default=True,
+    show_default=True,
+    help="Write truth/sheet.jpg, a contact sheet.",
 )
 @click.option("--print-spec", is_flag=True, help="Print the spec as YAML, and stop.")
 @click.option("--list", "listing", is_flag=True, help="List all presets.")
 @click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
 def simulate_command(
     name: str | None,
-    out: Path | None,
+    output: Path | None,
     seed: int,
     views: int | None,
     width: int | None,
@@ -65,7 +69,7 @@ def simulate_command(
     if print_spec:
         click.echo(dump_spec(spec), nl=False)
         return
-    if out is None:
+    if output is None:
         raise AwError(f"the output folder is missing: aw simulate {name} -o raw")
 
     from tqdm import tqdm
@@ -77,14 +81,14 @@ def simulate_command(
     def bar(shots: list) -> tqdm:
         return tqdm(shots, unit="photo", desc=f"simulate {spec.name}", disable=as_json or None)
 
-    check_output(out)
-    with folder_lock(out, f"aw simulate {name}"):
-        sweep_siblings(out)  # left by a killed call
-        facts = simulate(spec, out, seed, depth, overwrite, bar)
-        if sheet and not (facts["reused"] and (out / "truth" / "sheet.jpg").is_file()):
+    check_output(output)
+    with folder_lock(output, f"aw simulate {name}"):
+        sweep_siblings(output)  # left by a killed call
+        facts = simulate(spec, output, seed, depth, overwrite, bar)
+        if sheet and not (facts["reused"] and (output / "truth" / "sheet.jpg").is_file()):
             from ambiguous_wild.harness.pictures.sheets import write_capture_sheet
 
-            write_capture_sheet(out)
+            write_capture_sheet(output)
     outside = _outside(spec, facts["photos"])
     if outside:
         click.echo(
@@ -110,16 +114,16 @@ def simulate_command(
         f"(mean {100 * share['mean']:.1f} %) of a train photo"
     )
     click.echo(
-        f"{state}: {out}: {spec.train_views} train and {spec.test_views} test photos of "
+        f"{state}: {output}: {spec.train_views} train and {spec.test_views} test photos of "
         f"{spec.width}x{spec.height}; {covered if spec.distractors else 'no distractors'}"
     )
     effects = list(plain_spec(spec)["effects"])
     if effects:
         click.echo(f"effects: {', '.join(effects)}")
     if sheet:
-        click.echo(f"look at: {out / 'truth' / 'sheet.jpg'}")
-    scene = out.parent / f"{out.name}-scene"
-    click.echo(f"next: aw build-scene {shlex.quote(str(out))} -o {shlex.quote(str(scene))}")
+        click.echo(f"look at: {output / 'truth' / 'sheet.jpg'}")
+    scene = output.parent / f"{output.name}-scene"
+    click.echo(f"next: aw build-scene {shlex.quote(str(output))} -o {shlex.quote(str(scene))}")
 
 
 def _outside(spec: CaptureSpec, photos: dict[str, PhotoTruth]) -> int:

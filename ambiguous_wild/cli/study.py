@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from ambiguous_wild.cli.options import PathName
+from ambiguous_wild.cli.options import PathName, only_option
 
 
 @click.group("study")
@@ -15,27 +15,23 @@ def command() -> None:
     """Blind user study: how hard are distractors to see, and which render is better?
 
     \b
-    aw study make --runs runs --scene scene -o study.html    page for raters, and the private study.key.json
+    aw study make runs --scene scene -o study.html    page for raters, and the private study.key.json
     aw study score answers/ --key study.key.json             shares, ranking, agreement
     """
 
 
 @command.command("make")
+@click.argument("runs", required=False, type=PathName())
 @click.option(
     "--scene",
-    "scenes",
+    "photos_of",
     multiple=True,
     type=PathName(),
     help="Ask about the training photos of this scene folder; repeatable.",
 )
 @click.option(
-    "--runs",
-    type=PathName(),
-    help="Ask about the test renders in this output folder of 'aw bench'.",
-)
-@click.option(
     "-o",
-    "--out",
+    "--output",
     required=True,
     type=PathName(dir_okay=False),
     help="The page, *.html; the key is written next to it.",
@@ -43,12 +39,7 @@ def command() -> None:
 @click.option(
     "--method", "methods", multiple=True, help="Compare only this method; repeatable.  [default: all]"
 )
-@click.option(
-    "--only-scene",
-    "only",
-    multiple=True,
-    help="Compare only on this scene; repeatable.  [default: all]",
-)
+@only_option
 @click.option(
     "--questions",
     type=click.IntRange(1, 1000),
@@ -84,17 +75,18 @@ def command() -> None:
     "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the choice of questions."
 )
 @click.option(
-    "--force",
+    "--overwrite",
     is_flag=True,
     help="Replace an existing page and key; answers to the old page can no longer be scored.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
 def make_command(
-    scenes: tuple[Path, ...], runs: Path | None, out: Path, methods: tuple[str, ...], only: tuple[str, ...],
-    questions: int, truth: bool, outline: bool, side: int, quality: int, title: str, seed: int, force: bool,
+    runs: Path | None, photos_of: tuple[Path, ...], output: Path, methods: tuple[str, ...], scenes: tuple[str, ...],
+    questions: int, truth: bool, outline: bool, side: int, quality: int, title: str, seed: int, overwrite: bool,
     as_json: bool,
 ) -> None:  # fmt: skip
-    """Write the study as one HTML file that works offline and on a phone.
+    """Write the study as one HTML file that works offline and on a phone: about the test renders in RUNS, the
+    output of 'aw bench', about the photos of --scene, or both.
 
     The page contains no names of methods, scenes or files. The key does: do not give it to raters.
     """
@@ -105,33 +97,37 @@ def make_command(
     from ambiguous_wild.io.atomic import check_output
     from ambiguous_wild.study.make import Question, StudySettings, make_study, render_pairs, scene_photos
 
-    if not scenes and runs is None:
-        raise AwError("nothing to ask about: give --scene SCENE (photos), --runs RUNS (renders), or both")
-    if (methods or only) and runs is None:
-        raise AwError("--method and --only-scene choose among runs: give --runs too")
-    if out.suffix.lower() not in (".html", ".htm"):
+    if not photos_of and runs is None:
+        raise AwError("nothing to ask about: give --scene SCENE (photos), RUNS (renders), or both")
+    if (methods or scenes) and runs is None:
+        raise AwError("--method and --only choose among runs: give RUNS too")
+    if output.suffix.lower() not in (".html", ".htm"):
         raise AwError(
-            f"the page must be named *.html, so that browsers open it: -o {out.with_suffix('.html')}"
+            f"the page must be named *.html, so that browsers open it: -o {output.with_suffix('.html')}"
         )
     if not is_text(title):
         raise AwError(f"--title {title!a} contains half a character; set the terminal's encoding to UTF-8")
-    same = [scene for k, scene in enumerate(scenes) if scene.resolve() in [s.resolve() for s in scenes[:k]]]
+    same = [
+        scene for k, scene in enumerate(photos_of) if scene.resolve() in [s.resolve() for s in photos_of[:k]]
+    ]
     if same:
         raise AwError(f"--scene {same[0]} is given twice, so its photos would count twice; give it once")
-    key = out.with_suffix(".key.json")
-    for wanted in (out, key):
+    key = output.with_suffix(".key.json")
+    for wanted in (output, key):
         check_output(wanted)
-    there = [str(p) for p in (out, key) if p.exists()]
-    if there and not force:
+    there = [str(p) for p in (output, key) if p.exists()]
+    if there and not overwrite:
         raise AwError(
             f"{' and '.join(there)} {'exist' if len(there) > 1 else 'exists'}; answers to the old page could "
-            "not be scored without its key; choose another -o, or replace it with --force"
+            "not be scored without its key; choose another -o, or replace it with --overwrite"
         )
-    asked: list[Question] = [q for scene in scenes for q in scene_photos(scene, outline=outline)]
+    asked: list[Question] = [q for scene in photos_of for q in scene_photos(scene, outline=outline)]
     if runs is not None:
-        asked += render_pairs(runs, methods=methods, scenes=only, truth=truth)
+        asked += render_pairs(runs, methods=methods, scenes=scenes, truth=truth)
     settings = StudySettings(title=title, limit=questions, side=side, quality=quality, seed=seed)
-    made = make_study(asked, out, key, settings, lambda q: tqdm(q, unit="question", disable=as_json or None))
+    made = make_study(
+        asked, output, key, settings, lambda q: tqdm(q, unit="question", disable=as_json or None)
+    )
     if as_json:
         facts = {k: str(v) if isinstance(v, Path) else v for k, v in vars(made).items()}
         click.echo(json.dumps(facts, indent=2))
@@ -153,7 +149,7 @@ def make_command(
 )
 @click.option(
     "-o",
-    "--out",
+    "--output",
     type=PathName(file_okay=False),
     help="Folder for scores.md, .csv and .json.  [default: KEY-scores]",
 )
@@ -161,7 +157,9 @@ def make_command(
     "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the bootstrap over raters."
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the scores as JSON.")
-def score_command(answers: tuple[Path, ...], key: Path, out: Path | None, seed: int, as_json: bool) -> None:
+def score_command(
+    answers: tuple[Path, ...], key: Path, output: Path | None, seed: int, as_json: bool
+) -> None:
     """Score ANSWERS: files (JSON or CSV) saved by raters, or folders of them."""
     from ambiguous_wild.io.atomic import check_output, is_record, refuse_files_there
     from ambiguous_wild.io.atomic import refuse_foreign_files as refuse_strangers
@@ -171,7 +169,7 @@ def score_command(answers: tuple[Path, ...], key: Path, out: Path | None, seed: 
 
     known = read_key(key)
     raters = read_answers(answers, known, lambda text: click.echo(f"warning: {text}", err=True))
-    folder = out or key.with_name(key.name.removesuffix(".json").removesuffix(".key") + "-scores")
+    folder = output or key.with_name(key.name.removesuffix(".json").removesuffix(".key") + "-scores")
     if folder.is_dir():
         refuse_strangers(folder, SCORE_FILES)
         if not is_record(folder / "scores.json", "raters"):

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ambiguous_wild.cli.options import PathName, metric_file_option
+from ambiguous_wild.cli.options import PathName, metric_file_option, only_option, scene_folder_option
 from ambiguous_wild.core.errors import AwError
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ LAYOUTS = ("blocks", "paper", "means", "memory", "ablation")
 @click.option(
     "--metric", "metrics", multiple=True, help="Only this column; repeatable.  [default: all measured]"
 )
-@click.option("--scene", "scenes", multiple=True, help="Only this scene; repeatable.  [default: all]")
+@only_option
 @click.option(
     "--dataset", "datasets", multiple=True, metavar="NAME=SCENE,SCENE",
     help="Group these scenes as dataset NAME; repeatable.  [default: as in the papers' tables]",
@@ -92,7 +92,7 @@ def table_command(
     if style == "tidy":
         if layout != "blocks" or datasets or reported or reported_from or sheet:
             raise AwError(
-                "--format tidy goes with --metric, --scene and -o alone: it is every number there is"
+                "--format tidy goes with --metric, --only and -o alone: it is every number there is"
             )
         _write_tidy(_read(runs), output, metrics, scenes)
         return
@@ -101,7 +101,7 @@ def table_command(
         if layout == "ablation":
             if len(runs) > 1:
                 raise AwError("--layout ablation shows one folder, the output of 'aw ablate': give RUNS once")
-            refused |= {"--scene": scenes, "--sheet": sheet}
+            refused |= {"--only": scenes, "--sheet": sheet}
         for flag, value in refused.items():
             if value:
                 raise AwError(
@@ -283,7 +283,7 @@ def command_line(
     words = ["aw", "table", *map(str, runs)]
     words += ["--format", style] if style != "text" else []
     words += ["--layout", layout] if layout != "blocks" else []
-    for flag, values in (("--metric", metrics), ("--scene", scenes), ("--dataset", datasets)):
+    for flag, values in (("--metric", metrics), ("--only", scenes), ("--dataset", datasets)):
         for value in values:
             words += [flag, value]
     words += ["--reported"] if reported else []
@@ -293,15 +293,11 @@ def command_line(
 
 @click.command(name="rescore")
 @click.argument("runs", nargs=-1, required=True, type=PathName())
-@click.option(
-    "--scene",
-    type=PathName(file_okay=False),
-    help="Scene folder, if it was moved.  [default: as each run says]",
-)
+@scene_folder_option
 @metric_file_option
 @click.option("--json", "as_json", is_flag=True, help="Print what became of every run as JSON.")
 def rescore_command(
-    runs: tuple[Path, ...], scene: Path | None, metrics: tuple[Path, ...], as_json: bool
+    runs: tuple[Path, ...], scene_folder: Path | None, metrics: tuple[Path, ...], as_json: bool
 ) -> None:
     """Add metrics that were missing when the runs below RUNS ended, e.g. LPIPS before its weights were there.
 
@@ -318,7 +314,7 @@ def rescore_command(
 
     for file in metrics:
         load_metrics(file)
-    found = rescore(runs, scene=scene)
+    found = rescore(runs, scene=scene_folder)
     if as_json:
         click.echo(json.dumps([dataclasses.asdict(r) | {"run": str(r.run)} for r in found], indent=2))
     else:

@@ -11,13 +11,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ambiguous_wild.cli.options import PathName, plugin_option, say, scene_folder_option
+from ambiguous_wild.cli.options import PathName, plugin_option, say, scene_folder_option, threads_option
 from ambiguous_wild.core.errors import AwError
 
 if TYPE_CHECKING:
     from ambiguous_wild.viewing.model import Exported
 
 MOST_GAUSSIANS = 150_000
+_one_scene = click.option(
+    "--only", "scene", metavar="NAME", help="Name of the scene, if the runs have several."
+)
 
 
 @click.command(name="view")
@@ -26,7 +29,7 @@ MOST_GAUSSIANS = 150_000
     "-o", "--output", type=PathName(file_okay=False), default=Path("view"), show_default=True,
     help="Folder of the page; with --live, of the run (default then: runs).",
 )  # fmt: skip
-@click.option("--scene", help="Name of the scene, if the runs have several.")
+@_one_scene
 @scene_folder_option
 @click.option(
     "--max-gaussians", type=click.IntRange(1), default=MOST_GAUSSIANS, show_default=True,
@@ -153,10 +156,10 @@ def view_command(
 @click.option("--gif", type=PathName(dir_okay=False), help="Also write this GIF of the whole path.")
 @click.option("--gif-seconds", type=click.FloatRange(0.5, 30), default=4.0, show_default=True)
 @click.option("--gif-width", type=click.IntRange(16, 2048), default=640, show_default=True, help="Width, px.")
-@click.option("--scene", help="Name of the scene, if the runs have several.")
+@_one_scene
 @scene_folder_option
 @plugin_option
-@click.option("--threads", type=click.IntRange(1), help="CPU threads.")
+@threads_option
 def video_command(
     runs: tuple[Path, ...], output: Path, path: str, plugins: tuple[Path, ...], **options: Any
 ) -> None:
@@ -219,7 +222,7 @@ FORMATS = ("compressed-ply", "spz", "sog", "gltf")
 )
 @scene_folder_option
 @plugin_option
-@click.option("--threads", type=click.IntRange(1), help="CPU threads.")
+@threads_option
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
 def export_command(
     runs: tuple[Path, ...],

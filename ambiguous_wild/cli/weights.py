@@ -61,7 +61,7 @@ def list_command(as_json: bool) -> None:
 
 @command.command(name="get")
 @click.argument("names", nargs=-1, required=True)
-@click.option("--again", is_flag=True, help="Download also what is there and seems complete.")
+@click.option("--overwrite", "again", is_flag=True, help="Download also what is there and seems complete.")
 @click.option("--json", "as_json", is_flag=True, help="Print names and places as JSON.")
 def get_command(names: tuple[str, ...], again: bool, as_json: bool) -> None:
     """Download networks into AW_WEIGHTS (by default ~/.cache/ambiguous_wild/weights).

@@ -32,9 +32,10 @@ def unknown(kind: str, name: str, choices: Iterable[str], hint: str = "") -> AwE
         hint: how to see all of them, e.g. ``"'aw methods' lists them"``.
     """
     known = sorted(choices)
-    near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    lowered = {choice.casefold(): choice for choice in reversed(known)}
+    near = difflib.get_close_matches(name.casefold(), lowered, n=1, cutoff=0.5)
     if near:
-        tail = f"did you mean {near[0]!r}?"
+        tail = f"did you mean {lowered[near[0]]!r}?"
     elif len(known) <= 12:
         tail = "there is: " + ", ".join(known) if known else "there is none"
     else:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 
 Place = Literal["mask", "density", "regulariser"]
 Words = str | Path
+_BETWEEN_METHODS = re.compile(r",(?!\s*\w*\s*=)")
 
 
 class TrainSettings(TypedDict, total=False):
@@ -287,8 +289,12 @@ def bench(
 def _check_methods(
     methods: Sequence[str], plugins: Sequence[Words], parts: Mapping[Place, str], passes: int
 ) -> list[str]:
-    """The methods' names with the parts they take; a misspelt one is answered before torch is imported."""
+    """The methods' names with the parts they take; a misspelt one is answered before torch is imported.
+
+    "a,b" are two methods, but for the places of a graft (a@mask=b,density=c) and files with a comma.
+    """
     from ambiguous_wild.methods.graft import graft_name
+    from ambiguous_wild.methods.references import reference_file
     from ambiguous_wild.methods.registry import get_method, load_plugin
     from ambiguous_wild.methods.second_pass import second_pass_name, trained_once
 
@@ -296,12 +302,14 @@ def _check_methods(
         load_plugin(Path(plugin))
     donors: dict[str, str | None] = dict(parts.items())
     names = []
-    for name in methods:
-        once = trained_once(name)
-        names.append(second_pass_name(graft_name(once, donors), passes if once == name else 2))
-    for name in names:
-        get_method(name)
-    return names
+    for text in methods:
+        file = reference_file(text)
+        whole = file is not None and file.exists()
+        for name in [text] if whole else [part.strip() for part in _BETWEEN_METHODS.split(text)]:
+            once = trained_once(name)
+            names.append(second_pass_name(graft_name(once, donors), passes if once == name else 2))
+    entries = [get_method(name) for name in names]
+    return [name if entry.given_as else entry.name for name, entry in zip(names, entries)]
 
 
 def _check_effects(

@@ -13,6 +13,7 @@ import inspect
 import re
 import typing
 from pathlib import Path
+from types import ModuleType
 
 from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.core.names import check_name
@@ -86,8 +87,7 @@ def _recipe(name: str) -> MethodEntry:
     module = import_file(path)
     found = getattr(module, attribute, None)
     if found is None:
-        public = [key for key, value in vars(module).items() if callable(value) and not key.startswith("_")]
-        raise unknown(f"recipe in {path}", attribute, public)
+        raise unknown(f"recipe in {path}", attribute, _recipes(module))
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     if isinstance(found, MethodEntry):
         return dataclasses.replace(found, source_hash=digest)
@@ -101,6 +101,34 @@ def _recipe(name: str) -> MethodEntry:
     return MethodEntry(
         check_name("method name", attribute), summary, recipe, config=config, source_hash=digest
     )
+
+
+def without_recipe(path: Path) -> AwError:
+    """The error for a file without the name of a recipe; it gives the names."""
+    if not path.is_file():
+        return AwError(f"no file {path}: write FILE.py:RECIPE, or a name of 'aw methods'")
+    names = _recipes(import_file(path))
+    if not names:
+        return AwError(f"{path} has no recipe: write a function that returns Parts (docs/add-a-method.md)")
+    return AwError(
+        f"{path} is a file: add the name of a recipe in it: {', '.join(f'{path}:{n}' for n in names)}"
+    )
+
+
+def _recipes(module: ModuleType) -> list[str]:
+    """Names of the entries and of the functions that the file itself defines; some may be helpers."""
+    own = {
+        key: value
+        for key, value in vars(module).items()
+        if isinstance(value, MethodEntry)
+        or (inspect.isfunction(value) and value.__module__ == module.__name__ and not key.startswith("_"))
+    }
+    sure = [
+        key
+        for key, value in own.items()
+        if "Parts" in str(getattr(value, "__annotations__", {}).get("return"))
+    ]
+    return sure or list(own)
 
 
 def _config_of(recipe: typing.Callable[..., object], name: str) -> type | None:

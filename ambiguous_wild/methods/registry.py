@@ -17,7 +17,7 @@ from ambiguous_wild.methods.builtin import BUILTIN
 from ambiguous_wild.methods.entry import MethodEntry
 from ambiguous_wild.methods.graft import grafted, knows_truth, refuse_parts_of_program, split_graft
 from ambiguous_wild.methods.plugin_file import import_file
-from ambiguous_wild.methods.references import is_reference, read_reference
+from ambiguous_wild.methods.references import is_reference, read_reference, without_recipe
 from ambiguous_wild.methods.second_pass import second_pass, trained_once
 
 __all__ = [
@@ -53,9 +53,9 @@ def all_methods() -> dict[str, MethodEntry]:
 
 
 def get_method(name: str) -> MethodEntry:
-    """The method of that name; "host@mask=donor" is a graft, see graft.py, and "recipe.py:my_recipe",
-    "external:FILE" and "nerfbaselines:METHOD" are references, see references.py; "NAME+2passes" trains twice,
-    see second_pass.py.
+    """The method of that name, in capitals or not; "host@mask=donor" is a graft, see graft.py, and
+    "recipe.py:my_recipe", "external:FILE" and "nerfbaselines:METHOD" are references, see references.py;
+    "NAME+2passes" trains twice, see second_pass.py.
 
     Raises:
         AwError: there is none; names the nearest.
@@ -70,9 +70,12 @@ def get_method(name: str) -> MethodEntry:
     if name not in methods and "@" in name:
         host = get_method(split_graft(name)[0])
         return grafted(name, host, all_methods())
-    if name not in methods:
+    if name not in methods and name.endswith(".py"):
+        raise without_recipe(Path(name))
+    in_any_case = [known for known in methods if known.casefold() == name.casefold()]
+    if name not in methods and len(in_any_case) != 1:
         raise unknown("method", name, methods, "'aw methods' lists them")
-    return methods[name]
+    return methods[name if name in methods else in_any_case[0]]
 
 
 def load_reference(name: str, *, given_as: str = "") -> MethodEntry:

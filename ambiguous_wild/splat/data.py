@@ -86,7 +86,7 @@ def load_keep(
     if keep.shape != size:
         raise AwError(
             f"mask {view.keep_path} is {keep.shape[1]}x{keep.shape[0]} px, its photo is {size[1]}x{size[0]} "
-            "px; correct it, or build the scene again with 'aw build-scene --masks'"
+            "px; correct it, or build the scene again with 'aw build-scene --keep-masks'"
         )
     return keep if alpha is None else np.where(alpha > 0, keep, np.float32(0))
 

@@ -239,7 +239,7 @@ def make_study(
     pairs = sample_questions([q for q in questions if isinstance(q, PairQuestion)], settings.limit, rng)
     chosen = [*photos, *pairs]
     if not chosen:
-        raise AwError("a study needs at least one question: give --scene, --runs or both")
+        raise AwError("a study needs at least one question: give RUNS, --scene or both")
     album = _Album(settings, rng)
     asked, answers = [], {}
     for question in progress(chosen):

@@ -204,7 +204,7 @@ def status(weights: Iterable[Weight] = KNOWN) -> list[WeightStatus]:
 
 def get_command(*names: str, again: bool = False) -> str:
     """The command that downloads the weights; `again`: also those that it takes for complete."""
-    return f"aw weights get {'--again ' if again else ''}{' '.join(names)}"
+    return f"aw weights get {'--overwrite ' if again else ''}{' '.join(names)}"
 
 
 def fix(*names: str) -> str:

@@ -108,24 +108,17 @@ def test_no_distractor_pixels_give_no_verdict(scene: Path, tmp_path: Path) -> No
     assert "no distractors" in (tmp_path / "again/index.html").read_text()
 
 
-def test_what_white_means_is_asked_of_a_folder_alone(scene: Path, tmp_path: Path) -> None:
-    for more in ((), ("--masks", "truth")):
-        assert "of a folder given with --masks" in error(
-            scene, "-o", tmp_path / "out", "--masks-white", "keep", *more
-        )
-
-
 def test_own_masks_and_what_is_said_where_there_are_none(scene: Path, tmp_path: Path) -> None:
     own = tmp_path / "mine"
     shutil.copytree(scene / "truth/distractor", own)
     shutil.rmtree(scene / "truth")
-    assert "--masks DIR" in error(scene)
+    assert "--distractor-masks or --keep-masks DIR" in error(scene)
     blind = ("--background", "none")
-    assert report(scene, "--masks", own, "-o", tmp_path / "out", *blind)["occlusion"]["value"] > 0
+    assert report(scene, "--distractor-masks", own, "-o", tmp_path / "out", *blind)["occlusion"]["value"] > 0
     (own / TRAIN[2]).unlink()
-    assert TRAIN[2] in error(scene, "--masks", own)
+    assert TRAIN[2] in error(scene, "--distractor-masks", own)
     cv2.imwrite(str(own / TRAIN[2]), np.zeros((48, 20), np.uint8))
-    assert "another shape" in error(scene, "--masks", own, *blind)
+    assert "another shape" in error(scene, "--distractor-masks", own, *blind)
 
 
 def test_scores_are_noted_in_scene_json_unless_told_not_to(scene: Path, tmp_path: Path) -> None:
@@ -171,11 +164,13 @@ def test_keep_masks_are_the_inverse(scene: Path, tmp_path: Path) -> None:
     for name in TRAIN:
         mask = cv2.imread(str(scene / "truth/distractor" / name), 0)
         cv2.imwrite(str(scene / "masks/train" / name), 255 - mask)
-    kept = report(scene, "-o", tmp_path / "b", "--masks", "scene")
-    other = report(scene, "-o", tmp_path / "c", "--masks", scene / "masks/train", "--masks-white", "keep")
+    kept = report(scene, "-o", tmp_path / "b", "--distractor-masks", "scene")
+    other = report(scene, "-o", tmp_path / "c", "--keep-masks", scene / "masks/train")
     assert kept["masks"] == "scene" and other["masks"] == "folder"
     assert kept[COLOUR_METRIC] == other[COLOUR_METRIC] == facts[COLOUR_METRIC]
-    assert "needs --run" in error(scene, "--masks", "run") and "needs --run" in error(
+    both = ("--distractor-masks", "truth", "--keep-masks", scene / "masks/train")
+    assert "exclude each other" in error(scene, *both)
+    assert "needs --run" in error(scene, "--distractor-masks", "run") and "needs --run" in error(
         scene, "--background", "run"
     )
 

@@ -11,6 +11,7 @@ import pytest
 
 from ambiguous_wild.cli.bench import parse_budget
 from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.bench import _check_methods
 from tests.command_line import ROOT, aw
 from tests.tiny_scene import write_tiny_scene
 
@@ -32,6 +33,10 @@ def test_what_is_no_budget(text):
         (["--method", "refinsplat"], "did you mean 'refinesplat'"),
         (["--method", "3dgs", "--iterations", "5", "--budget", "1m"], "exclude each other"),
         (["--method", "3dgs", "--iterations", "0"], "--iterations"),
+        (["--method", "3dgs", "--iterations", "10k"], "'10k' is not a whole number"),
+        (["--method", "3DGS", "--passes", "2", "refinesplat"], "did you mean --method refinesplat?"),
+        (["--method", "3dgs", "./other"], "did you mean --scene ./other?"),
+        (["--method", "3dgs,refinsplat"], "unknown method 'refinsplat': did you mean 'refinesplat'"),
         (["--method", "3dgs", "--overwrite", "perhaps"], "'never', 'missing', 'always'"),
         (["--method", "3dgs", "--itterations", "5"], "--iterations"),
         (["--method", "refinesplat", "--set", "refinesplat.lamda_cr=1"], "did you mean 'lambda_cr'"),
@@ -50,6 +55,20 @@ def test_mistakes_get_one_line_and_exit_code_2(scene, tmp_path, arguments, messa
     assert done.stderr.count("\n") == 1
     assert "Traceback" not in done.stderr
     assert not (tmp_path / "runs").exists()
+
+
+def test_a_file_without_a_recipe_names_its_recipes(scene, tmp_path):
+    own = "from dataclasses import dataclass\nfrom ambiguous_wild.splat.parts import Parts\n"
+    (tmp_path / "own.py").write_text(own + "def helper(x): ...\ndef chroma() -> Parts: return Parts()\n")
+    done = aw("bench", "--scene", scene, "--method", "own.py", cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr == "error: own.py is a file: add the name of a recipe in it: own.py:chroma\n"
+
+
+def test_methods_with_commas_and_in_any_case():
+    names = ["3DGS, RefineSplat", "robustsplat@density=absgs,mask=truth,3dgs"]
+    known = ["3dgs", "refinesplat", "robustsplat@mask=truth,density=absgs", "3dgs"]
+    assert _check_methods(names, [], {}, 1) == known
 
 
 def test_no_scene_there(tmp_path):

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from ambiguous_wild.builder.report import verdict
 from ambiguous_wild.cli.main import main
 from ambiguous_wild.io.scene_folder import load_scene
 from tests.builder.capture_maker import HEIGHT, WIDTH, write_capture
@@ -98,11 +99,11 @@ def test_masks_missing_and_of_the_wrong_size(aw, tmp_path):
     write_capture(tmp_path / "raw", 3)
     (tmp_path / "masks").mkdir()
     cv2.imwrite(str(tmp_path / "masks" / "p00.png"), np.zeros((HEIGHT, WIDTH), np.uint8))
-    message = fails(aw, "raw", "-o", "scene", "--masks", "masks")
+    message = fails(aw, "raw", "-o", "scene", "--keep-masks", "masks")
     assert "2 of 3 photos have no mask: p01.jpg, p02.jpg" in message
     for i in (1, 2):
         cv2.imwrite(str(tmp_path / "masks" / f"p0{i}.png"), np.zeros((HEIGHT, WIDTH - i), np.uint8))
-    assert "2 of 3 masks" in fails(aw, "raw", "-o", "scene", "--masks", "masks")
+    assert "2 of 3 masks" in fails(aw, "raw", "-o", "scene", "--keep-masks", "masks")
     assert sorted(os.listdir(tmp_path)) == ["masks", "raw"]
 
 
@@ -182,7 +183,9 @@ def test_the_folder_s_name_must_do_as_a_name_too(aw, tmp_path):
 def test_a_mask_file_is_not_said_to_be_absent(aw, tmp_path):
     write_capture(tmp_path / "raw", 3)
     (tmp_path / "mask.png").write_bytes(b"x")
-    assert "mask.png is a file; give the folder" in fails(aw, "raw", "-o", "scene", "--masks", "mask.png")
+    assert "mask.png is a file; give the folder" in fails(
+        aw, "raw", "-o", "scene", "--keep-masks", "mask.png"
+    )
 
 
 def test_masks_that_keep_nothing_are_named_where_registration_fails(aw, tmp_path):
@@ -190,7 +193,7 @@ def test_masks_that_keep_nothing_are_named_where_registration_fails(aw, tmp_path
     (tmp_path / "masks").mkdir()
     for i in range(3):
         cv2.imwrite(str(tmp_path / "masks" / f"p0{i}.png"), np.zeros((HEIGHT, WIDTH), np.uint8))
-    message = fails(aw, "raw", "-o", "scene", "--masks", "masks", "--max-features", 200)
+    message = fails(aw, "raw", "-o", "scene", "--keep-masks", "masks", "--max-features", 200)
     assert "masks keep only 0 % of a photo" in message and "white = keep" in message
 
 
@@ -221,3 +224,14 @@ def test_outputs_that_cannot_be_are_one_line(aw, tmp_path, output):
     (tmp_path / "file").write_text("x")
     fails(aw, "raw", "-o", output)
     assert sorted(os.listdir(tmp_path)) == ["file", "raw"]
+
+
+@pytest.mark.parametrize(
+    ("photos", "word"), [(3, "few photos, about 20 are needed"), (19, "few photos"), (20, "ready")]
+)
+def test_the_verdict_says_whether_the_photos_are_enough(photos, word):
+    counts = {"registered": photos, "photos": photos, "points": 900}
+    line = verdict(
+        {"counts": counts, "lost": [], "reprojection_error_px": 0.5, "factor": 1}, (4, 3), Path("s")
+    )
+    assert word in line and ("ready" in line) == (photos >= 20)

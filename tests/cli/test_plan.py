@@ -18,15 +18,15 @@ def test_a_plan_is_a_table_and_a_file_and_leaves_the_scene_alone(scene, tmp_path
     lines = done.stdout.splitlines()
     assert lines[0].startswith("scene: masks on: ")  # a line for every decision, as it is made
     assert lines[1].split()[:2] == ["effect", "evidence"]
-    assert "a method makes them while it trains" in lines[-4] and "--masks FOLDER" in lines[-4]
+    assert "a method makes them while it trains" in lines[-4] and "--keep-masks FOLDER" in lines[-4]
     assert "of the run (at most 10 %)" in lines[-2]
     plan = json.loads((tmp_path / "plan.json").read_text())
     assert plan["probed"] and plan["scene"] == "scene"
     found = {d["effect"]: d for d in plan["decisions"]}
     # a red square stands elsewhere in every photo; there are no tracks to say anything else
     assert found["masks"]["decision"] == "on" and found["masks"]["value"] > 0.02
-    assert found["affine exposure"]["decision"] == "unknown" and found["affine exposure"]["value"] is None
-    assert isinstance(found["antialiasing"]["cost_ms"], float)
+    assert found["exposure"]["decision"] == "unknown" and found["exposure"]["value"] is None
+    assert isinstance(found["antialias"]["cost_ms"], float)
     assert found["masks"]["cost_ms"] is None
     assert isinstance(found["masks"]["gain_db"], float) and found["masks"]["error_db"] > 0
     assert 0 < plan["cost"]["share"] <= 0.1

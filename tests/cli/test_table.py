@@ -74,11 +74,11 @@ def test_rows_fit_the_terminal(width: int, tmp_path: Path, monkeypatch: pytest.M
 
 def test_csv_is_clean_and_notes_go_to_standard_error(tmp_path: Path) -> None:
     save(tmp_path, fake_result("3dgs", psnr=(20.0, 21.0)), failed("c"))
-    out, err = aw_table(tmp_path, "--format", "csv", "--metric", "psnr", "--scene", "yard")
+    out, err = aw_table(tmp_path, "--format", "csv", "--metric", "psnr", "--only", "yard")
     frame = pd.read_csv(io.StringIO(out)).set_index("method")
     assert frame.loc["3dgs", "psnr"] == 20.5 and pd.isna(frame.loc["c", "psnr"])
     assert "failed: c on yard" in err
-    assert f"aw table {tmp_path} --format csv --metric psnr --scene yard" in err
+    assert f"aw table {tmp_path} --format csv --metric psnr --only yard" in err
 
 
 def test_an_unknown_metric_names_others_and_a_sheet_is_a_picture(tmp_path: Path) -> None:
@@ -92,6 +92,15 @@ def test_an_unknown_metric_names_others_and_a_sheet_is_a_picture(tmp_path: Path)
         error = CliRunner().invoke(command, [str(runs), *words]).exception
         assert isinstance(error, AwError) and expected in str(error)
     assert not sheet.exists()
+
+
+@pytest.mark.parametrize(
+    ("file", "message"), [("a.JPG", "holds photos, not runs"), ("scene.json", "is a scene, not runs")]
+)
+def test_a_folder_of_other_things_is_named(file: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / file).write_text("{}")
+    error = CliRunner().invoke(command, [str(tmp_path)]).exception
+    assert isinstance(error, AwError) and message in str(error) and f"-o {tmp_path}" not in str(error)
 
 
 def test_errors_say_what_to_do(tmp_path: Path) -> None:
@@ -133,7 +142,7 @@ def test_what_does_not_go_together_is_refused(tmp_path: Path) -> None:
     for words, expected in (
         (["--reported"], "--layout paper"),
         (["--layout", "paper", "--dataset", "D"], "NAME=SCENE"),
-        (["--layout", "ablation", "--scene", "yard"], "--scene does not go"),
+        (["--layout", "ablation", "--only", "yard"], "--only does not go"),
         (["--layout", "ablation"], "aw ablate"),
     ):
         error = CliRunner().invoke(command, [str(tmp_path), *words]).exception

@@ -62,7 +62,7 @@ def _grid(inputs: Path, out: Path) -> list[str]:
 
 def _build(inputs: Path, out: Path) -> list[str]:
     words = ["build-scene", str(inputs / "raw"), "-o", str(out / "scene"), "--factor", "2"]
-    return [*words, "--max-features", "500", "--jobs", "1", "--name", "walls"]
+    return [*words, "--max-features", "500", "--threads", "1", "--name", "walls"]
 
 
 def _simulate(inputs: Path, out: Path) -> list[str]:

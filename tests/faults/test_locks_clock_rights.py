@@ -102,7 +102,7 @@ def test_read_only_folders_end_with_one_line(scene, tmp_path, capsys):
         read_only(disk)
         commands = {
             "bench": bench_words(scene, disk / "runs"),
-            "build-scene": ["build-scene", disk / "raw", "-o", disk / "scene", "--jobs", 1],
+            "build-scene": ["build-scene", disk / "raw", "-o", disk / "scene", "--threads", 1],
             "simulate": ["simulate", "tiny", "-o", disk / "capture", "--views", 6, "--width", 96],
         }
         for name, words in commands.items():

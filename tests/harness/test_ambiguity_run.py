@@ -56,7 +56,16 @@ def run(scene: Path, tmp_path: Path) -> Path:
 def test_scores_of_a_good_render_are_those_of_the_clean_photos(
     scene: Path, run: Path, tmp_path: Path
 ) -> None:
-    words = [str(scene), "--run", str(run), "-o", str(tmp_path / "out"), "--masks", "run", "--json"]
+    words = [
+        str(scene),
+        "--run",
+        str(run),
+        "-o",
+        str(tmp_path / "out"),
+        "--distractor-masks",
+        "run",
+        "--json",
+    ]
     facts = json.loads(CliRunner().invoke(command, words, catch_exceptions=False).stdout)
     assert (facts["masks"], facts["background"]) == ("run", "run")
     clean = write_tiny_scene(tmp_path / "clean", distractors=False)
@@ -114,7 +123,7 @@ def test_runs_that_do_not_fit_are_refused(scene: Path, run: Path, tmp_path: Path
 
     (run / "config.yaml").write_text("scene: {sha256: other, name: yard}")
     assert "'yard'" in error()
-    assert "'yard'" in error("--masks", "run", "--background", "none")
+    assert "'yard'" in error("--distractor-masks", "run", "--background", "none")
     (scene / "truth/clean").mkdir()
     for name in TRAIN:  # with a truth the run is not even read, and is still the wrong one
         (scene / "truth/clean" / name).write_bytes((scene / "images" / name).read_bytes())

@@ -171,7 +171,7 @@ SPOILT: dict[str, tuple[Callable[[Path], object], str]] = {
     "seed": (lambda r: change_config(r, lambda c: c["train"].update(seed=4), hashed=True), "seed is '4'"),
     "no config": (lambda r: (r / "config.yaml").unlink(), "config.yaml is absent"),
     "code": (anonymous, "has no hash of its code"),
-    "photo": (retouch_photo, "name the right one with --scenes"),
+    "photo": (retouch_photo, "name the right one with --scene"),
     "path": (lambda r: change_result(r, outside), "outside itself"),
     "failed": (fail, "a failed run has no numbers"),
     "unfinished": (lambda r: (r / "metrics.json").unlink(), "has no metrics.json"),
@@ -208,9 +208,9 @@ def test_other_numbers_for_a_cell_need_replace(one: Path, tmp_path: Path) -> Non
     add(board, one)
     before = content(board)
     refused = add(board, worse)
-    assert refused.exit_code == 2 and "pass --replace" in refused.stdout and content(board) == before
-    assert "1 replaced" in add(board, worse, "--replace", "--dry-run").stderr and content(board) == before
-    assert "1 replaced" in add(board, worse, "--replace").stderr
+    assert refused.exit_code == 2 and "pass --overwrite" in refused.stdout and content(board) == before
+    assert "1 replaced" in add(board, worse, "--overwrite", "--dry-run").stderr and content(board) == before
+    assert "1 replaced" in add(board, worse, "--overwrite").stderr
     after = content(board)
     changed = {name for name in before if before[name] != after[name]}
     assert len(after) == len(before) and len(changed) == 5  # two tables, the index, two renders
@@ -236,7 +236,7 @@ def test_without_its_scene_a_run_is_marked_and_needs_a_dataset(one: Path, tmp_pa
     add(board, one)
     assert [e.checked for e in read_board(board)] == ["files"]
     # The board knows the dataset now; with the scene the stronger check counts, and stays.
-    assert aw("add", one, "--board", board, "--scenes", moved.parent).exit_code == 0
+    assert aw("add", one, "--board", board, "--scene", moved.parent).exit_code == 0
     assert [e.checked for e in read_board(board)] == ["photos"]
     add(board, one)
     assert [e.checked for e in read_board(board)] == ["photos"]

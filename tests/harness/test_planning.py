@@ -90,10 +90,10 @@ def decisions(**kw):
 
 
 INJECTED = {
-    "affine exposure": {"exposure": 0.15},
-    "appearance embedding": {"place": 0.4},
-    "antialiasing": {"zoom": 3.0},
-    "pose refinement": {"noise_px": 2.5},
+    "exposure": {"exposure": 0.15},
+    "appearance": {"place": 0.4},
+    "antialias": {"zoom": 3.0},
+    "poses": {"noise_px": 2.5},
     "SH degree": {"shine": 0.25},
 }
 
@@ -101,7 +101,7 @@ INJECTED = {
 @pytest.mark.parametrize("seed", [0, 1])
 def test_nothing_is_called_for_where_nothing_was_put_in(seed):
     found = decisions(seed=seed)
-    off = dict.fromkeys([*INJECTED, "skybox", "dense start"], "off")
+    off = dict.fromkeys([*INJECTED, "skybox", "dense"], "off")
     assert {name: d.decision for name, d in found.items()} == off
 
 
@@ -111,7 +111,7 @@ def test_what_was_put_in_is_called_for_and_nothing_else(effect):
     others = {name for name, a in answers.items() if a == "on"} - {effect}
     assert answers[effect] == "on"
     # a colour that follows the direction or the place leaves its mark on what is read as the other
-    assert others <= {"SH degree"} if effect in ("appearance embedding", "pose refinement") else not others
+    assert others <= {"SH degree"} if effect in ("appearance", "poses") else not others
 
 
 @pytest.mark.parametrize(
@@ -119,7 +119,7 @@ def test_what_was_put_in_is_called_for_and_nothing_else(effect):
 )
 def test_few_photos_call_for_a_dense_start(photos, answer):
     plan = decide("dots", dataclasses.replace(measured(), photos=photos))
-    assert [d.decision for d in plan.decisions if d.effect == "dense start"] == [answer]
+    assert [d.decision for d in plan.decisions if d.effect == "dense"] == [answer]
     assert plan.effects() == (("dense",) if answer == "on" else ())
     assert (
         choose("auto", synthetic()[0], [get_method("refinesplat")], plan)["refinesplat"].effects
@@ -130,7 +130,7 @@ def test_few_photos_call_for_a_dense_start(photos, answer):
 @pytest.mark.parametrize(("outward", "dense"), [(0.1, "off"), (1.1, "off"), (7.0, "on")])
 def test_cameras_in_the_middle_of_a_place_call_for_a_dense_start(outward, dense):
     plan = decide("dots", dataclasses.replace(measured(), outward=outward))
-    (line,) = (d for d in plan.decisions if d.effect == "dense start")
+    (line,) = (d for d in plan.decisions if d.effect == "dense")
     assert line.decision == dense
     shown = (line.value, line.threshold, line.unit)
     assert shown == ((outward, OUTWARD, "times") if dense == "on" else (25, FEW_PHOTOS, "photos"))
@@ -258,7 +258,7 @@ def test_a_plan_survives_its_file(tmp_path):
     again = read_plan(tmp_path / "plan.json")
     assert again.plain() == plan.plain()
     assert again.effects() == ("antialias",)  # a lower degree of the harmonics is never decided on
-    assert [d.cost_ms for d in again.decisions if d.effect == "antialiasing"] == [0.5]
+    assert [d.cost_ms for d in again.decisions if d.effect == "antialias"] == [0.5]
     for text in (
         "{half",
         "[]",
@@ -361,7 +361,7 @@ def test_a_run_says_what_was_on_and_why_and_ships_the_filtered_model(tiny, tmp_p
     assert report.outcome == "trained", report.error
     said = json.loads((cell_folder(tmp_path, cells[0]) / "effects.json").read_text())
     assert said["asked"] == "auto" and said["effects"] == ["antialias"]
-    assert {d["effect"] for d in said["plan"]["decisions"]} == {*INJECTED, "skybox", "dense start"}
+    assert {d["effect"] for d in said["plan"]["decisions"]} == {*INJECTED, "skybox", "dense"}
     facts = report.result["facts"]
     assert facts["effects"] == ["antialias"] and facts["protocol"] == "half"
     assert facts["effect_facts"]["antialias"]["filter_size_median"] > 0

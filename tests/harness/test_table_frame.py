@@ -54,7 +54,7 @@ def test_the_command_writes_it_and_names_what_is_not_there(tmp_path: Path) -> No
     save(tmp_path, fake_result("a"), fake_result("a", scene="hall"))
     start(tmp_path, "c")
     out = tmp_path / "all.csv"
-    words = [str(tmp_path), "--format", "tidy", "--metric", "psnr", "--scene", "hall", "-o", str(out)]
+    words = [str(tmp_path), "--format", "tidy", "--metric", "psnr", "--only", "hall", "-o", str(out)]
     done = CliRunner().invoke(command, words, catch_exceptions=False)
     assert "wrote" in done.stderr and "incomplete" in done.stderr
     back = pd.read_csv(out)

@@ -91,9 +91,9 @@ def test_each_effect_is_tried_beside_those_that_paid(tmp_path):
     assert ("exposure", "antialias") in asked and ("antialias",) not in asked
     assert found.effects() == ("exposure", "poses")
     lines = {d.effect: d for d in found.decisions}
-    assert lines["antialiasing"].decision == "off"
-    assert lines["antialiasing"].gain_db == pytest.approx(-0.1 + 0.025)
-    assert lines["antialiasing"].why == tried.PAYS_NOT and lines["affine exposure"].cost_ms == 1.5
+    assert lines["antialias"].decision == "off"
+    assert lines["antialias"].gain_db == pytest.approx(-0.1 + 0.025)
+    assert lines["antialias"].why == tried.PAYS_NOT and lines["exposure"].cost_ms == 1.5
     assert lines["SH degree"].gain_db is None
     assert len(said) == 3 and "antialias off: -0.08" in said[1]  # a line for every decision
     write_json(tmp_path / "plan.json", found.plain())
@@ -108,7 +108,7 @@ def test_the_embedding_must_pay_beyond_exposure(appearance, on):
     found, _, _ = tried_with(plan_of(appearance=0.1, exposure=0.2), gains)
     assert found.effects() == on
     if "appearance" in on:
-        assert {d.effect: d.why for d in found.decisions}["affine exposure"] == tried.COVERED
+        assert {d.effect: d.why for d in found.decisions}["exposure"] == tried.COVERED
 
 
 def test_within_noise_the_limit_decides_on_colour():
@@ -120,7 +120,7 @@ def test_within_noise_the_limit_decides_on_colour():
 
     found = tried.try_effects(plan, names, train, dict.fromkeys(names, 1.0), print)
     assert found.effects() == ("exposure",)  # neither antialiasing nor appearance beyond it
-    assert {d.effect: d.why for d in found.decisions}["affine exposure"] == tried.GUESSED
+    assert {d.effect: d.why for d in found.decisions}["exposure"] == tried.GUESSED
     below = plan_of(appearance=0.03, exposure=0.01)  # both are tried, no limit is reached
     found = tried.try_effects(below, tried.candidates(below), train, dict.fromkeys(names, 1.0), print)
     assert found.effects() == ()
@@ -136,7 +136,7 @@ def test_too_few_photos_leave_the_limits():
 def test_a_limit_alone_switches_on_colour_only():
     found = tried.untried(plan_of(sampling=3.0, exposure=0.2, reprojection_px=3.0), "too short")
     assert found.effects() == ("exposure",)
-    assert [d.why.endswith("not tried: too short") for d in found.decisions if d.effect == "antialiasing"]
+    assert [d.why.endswith("not tried: too short") for d in found.decisions if d.effect == "antialias"]
 
 
 def test_masks_are_off_where_leaving_the_patches_out_does_not_pay():
@@ -372,6 +372,6 @@ def test_bench_tries_within_its_own_length_and_keeps_what_it_tried(scene, tmp_pa
     assert run.outcome == "trained" and run.effects == ()
     said = json.loads((run.folder / "effects.json").read_text())
     why = {d["effect"]: d["why"] for d in said["plan"]["decisions"]}
-    assert why["antialiasing"].endswith(probed.TOO_SHORT)
+    assert why["antialias"].endswith(probed.TOO_SHORT)
     assert f"scene: antialias not tried: {probed.TOO_SHORT}" in Heard.lines
     assert list((tmp_path / ".cache" / "plans").glob("scene-*.json"))

@@ -47,7 +47,7 @@ def simulated(folder: Path, text: str) -> Result:
     """`aw simulate` of a spec in the folder."""
     path = folder / "spec.yaml"
     path.write_text(text)
-    return CliRunner().invoke(command, [str(path), "-o", str(folder / "raw"), "--no-sheet"])
+    return CliRunner().invoke(command, [str(path), "-o", str(folder / "raw"), "--no-pictures"])
 
 
 @pytest.mark.parametrize(

@@ -50,7 +50,7 @@ def pixels(uri: str) -> np.ndarray:
 
 def test_page_and_key_fit_together(made: tuple[Path, Path], tmp_path: Path) -> None:
     scene, runs = made
-    facts = make("--scene", scene, "--runs", runs, "-o", tmp_path / "s.html")
+    facts = make("--scene", scene, runs, "-o", tmp_path / "s.html")
     key = json.loads((tmp_path / "s.key.json").read_text())
     data = data_of(tmp_path / "s.html")
     assert facts["photos"] == len(TRAIN) and facts["pairs"] == 3 * len(TEST)
@@ -73,7 +73,7 @@ def test_page_and_key_fit_together(made: tuple[Path, Path], tmp_path: Path) -> N
 
 def test_the_page_is_blind(made: tuple[Path, Path], tmp_path: Path) -> None:
     scene, runs = made
-    make("--scene", scene, "--runs", runs, "-o", tmp_path / "s.html")
+    make("--scene", scene, runs, "-o", tmp_path / "s.html")
     data = data_of(tmp_path / "s.html")
     blank = dict.fromkeys(data["images"], "")
     text = json.dumps({**data, "images": blank})
@@ -88,7 +88,7 @@ def test_the_page_is_blind(made: tuple[Path, Path], tmp_path: Path) -> None:
 
 
 def test_pictures_are_bounded_and_shared(made: tuple[Path, Path], tmp_path: Path) -> None:
-    facts = make("--runs", made[1], "-o", tmp_path / "s.html", "--side", 64)
+    facts = make(made[1], "-o", tmp_path / "s.html", "--side", 64)
     data = data_of(tmp_path / "s.html")
     assert all(max(pixels(u).shape) == 64 for u in data["images"].values())
     assert facts["pictures"] == len(data["images"]) == len(TEST) * (len(METHODS) + 1)
@@ -98,7 +98,7 @@ def test_the_same_seed_makes_the_same_files_and_another_another(
     made: tuple[Path, Path], tmp_path: Path
 ) -> None:
     for name, seed in (("a", 0), ("b", 0), ("c", 1)):
-        make("--runs", made[1], "-o", tmp_path / f"{name}.html", "--seed", seed)
+        make(made[1], "-o", tmp_path / f"{name}.html", "--seed", seed)
     text = {n: (tmp_path / f"{n}.html").read_text() for n in "abc"}
     assert text["a"] == text["b"] != text["c"]
     assert (tmp_path / "a.key.json").read_text() == (tmp_path / "b.key.json").read_text()
@@ -119,7 +119,7 @@ def test_drawing_is_even_over_pairs(tmp_path: Path) -> None:
 
 def test_outline_and_truth_can_be_left_out(made: tuple[Path, Path], tmp_path: Path) -> None:
     scene, runs = made
-    make("--scene", scene, "--runs", runs, "-o", tmp_path / "s.html", "--no-outline", "--no-truth")
+    make("--scene", scene, runs, "-o", tmp_path / "s.html", "--no-outline", "--no-truth")
     slots = {tuple(q["images"]) for q in data_of(tmp_path / "s.html")["questions"]}
     assert slots == {("photo",), ("x", "y")}
 
@@ -140,18 +140,18 @@ def test_what_cannot_be_is_said(made: tuple[Path, Path], tmp_path: Path) -> None
     assert "nothing to ask" in error("-o", out)
     assert "*.html" in error("--scene", scene, "-o", tmp_path / "s.txt")
     assert "unknown method 'refinesplit': did you mean 'refinesplat'" in error(
-        "--runs", runs, "-o", out, "--method", "refinesplit"
+        runs, "-o", out, "--method", "refinesplit"
     )
-    assert "two methods" in error("--runs", runs, "-o", out, "--method", "3dgs")
-    assert "give --runs" in error("--scene", scene, "-o", out, "--method", "3dgs")
+    assert "two methods" in error(runs, "-o", out, "--method", "3dgs")
+    assert "give RUNS" in error("--scene", scene, "-o", out, "--method", "3dgs")
     wide = runs / "yard/3dgs/seed0/renders/test" / TEST[0]
     cv2.imwrite(str(wide), np.zeros((48, 70, 3), np.uint8))
-    assert "differ in size" in error("--runs", runs, "-o", out)
+    assert "differ in size" in error(runs, "-o", out)
     shutil.rmtree(wide.parent)
-    assert "3dgs lacks renders/test" in error("--runs", runs, "-o", out)
+    assert "3dgs lacks renders/test" in error(runs, "-o", out)
     shutil.rmtree(runs / "yard/3dgs")
     shutil.rmtree(scene)
-    assert "--no-truth" in error("--runs", runs, "-o", out)
+    assert "--no-truth" in error(runs, "-o", out)
     assert not out.exists() and not (tmp_path / "s.key.json").exists()
 
 
@@ -159,9 +159,9 @@ def test_an_old_page_is_not_replaced_unasked(made: tuple[Path, Path], tmp_path: 
     out = tmp_path / "s.html"
     make("--scene", made[0], "-o", out)
     before = out.read_text()
-    assert "--force" in error("--scene", made[0], "-o", out, "--seed", 1)
+    assert "--overwrite" in error("--scene", made[0], "-o", out, "--seed", 1)
     assert out.read_text() == before
-    make("--scene", made[0], "-o", out, "--seed", 1, "--force")
+    make("--scene", made[0], "-o", out, "--seed", 1, "--overwrite")
     assert out.read_text() != before
 
 
@@ -175,7 +175,7 @@ def test_data_cannot_leave_its_script_element() -> None:
 def test_a_method_of_any_name_stays_in_the_key(tmp_path: Path) -> None:
     _, runs = write_runs(tmp_path, ("<b>a</b>", "=b"))
     assert {m for p in render_pairs(runs) for m in p.methods} == {"<b>a</b>", "=b"}
-    make("--runs", runs, "-o", tmp_path / "s.html")
+    make(runs, "-o", tmp_path / "s.html")
     assert "<b>a" not in (tmp_path / "s.html").read_text()
 
 

@@ -21,7 +21,7 @@ ASKED = len(TRAIN) + 3 * len(TEST)
 def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("study")
     scene, runs = write_runs(root)
-    words = ["make", "--scene", scene, "--runs", runs, "-o", root / "s.html", "--title", "<b>A & B</b>"]
+    words = ["make", "--scene", scene, runs, "-o", root / "s.html", "--title", "<b>A & B</b>"]
     assert CliRunner().invoke(command, [str(w) for w in words], catch_exceptions=False).exit_code == 0
     return root
 

@@ -146,7 +146,7 @@ def test_a_damaged_folder_is_downloaded_again_by_the_command_of_the_error(
         with pytest.raises(AwError) as error:
             _ = DinoFeatures(DINO).model
         words = str(error.value).partition("; run: aw weights ")[2].split()
-        assert words == ["get", "--again", DINO] and "\n" not in str(error.value)
+        assert words == ["get", "--overwrite", DINO] and "\n" not in str(error.value)
     done = CliRunner().invoke(command, ["get", DINO], catch_exceptions=False)
     assert ("downloading it again" in done.output) == (recorded or "record" not in what)
     for name in ("config.json", "model.safetensors"):
@@ -159,10 +159,10 @@ def test_the_command_of_the_error_replaces_what_the_check_cannot_see(
 ) -> None:
     hub.repository(f"facebook/{DINO}", checkpoint("dinov2"))
     shutil.copytree(checkpoint("registers"), own / DINO)
-    with pytest.raises(AwError, match=f"run: aw weights get --again {DINO}$"):
+    with pytest.raises(AwError, match=f"run: aw weights get --overwrite {DINO}$"):
         locate(DINO, ("dinov2",))
     assert "already in" in said(weights.named(DINO))[0]
-    CliRunner().invoke(command, ["get", "--again", DINO], catch_exceptions=False)
+    CliRunner().invoke(command, ["get", "--overwrite", DINO], catch_exceptions=False)
     assert locate(DINO, ("dinov2",)).folder == own / DINO
 
 

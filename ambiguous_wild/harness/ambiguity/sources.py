@@ -40,23 +40,18 @@ class Masks:
         return ~white if self.keep else white
 
 
-def find_masks(scene: Scene, choice: str | None, run: Path | None, keep: bool = False) -> Masks:
+def find_masks(scene: Scene, choice: str | Path | None, run: Path | None) -> Masks:
     """Distractor masks of the train photos.
 
     Args:
         scene: whose photos.
-        choice: "truth", "scene" (masks/train), "run", or a folder; None takes the first of truth, run and
-            scene that is there.
+        choice: "truth", "scene" (masks/train), "run", or a folder: a Path, where white means keep, or a str,
+            where it means distractor; None takes the first of truth, run and scene that is there.
         run: folder of a run with masks/.
-        keep: white means keep in a folder of the user's; by default white means distractor.
 
     Raises:
-        AwError: there is none, photos lack theirs, or `keep` is said of others than a folder's.
+        AwError: there is none, or photos lack theirs.
     """
-    if keep and choice in (None, "truth", "scene", "run"):
-        raise AwError(
-            "--masks-white keep is of a folder given with --masks; all other masks say it themselves"
-        )
     truth = scene.root / "truth" / "distractor"
     if choice is None:
         if truth.is_dir():
@@ -68,8 +63,8 @@ def find_masks(scene: Scene, choice: str | None, run: Path | None, keep: bool = 
         else:
             raise AwError(
                 f"{scene.name} has no distractor masks: neither truth/distractor nor masks/train; give "
-                "--masks DIR (PNG of the photo's stem, white = distractor) or --run RUN of a method that "
-                "masks"
+                "--distractor-masks or --keep-masks DIR (PNG of the photo's stem) or --run RUN of a method "
+                "that masks"
             )
     if choice == "truth":
         return Masks("truth", _all(scene, truth, "add them (all black where there is no distractor)"), False)
@@ -78,16 +73,17 @@ def find_masks(scene: Scene, choice: str | None, run: Path | None, keep: bool = 
         return Masks("scene", _all(scene, folder, "add them (all white where there is no distractor)"), True)
     if choice == "run":
         if run is None:
-            raise AwError("--masks run needs --run RUN, a folder of 'aw bench'")
+            raise AwError("--distractor-masks run needs --run RUN, a folder of 'aw bench'")
         return Masks("run", _all(scene, run / "masks", "this method draws no masks; take another run"), True)
-    wanted = "add them (all black where there is no distractor)"
+    keep = isinstance(choice, Path)
+    wanted = f"add them (all {'white' if keep else 'black'} where there is no distractor)"
     return Masks("folder", _all(scene, Path(choice), wanted), keep)
 
 
 def _all(scene: Scene, folder: Path, advice: str) -> dict[str, Path]:
     if not folder.is_dir():
         raise AwError(
-            f"there is no mask folder {folder} for {scene.name}: give --masks DIR, truth, scene or run"
+            f"there is no mask folder {folder} for {scene.name}: give --distractor-masks truth|scene|run|DIR"
         )
     found = {v.name: folder / f"{stem(v)}.png" for v in scene.train}
     missing = [name for name, path in found.items() if not path.is_file()]

@@ -153,7 +153,7 @@ def _other_numbers(new: Verified, old: Entry) -> str:
     )
     return (
         f"{new.run}: {old.name} is on the board with another result ({shown}); leave it out, or pass "
-        "--replace"
+        "--overwrite"
     )
 
 

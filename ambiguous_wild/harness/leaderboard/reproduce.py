@@ -269,7 +269,7 @@ class Scenes:
         if identity != asked.get("sha256"):
             raise AwError(
                 f"{run} is of another scene than {path}: the run's has hash {str(asked.get('sha256'))[:12]}, "
-                f"this one {identity[:12]}; name the right one with --scenes, or run again on this one"
+                f"this one {identity[:12]}; name the right one with --scene, or run again on this one"
             )
         return scene
 

@@ -246,7 +246,7 @@ def _check_values(run: Path, result: RunResult, *, photos: bool) -> None:
                 _impossible(run, f"{metric} of {row['name']}", value, why)
             if math.isinf(value) and not (about.infinite and photos):
                 why = "is infinite only where picture and photo are equal, and the photos are not at hand: "
-                why = f"{why}name them with --scenes" if about.infinite else "is finite"
+                why = f"{why}name them with --scene" if about.infinite else "is finite"
                 _impossible(run, f"{metric} of {row['name']}", value, why)
     masks: Mapping[str, Any] = result["masks"] or {}
     for name in MASK_SCORES:

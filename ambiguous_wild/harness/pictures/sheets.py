@@ -201,7 +201,7 @@ def write_sheet(runs: Runs, path: Path, *, scene: str | None = None, views: int 
     finished = runs.runs[runs.runs["status"] == "ok"]
     names = sorted(finished["scene"].unique())
     if scene is None and len(names) > 1:
-        raise AwError(f"runs of {len(names)} scenes: name one with --scene ({', '.join(names)})")
+        raise AwError(f"runs of {len(names)} scenes: name one with --only ({', '.join(names)})")
     chosen = finished if scene is None else finished[finished["scene"] == scene]
     if chosen.empty:
         raise AwError("no finished run to show; 'aw table' lists what is there")

@@ -141,18 +141,18 @@ def decide(scene: str, found: Evidence) -> Plan:
     behind = answer(found.uncovered, UNCOVERED)
     lines: tuple[Decision, ...] = (
         Decision(
-            "appearance embedding", "spread at a point after gain and shine", by_place,
+            "appearance", "spread at a point after gain and shine", by_place,
             APPEARANCE, "of a code", local,
             "light differs by place" if local == "on" else "no more than texture and noise",
             "--effects appearance",
         ),
         Decision(
-            "affine exposure", "spread of the photos' gains at the same points", found.exposure, EXPOSURE,
+            "exposure", "spread of the photos' gains at the same points", found.exposure, EXPOSURE,
             "of a code", "off" if local == "on" and globally == "on" else globally, globally_why,
             "--effects exposure",
         ),
         Decision(
-            "antialiasing", "pixel size on the scene, coarsest over finest photo", found.sampling, SAMPLING,
+            "antialias", "pixel size on the scene, coarsest over finest photo", found.sampling, SAMPLING,
             "times", smooth,
             "seen from near and far" if smooth == "on" else "all photos resolve about the same",
             "--effects antialias",
@@ -164,7 +164,7 @@ def decide(scene: str, found: Evidence) -> Plan:
             "--effects sh1",
         ),
         Decision(
-            "pose refinement", "reprojection error of the sparse model", found.reprojection_px,
+            "poses", "reprojection error of the sparse model", found.reprojection_px,
             REPROJECTION_PX, "px", moved,
             "poses are off by more than the photos can hide" if moved == "on" else "poses fit the photos",
             "--effects poses",
@@ -196,11 +196,11 @@ def _dense_start(found: Evidence) -> Decision:
     decision: Answer = "unknown" if not known else "on" if few or middle else "off"
     if middle and not few:
         return Decision(
-            "dense start", "spread of what cameras look at, over theirs", found.outward, OUTWARD, "times",
+            "dense", "spread of what cameras look at, over theirs", found.outward, OUTWARD, "times",
             decision, "cameras look outward", "--effects dense",
         )  # fmt: skip
     return Decision(
-        "dense start", "train photos; on up to the limit", photos or math.nan, FEW_PHOTOS, "photos",
+        "dense", "train photos; on up to the limit", photos or math.nan, FEW_PHOTOS, "photos",
         decision, "photos leave much to guess" if few else "enough photos see a surface", "--effects dense",
     )  # fmt: skip
 

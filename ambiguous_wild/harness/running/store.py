@@ -18,6 +18,7 @@ from ambiguous_wild.harness.measures import partial
 from ambiguous_wild.harness.running.result_file import FAILED, RESULT, RunResult, metrics_of, read_result
 from ambiguous_wild.harness.running.timing import timing_of
 from ambiguous_wild.io import plain_yaml
+from ambiguous_wild.io.photos import PHOTO_SUFFIXES
 
 CONFIG = "config.yaml"
 MASK_SCORES = ("iou", "precision", "recall")
@@ -109,9 +110,24 @@ def _read_folder(root: Path, incomplete: list[Incomplete]) -> list[FoundResult]:
         except AwError as error:
             incomplete.append(Incomplete(run, str(error), *_method_and_scene(run)))
     if not results and len(incomplete) == before:
-        raise AwError(f"no run in {root}: 'aw bench --method NAME --scene SCENE -o {root}' makes one")
+        raise _no_run(root)
     _refuse_duplicates(results)
     return results
+
+
+def _no_run(root: Path) -> AwError:
+    """The error for a folder without runs; it says what the folder is, where that can be seen."""
+    within = [root, *(child for child in root.iterdir() if child.is_dir())]
+    if (root / "scene.json").exists():
+        return AwError(
+            f"{root} is a scene, not runs: 'aw bench --method NAME --scene {root} -o runs' makes some"
+        )
+    if any(path.suffix.lower() in PHOTO_SUFFIXES for folder in within for path in folder.iterdir()):
+        return AwError(
+            f"{root} holds photos, not runs: 'aw build-scene {root} -o scene' makes a scene of them, "
+            "'aw bench --method NAME --scene scene -o runs' the runs"
+        )
+    return AwError(f"no run in {root}: 'aw bench --method NAME --scene SCENE -o {root}' makes one")
 
 
 def run_folders(root: Path) -> Iterator[Path]:

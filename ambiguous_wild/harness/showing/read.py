@@ -67,7 +67,7 @@ def read_models(
         if not found:
             raise unknown("scene", scene, names)
     elif len(names) > 1:
-        raise AwError(f"these runs are of {len(names)} scenes ({shortlist(names)}): choose one with --scene")
+        raise AwError(f"these runs are of {len(names)} scenes ({shortlist(names)}): choose one with --only")
     if len({f.scene_hash for f in found}) > 1:
         runs = shortlist(sorted(str(f.run) for f in found), 3)
         raise AwError(
@@ -129,7 +129,7 @@ def open_scene(run: Path, folder: Path | None = None, *, verify: bool = True) ->
     if not path.is_dir():
         raise AwError(
             f"the scene of {run} is not at {path}: move the scene back "
-            "('aw view', 'aw video' and 'aw export' take its folder: --scene-folder)"
+            "('aw view', 'aw video' and 'aw export' take its folder: --scene)"
         )
     factor = asked.get("factor")
     scene = load_scene(path, factor=factor if isinstance(factor, int) else None, verify=verify)

@@ -1,0 +1,100 @@
+"""One name per option over all commands; names of the version before still work."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+import pytest
+
+from ambiguous_wild.cli.main import cli
+from ambiguous_wild.cli.renamed import RENAMED, with_new_names
+
+
+def _walk(command: click.Command, words: tuple[str, ...] = ()) -> Iterator[tuple[str, click.Command]]:
+    if not isinstance(command, click.Group):
+        yield " ".join(words), command
+        return
+    ctx = click.Context(command)
+    for name in command.list_commands(ctx):
+        inner = command.get_command(ctx, name)
+        assert inner is not None
+        yield from _walk(inner, (*words, name))
+
+
+COMMANDS = dict(_walk(cli))
+OPTIONS = {
+    name: {
+        flag: p
+        for p in command.params
+        if isinstance(p, click.Option)
+        for flag in [*p.opts, *p.secondary_opts]
+    }
+    for name, command in COMMANDS.items()
+}
+
+
+def _kind(option: click.Option) -> str:
+    if isinstance(option.type, click.Path):
+        return "path"
+    return "flag" if option.is_flag else option.type.name.removesuffix(" range")
+
+
+def test_an_option_of_one_name_has_one_kind_of_value() -> None:
+    kinds: dict[str, dict[str, set[str]]] = defaultdict(lambda: defaultdict(set))
+    for command, options in OPTIONS.items():
+        for flag, option in options.items():
+            kinds[flag][_kind(option)].add(command)
+    differ = {flag: dict(found) for flag, found in kinds.items() if len(found) > 1}
+    assert set(differ) == {"--overwrite"}, differ  # a flag, or never | missing | always; see below
+
+
+def test_the_same_meaning_has_the_same_name() -> None:
+    for command, options in OPTIONS.items():
+        assert ("-o" in options) == ("--output" in options), command
+        assert not {"--runs", "--force", "--replace", "--again", "--masks"} & {*options}, command
+        assert ("--jobs" in options) == ("--engine" in options), command  # runs at a time
+        if "--threads" in options:
+            assert "threads" in (options["--threads"].help or ""), command
+        for flag, kind in {"--scene": "path", "--only": "text"}.items():
+            assert flag not in options or _kind(options[flag]) == kind, (command, flag)
+    described = {flag: o.help or "" for options in OPTIONS.values() for flag, o in options.items()}
+    white = {flag for flag, text in described.items() if "white =" in text}
+    assert white == {"--keep-masks", "--distractor-masks", "--objects"}
+
+
+@pytest.mark.parametrize("name", [name for name, options in OPTIONS.items() if "--overwrite" in options])
+def test_overwrite_alone_replaces_what_is_there(name: str) -> None:
+    option = OPTIONS[name]["--overwrite"]
+    command = click.Command("any", params=[option])
+    values = command.make_context("any", ["--overwrite"]).params
+    assert values[option.name or ""] in (True, "always")
+
+
+@pytest.mark.parametrize("command", RENAMED)
+def test_old_names_lead_to_options_of_today_and_say_so(
+    command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for old, new in RENAMED[command].items():
+        assert old not in OPTIONS[command] or (old == "--scene" and "--scene-folder" in RENAMED[command])
+        assert not new or new in OPTIONS[command]
+        kept = [new] if new else []
+        value = [] if new is None else ["x"]
+        assert with_new_names([*command.split(), old, "x", "y"]) == [*command.split(), *kept, *value, "y"]
+        told = capsys.readouterr().err
+        assert told.startswith(f"{old} is now") and told.count("\n") == 1
+
+
+def test_other_words_stay_as_they_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "hall").mkdir()
+    for words in (["bench", "--jobs", "2"], ["view", "r", "--scene", "hall"], ["plan", "--", "--out"], []):
+        assert with_new_names(words) == words
+    assert capsys.readouterr().err == ""
+    assert with_new_names(["plan", "s", "--out=p"]) == ["plan", "s", "--output=p"]
+    old = ["ambiguity-report", "s", "--masks", "m", "--masks-white", "keep"]
+    assert with_new_names(old) == ["ambiguity-report", "s", "--keep-masks", "m"]

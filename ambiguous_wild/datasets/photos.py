@@ -16,7 +16,7 @@ from ambiguous_wild.builder.downsample import downsample_mask, downsample_photo,
 from ambiguous_wild.builder.undistort import Lens, make_lens
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.datasets.foreign import ForeignScene, find_photo, without_suffix
-from ambiguous_wild.io.colmap_records import ModelCamera, ModelImage
+from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage
 from ambiguous_wild.io.images import MAX_PIXELS, header_size, read_alpha, read_mask, read_png_rgb, write_png
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
@@ -43,6 +43,37 @@ class PlacedPhoto:
     camera: ModelCamera  # pinhole
     notes: tuple[str, ...]  # what was done to it
     source: str  # relative to the dataset
+
+
+def at_photo_size(scene: ForeignScene) -> tuple[ForeignScene, float]:
+    """The scene with its cameras and positions at the size of its photos, where these are of another size.
+
+    Returns:
+        It, and how many times smaller than their cameras the photos are: the median, 1 for the same size.
+    """
+    folder = scene.photos if scene.photos.is_dir() else scene.root / f"images_{scene.factor}"
+    cameras, taken = dict(scene.model.cameras), dict[tuple[int, int, int], int]()
+    images, ratios = {}, []
+    for number, image in scene.model.images.items():
+        images[number] = image
+        camera = scene.model.cameras[image.camera_id]
+        photo = find_photo(folder, image.name) if image.name in scene.split else None
+        size = header_size(photo) if photo is not None else None
+        if size is None or not _same_shape(size, (camera.width, camera.height)):
+            continue  # `plan_photos` says so
+        ratios.append(camera.width / size[0])
+        if abs(ratios[-1] - 1) < 0.02:
+            continue
+        if (key := (image.camera_id, *size)) not in taken:
+            taken[key] = max(cameras) + 1
+            cameras[taken[key]] = dataclasses.replace(resized(camera, *size), camera_id=taken[key])
+        xys = image.xys * (np.array(size) / (camera.width, camera.height))
+        images[number] = dataclasses.replace(image, camera_id=taken[key], xys=xys)
+    used = {image.camera_id for image in images.values()}
+    cameras = {number: camera for number, camera in cameras.items() if number in used}
+    model = Model(cameras, images, scene.model.points)
+    times = float(np.median(ratios)) if ratios and taken else 1.0
+    return dataclasses.replace(scene, model=model) if taken else scene, times
 
 
 def plan_photos(scene: ForeignScene) -> list[PhotoPlan]:

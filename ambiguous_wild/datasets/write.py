@@ -19,16 +19,26 @@ from ambiguous_wild.builder.workspace import build_lock, content_key, versions
 from ambiguous_wild.core.errors import AwError, counted, shortlist
 from ambiguous_wild.core.names import check_name
 from ambiguous_wild.datasets.foreign import SIDES, ForeignScene
-from ambiguous_wild.datasets.photos import PhotoPlan, PlacedPhoto, place_mask, place_photo, plan_photos
+from ambiguous_wild.datasets.photos import (
+    PhotoPlan,
+    PlacedPhoto,
+    at_photo_size,
+    place_mask,
+    place_photo,
+    plan_photos,
+)
 from ambiguous_wild.datasets.points import drop_test_only, find_motion, random_points, triangulate
 from ambiguous_wild.datasets.readers import read_foreign
 from ambiguous_wild.datasets.suites import differences, suite_of
 from ambiguous_wild.io.atomic import check_output, refuse_foreign_files, write_json, write_text
 from ambiguous_wild.io.colmap_model import write_model
 from ambiguous_wild.io.colmap_records import Model
+from ambiguous_wild.io.photos import MIN_SIDE
 from ambiguous_wild.io.scene_folder import SCENE_SCHEMA, read_scene_json, verify_files
 
 HIDDEN = "alpha hides pixels"
+LARGER = 1.5  # times; cameras that are so much larger than their photos are those of other files
+SMALL_SIDE = 100  # px; below, a training shows little of what a method can do
 
 
 @dataclass(frozen=True)
@@ -101,8 +111,7 @@ def import_scene(
             "used; --no-masks leaves them out"
         )
         foreign = dataclasses.replace(foreign, notes=(*foreign.notes, told))
-    if settings.factor is not None:
-        foreign = dataclasses.replace(foreign, factor=settings.factor)
+    foreign = _sized(foreign, settings)
     plans = plan_photos(foreign)
     key = _key(foreign, plans, settings, name)
     target = check_output(target)
@@ -130,6 +139,26 @@ def import_scene(
             shutil.rmtree(left, ignore_errors=True)
     info = json.loads((target / "scene.json").read_text(encoding="utf-8"))
     return ImportResult(target, info, why, False)
+
+
+def _sized(foreign: ForeignScene, settings: ImportSettings) -> ForeignScene:
+    """The scene with cameras at the size of its photos, and what is left of the factor."""
+    alone = not foreign.photos.is_dir()  # images_N without images: N says where they lie
+    foreign, times = at_photo_size(foreign)
+    if times > LARGER and not alone:
+        # The published factor is that of the cameras; photos that were reduced before are not reduced again.
+        note = f"photos are {times:.3g} times smaller than the model's cameras: intrinsics are scaled to them"
+        factor = max(1, round(foreign.factor / times))
+        foreign = dataclasses.replace(foreign, factor=factor, notes=(*foreign.notes, note))
+    if settings.factor is None:
+        return foreign
+    side = min(min(c.width, c.height) for c in foreign.model.cameras.values()) / settings.factor
+    if side < MIN_SIDE and settings.factor > 1:
+        raise AwError(
+            f"--factor {settings.factor} leaves photos of {side:.0f} px a side, too small to train on (at "
+            f"least {MIN_SIDE}); choose a smaller factor"
+        )
+    return dataclasses.replace(foreign, factor=settings.factor)
 
 
 def _key(foreign: ForeignScene, plans: list[PhotoPlan], settings: ImportSettings, name: str) -> str:
@@ -279,6 +308,12 @@ def _record(
         for side, names in foreign.missing.items()
         if names
     ]
+    divisor = foreign.factor if foreign.photos.is_dir() else 1
+    size = min(((p.camera.width // divisor, p.camera.height // divisor) for p in placed), key=min)
+    if min(size) < SMALL_SIDE:
+        warnings.append(
+            f"the scene trains on photos of {size[0]}x{size[1]} px; is factor {foreign.factor} meant?"
+        )
     suite = suite_of(settings.dataset, foreign.root)
     if suite is not None:
         full = {(c.width, c.height) for c in foreign.model.cameras.values()}

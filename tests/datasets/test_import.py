@@ -16,9 +16,8 @@ from ambiguous_wild.datasets.readers import READERS, recognise
 from ambiguous_wild.datasets.suites import suites
 from ambiguous_wild.datasets.write import ImportSettings, import_scene
 from ambiguous_wild.harness.running.grid import plan_cells
-from ambiguous_wild.io.images import read_gray, read_mask, read_png_rgb
+from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.scene_folder import load_scene
-from ambiguous_wild.splat.data import load_keep
 from ambiguous_wild.splat.pace import TrainConfig
 from tests.command_line import aw
 from tests.datasets import layouts
@@ -179,64 +178,6 @@ def test_keep_masks_of_nerfstudio_keep_their_meaning(imported):
     assert view.keep_path is not None
     mask = read_gray(view.keep_path)
     assert (mask[:, :20] == 0).all() and (mask[:, 20:] == 255).all()
-
-
-@pytest.mark.parametrize(
-    ("names", "masks"),
-    [
-        ({}, ["{stem}.png", "{stem}.JPG.png", "{name}.PNG"]),
-        ({"images/": "front/"}, ["front/{stem}.jpg", "{stem}.png", "front/{name}.png"]),
-    ],
-    ids=["flat", "folders"],
-)
-def test_masks_beside_the_photos_are_found_and_said(names, masks, tmp_path):
-    prefix = names.get("images/", "")
-    all_names = [f"{prefix}{n[:-4]}.JPG" for n in layouts.NAMES]
-    root = tmp_path / "raw"
-    layouts.write_photos(root / "images", all_names)
-    layouts.write_model(root / "sparse" / "0", layouts.make_model(all_names))
-    layouts.write_lists(root, all_names[:5], all_names[5:])
-    keep = np.zeros((layouts.HEIGHT, layouts.WIDTH), np.uint8)
-    keep[:, 20:] = 1
-    for spelling, name in zip(masks, all_names):
-        base = Path(name).name
-        path = root / "masks" / spelling.format(stem=base[:-4], name=base)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(cv2.imencode(".png", keep)[1].tobytes())
-    done = aw("import", root, "-o", tmp_path / "scene")
-    assert "keep masks of 3 of 5 training photos in masks" in done.stdout and "--no-masks" in done.stdout
-    for scene in (load_scene(tmp_path / "scene"), load_scene(root)):
-        assert [bool(v.keep_path) for v in scene.train] == [True] * 3 + [False] * 2
-        for view in scene.train[:3]:
-            assert np.array_equal(load_keep(view), keep)
-    assert "keep masks of 3 train photos" in load_scene(root).info["warnings"][0]
-    aw("import", root, "-o", tmp_path / "without", "--no-masks")
-    assert not any(v.keep_path for v in load_scene(tmp_path / "without").train)
-
-
-@pytest.mark.parametrize("factor", [1, 2])
-def test_alpha_of_photos_is_a_keep_mask(factor, tmp_path):
-    root = layouts.native(tmp_path / "raw")
-    alpha = np.full((layouts.HEIGHT, layouts.WIDTH), 255, np.uint8)
-    for name, left in ((layouts.TRAIN[0], 0), (layouts.TRAIN[1], 20), (layouts.TEST[0], 20)):
-        alpha[:, :left] = 0
-        path = root / "images" / name
-        pixels = np.dstack([cv2.imread(str(path)), alpha])
-        path.write_bytes(cv2.imencode(".png", pixels)[1].tobytes())
-    (root / "masks").mkdir()
-    rows = np.full_like(alpha, 255)
-    rows[:6] = 0
-    cv2.imwrite(str(root / "masks" / layouts.TRAIN[1]), rows)
-    done = import_scene(root, tmp_path / "scene", ImportSettings(factor=factor))
-    assert any("alpha of 2 photos hides pixels" in note for note in done.info["imported"]["notes"])
-    scene = load_scene(done.scene)
-    assert [bool(v.keep_path) for v in scene.train] == [False, True, False, False, False]
-    kept = np.minimum(rows, alpha)[::factor, ::factor] > 0
-    assert np.array_equal(load_keep(scene.train[1]) > 0, kept)
-    tested = read_mask(done.scene / "masks" / "test" / layouts.TEST[0]) > 0
-    assert np.array_equal(tested, alpha[::factor, ::factor] > 0)
-    assert not (done.scene / "masks" / "test" / layouts.TEST[1]).exists()
-    assert np.array_equal(load_keep(load_scene(root).train[1]) > 0, np.minimum(rows, alpha) > 0)
 
 
 def test_points_of_test_photos_are_dropped_on_demand(imported, tmp_path):

@@ -130,8 +130,6 @@ def _palette():
         _mask(np.where(LEFT[..., None], [0, 0, 0, 7], [255, 255, 255, 7]).astype(np.uint8)),
         _palette(),
     ],
-    ids=["255", "01", "01-16", "16-bit", "01-float", "01-rgb", "jpeg", "smooth", "rgba", "alpha", "cut-out",
-         "same-alpha", "palette"],
 )  # fmt: skip
 def test_a_mask_is_read_by_its_values(data, tmp_path):
     (tmp_path / "m").write_bytes(data)

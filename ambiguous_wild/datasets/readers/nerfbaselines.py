@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.datasets.foreign import Evaluation, ForeignScene, inside
+from ambiguous_wild.datasets.photos import at_photo_size
 from ambiguous_wild.datasets.readers.colmap import read_plain
 from ambiguous_wild.datasets.readers.phototourism import NERF_W
 from ambiguous_wild.datasets.readers.transforms import read_blender, read_json, read_transforms
@@ -36,9 +38,13 @@ def read_nerfbaselines(root: Path) -> ForeignScene:
     if protocol not in PROTOCOLS:
         raise unknown(f"evaluation_protocol in {path}", protocol[:60], PROTOCOLS)
     scene = LOADERS[loader](root)
-    options = info.get("loader_kwargs") or {}
-    images = options.get("images_path", "images") if isinstance(options, dict) else "images"
-    factor = _factor(str(images), info.get("downscale_factor"), root, path)
+    kwargs = info.get("loader_kwargs")
+    options: dict[str, Any] = kwargs if isinstance(kwargs, dict) else {}
+    images = options.get("images_path", "images")
+    factor = _factor(str(images), _whole(info.get("downscale_factor")), root, path)
+    loaded = _whole(info.get("downscale_loaded_factor") or options.get("downscale_loaded_factor"))
+    if loaded > 1:  # of the photos on disk, whatever the size of their cameras
+        factor = loaded * max(factor, round(at_photo_size(scene)[1]))
     identity = str(info.get("id") or "").lower()
     return dataclasses.replace(
         scene,
@@ -49,15 +55,16 @@ def read_nerfbaselines(root: Path) -> ForeignScene:
     )
 
 
-def _factor(images: str, stated: object, root: Path, path: Path) -> int:
+def _whole(stated: object) -> int:
+    return stated if isinstance(stated, int) and not isinstance(stated, bool) and stated > 1 else 1
+
+
+def _factor(images: str, stated: int, root: Path, path: Path) -> int:
     """images_8 -> 8; images -> 1."""
     folder = inside(images, root)
     tail = folder.removeprefix("images").removeprefix("_")
     if folder == "images":
-        if isinstance(stated, int) and not isinstance(stated, bool) and stated > 1:
-            # The loader reduces the photos itself.
-            return stated
-        return 1
+        return stated  # of the cameras; `aw import` finds what the photos on disk have of it
     if not tail.isdigit() or not 1 <= int(tail) <= 64:
         raise AwError(f"{path}: images_path {images[:60]!r} is not supported: images or images_N is")
     return int(tail)

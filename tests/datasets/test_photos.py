@@ -1,0 +1,116 @@
+"""Photos, masks and models as people have them: sizes, alpha, names, several models."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from ambiguous_wild.datasets.write import ImportSettings, import_scene
+from ambiguous_wild.io.images import read_mask
+from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.splat.data import load_keep
+from tests.command_line import aw
+from tests.datasets import layouts
+
+
+@pytest.mark.parametrize(
+    ("names", "masks"),
+    [
+        ({}, ["{stem}.png", "{stem}.JPG.png", "{name}.PNG"]),
+        ({"images/": "front/"}, ["front/{stem}.jpg", "{stem}.png", "front/{name}.png"]),
+    ],
+    ids=["flat", "folders"],
+)
+def test_masks_beside_the_photos_are_found_and_said(names, masks, tmp_path):
+    prefix = names.get("images/", "")
+    all_names = [f"{prefix}{n[:-4]}.JPG" for n in layouts.NAMES]
+    root = tmp_path / "raw"
+    layouts.write_photos(root / "images", all_names)
+    layouts.write_model(root / "sparse" / "0", layouts.make_model(all_names))
+    layouts.write_lists(root, all_names[:5], all_names[5:])
+    keep = np.zeros((layouts.HEIGHT, layouts.WIDTH), np.uint8)
+    keep[:, 20:] = 1
+    for spelling, name in zip(masks, all_names):
+        base = Path(name).name
+        path = root / "masks" / spelling.format(stem=base[:-4], name=base)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(cv2.imencode(".png", keep)[1].tobytes())
+    done = aw("import", root, "-o", tmp_path / "scene")
+    assert "keep masks of 3 of 5 training photos in masks" in done.stdout and "--no-masks" in done.stdout
+    for scene in (load_scene(tmp_path / "scene"), load_scene(root)):
+        assert [bool(v.keep_path) for v in scene.train] == [True] * 3 + [False] * 2
+        for view in scene.train[:3]:
+            assert np.array_equal(load_keep(view), keep)
+    assert "keep masks of 3 train photos" in load_scene(root).info["warnings"][0]
+    aw("import", root, "-o", tmp_path / "without", "--no-masks")
+    assert not any(v.keep_path for v in load_scene(tmp_path / "without").train)
+
+
+@pytest.mark.parametrize("factor", [1, 2])
+def test_alpha_of_photos_is_a_keep_mask(factor, tmp_path):
+    root = layouts.native(tmp_path / "raw")
+    alpha = np.full((layouts.HEIGHT, layouts.WIDTH), 255, np.uint8)
+    for name, left in ((layouts.TRAIN[0], 0), (layouts.TRAIN[1], 20), (layouts.TEST[0], 20)):
+        alpha[:, :left] = 0
+        path = root / "images" / name
+        pixels = np.dstack([cv2.imread(str(path)), alpha])
+        path.write_bytes(cv2.imencode(".png", pixels)[1].tobytes())
+    (root / "masks").mkdir()
+    rows = np.full_like(alpha, 255)
+    rows[:6] = 0
+    cv2.imwrite(str(root / "masks" / layouts.TRAIN[1]), rows)
+    done = import_scene(root, tmp_path / "scene", ImportSettings(factor=factor))
+    assert any("alpha of 2 photos hides pixels" in note for note in done.info["imported"]["notes"])
+    scene = load_scene(done.scene)
+    assert [bool(v.keep_path) for v in scene.train] == [False, True, False, False, False]
+    kept = np.minimum(rows, alpha)[::factor, ::factor] > 0
+    assert np.array_equal(load_keep(scene.train[1]) > 0, kept)
+    tested = read_mask(done.scene / "masks" / "test" / layouts.TEST[0]) > 0
+    assert np.array_equal(tested, alpha[::factor, ::factor] > 0)
+    assert not (done.scene / "masks" / "test" / layouts.TEST[1]).exists()
+    assert np.array_equal(load_keep(load_scene(root).train[1]) > 0, np.minimum(rows, alpha) > 0)
+
+
+def _larger_cameras(root, times):
+    """The native scene whose model was made of photos that are `times` larger."""
+    layouts.native(root)
+    model = layouts.make_model()
+    for camera in model.cameras.values():
+        values = {"width": camera.width * times, "height": camera.height * times}
+        values["params"] = tuple(times * v for v in camera.params)
+        for name, value in values.items():
+            object.__setattr__(camera, name, value)
+    for image in model.images.values():
+        image.xys[:] *= times
+    layouts.write_model(root / "sparse" / "0", model)
+    return root
+
+
+@pytest.mark.parametrize(
+    ("folder", "info", "times", "factor"),
+    [
+        ("toy", {"loader": "colmap", "downscale_factor": 8}, 8, 1),
+        ("toy", {"loader": "colmap", "downscale_factor": 8}, 4, 2),
+        ("corner", None, 8, 1),
+        ("toy", None, 3, 1),
+        ("toy", {"loader": "colmap", "downscale_loaded_factor": 2}, 1, 2),
+        ("toy", {"loader": "colmap", "downscale_loaded_factor": 2}, 8, 2),
+    ],
+)
+def test_photos_smaller_than_their_cameras_are_trained_on_as_they_are(folder, info, times, factor, tmp_path):
+    root = _larger_cameras(tmp_path / folder, times)
+    if info:
+        (root / "nb-info.json").write_text(json.dumps(info))
+    done = import_scene(root, tmp_path / "scene")
+    assert done.info["factor"] == factor
+    assert any("smaller than the model's cameras" in note for note in done.info["imported"]["notes"]) == (
+        times > 1
+    )
+    scene, native = load_scene(done.scene), load_scene(layouts.native(tmp_path / "native"))
+    assert scene.views[0].camera.width == layouts.WIDTH // factor
+    for a, b in zip(scene.views, native.views, strict=True):
+        assert np.allclose(a.camera.intrinsics[:2], b.camera.intrinsics[:2] / factor, rtol=1e-6)
+    assert np.allclose(scene.points.track_xy, native.points.track_xy / factor, atol=1e-3)
+    assert any("trains on photos of" in warning for warning in done.info["warnings"])

@@ -16,6 +16,7 @@ from ambiguous_wild.core.errors import AwError, unknown
 
 # command -> (module, one line of help); help is here so that `aw --help` imports no command.
 COMMANDS = {
+    "try": ("try_all", "Try it on your photos or video: scene, two methods, page and table in one go."),
     "doctor": ("doctor", "Check this machine: missing dependencies and the commands that install them."),
     "simulate": (
         "simulate",
@@ -56,6 +57,7 @@ COMMANDS = {
 
 # Heading of `aw --help` -> its commands, in the order of the work.
 SECTIONS = {
+    "In one go": ("try",),
     "Photos": (
         "simulate", "composite", "capture", "screen", "build-scene", "import", "fetch", "export-scene",
         "ambiguity-report",

@@ -151,6 +151,16 @@ def read_config(run: Path) -> dict[str, Any]:
         return {}
 
 
+def known_iterations(root: Path) -> int | None:
+    """The length of the first run below a folder; None where there is none, or it is not known."""
+    for run in run_folders(root):
+        train = read_config(run).get("train")
+        known = train.get("iterations") if isinstance(train, dict) else None
+        if isinstance(known, int):
+            return known
+    return None
+
+
 def _method_and_scene(run: Path) -> tuple[str, str]:
     """Whose run it is, for one without a result: by its settings, else by its path."""
     config, method_folder = read_config(run), run.absolute().parent

@@ -1,0 +1,116 @@
+"""`aw try`: from photos or a video to a table and a page, each step an ordinary command."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import time
+from pathlib import Path
+
+import click
+
+from ambiguous_wild.cli.options import PathName, say, threads_option
+from ambiguous_wild.core.errors import AwError, counted
+
+METHODS = ("3dgs", "refinesplat")
+IN_3DGS = 1 + 1.2  # time of an iteration of both, in iterations of 3dgs (docs/refinesplat.md)
+# Of the time that is left once the scene is built; the plan, measuring and the page take the rest.
+TRAINING = 0.7
+SHORTEST, LONGEST = 300, 30_000  # iterations; shorter runs show no difference of methods
+FRAMES = 60  # of a video
+# Screening and building take so long on two cores: 60 frames of 480 px and eleven photos of 24 MP.
+SCENE_S = (10.0, 2.5)  # for any scene, for every photo
+
+
+@click.command("try")
+@click.argument("source", type=PathName(exists=True), metavar="PHOTOS|VIDEO")
+@click.option("-o", "--output", type=PathName(file_okay=False), required=True, help="Folder for everything.")
+@click.option("--budget", default="5m", show_default=True, help="Time for everything: 90s, 10m, 1.5h.")
+@threads_option
+@click.pass_context
+def command(ctx: click.Context, source: Path, output: Path, budget: str, threads: int | None) -> None:
+    """Try it on your photos: check, scene, plan, 3dgs and refinesplat, page, table.
+
+    Each step is a command that is printed first and can be typed alone. The time decides how many iterations
+    both methods train, 300 at least. If it is stopped, the same command continues.
+
+    \b
+    aw try photos/ -o out
+    aw try walk.mp4 -o out --budget 15m
+    """
+    from ambiguous_wild.cli.bench import parse_budget
+    from ambiguous_wild.harness.running.store import known_iterations
+
+    begin, seconds = time.monotonic(), parse_budget(budget)
+    photos, scene, runs, plan = (output / name for name in ("photos", "scene", "runs", "plan.json"))
+    video = source.is_file()
+    if not video:
+        photos = source
+    say(_announced(source, seconds))
+    cores = ["--threads", str(threads)] if threads else []
+
+    def step(*words: str | Path, done: Path | None = None) -> None:
+        line = [str(word) for word in words]
+        click.echo(f"\n$ aw {shlex.join(line)}", err=True)
+        if done is not None and done.exists():
+            say(f"done before: {done}")
+            return
+        ctx.find_root().command.main(line, prog_name="aw", standalone_mode=False)
+
+    if video:
+        step("capture", source, "-o", photos, "--frames", str(FRAMES), *cores, done=photos)
+    if not (scene / "scene.json").exists():
+        step("screen", photos, *cores)
+    step("build-scene", photos, "-o", scene, "--name", source.resolve().stem, *cores)
+    iterations = known_iterations(runs) or _iterations(scene, seconds - (time.monotonic() - begin), threads)
+    length = ["--iterations", str(iterations)]
+    step("plan", scene, *length, "-o", plan, done=plan)
+    step(
+        "bench", "--method", ",".join(METHODS), "--scene", scene, *length, "--plan", plan, "-o", runs, *cores
+    )
+    page = output / "view"
+    step("view", runs, "-o", page)
+    step("table", runs, "--sheet", output / "comparison.png")
+    say(
+        f"\n{(time.monotonic() - begin) / 60:.1f} min. Look at {page / 'index.html'} and "
+        f"{output / 'comparison.png'}; train longer with --budget and another -o"
+    )
+
+
+def _announced(source: Path, seconds: float) -> str:
+    """How long it will take; refuses what is neither photos nor a video before anything is written."""
+    from ambiguous_wild.io.photos import PHOTO_SUFFIXES
+
+    count = FRAMES
+    if source.is_dir():
+        names = [name for _, _, files in os.walk(source) for name in files]
+        count = sum(Path(name).suffix.lower() in PHOTO_SUFFIXES for name in names)
+        if not count:
+            raise AwError(f"{source} holds no photos: give a folder of photos, or a video")
+    scene_s = SCENE_S[0] + SCENE_S[1] * count
+    total = max(seconds, scene_s + seconds * (1 - TRAINING))
+    return (
+        f"{counted(count, 'photo')}: about {_minutes(total)}, of which {_minutes(scene_s)} for the scene, "
+        f"unless it was built before"
+    )
+
+
+def _minutes(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
+
+
+def _iterations(scene: Path, seconds: float, threads: int | None) -> int:
+    """How many iterations both methods can train in this time, measured here; told with its time."""
+    from ambiguous_wild.cli.options import prepare_cpu
+    from ambiguous_wild.harness.running.timing import expected_s, slowness
+    from ambiguous_wild.io.scene_folder import load_scene
+
+    prepare_cpu(threads)
+    camera = load_scene(scene).train[0].camera
+    pixels = camera.width * camera.height
+    one = IN_3DGS * expected_s(1, pixels, pixels) * slowness()
+    most = round(TRAINING * seconds / one, -2)
+    iterations = int(min(max(most, SHORTEST), LONGEST))
+    more = "; the time is too short, it will take longer" if most < SHORTEST else ""
+    say(f"\n{iterations} iterations a method: about {_minutes(iterations * one)} of training here{more}")
+    return iterations

@@ -114,3 +114,17 @@ def test_photos_smaller_than_their_cameras_are_trained_on_as_they_are(folder, in
         assert np.allclose(a.camera.intrinsics[:2], b.camera.intrinsics[:2] / factor, rtol=1e-6)
     assert np.allclose(scene.points.track_xy, native.points.track_xy / factor, atol=1e-3)
     assert any("trains on photos of" in warning for warning in done.info["warnings"])
+
+
+def test_a_label_map_is_no_mask(tmp_path):
+    root = layouts.nerfstudio(tmp_path / "raw")
+    labels = np.arange(layouts.WIDTH, dtype=np.uint8)[None].repeat(layouts.HEIGHT, 0) // 20
+    cv2.imwrite(str(root / "masks" / "m.png"), labels)
+    with pytest.raises(AwError, match=r"m.png is no mask .* 4 values, 0 \(31 %\), 1 \(31 %\)"):
+        import_scene(root, tmp_path / "scene")
+    assert [p.name for p in tmp_path.iterdir()] == ["raw"]
+    assert (
+        not load_scene(import_scene(root, tmp_path / "scene", ImportSettings(masks=False)).scene)
+        .train[0]
+        .keep_path
+    )

@@ -153,7 +153,7 @@ def test_what_no_mapper_writes_is_named_when_the_model_is_read(tmp_path, spoil, 
 
 
 def test_points_without_tracks_are_read_and_written_as_others(tmp_path):
-    model = make_model()
+    model = make_model(["a.png", "b.png"])
     bare = dataclasses.replace(model, points=points_without_tracks(model.points.xyz, model.points.rgb))
     write_model(tmp_path / "0", bare)
     theirs = pycolmap.Reconstruction()

@@ -111,6 +111,12 @@ def import_scene(
             "used; --no-masks leaves them out"
         )
         foreign = dataclasses.replace(foreign, notes=(*foreign.notes, told))
+    for side in SIDES:
+        if side not in foreign.split.values():
+            raise AwError(
+                f"{root} has no {side} photo: {counted(len(foreign.split), 'photo')} in the split; add "
+                "photos, or write train_list.txt and test_list.txt"
+            )
     foreign = _sized(foreign, settings)
     plans = plan_photos(foreign)
     key = _key(foreign, plans, settings, name)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path, PurePosixPath
+from typing import TypeVar
 
 import numpy as np
 
@@ -31,6 +32,9 @@ from ambiguous_wild.io.colmap_records import (
 
 _OBSERVATION = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 _POINT = struct.Struct("<Q3d3BdQ")  # id, xyz, rgb, error, track length
+_POINT_ROW = np.dtype(
+    [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")]
+)
 
 
 def read_model(folder: Path | str) -> Model:
@@ -69,6 +73,9 @@ def read_model(folder: Path | str) -> Model:
                 f"{root}: image {image.name!r} is there twice: the model is damaged; build it again"
             )
         names.add(image.name)
+    ids, counts = np.unique(model.points.ids, return_counts=True)
+    if (counts > 1).any():
+        raise AwError(f"{paths[2]} has the id {ids[counts > 1][0]} twice: keep one, or build the model again")
     odd = np.flatnonzero(~(np.abs(model.points.xyz) < LARGEST_COORDINATE).all(axis=1))
     if len(odd):
         raise AwError(
@@ -137,7 +144,8 @@ def _binary_cameras(path: Path) -> dict[int, ModelCamera]:
     for _ in range(reader.count(24)):
         camera_id, number, width, height = reader.unpack("<iiQQ")
         name, count = model_of_id(number, str(path))
-        cameras[camera_id] = ModelCamera(camera_id, name, width, height, reader.unpack(f"<{count}d"))
+        camera = ModelCamera(camera_id, name, width, height, reader.unpack(f"<{count}d"))
+        _add(path, cameras, camera_id, camera)
     return cameras
 
 
@@ -149,16 +157,20 @@ def _binary_images(path: Path) -> dict[int, ModelImage]:
         name = reader.text()
         count = reader.count(_OBSERVATION.itemsize)
         rows = np.frombuffer(reader.take(count * _OBSERVATION.itemsize), dtype=_OBSERVATION)
-        images[image_id] = ModelImage(
-            image_id,
-            np.array(pose[:4]),
-            np.array(pose[4:]),
-            camera_id,
-            name,
-            np.array(rows["xy"]).reshape(-1, 2),
-            np.array(rows["point"]),
-        )
+        xys, points = np.array(rows["xy"]).reshape(-1, 2), np.array(rows["point"])
+        image = ModelImage(image_id, np.array(pose[:4]), np.array(pose[4:]), camera_id, name, xys, points)
+        _add(path, images, image_id, image)
     return images
+
+
+_Record = TypeVar("_Record", ModelCamera, ModelImage)
+
+
+def _add(path: Path, records: dict[int, _Record], number: int, record: _Record) -> None:
+    if number in records:
+        what = " and ".join(repr(getattr(r, "name", r)) for r in (records[number], record))
+        raise AwError(f"{path} has the id {number} twice ({what}): keep one, or build the model again")
+    records[number] = record
 
 
 def _binary_points(path: Path) -> ModelPoints:
@@ -167,7 +179,21 @@ def _binary_points(path: Path) -> ModelPoints:
     total = reader.count(_POINT.size)
     ids, xyz = np.empty(total, np.int64), np.empty((total, 3))
     rgb, error = np.empty((total, 3), np.uint8), np.empty(total)
-    offsets, tracks = np.zeros(total + 1, np.int64), []
+    offsets, tracks = np.zeros(total + 1, np.int64), list[np.ndarray]()
+    if len(reader.data) - reader.at == total * _POINT.size:  # no tracks: rows of one size
+        rows = np.frombuffer(reader.take(total * _POINT.size), _POINT_ROW)
+        if rows["track"].any() or (rows["id"] >= 2**63).any():
+            raise AwError(f"{path} is damaged: its ids or tracks are not what its size allows; copy it again")
+        none = np.zeros(0, np.int64)
+        return ModelPoints(
+            rows["id"].astype(np.int64),
+            rows["xyz"].copy(),
+            rows["rgb"].copy(),
+            rows["error"].copy(),
+            offsets,
+            none,
+            none,
+        )
     for i in range(total):
         row = _POINT.unpack(reader.take(_POINT.size))
         if row[0] >= 2**63:
@@ -195,7 +221,7 @@ def _text_cameras(path: Path) -> dict[int, ModelCamera]:
             raise unknown(f"camera model in {path}", model, MODELS)
         if len(params) != MODELS[model][1]:
             raise _damaged(path, number)
-        cameras[camera_id] = ModelCamera(camera_id, model, width, height, params)
+        _add(path, cameras, camera_id, ModelCamera(camera_id, model, width, height, params))
     return cameras
 
 
@@ -218,7 +244,8 @@ def _text_images(path: Path) -> dict[int, ModelImage]:
             ids = np.array([int(v) for v in rest[2::3]], dtype=np.int64)
         except (ValueError, IndexError, OverflowError) as error:
             raise _damaged(path, number) from error
-        images[image_id] = ModelImage(image_id, pose[:4], pose[4:], camera_id, name, table[:, :2].copy(), ids)
+        image = ModelImage(image_id, pose[:4], pose[4:], camera_id, name, table[:, :2].copy(), ids)
+        _add(path, images, image_id, image)
     return images
 
 
@@ -315,6 +342,12 @@ def _write_points(path: Path, points: ModelPoints) -> None:
     """Write points3D.bin, in the order given."""
     tracks = np.stack([points.track_image_ids, points.track_point2d], axis=1).astype("<i4")
     parts = [struct.pack("<Q", len(points.ids))]
+    if not len(tracks):
+        rows = np.zeros(len(points.ids), _POINT_ROW)
+        rows["id"], rows["error"] = points.ids, points.error_px
+        rows["xyz"], rows["rgb"] = points.xyz, points.rgb
+        _write(path, [*parts, rows.tobytes()])
+        return
     for i in range(len(points.ids)):
         start, end = points.track_offsets[i], points.track_offsets[i + 1]
         head = (*points.xyz[i], *(int(v) for v in points.rgb[i]), points.error_px[i], end - start)

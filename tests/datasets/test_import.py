@@ -4,7 +4,6 @@ import dataclasses
 import json
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -238,14 +237,6 @@ def _mask_size(root):
     write_png(root / "masks" / "m.png", np.zeros((50, 40), np.uint8))
 
 
-def _labels(root):
-    layouts.nerfstudio(root)
-    cv2.imwrite(
-        str(root / "masks" / "m.png"),
-        np.arange(layouts.WIDTH)[None].repeat(layouts.HEIGHT, 0).astype(np.uint8) // 20,
-    )
-
-
 def _photo_absent(root):
     layouts.robustnerf(root)
     (root / "images" / "extra001.png").unlink()
@@ -336,10 +327,6 @@ def _protocol(root):
         (_no_list, "test_list.txt"),
         (_other_table, "table of another scene"),
         (_mask_size, "m.png is 40x50 but its photo clutter000.png 64x36"),
-        (
-            _labels,
-            "m.png is no mask of black and white, or of 0 and 1: it holds 4 values, 0 (31 %), 1 (31 %)",
-        ),
         (_photo_absent, "1 of 7 photos that the model registers are not in"),
         (_two_splits, "choose one with --as"),
         (_keyword, "other.png (none)"),

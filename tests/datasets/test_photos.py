@@ -7,10 +7,13 @@ import cv2
 import numpy as np
 import pytest
 
+from ambiguous_wild.core import AwError
 from ambiguous_wild.datasets.write import ImportSettings, import_scene
+from ambiguous_wild.harness.running.grid import plan_cells
 from ambiguous_wild.io.images import read_mask
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.data import load_keep
+from ambiguous_wild.splat.pace import TrainConfig
 from tests.command_line import aw
 from tests.datasets import layouts
 
@@ -114,3 +117,50 @@ def test_photos_smaller_than_their_cameras_are_trained_on_as_they_are(folder, in
         assert np.allclose(a.camera.intrinsics[:2], b.camera.intrinsics[:2] / factor, rtol=1e-6)
     assert np.allclose(scene.points.track_xy, native.points.track_xy / factor, atol=1e-3)
     assert any("trains on photos of" in warning for warning in done.info["warnings"])
+
+
+def test_a_label_map_is_no_mask(tmp_path):
+    root = layouts.nerfstudio(tmp_path / "raw")
+    labels = np.arange(layouts.WIDTH, dtype=np.uint8)[None].repeat(layouts.HEIGHT, 0) // 20
+    cv2.imwrite(str(root / "masks" / "m.png"), labels)
+    with pytest.raises(AwError, match=r"m.png is no mask .* 4 values, 0 \(31 %\), 1 \(31 %\)"):
+        import_scene(root, tmp_path / "scene")
+    assert [p.name for p in tmp_path.iterdir()] == ["raw"]
+    assert (
+        not load_scene(import_scene(root, tmp_path / "scene", ImportSettings(masks=False)).scene)
+        .train[0]
+        .keep_path
+    )
+
+
+def _one_photo(root):
+    layouts.write_photos(root / "images", layouts.NAMES[:1])
+    layouts.write_model(root / "sparse" / "0", layouts.make_model(layouts.NAMES[:1]))
+
+
+def _no_test(root):
+    layouts.nerfstudio(root)
+    data = json.loads((root / "transforms.json").read_text())
+    (root / "transforms.json").write_text(json.dumps({**data, "test_filenames": []}))
+
+
+@pytest.mark.parametrize(
+    ("make", "options", "message"),
+    [
+        (_one_photo, (), "has no train photo: 1 photo in the split"),
+        (_no_test, (), "none of the 0 test photos"),
+        (layouts.native, ("--factor", 5), "--factor 5 leaves photos of 7 px a side"),
+    ],
+)
+def test_a_scene_that_cannot_be_trained_or_measured_is_refused(make, options, message, tmp_path):
+    make(tmp_path / "raw")
+    done = aw("import", tmp_path / "raw", "-o", tmp_path / "scene", *options)
+    assert done.returncode == 2 and message in done.stderr and not (tmp_path / "scene").exists()
+
+
+@pytest.mark.parametrize("names", ["", "\ufeffextra000.png\n"], ids=["empty", "utf-16"])
+def test_a_bench_that_tests_nothing_is_refused(names, tmp_path):
+    root = layouts.native(tmp_path / "scene")
+    (root / "test_list.txt").write_bytes(names.encode("utf-16-le"))
+    with pytest.raises(AwError, match="tests nothing"):
+        plan_cells(["3dgs"], [root], [0], TrainConfig(iterations=20))

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.colmap_model import read_model, write_model
-from ambiguous_wild.io.colmap_records import rotation_from_quaternion
+from ambiguous_wild.io.colmap_records import points_without_tracks, rotation_from_quaternion
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 from tests.io.model_maker import make_model
 
@@ -149,4 +149,35 @@ def test_what_no_mapper_writes_is_named_when_the_model_is_read(tmp_path, spoil, 
     spoil(model)
     write_model(tmp_path, model)
     with pytest.raises(AwError, match=said):
+        read_model(tmp_path)
+
+
+def test_points_without_tracks_are_read_and_written_as_others(tmp_path):
+    model = make_model(["a.png", "b.png"])
+    bare = dataclasses.replace(model, points=points_without_tracks(model.points.xyz, model.points.rgb))
+    write_model(tmp_path / "0", bare)
+    theirs = pycolmap.Reconstruction()
+    theirs.read_binary(tmp_path / "0")
+    back = read_model(tmp_path / "0").points
+    assert np.array_equal(back.xyz, bare.points.xyz) and np.array_equal(back.rgb, bare.points.rgb)
+    assert np.array_equal(back.ids, bare.points.ids) and not back.track_offsets.any()
+    assert np.allclose([theirs.points3D[i].xyz for i in back.ids], back.xyz)
+
+
+@pytest.mark.parametrize(
+    ("name", "row"),
+    [
+        ("cameras", "1 PINHOLE 64 48 60 60 32 24"),
+        ("images", "1 1 0 0 0 0 0 0 1 other.png\n"),
+        ("points3D", "1 0 0 1 9 9 9 0.5"),
+    ],
+)
+def test_an_id_that_is_there_twice_is_refused(name, row, tmp_path):
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 64 48 60 60 32 24\n")
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n")
+    (tmp_path / "points3D.txt").write_text("1 0 0 4 9 9 9 0.5\n")
+    assert len(read_model(tmp_path).points.ids) == 1
+    with open(tmp_path / f"{name}.txt", "a") as f:
+        f.write(row + "\n")
+    with pytest.raises(AwError, match=rf"{name}.txt has the id 1 twice"):
         read_model(tmp_path)

@@ -116,6 +116,12 @@ def plan_cells(
     ]
     distinct = list({path.resolve(): path for path in scenes}.values())
     loaded = [load_scene(path, factor=factor) for path in distinct]
+    for scene in loaded:
+        if not scene.test:
+            raise AwError(
+                f"{scene.root} tests nothing: no name in its test_list.txt is a photo of the model; correct "
+                "the list (one name a line, UTF-8), or remove both lists, then every 8th photo tests"
+            )
     names = [scene.name for scene in loaded]
     twice = {name for name in names if names.count(name) > 1}
     if twice:

@@ -73,10 +73,11 @@ _TRAINING = (
     plugin_option,
     click.option(
         "--overwrite",
-        type=click.Choice(["never", "missing", "always"]),
+        type=click.Choice(["never", "missing", "changed", "always"]),
         default="missing",
         show_default=True,
-        help="missing: train what is not finished; never: skip existing folders; always: train again.",
+        help="missing: train what is not finished; changed: also where a method's file has changed; never: skip "
+        "existing folders; always: train again.",
     ),
     click.option(
         "--cache",

@@ -32,7 +32,7 @@ def test_what_is_no_budget(text):
         (["--method", "refinsplat"], "did you mean 'refinesplat'"),
         (["--method", "3dgs", "--iterations", "5", "--budget", "1m"], "exclude each other"),
         (["--method", "3dgs", "--iterations", "0"], "--iterations"),
-        (["--method", "3dgs", "--overwrite", "perhaps"], "'never', 'missing', 'always'"),
+        (["--method", "3dgs", "--overwrite", "perhaps"], "'never', 'missing', 'changed', 'always'"),
         (["--method", "3dgs", "--itterations", "5"], "--iterations"),
         (["--method", "refinesplat", "--set", "refinesplat.lamda_cr=1"], "did you mean 'lambda_cr'"),
         (["--method", "3dgs", "--plugin", "absent.py"], "no plugin file"),

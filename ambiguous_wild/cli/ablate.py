@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import json
 import shlex
@@ -19,6 +20,9 @@ from ambiguous_wild.methods.ablation import Group
 @click.option("--method", default="refinesplat", show_default=True, help="Method whose parts are varied.")
 @click.option("--scene", "scenes", multiple=True, type=PathName(), help="A scene folder; repeatable.")
 @click.option("--group", "groups", multiple=True, help="Only this group; repeatable.  [default: all]")
+@click.option(
+    "--sweep", "sweeps", multiple=True, metavar="KEY=V1,V2", help="Values of an option instead; repeatable."
+)
 @training_options
 @click.option("--budget", help="Training time instead of --iterations: 90s, 10m, 1.5h.")
 @click.option(
@@ -32,6 +36,7 @@ def command(
     method: str,
     scenes: tuple[Path, ...],
     groups: tuple[str, ...],
+    sweeps: tuple[str, ...],
     seeds: tuple[int, ...],
     iterations: int | None,
     budget: str | None,
@@ -56,14 +61,23 @@ def command(
     \b
     aw ablate --list
     aw ablate --method refinesplat --scene scene --group masks --iterations 3000 -o ablation
+    aw ablate --method my.py:trimmed --scene scene --sweep share=0.7,0.9 -o ablation
     """
-    from ambiguous_wild.methods.ablation import choose_groups
-    from ambiguous_wild.methods.registry import get_method, load_plugin
+    from ambiguous_wild.methods.ablation import choose_groups, sweep_groups
+    from ambiguous_wild.methods.registry import get_method, load_plugin, register
 
     for plugin in plugins:
         load_plugin(plugin)
     entry = get_method(method)
+<<<<<<< HEAD
     method = method if entry.given_as else entry.name  # as it is written
+=======
+    method = entry.name  # of a file's recipe; its reference would read the file again
+    if sweeps:
+        swept = sweep_groups(entry.options(), sweeps)
+        entry = register(dataclasses.replace(entry, ablations=(*entry.ablation_groups(), *swept)))
+        groups = (*groups, *(group.name for group in swept))
+>>>>>>> hC
     chosen = choose_groups(method, entry.ablation_groups(), groups)
     if listing:
         click.echo(json.dumps(_listed(chosen), indent=2) if as_json else _list_text(chosen))

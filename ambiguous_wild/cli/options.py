@@ -86,12 +86,20 @@ _TRAINING = (
     plugin_option,
     click.option(
         "--overwrite",
+<<<<<<< HEAD
         type=click.Choice(["never", "missing", "always"]),
         is_flag=False,
         flag_value="always",
         default="missing",
         show_default=True,
         help="Alone, or always: train again; missing: what is not finished; never: skip existing folders.",
+=======
+        type=click.Choice(["never", "missing", "changed", "always"]),
+        default="missing",
+        show_default=True,
+        help="missing: train what is not finished; changed: also where a method's file has changed; never: skip "
+        "existing folders; always: train again.",
+>>>>>>> hC
     ),
     click.option(
         "--cache",

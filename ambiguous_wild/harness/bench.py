@@ -175,8 +175,8 @@ def bench(
         factor: which images_N; None = what the scene was built for.
         protocol: "full" measures whole test photos, "half" the right half (NeRF-W); None = what the scene's
             scene.json says, else "full".
-        overwrite: "missing" keeps what is finished and resumes what stopped, "always" starts anew, "never"
-            leaves folders that exist as they are.
+        overwrite: "missing" keeps what is finished and resumes what stopped, "changed" also trains again
+            where a method's file has changed, "always" starts anew, "never" leaves folders that exist.
         cache: for features and instance masks; None = OUTPUT/.cache.
         pictures: draw what the method saw into RUN/pictures.
         callbacks: told what happens; None = nothing is. `Lines()` prints a line a run.

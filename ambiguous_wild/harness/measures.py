@@ -13,8 +13,9 @@ import math
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypedDict
+from typing import TYPE_CHECKING, Any, Literal, TypedDict, cast
 
 import numpy as np
 
@@ -140,11 +141,16 @@ FAMILIES = {"psnr": "psnr", "ssim": "ssim", "lpips": "lpips_alex"}
 _own: dict[str, Metric] = {}  # registered; without a function: as a result that was read describes it
 
 
+@cache
+def _installed() -> dict[str, Metric]:
+    return {point.name: point.load() for point in importlib.metadata.entry_points(group=ENTRY_POINTS)}
+
+
 def metrics() -> dict[str, Metric]:
     """Every metric that can be computed, by key: built in, registered, installed as entry points."""
-    for point in importlib.metadata.entry_points(group=ENTRY_POINTS):
-        if point.name not in _own:
-            register(point.load())
+    for key, metric in _installed().items():
+        if key not in _own or not _own[key].function:  # what a result describes has none
+            register(metric)
     return {k: m for k, m in (MEASURES | _own).items() if isinstance(m, Metric) and m.function}
 
 
@@ -224,18 +230,15 @@ class MetricRecord(TypedDict):
 
 def records(keys: Iterable[str]) -> dict[str, MetricRecord]:
     """Of the own metrics among these."""
-    return {
-        key: MetricRecord(label=m.label, better=m.better, digits=m.digits, partial=m.partial, source=m.source)
-        for key, m in own().items()
-        if key in keys
-    }
+    fields, mine = MetricRecord.__annotations__, own()
+    return {k: cast(MetricRecord, {f: getattr(mine[k], f) for f in fields}) for k in keys if k in mine}
 
 
 def remember(known: Mapping[str, MetricRecord]) -> None:
     """Name the columns of a result's metrics as the run that measured them did."""
     for key, record in known.items():
-        if key not in MEASURES and not _own.get(key):
-            _own[key] = Metric(key, function="", **record)
+        if key not in MEASURES:
+            _own.setdefault(key, Metric(key, function="", **record))
 
 
 def measure_images(

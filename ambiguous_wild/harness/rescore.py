@@ -176,6 +176,5 @@ def _add(
     result["per_image"] = [cast(ImageRow, {**old, **new}) for old, new in zip(result["per_image"], rows)]
     added = {key for row in rows for key in metrics_of(row)}
     result["missing"] = {key: why for key, why in (result["missing"] | missing).items() if key not in added}
-    if new := records(added):
-        result["metrics"] = {**result.get("metrics", {}), **new}
+    result["metrics"] = {**result.get("metrics", {}), **records(added)}
     return tuple(sorted(added))

@@ -8,7 +8,9 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
+from ambiguous_wild.core.config import with_options
 from ambiguous_wild.core.errors import AwError, unknown
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9._-]*")  # names become folders
@@ -57,6 +59,26 @@ def check_groups(method: str, groups: Sequence[Group]) -> None:
             raise AwError(f"ablations of {method}: {kind} {what}; use small letters, digits, '.', '_', '-'")
 
 
+def sweep_groups(options: Any, sweeps: Sequence[str]) -> tuple[Group, ...]:
+    """A group for each "KEY=V1,V2,...", a variant for each value.
+
+    Args:
+        options: the method's, at their defaults.
+        sweeps: as typed.
+
+    Raises:
+        AwError: not of that form, or a key or value that the options refuse.
+    """
+    groups = []
+    for key, values in ((k, v.split(",")) for k, _, v in (text.partition("=") for text in sweeps)):
+        for value in values:
+            with_options(options, {key: value}, "option of --sweep")
+        names = (re.sub(r"[^a-z0-9._-]+", "_", re.sub("^-", "minus", v.lower())) for v in values)
+        variants = (Variant(name, (f"{key}={value}",)) for name, value in zip(names, values))
+        groups.append(Group(re.sub("[^a-z0-9._]+", "_", key.lower()), f"values of {key}", tuple(variants)))
+    return tuple(groups)
+
+
 def choose_groups(method: str, groups: Sequence[Group], names: Sequence[str]) -> tuple[Group, ...]:
     """The groups of these names in their own order; all if none is named.
 
@@ -64,7 +86,10 @@ def choose_groups(method: str, groups: Sequence[Group], names: Sequence[str]) ->
         AwError: the method has no ablations, or none of that name.
     """
     if not groups:
-        raise AwError(f"{method} declares no ablations: see 'ablations' in docs/add-a-method.md")
+        raise AwError(
+            f"{method} declares no ablations: name an option's values, --sweep KEY=V1,V2, or see "
+            "'Options, ablations, sharing' in docs/add-a-method.md"
+        )
     check_groups(method, groups)
     known = [group.name for group in groups]
     for name in names:

@@ -90,7 +90,7 @@ def load_reference(name: str, *, given_as: str = "") -> MethodEntry:
     """
     entry = read_reference(name, given_as=given_as)
     known = all_methods().get(entry.name)
-    if known is not None and known.source_hash != entry.source_hash:
+    if known is not None and known.source_hash != entry.source_hash and known.given_as != entry.given_as:
         raise AwError(f"{name} is called {entry.name!r}, and so is another method: give it another name")
     return register(entry)
 

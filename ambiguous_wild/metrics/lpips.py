@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -135,19 +135,11 @@ def load(name: str) -> Metric:
     return measure
 
 
-def lpips_alex(render: np.ndarray, photo: np.ndarray) -> float:
-    """LPIPS of AlexNet; like the next two of images [H, W, 3], with the errors of `load` and its metric."""
-    return load("lpips_alex")(render, photo)
+def _lpips(name: str, render: np.ndarray, photo: np.ndarray) -> float:
+    return load(name)(render, photo)
 
 
-def lpips_vgg(render: np.ndarray, photo: np.ndarray) -> float:
-    """LPIPS of VGG-16."""
-    return load("lpips_vgg")(render, photo)
-
-
-def lpips_vgg_01(render: np.ndarray, photo: np.ndarray) -> float:
-    """LPIPS of VGG-16 that gets [0, 1], not [-1, 1]."""
-    return load("lpips_vgg_01")(render, photo)
+lpips_alex, lpips_vgg, lpips_vgg_01 = (partial(_lpips, name) for name in VARIANTS)
 
 
 def _distance(

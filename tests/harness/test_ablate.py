@@ -20,6 +20,7 @@ from ambiguous_wild.methods.ablation import Group, Variant, check_groups, choose
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.parts import Parts
+from tests.command_line import aw
 from tests.harness.fake_runs import fake_result
 
 SHORT = TrainConfig(iterations=30, probes=0)
@@ -237,3 +238,19 @@ def _at(options, key):
     for part in key.split("."):
         options = getattr(options, part)
     return options
+
+
+def test_values_of_an_option_of_a_method_in_a_file_are_swept_without_a_registry_entry(scene, tmp_path):
+    own = tmp_path / "my.py"
+    own.write_text(
+        "from dataclasses import dataclass\nfrom ambiguous_wild.splat.parts import Parts\n"
+        "@dataclass(frozen=True)\nclass Config:\n    sh_degree: int = 2\n"
+        "def mine(config: Config): return Parts(sh_degree=config.sh_degree)\n"
+    )
+    words = ["ablate", "--method", f"{own}:mine", "--scene", scene, "--iterations", "3", "--device", "cpu"]
+    done = aw(*words, "--sweep", "sh_degree=0,2,1", "-o", tmp_path / "ablation")
+    assert done.returncode == 0, done.stderr
+    rows = list(csv.DictReader((tmp_path / "ablation/ablation.csv").open()))
+    assert [row["variant"] for row in rows] == ["default", "0", "2", "1"] and rows[0]["group"] == "sh_degree"
+    assert all(row["psnr"] for row in rows)
+    assert "unknown option of --sweep 'sh_degre'" in aw(*words, "--sweep", "sh_degre=1").stderr

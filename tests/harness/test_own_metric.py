@@ -30,6 +30,7 @@ CONTRAST = Metric("contrast", "contrast", "higher", function=lambda render: rend
 @pytest.fixture(autouse=True)
 def forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(measures, "_own", {})
+    measures._installed.cache_clear()
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ import torch
 import yaml
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.running.grid import cell_folder, plan_cells, run_cells
+from ambiguous_wild.harness.running.grid import cell_folder, plan_cells, run_cells, try_recipes
 from ambiguous_wild.harness.running.result_file import check_model, read_result
 from ambiguous_wild.harness.running.run import refuse_other_config
 from ambiguous_wild.io.hashing import sha256_file
@@ -211,11 +211,45 @@ def test_a_folder_that_is_not_ours_is_left_alone(scene, tmp_path):
 def test_a_failing_cell_does_not_take_the_others_with_it(scene, tmp_path):
     cells, reports = bench(scene, tmp_path, "broken", "3dgs")
     assert [r.outcome for r in reports] == ["failed", "trained"]
-    assert reports[0].error == "RuntimeError: boom"
     folder = cell_folder(tmp_path, cells[0])
+    assert reports[0].error == f"RuntimeError: boom; traceback: {folder / 'traceback.txt'}"
     result = read_result(folder / "failed.json")
     assert result["status"] == "failed" and result["code_hash"] and "--method broken" in result["reproduce"]
     assert "boom" in (folder / "traceback.txt").read_text()
+
+
+@pytest.mark.parametrize(
+    ("fault", "error"), [("1 / 0", "ZeroDivisionError: division by zero"), ("sys.exit(3)", "SystemExit: 3")]
+)
+def test_a_fault_of_a_method_of_ones_own_is_told_with_its_line(scene, tmp_path, fault, error):
+    own = tmp_path / "my.py"
+    own.write_text(f"import sys\n\ndef mine():\n    {fault}\n")
+    cells, reports = bench(scene, tmp_path / "runs", f"{own}:mine", "3dgs")
+    folder = cell_folder(tmp_path / "runs", cells[0])
+    assert reports[0].error == f"{error} (my.py, line 4); traceback: {folder / 'traceback.txt'}"
+    assert (folder / "traceback.txt").is_file() and reports[1].outcome == "trained"
+    assert read_result(folder / "failed.json")["error"] == f"{error} (my.py, line 4)"
+    try_recipes(cells)  # left to the run
+
+
+def test_a_changed_file_is_named_and_trained_again_alone(scene, tmp_path):
+    own, code = (
+        tmp_path / "my.py",
+        "from ambiguous_wild.splat.parts import Parts\ndef mine(): return Parts({})",
+    )
+    methods = (f"{own}:mine", "3dgs")
+    own.write_text(code.format(""))
+    bench(scene, tmp_path / "runs", *methods)
+    own.write_text(code.format("sh_degree=1"))
+    with pytest.raises(AwError) as refused:
+        bench(scene, tmp_path / "runs", *methods)
+    assert "(my.py has changed since this run)" in str(refused.value)
+    assert "--overwrite changed" in str(refused.value)
+    outcomes = [r.outcome for r in bench(scene, tmp_path / "runs", *methods, overwrite="changed")[1]]
+    assert outcomes == ["trained", "kept"]
+    longer = dataclasses.replace(SHORT, iterations=61)
+    with pytest.raises(AwError, match=r"train\.iterations was 60, is 61"):
+        bench(scene, tmp_path / "runs", "3dgs", train=longer, overwrite="changed")
 
 
 def test_a_run_that_succeeds_after_a_failure_leaves_no_trace_of_it(scene, tmp_path, monkeypatch):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ from ambiguous_wild.core.config import config_hash, flatten, to_plain, with_opti
 from ambiguous_wild.harness.measures import Measure, measure
 from ambiguous_wild.harness.running.cell import Cell
 from ambiguous_wild.harness.running.grid import cell_folder, plan_cells
-from ambiguous_wild.harness.running.result_file import FAILED, RESULT, RunResult, metrics_of, read_result
+from ambiguous_wild.harness.running.result_file import FAILED, RESULT, RunResult, metric_mean, read_result
 from ambiguous_wild.methods.ablation import DEFAULT, Group, Variant, choose_groups, folder_name
 from ambiguous_wild.methods.describe import BACK_ENDS
 from ambiguous_wild.methods.registry import MethodEntry, get_method
@@ -283,9 +284,8 @@ class Outcome:
             return sum(known) if len(known) == len(parts) else None
         if metric in cost:
             return cost[metric]
-        values = [metrics_of(row).get(metric) for row in self.result["per_image"]]
-        known = [value for value in values if value is not None]
-        return sum(known) / len(known) if known and len(known) == len(values) else None
+        mean = metric_mean(self.result, metric)
+        return None if math.isnan(mean) else mean
 
 
 # What is tabulated of every variant; keys as in ablation.json.

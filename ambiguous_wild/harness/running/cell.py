@@ -35,11 +35,11 @@ from ambiguous_wild.harness.running.result_file import (
     RunConfig,
     RunResult,
     UnusualConfig,
-    metrics_of,
 )
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.motion_points import FILE as MOTION
 from ambiguous_wild.methods.graft import Graft
+from ambiguous_wild.methods.references import reference_file
 from ambiguous_wild.methods.registry import MethodEntry, all_methods
 from ambiguous_wild.splat.pace import TrainConfig
 
@@ -181,7 +181,7 @@ def _digest_of(path: Path, size: int, mtime_ns: int) -> str:
     return sha256_file(path)
 
 
-Overwrite = Literal["never", "missing", "always"]
+Overwrite = Literal["never", "missing", "changed", "always"]
 Protocol = Literal["full", "half"]
 Outcome = Literal["trained", "kept", "skipped", "failed"]
 
@@ -257,10 +257,7 @@ class Cell:
         known: dict[str, Any] = {**(facts or {}), "length": asked_length(self.train)}
         if mixed := mixed_tests(self.scene):
             known["test_photos"] = mixed
-        mine = records({key for row in per_image for key in metrics_of(row)})
-        more: Any = {"metrics": mine} if mine else {}
         return {
-            **more,
             "schema": SCHEMA,
             "method": self.method.name,
             "scene": self.scene.name,
@@ -269,6 +266,7 @@ class Cell:
             "error": error,
             "options": to_plain(self.options),
             "per_image": list(per_image),
+            "metrics": records({key for row in per_image for key in row}),
             "missing": dict(missing or {}),
             "masks": masks,
             "facts": known,
@@ -284,8 +282,8 @@ class RunOptions:
     """How runs are made and kept; nothing of this changes a result."""
 
     cache_dir: Path  # for features and instance masks shared between runs
-    # "missing" keeps a finished run and resumes a stopped one, "always" starts anew, "never" leaves a folder
-    # that exists as it is
+    # "missing" keeps a finished run and resumes a stopped one, "changed" also replaces one whose method's
+    # file has changed, "always" starts anew, "never" leaves a folder that exists as it is
     overwrite: Overwrite = "missing"
     pictures: bool = True  # draw what the method saw into pictures/
 
@@ -388,6 +386,11 @@ def _plugins(method: MethodEntry) -> list[Path]:
     # a reference is no plugin: its file need not call register
     found = [_plugin(member) for member in members if not member.given_as]
     return [path for path in dict.fromkeys(found) if path is not None]
+
+
+def file_of(method: MethodEntry) -> Path | None:
+    """The file of a method of one's own."""
+    return reference_file(method.given_as) if method.given_as else _plugin(method)
 
 
 def _plugin(method: MethodEntry) -> Path | None:

@@ -28,6 +28,7 @@ from ambiguous_wild.harness.running.choosing import (
 )
 from ambiguous_wild.harness.running.run import (
     left_alone,
+    made_anew,
     refuse_other_config,
     refuse_strange_folder,
     run_cell,
@@ -55,7 +56,7 @@ def try_recipes(cells: Sequence[Cell]) -> None:
             with_effects(cell.method.build(cell.options), cell.chosen.effects)
         except AwError as error:
             raise AwError(f"{cell.method.name}: {error}") from error
-        except Exception:
+        except (Exception, SystemExit):
             continue  # a plug-in's bug: its runs fail with their traceback, the others are trained
 
 
@@ -214,7 +215,7 @@ def checked_folders(cells: Sequence[Cell], output: Path, options: RunOptions) ->
     for cell, folder in zip(cells, folders):
         if folder.exists() and options.overwrite != "never":
             refuse_strange_folder(folder)
-            if options.overwrite == "missing":
+            if not made_anew(folder, options.overwrite, cell.config):
                 refuse_other_config(folder, cell)
     for needed in (output, options.cache_dir):
         check_output(needed / "run")  # what cannot be written is found before it is needed
@@ -247,7 +248,7 @@ def _moved(cell: Cell, seconds: float | None, group: str) -> Cell:
 
 def unfinished(cells: Sequence[Cell], output: Path, overwrite: Overwrite) -> list[Cell]:
     """The cells that will be run: not those that are kept."""
-    return [cell for cell in cells if left_alone(cell_folder(output, cell), overwrite) is None]
+    return [cell for cell in cells if left_alone(cell_folder(output, cell), overwrite, cell.config) is None]
 
 
 def expected_line(cells: Sequence[Cell]) -> str:

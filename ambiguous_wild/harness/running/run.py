@@ -20,15 +20,25 @@ from ambiguous_wild.harness.running.cell import (
     Overwrite,
     RunOptions,
     environment,
+    file_of,
     provenance,
 )
 from ambiguous_wild.harness.running.external import run_program
-from ambiguous_wild.harness.running.result_file import FAILED, RESULT, model_hash, read_result, write_result
+from ambiguous_wild.harness.running.result_file import (
+    FAILED,
+    RESULT,
+    RunConfig,
+    model_hash,
+    read_result,
+    write_result,
+)
+from ambiguous_wild.harness.running.store import read_config
 from ambiguous_wild.harness.running.training import Tick, train_and_measure
 from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.atomic import sweep, write_json, write_text
 from ambiguous_wild.io.lock import folder_lock
 from ambiguous_wild.methods.external.program import DONE, LOGS, WORK
+from ambiguous_wild.methods.plugin_file import place_of
 
 CONFIG = "config.yaml"
 ENVIRONMENT = "env.json"
@@ -49,27 +59,43 @@ def is_finished(folder: Path) -> bool:
     return True
 
 
-def left_alone(folder: Path, overwrite: Overwrite) -> Literal["kept", "skipped"] | None:
+def left_alone(folder: Path, overwrite: Overwrite, config: RunConfig) -> Literal["kept", "skipped"] | None:
     """What a run becomes that need not be made: finished before, or to be left as it is; else None."""
     if overwrite == "never":
         return "skipped" if folder.exists() else None
-    return "kept" if overwrite == "missing" and is_finished(folder) else None
+    return "kept" if is_finished(folder) and not made_anew(folder, overwrite, config) else None
 
 
-def record_failure(cell: Cell, folder: Path, error: Exception) -> None:
+def made_anew(folder: Path, overwrite: Overwrite, config: RunConfig) -> bool:
+    """Whether an earlier run of the folder is to be replaced: always, or where the method's file changed."""
+    if overwrite != "changed":
+        return overwrite == "always"
+    names = _different(read_config(folder), config)
+    return "source" in names and all(k == "source" or k.startswith("options.") for k in names)
+
+
+def _different(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """Keys that decide the result and differ between two configurations, the method's file first."""
+    ignored = {f"{part}.{key}" for part, keys in IGNORED.items() for key in keys} | {"config_hash"}
+    old, new = flatten(dict(before)), flatten(dict(now))
+    names = [k for k in old.keys() | new.keys() if old.get(k) != new.get(k) and k not in ignored]
+    return sorted(names, key=lambda k: (k != "source", k))
+
+
+def record_failure(cell: Cell, folder: Path, error: BaseException) -> None:
     """Write failed.json, and the traceback where the error is a fault of this package."""
     if not isinstance(error, (AwError, OSError)):
         write_text(folder / TRACEBACK, "".join(traceback.format_exception(error)))
     write_result(folder / FAILED, {**cell.result(error=error_line(error)), **provenance(cell)})
 
 
-def error_line(error: Exception) -> str:
-    """One line that says what went wrong."""
+def error_line(error: BaseException) -> str:
+    """One line that says what went wrong, with the line of a method's own file."""
     if isinstance(error, AwError):
         return str(error)
     if isinstance(error, OSError):
         return f"{error.filename or 'input or output'}: {error.strerror or error}"
-    return f"{type(error).__name__}: {error}"
+    return f"{type(error).__name__}: {error}{place_of(error)}"
 
 
 def refuse_strange_folder(folder: Path) -> None:
@@ -93,9 +119,13 @@ def _is_our_config(path: Path) -> bool:
         return True
 
 
-def _said(key: str, config: Mapping[str, Any]) -> str:
-    """A value as the command line writes it: a config leaves out the full protocol."""
-    return str(config.get(key, "full" if key == "protocol" else None))
+def _said(key: str, before: Mapping[str, Any], now: Mapping[str, Any], cell: Cell) -> str:
+    """What changed, as the command line writes it: a config leaves out the full protocol."""
+    if key == "source":
+        file = file_of(cell.method)
+        return f"{file.name if file else f'the code of {cell.method.name}'} has changed since this run"
+    was, is_now = (str(of.get(key, "full" if key == "protocol" else None)) for of in (before, now))
+    return f"{key} was {was}, is {is_now}"
 
 
 def _of_weights(cell: Cell, names: Sequence[str], before: Mapping[str, Any]) -> str:
@@ -121,15 +151,13 @@ def refuse_other_config(folder: Path, cell: Cell) -> None:
         raise AwError(f"{error}; start anew with --overwrite always") from None
     if old.get("config_hash") == cell.identity:
         return
-    ignored = {f"{part}.{key}" for part, keys in IGNORED.items() for key in keys} | {"config_hash"}
     before, now = flatten(old), flatten(dict(cell.config))
-    names = [
-        k for k in sorted(before.keys() | now.keys()) if before.get(k) != now.get(k) and k not in ignored
-    ]
-    shown = ", ".join(f"{k} was {_said(k, before)}, is {_said(k, now)}" for k in names[:4]) or "its hash"
+    names = _different(old, cell.config)
+    shown = ", ".join(_said(k, before, now, cell) for k in names[:4]) or "its hash"
+    how = "changed" if made_anew(folder, "changed", cell.config) else "always"
     raise AwError(
         f"{folder} holds a run of another configuration ({shown}); "
-        f"choose another -o, or replace it with --overwrite always{_of_weights(cell, names, before)}"
+        f"choose another -o, or replace it with --overwrite {how}{_of_weights(cell, names, before)}"
     )
 
 
@@ -144,8 +172,11 @@ def run_cell(cell: Cell, folder: Path, options: RunOptions, tick: Tick | None = 
     """
     try:
         return _run(cell, Path(os.path.realpath(folder)), options, tick)
-    except Exception as error:
-        return CellReport(folder, "failed", error=error_line(error))
+    except (Exception, SystemExit) as error:  # a method of one's own may call sys.exit
+        where = folder / TRACEBACK
+        return CellReport(
+            folder, "failed", error=error_line(error) + (f"; traceback: {where}" if where.is_file() else "")
+        )
 
 
 def _run(cell: Cell, folder: Path, options: RunOptions, tick: Tick | None) -> CellReport:
@@ -155,7 +186,7 @@ def _run(cell: Cell, folder: Path, options: RunOptions, tick: Tick | None) -> Ce
     with folder_lock(folder, f"aw bench --method {cell.method.name}"):
         if folder.exists():
             refuse_strange_folder(folder)
-            if options.overwrite == "always":
+            if made_anew(folder, options.overwrite, cell.config):
                 shutil.rmtree(folder)
             else:
                 refuse_other_config(folder, cell)
@@ -168,7 +199,7 @@ def _run(cell: Cell, folder: Path, options: RunOptions, tick: Tick | None) -> Ce
             else:
                 result = train_and_measure(cell, folder, options, tick)
             write_result(folder / RESULT, {**result, **model_hash(folder), **provenance(cell)})
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             record_failure(cell, folder, error)
             raise
     return CellReport(folder, "trained", result=result)

@@ -130,7 +130,7 @@ class RayCluster:
                 token.touch()
             for index, job in enumerate(jobs):
                 folder = Path(job.folder)
-                if (outcome := left_alone(folder, job.options.overwrite)) is not None:
+                if (outcome := left_alone(folder, job.options.overwrite, job.config)) is not None:
                     ended(index, CellReport(folder, outcome))
                 elif store:
                     if job.scene not in scenes:

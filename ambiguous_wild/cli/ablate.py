@@ -69,15 +69,11 @@ def command(
     for plugin in plugins:
         load_plugin(plugin)
     entry = get_method(method)
-<<<<<<< HEAD
-    method = method if entry.given_as else entry.name  # as it is written
-=======
     method = entry.name  # of a file's recipe; its reference would read the file again
     if sweeps:
         swept = sweep_groups(entry.options(), sweeps)
         entry = register(dataclasses.replace(entry, ablations=(*entry.ablation_groups(), *swept)))
         groups = (*groups, *(group.name for group in swept))
->>>>>>> hC
     chosen = choose_groups(method, entry.ablation_groups(), groups)
     if listing:
         click.echo(json.dumps(_listed(chosen), indent=2) if as_json else _list_text(chosen))

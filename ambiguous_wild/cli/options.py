@@ -86,20 +86,13 @@ _TRAINING = (
     plugin_option,
     click.option(
         "--overwrite",
-<<<<<<< HEAD
-        type=click.Choice(["never", "missing", "always"]),
+        type=click.Choice(["never", "missing", "changed", "always"]),
         is_flag=False,
         flag_value="always",
         default="missing",
         show_default=True,
-        help="Alone, or always: train again; missing: what is not finished; never: skip existing folders.",
-=======
-        type=click.Choice(["never", "missing", "changed", "always"]),
-        default="missing",
-        show_default=True,
         help="missing: train what is not finished; changed: also where a method's file has changed; never: skip "
-        "existing folders; always: train again.",
->>>>>>> hC
+        "existing folders; always, or no word: train again.",
     ),
     click.option(
         "--cache",

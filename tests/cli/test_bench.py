@@ -33,15 +33,11 @@ def test_what_is_no_budget(text):
         (["--method", "refinsplat"], "did you mean 'refinesplat'"),
         (["--method", "3dgs", "--iterations", "5", "--budget", "1m"], "exclude each other"),
         (["--method", "3dgs", "--iterations", "0"], "--iterations"),
-<<<<<<< HEAD
         (["--method", "3dgs", "--iterations", "10k"], "'10k' is not a whole number"),
         (["--method", "3DGS", "--passes", "2", "refinesplat"], "did you mean --method refinesplat?"),
         (["--method", "3dgs", "./other"], "did you mean --scene ./other?"),
         (["--method", "3dgs,refinsplat"], "unknown method 'refinsplat': did you mean 'refinesplat'"),
-        (["--method", "3dgs", "--overwrite", "perhaps"], "'never', 'missing', 'always'"),
-=======
         (["--method", "3dgs", "--overwrite", "perhaps"], "'never', 'missing', 'changed', 'always'"),
->>>>>>> hC
         (["--method", "3dgs", "--itterations", "5"], "--iterations"),
         (["--method", "refinesplat", "--set", "refinesplat.lamda_cr=1"], "did you mean 'lambda_cr'"),
         (["--method", "3dgs", "--plugin", "absent.py"], "no plugin file"),

@@ -36,8 +36,8 @@ KINDS = (
 )
 @click.option("--motion", is_flag=True, help="Match the photos to find what moves, for masks (motion.npz).")
 @click.option(
-    "--masks/--no-masks", default=True, show_default=True,
-    help="Use keep masks: those that the layout names, masks/ beside the photos, the photos' alpha.",
+    "--no-masks", "masks", is_flag=True, flag_value=False, default=True,
+    help="Leave out keep masks: those that the layout names, masks/ beside the photos, the photos' alpha.",
 )  # fmt: skip
 @threads_option
 @click.option(

@@ -31,7 +31,7 @@ plugin_option = click.option(
     help="A Python file that registers your methods; repeatable.",
 )
 metric_file_option = click.option(
-    "--metric",
+    "--metric-file",
     "metrics",
     multiple=True,
     type=PathName(),

@@ -1,6 +1,6 @@
 """What can be measured of a run, as data: metrics of test images, built in or of one's own, masks and cost.
 
-A metric of one's own is a `Metric` in a file (`--metric my_metric.py`), of an installed package (entry points
+A metric of one's own is a `Metric` in a file (`--metric-file my_metric.py`), of an installed package (entry points
 `ambiguous_wild.metrics`) or given to `register`. Its record is kept in each result, so that tables need
 neither.
 """
@@ -193,7 +193,7 @@ def load_metrics(path: Path) -> None:
         AwError: no such file, none in it, or one that `register` refuses.
     """
     if not path.is_file():
-        raise AwError(f"no file {path} for --metric: give the path of a .py file with a Metric in it")
+        raise AwError(f"no file {path} for --metric-file: give the path of a .py file with a Metric in it")
     found = [value for value in vars(import_file(path)).values() if isinstance(value, Metric)]
     if not found:
         raise AwError(f"{path} holds no Metric: see 'Your own metric' in docs/metrics.md")

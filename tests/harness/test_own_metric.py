@@ -48,7 +48,7 @@ def test_it_is_measured_and_stands_in_table_cost_and_board_without_its_file(
         write_run(tmp_path / "runs", scene, method, noise=noise)
         for method, noise in (("3dgs", 20.0), ("robustsplat", 5.0))
     ]
-    done = aw("rescore", tmp_path / "runs", "--metric", own)
+    done = aw("rescore", tmp_path / "runs", "--metric-file", own)
     assert done.returncode == 0 and "grey_error" in done.stdout
     result = read_result(runs[0] / "metrics.json")
     render = read_png_rgb((runs[0] / "renders/test" / result["per_image"][0]["name"]).with_suffix(".png"))
@@ -56,10 +56,10 @@ def test_it_is_measured_and_stands_in_table_cost_and_board_without_its_file(
     assert result["per_image"][0]["grey_error"] == abs(render.mean() - photo.mean())  # type: ignore[typeddict-item]
     assert result["per_image"][0]["contrast"] == render.std()  # type: ignore[typeddict-item]
     assert result["metrics"]["grey_error"]["label"] == "grey error levels"
-    assert aw("rescore", tmp_path / "runs", "--metric", own).stderr.startswith("2 complete")
+    assert aw("rescore", tmp_path / "runs", "--metric-file", own).stderr.startswith("2 complete")
 
     own.write_text(OWN.replace("* 1", "* 2"))  # another state of the file measures again
-    assert "added contrast, grey_error" in aw("rescore", tmp_path / "runs", "--metric", own).stdout
+    assert "added contrast, grey_error" in aw("rescore", tmp_path / "runs", "--metric-file", own).stdout
     again = read_result(runs[0] / "metrics.json")["per_image"][0]
     assert again["grey_error"] == 2 * result["per_image"][0]["grey_error"]  # type: ignore[typeddict-item]
 

@@ -140,7 +140,8 @@ class _Reader:
 
 def _binary_cameras(path: Path) -> dict[int, ModelCamera]:
     """cameras.bin."""
-    reader, cameras = _Reader(path), {}
+    reader = _Reader(path)
+    cameras: dict[int, ModelCamera] = {}
     for _ in range(reader.count(24)):
         camera_id, number, width, height = reader.unpack("<iiQQ")
         name, count = model_of_id(number, str(path))
@@ -151,7 +152,8 @@ def _binary_cameras(path: Path) -> dict[int, ModelCamera]:
 
 def _binary_images(path: Path) -> dict[int, ModelImage]:
     """images.bin."""
-    reader, images = _Reader(path), {}
+    reader = _Reader(path)
+    images: dict[int, ModelImage] = {}
     for _ in range(reader.count(73)):
         image_id, *pose, camera_id = reader.unpack("<i7di")
         name = reader.text()

@@ -34,7 +34,7 @@ class BuildSettings:
     sfm: Effort = "auto"  # auto: fast, then more where it leaves photos out
     matcher: Matcher = "auto"  # auto: exhaustive up to 25 photos (thorough: 200), then retrieval
     mapper: Mapper = "incremental"  # global is faster on many photos, weaker on few
-    max_features: int = 3000  # SIFT features a photo
+    max_features: int = 3000  # SIFT features a photo, as COLMAP counts: up to 5400
     max_side: int = 1600  # px; photos are reduced to this for SIFT only
     seed: int = 0  # of every random choice inside COLMAP
     masks_missing: Literal["error", "keep"] = "error"  # a photo without a mask: refuse, or use it whole

@@ -39,7 +39,7 @@ from ambiguous_wild.builder.sfm import (
     SfmJob,
     TriangulationJob,
 )
-from ambiguous_wild.builder.sift import features_of
+from ambiguous_wild.builder.sift import PLACES_A_FEATURE, features_of
 from ambiguous_wild.io.atomic import write_json
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
@@ -89,7 +89,7 @@ def _extract_with_opencv(job: FeatureJob) -> None:
             Path(job["photos"]),
             masks,
             job["names"],
-            job["settings"]["max_features"],
+            round(PLACES_A_FEATURE * job["settings"]["max_features"]),
             job["settings"]["max_side"],
             job["jobs"],
         ):

@@ -19,6 +19,8 @@ PEAK, EDGE, LEVELS, BLUR = 0.02, 10.0, 3, 1.6
 SCALE = 512.0  # descriptors are stored as bytes; of a unit vector few elements exceed a half
 OCTAVES = 4  # from the doubled photo on; features of coarser ones are badly placed
 GRAY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION  # as COLMAP reads
+# COLMAP's SIFT ends with the octave that exceeds the limit on features; so many places give as many as it has
+PLACES_A_FEATURE = 1.4
 AHEAD = 2  # photos in work a thread, so that few lie in memory
 
 

@@ -24,7 +24,7 @@ from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.atomic import atomic_dir, write_json
 from ambiguous_wild.io.lock import Held, file_lock, lock_path
 
-BUILDER = 14  # raised when a stage gives another result for the same input
+BUILDER = 15  # raised when a stage gives another result for the same input
 _LIBRARIES = ("pycolmap", "OpenImageIO", "opencv-contrib-python-headless", "pillow", "numpy")
 _RESULT = "stage.json"
 Facts = TypeVar("Facts", bound=Mapping[str, object])  # a record of `records.py`

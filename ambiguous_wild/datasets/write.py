@@ -271,6 +271,8 @@ def _with_points(
         if not len(model.points.ids):
             notes.append("too few points could be triangulated: initial points are random")
     if not len(model.points.ids):
+        if foreign.points == "model":
+            notes.append("the model has no points: training starts from random ones")
         points = random_points(model, foreign.split, blender=foreign.points == "random", seed=settings.seed)
         model = Model(model.cameras, model.images, points)
     return model

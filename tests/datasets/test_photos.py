@@ -1,5 +1,6 @@
 """Photos, masks and models as people have them: sizes, alpha, names, several models."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 from ambiguous_wild.core import AwError
 from ambiguous_wild.datasets.write import ImportSettings, import_scene
 from ambiguous_wild.harness.running.grid import plan_cells
+from ambiguous_wild.io.colmap_records import points_without_tracks
 from ambiguous_wild.io.images import read_mask
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.data import load_keep
@@ -164,3 +166,23 @@ def test_a_bench_that_tests_nothing_is_refused(names, tmp_path):
     (root / "test_list.txt").write_bytes(names.encode("utf-16-le"))
     with pytest.raises(AwError, match="tests nothing"):
         plan_cells(["3dgs"], [root], [0], TrainConfig(iterations=20))
+
+
+def test_colours_of_start_points_are_read_under_other_names(tmp_path):
+    root = layouts.nerfstudio(tmp_path / "raw")
+    text = (root / "sparse_pc.ply").read_text()
+    for colour in ("red", "green", "blue"):
+        text = text.replace(f"uint8 {colour}", f"uint8 diffuse_{colour}")
+    (root / "sparse_pc.ply").write_text(text)
+    points = load_scene(import_scene(root, tmp_path / "scene").scene).points
+    assert np.array_equal(points.rgb, layouts.make_model().points.rgb)
+
+
+def test_a_model_without_points_starts_from_random_ones_and_says_so(tmp_path):
+    root = layouts.native(tmp_path / "raw")
+    model = dataclasses.replace(layouts.make_model(), points=points_without_tracks())
+    images = {k: dataclasses.replace(i, point_ids=np.full(len(i.xys), -1)) for k, i in model.images.items()}
+    layouts.write_model(root / "sparse" / "0", dataclasses.replace(model, images=images))
+    done = aw("import", root, "-o", tmp_path / "scene")
+    assert "note: the model has no points: training starts from random ones" in done.stdout
+    assert len(load_scene(tmp_path / "scene").points) == 100_000

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.datasets.readers import recognise
 from ambiguous_wild.datasets.write import ImportSettings, import_scene
 from ambiguous_wild.harness.running.grid import plan_cells
 from ambiguous_wild.io.colmap_records import points_without_tracks
@@ -186,3 +187,36 @@ def test_a_model_without_points_starts_from_random_ones_and_says_so(tmp_path):
     done = aw("import", root, "-o", tmp_path / "scene")
     assert "note: the model has no points: training starts from random ones" in done.stdout
     assert len(load_scene(tmp_path / "scene").points) == 100_000
+
+
+def test_of_several_models_the_largest_is_read_or_the_one_that_is_named(tmp_path):
+    root = layouts.native(tmp_path / "raw")
+    (root / "sparse" / "0").rename(root / "sparse" / "1")
+    few = layouts.NAMES[2:]
+    layouts.write_model(root / "sparse" / "0", layouts.make_model(few))
+    done = aw("import", root, "-o", tmp_path / "scene")
+    assert "sparse holds 2 COLMAP models: 1 with 7 photos is read, not 0 (5)" in done.stdout
+    direct = load_scene(root)
+    assert len(load_scene(tmp_path / "scene").views) == len(direct.views) == 7
+    assert "2 COLMAP models" in direct.info["warnings"][0]
+    named = import_scene(root, tmp_path / "named", ImportSettings(model="0"))
+    assert [v.name for v in load_scene(named.scene).views] == sorted(few)
+    with pytest.raises(AwError, match="unknown model '2'"):
+        import_scene(root, tmp_path / "none", ImportSettings(model="2"))
+
+
+@pytest.mark.parametrize(
+    "loader", ["nerfbaselines.datasets.phototourism:load_phototourism_dataset", "phototourism"]
+)
+def test_photo_tourism_as_nerfbaselines_hands_it_out(loader, tmp_path):
+    layouts.phototourism(tmp_path / "raw")
+    root = tmp_path / "raw" / "dense"
+    (tmp_path / "raw" / "toy.tsv").rename(root / "nerfw_split.csv")
+    assert recognise(root)[0] == "photo-tourism"
+    (root / "nb-info.json").write_text(json.dumps({"loader": loader, "id": "phototourism", "type": None}))
+    done = import_scene(root, tmp_path / "scene")
+    assert done.info["evaluation"]["protocol"] == "half" and done.info["dataset"] == "Photo Tourism"
+    sides = {name: facts["split"] for name, facts in done.info["photos"].items()}
+    assert sides == {n: "train" if n in layouts.TRAIN else "test" for n in layouts.NAMES}
+    with pytest.raises(AwError, match=r"nerfw_split.csv is a table of splits"):
+        import_scene(root, tmp_path / "wrong", ImportSettings(kind="colmap"))

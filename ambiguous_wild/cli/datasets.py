@@ -25,6 +25,7 @@ KINDS = (
 @click.argument("source", type=PathName())
 @click.option("-o", "--output", required=True, type=PathName(), help="Scene folder to make.")
 @click.option("--as", "kind", type=click.Choice(KINDS), help="Layout of SOURCE.  [default: recognised]")
+@click.option("--model", default="", help="Name of one of several COLMAP models.  [default: most photos]")
 @click.option("--factor", type=int, help="Downsampling.  [default: as in the papers]")
 @click.option("--name", default="", help="Name of the scene.  [default: the output folder's]")
 @click.option("--license", "license_", default="", help="Licence of the photos, recorded in scene.json.")
@@ -53,6 +54,7 @@ def import_command(
     source: Path,
     output: Path,
     kind: str | None,
+    model: str,
     factor: int | None,
     name: str,
     license_: str,
@@ -74,7 +76,7 @@ def import_command(
     from ambiguous_wild.datasets.write import ImportSettings, import_scene
 
     settings = ImportSettings(
-        kind, factor, name, license_, dataset, drop_test_only_points, seed, motion, masks
+        kind, factor, name, license_, dataset, drop_test_only_points, seed, motion, model, masks
     )
     done = import_scene(source, output, settings, overwrite=overwrite, jobs=threads, progress=not as_json)
     info = done.info

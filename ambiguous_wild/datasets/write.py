@@ -53,6 +53,7 @@ class ImportSettings:
     drop_test_only_points: bool = False  # points that no training photo sees leak the test photos
     seed: int = 0  # of matching and of random points
     motion: bool = False  # match the photos and keep what moves
+    model: str = ""  # of several COLMAP models; empty = the one with most photos
     masks: bool = True  # use keep masks, the photos' alpha among them
 
 
@@ -100,7 +101,7 @@ def import_scene(
         raise AwError(
             f"{target} and the dataset {root} lie inside each other; choose a folder outside for -o"
         )
-    foreign, why = read_foreign(root, settings.kind)
+    foreign, why = read_foreign(root, settings.kind, settings.model)
     if not settings.masks:
         foreign = dataclasses.replace(foreign, masks={})
     elif foreign.masks:
@@ -271,6 +272,8 @@ def _with_points(
         if not len(model.points.ids):
             notes.append("too few points could be triangulated: initial points are random")
     if not len(model.points.ids):
+        if foreign.points == "model":
+            notes.append("the model has no points: training starts from random ones")
         points = random_points(model, foreign.split, blender=foreign.points == "random", seed=settings.seed)
         model = Model(model.cameras, model.images, points)
     return model

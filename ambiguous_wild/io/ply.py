@@ -19,6 +19,7 @@ _TYPES = {
     "float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8",
 }  # fmt: skip
 _COLOURS = ("red", "green", "blue")
+_SPELLINGS = (_COLOURS, tuple(f"diffuse_{c}" for c in _COLOURS), tuple("rgb"), ("Red", "Green", "Blue"))
 _SHAPES = {"means": (3,), "quats": (4,), "log_scales": (3,), "opacity_logits": (), "sh0": (3,)}
 
 
@@ -120,9 +121,10 @@ def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     xyz = np.stack([table[a].astype(np.float64) for a in "xyz"], axis=1)
     if not np.isfinite(xyz).all():
         raise AwError(f"{path} holds positions that are not finite")
-    if not all(c in names for c in _COLOURS):
+    spelt = [of for of in _SPELLINGS if all(c in names for c in of)]
+    if not spelt:
         return xyz, np.full(xyz.shape, 128, np.uint8)
-    rgb = np.stack([table[c] for c in _COLOURS], axis=1)
+    rgb = np.stack([table[c] for c in spelt[0]], axis=1)
     shares = rgb.dtype.kind == "f" and not (rgb > 1.0).any()  # others write 0 to 255 as floats
     return xyz, np.clip(rgb * (255.0 if shares else 1.0), 0, 255).astype(np.uint8)
 

@@ -75,6 +75,8 @@ def load_scene(
         for side, names in missing.items()
         if names
     ]
+    if read is None and (told := several_models(models_in(root), sparse)):
+        info["warnings"].append(told)
     masks: dict[str, Path] = {}
     if read is None and not (root / "masks" / OWN_MASKS).is_file():
         masks = find_masks(root / "masks", [name for name, side in split.items() if side == "train"])
@@ -218,15 +220,53 @@ def find_masks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
     return found
 
 
+def models_in(root: Path, places: Iterable[str] = ("sparse", "colmap/sparse")) -> list[tuple[Path, int]]:
+    """COLMAP models of the first place that has one, with their numbers of photos, the largest first."""
+    for place in places:
+        inner = sorted((root / place).glob("*/"), key=lambda p: (p.name != "0", p.name))
+        for folders in (inner, [root / place]):
+            found = [
+                (folder, registered(folder))
+                for folder in folders
+                if (folder / "cameras.bin").is_file() or (folder / "cameras.txt").is_file()
+            ]
+            if found:
+                return sorted(found, key=lambda item: -item[1])
+    return []
+
+
+def registered(folder: Path) -> int:
+    """Photos of a COLMAP model, from the head of its file; 0 where it cannot be read."""
+    try:
+        if (folder / "images.bin").is_file():
+            with open(folder / "images.bin", "rb") as f:
+                return int.from_bytes(f.read(8), "little")
+        with open(folder / "images.txt", "rb") as f:
+            return (sum(not line.startswith(b"#") for line in f) + 1) // 2
+    except OSError:
+        return 0
+
+
+def several_models(models: list[tuple[Path, int]], used: Path) -> str:
+    """The line that says which of several models is read; empty for one."""
+    others = [f"{folder.name} ({count})" for folder, count in models if folder != used]
+    if not others:
+        return ""
+    photos = dict(models)[used]
+    return (
+        f"{used.parent.name} holds {len(models)} COLMAP models: {used.name} with {photos} photos is read, "
+        f"not {shortlist(others)}; 'aw import --model NAME' reads another"
+    )
+
+
 def model_folder(root: Path) -> Path:
-    """Where the scene's COLMAP model lies.
+    """Where the scene's COLMAP model lies, of several the one with most photos.
 
     Raises:
         AwError: there is none.
     """
-    for folder in (root / "sparse" / "0", root / "sparse", root / "colmap" / "sparse" / "0"):
-        if (folder / "cameras.bin").is_file() or (folder / "cameras.txt").is_file():
-            return folder
+    if models := models_in(root):
+        return models[0][0]
     raise AwError(
         f"{root} is no scene: neither sparse/0 nor sparse holds a COLMAP model; "
         f"if it holds photos, build one with 'aw build-scene {root} -o SCENE'"

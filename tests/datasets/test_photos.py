@@ -1,5 +1,6 @@
 """Photos, masks and models as people have them: sizes, alpha, names, several models."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -8,8 +9,10 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.datasets.readers import recognise
 from ambiguous_wild.datasets.write import ImportSettings, import_scene
 from ambiguous_wild.harness.running.grid import plan_cells
+from ambiguous_wild.io.colmap_records import points_without_tracks
 from ambiguous_wild.io.images import read_mask
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.data import load_keep
@@ -164,3 +167,56 @@ def test_a_bench_that_tests_nothing_is_refused(names, tmp_path):
     (root / "test_list.txt").write_bytes(names.encode("utf-16-le"))
     with pytest.raises(AwError, match="tests nothing"):
         plan_cells(["3dgs"], [root], [0], TrainConfig(iterations=20))
+
+
+def test_colours_of_start_points_are_read_under_other_names(tmp_path):
+    root = layouts.nerfstudio(tmp_path / "raw")
+    text = (root / "sparse_pc.ply").read_text()
+    for colour in ("red", "green", "blue"):
+        text = text.replace(f"uint8 {colour}", f"uint8 diffuse_{colour}")
+    (root / "sparse_pc.ply").write_text(text)
+    points = load_scene(import_scene(root, tmp_path / "scene").scene).points
+    assert np.array_equal(points.rgb, layouts.make_model().points.rgb)
+
+
+def test_a_model_without_points_starts_from_random_ones_and_says_so(tmp_path):
+    root = layouts.native(tmp_path / "raw")
+    model = dataclasses.replace(layouts.make_model(), points=points_without_tracks())
+    images = {k: dataclasses.replace(i, point_ids=np.full(len(i.xys), -1)) for k, i in model.images.items()}
+    layouts.write_model(root / "sparse" / "0", dataclasses.replace(model, images=images))
+    done = aw("import", root, "-o", tmp_path / "scene")
+    assert "note: the model has no points: training starts from random ones" in done.stdout
+    assert len(load_scene(tmp_path / "scene").points) == 100_000
+
+
+def test_of_several_models_the_largest_is_read_or_the_one_that_is_named(tmp_path):
+    root = layouts.native(tmp_path / "raw")
+    (root / "sparse" / "0").rename(root / "sparse" / "1")
+    few = layouts.NAMES[2:]
+    layouts.write_model(root / "sparse" / "0", layouts.make_model(few))
+    done = aw("import", root, "-o", tmp_path / "scene")
+    assert "sparse holds 2 COLMAP models: 1 with 7 photos is read, not 0 (5)" in done.stdout
+    direct = load_scene(root)
+    assert len(load_scene(tmp_path / "scene").views) == len(direct.views) == 7
+    assert "2 COLMAP models" in direct.info["warnings"][0]
+    named = import_scene(root, tmp_path / "named", ImportSettings(model="0"))
+    assert [v.name for v in load_scene(named.scene).views] == sorted(few)
+    with pytest.raises(AwError, match="unknown model '2'"):
+        import_scene(root, tmp_path / "none", ImportSettings(model="2"))
+
+
+@pytest.mark.parametrize(
+    "loader", ["nerfbaselines.datasets.phototourism:load_phototourism_dataset", "phototourism"]
+)
+def test_photo_tourism_as_nerfbaselines_hands_it_out(loader, tmp_path):
+    layouts.phototourism(tmp_path / "raw")
+    root = tmp_path / "raw" / "dense"
+    (tmp_path / "raw" / "toy.tsv").rename(root / "nerfw_split.csv")
+    assert recognise(root)[0] == "photo-tourism"
+    (root / "nb-info.json").write_text(json.dumps({"loader": loader, "id": "phototourism", "type": None}))
+    done = import_scene(root, tmp_path / "scene")
+    assert done.info["evaluation"]["protocol"] == "half" and done.info["dataset"] == "Photo Tourism"
+    sides = {name: facts["split"] for name, facts in done.info["photos"].items()}
+    assert sides == {n: "train" if n in layouts.TRAIN else "test" for n in layouts.NAMES}
+    with pytest.raises(AwError, match=r"nerfw_split.csv is a table of splits"):
+        import_scene(root, tmp_path / "wrong", ImportSettings(kind="colmap"))

@@ -266,6 +266,16 @@ def test_a_short_run_grows_no_more_than_a_gaussian_a_pixel(scene, tmp_path):
     assert trainer_for(scene, tmp_path, iterations=100, max_gaussians=500).pace.most == 500
 
 
+def test_more_points_than_a_run_may_hold_are_thinned_evenly(scene, tmp_path):
+    whole, few = trainer_for(scene, tmp_path / "a"), trainer_for(scene, tmp_path / "b", max_gaussians=300)
+    assert len(whole.gaussians) == 400 and len(few.gaussians) == 200
+    kept = (few.gaussians.means[:, None] == whole.gaussians.means[None]).all(dim=2)
+    assert (
+        kept.sum() == 200
+        and abs(float(few.gaussians.means[:, 0].mean() - whole.gaussians.means[:, 0].mean())) < 0.3
+    )
+
+
 def test_shrinking_averages_photos_and_keeps_only_whole_blocks():
     photo = torch.arange(4 * 6 * 3, dtype=torch.float32).reshape(4, 6, 3)
     small = shrink(photo, 2)

@@ -12,7 +12,7 @@ from ambiguous_wild.datasets.readers import colmap, nerfbaselines, on_the_go, ph
 from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.scene_folder import OWN_MASKS, find_masks
 
-READERS: dict[str, Callable[[Path], ForeignScene]] = {
+READERS: dict[str, Callable[..., ForeignScene]] = {
     "on-the-go": on_the_go.read_on_the_go,
     "robustnerf": colmap.read_robustnerf,
     "photo-tourism": phototourism.read_phototourism,
@@ -24,6 +24,7 @@ READERS: dict[str, Callable[[Path], ForeignScene]] = {
     "blender": transforms.read_blender,
     "colmap": colmap.read_plain,
 }
+COLMAP_KINDS = ("on-the-go", "robustnerf", "photo-tourism", "drone", "dualsplat", "nerfbaselines", "colmap")
 DRONE_SCENES = ("Cultural_Center", "TangTian", "Pavilion", "Simingshan", "Intersection", "Sculpture")
 
 
@@ -62,7 +63,7 @@ def _candidates(root: Path) -> list[tuple[str, str]]:
         found.append(("blender", "transforms_train.json"))
     if (root / "split.json").is_file():
         found.append(("on-the-go", "split.json"))
-    if sorted(root.glob("*.tsv")):
+    if sorted(root.glob("*.tsv")) or (root / "nerfw_split.csv").is_file():
         found.append(("photo-tourism", "a .tsv table"))
     elif (root / "dense" / "sparse").is_dir():
         found.append(("photo-tourism", "dense/sparse"))
@@ -91,12 +92,13 @@ def _candidates(root: Path) -> list[tuple[str, str]]:
     return [("colmap", "a COLMAP model")]
 
 
-def read_foreign(root: Path, kind: str | None = None) -> tuple[ForeignScene, str]:
+def read_foreign(root: Path, kind: str | None = None, model: str = "") -> tuple[ForeignScene, str]:
     """Read a dataset's scene.
 
     Args:
         root: its folder.
         kind: the layout; None = recognised.
+        model: name of one of several COLMAP models; empty = the one with most photos.
 
     Returns:
         The scene, and why it is taken for this layout.
@@ -112,7 +114,18 @@ def read_foreign(root: Path, kind: str | None = None) -> tuple[ForeignScene, str
         if not root.is_dir():
             raise AwError(f"dataset {root} does not exist or is no folder")
         why = "--as"
-    return _with_masks(READERS[kind](root)), why
+    if kind == "colmap" and (table := phototourism.find_table(root)) is not None:
+        raise AwError(
+            f"{table} is a table of splits, which --as colmap would not follow: pass --as photo-tourism, "
+            "or move the table away"
+        )
+    if kind not in COLMAP_KINDS:
+        if model:
+            raise AwError(f"--model {model} chooses among COLMAP models, which layout {kind} does not use")
+        return _with_masks(READERS[kind](root)), why
+    scene = _with_masks(READERS[kind](root, model))
+    told = colmap.which_model(root, model)
+    return (dataclasses.replace(scene, notes=(*scene.notes, told)) if told else scene), why
 
 
 def _with_masks(scene: ForeignScene) -> ForeignScene:

@@ -5,39 +5,51 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 
-from ambiguous_wild.core.errors import AwError, shortlist
+from ambiguous_wild.core.errors import AwError, shortlist, unknown
 from ambiguous_wild.core.scene import Split
 from ambiguous_wild.datasets.foreign import SIDES, ForeignScene, every_nth, inside, split_by_lists
 from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.colmap_records import Model
-from ambiguous_wild.io.scene_folder import read_list
+from ambiguous_wild.io.scene_folder import models_in, read_list, several_models
 
 LISTS: dict[Split, str] = {"train": "train_list.txt", "test": "test_list.txt"}
 KEYWORDS: dict[str, Split | None] = {"clutter": "train", "extra": "test", "clean": None}
-MODEL_FOLDERS = ("sparse/0", "sparse", "dense/sparse/0", "dense/sparse", "colmap/sparse/0")
+MODEL_FOLDERS = ("sparse", "dense/sparse", "colmap/sparse")  # or numbered models below one of them
 DRONE_WIDTH = 1920  # px; DroneSplat's loader reduces wider photos to it
 _NO_KEEP_MASKS = "are not keep masks of the dataset: left out"
 
 
-def model_folder(root: Path) -> Path | None:
-    """Where the COLMAP model lies; None without one."""
-    for name in MODEL_FOLDERS:
-        folder = root / name
-        if (folder / "cameras.bin").is_file() or (folder / "cameras.txt").is_file():
-            return folder
-    return None
+def model_folder(root: Path, chosen: str = "") -> Path | None:
+    """Where the COLMAP model lies: the one called `chosen`, else the largest; None without one.
+
+    Raises:
+        AwError: none is called `chosen`.
+    """
+    models = models_in(root, MODEL_FOLDERS)
+    if not chosen or not models:
+        return models[0][0] if models else None
+    by_name = {folder.name: folder for folder, _ in models}
+    if chosen not in by_name:
+        raise unknown("model", chosen, by_name)
+    return by_name[chosen]
 
 
-def read_named_model(root: Path) -> Model:
-    """The model, its photos' names checked.
+def which_model(root: Path, chosen: str = "") -> str:
+    """What is said where there are several models; empty for one."""
+    folder = model_folder(root, chosen)
+    return "" if folder is None else several_models(models_in(root, MODEL_FOLDERS), folder)
+
+
+def read_named_model(root: Path, chosen: str = "") -> Model:
+    """The model, its photos' names checked; `chosen` is the name of one of several.
 
     Raises:
         AwError: no model, a damaged one, or a name that leads out of the folder.
     """
-    folder = model_folder(root)
+    folder = model_folder(root, chosen)
     if folder is None:
         raise AwError(
-            f"{root} has no COLMAP model in {', '.join(MODEL_FOLDERS[:4])}; build a scene from the photos "
+            f"{root} has no COLMAP model in {', '.join(MODEL_FOLDERS)}; build a scene from the photos "
             "with 'aw build-scene'"
         )
     model = read_model(folder)
@@ -90,9 +102,9 @@ def has_lists(root: Path) -> bool:
     return any((root / name).is_file() for name in LISTS.values())
 
 
-def read_plain(root: Path) -> ForeignScene:
+def read_plain(root: Path, chosen: str = "") -> ForeignScene:
     """COLMAP with images: split by lists, else every 8th photo tests."""
-    model = read_named_model(root)
+    model = read_named_model(root, chosen)
     names = model_names(model)
     factors = shipped_factors(root)
     factor = factors[0] if len(factors) == 1 and not photo_folder(root).is_dir() else 1
@@ -132,9 +144,9 @@ def has_keywords(names: Iterable[str]) -> bool:
     return any("clutter" in b for b in bases) and any("extra" in b for b in bases)
 
 
-def read_robustnerf(root: Path) -> ForeignScene:
+def read_robustnerf(root: Path, chosen: str = "") -> ForeignScene:
     """RobustNeRF, the SpotLessSplats release and RobustSplat's renamed ones: the split is in the names."""
-    model = read_named_model(root)
+    model = read_named_model(root, chosen)
     sides = keyword_sides(model_names(model))
     split: dict[str, Split] = {name: side for name, side in sides.items() if side is not None}
     lacking = [side for side in SIDES if side not in split.values()]
@@ -161,9 +173,9 @@ def first_dot(name: str) -> str:
     return PurePosixPath(name).name.partition(".")[0]
 
 
-def read_drone(root: Path) -> ForeignScene:
+def read_drone(root: Path, chosen: str = "") -> ForeignScene:
     """Drone Imagery of DroneSplat: two lists, names compared up to their first dot, at most 1920 px wide."""
-    model = read_named_model(root)
+    model = read_named_model(root, chosen)
     split, missing = split_by_lists(model_names(model), read_lists(root), root, first_dot)
     notes: tuple[str, ...] = ()
     if (root / "masks").is_dir():
@@ -181,9 +193,9 @@ def read_drone(root: Path) -> ForeignScene:
     )
 
 
-def read_dualsplat(root: Path) -> ForeignScene:
+def read_dualsplat(root: Path, chosen: str = "") -> ForeignScene:
     """DualSplat's preparation: lists beside masks and depths of its own, which other methods do not get."""
-    model = read_named_model(root)
+    model = read_named_model(root, chosen)
     split, missing = split_by_lists(model_names(model), read_lists(root), root)
     own = [n for n in ("sam_masks", "pseudo_masks", "depths") if (root / n).is_dir()]
     notes = (f"{', '.join(own)} are results of a method: left out",)

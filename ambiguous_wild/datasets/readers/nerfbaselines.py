@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,15 @@ from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.datasets.foreign import Evaluation, ForeignScene, inside
 from ambiguous_wild.datasets.photos import at_photo_size
 from ambiguous_wild.datasets.readers.colmap import read_plain
-from ambiguous_wild.datasets.readers.phototourism import NERF_W
+from ambiguous_wild.datasets.readers.phototourism import NERF_W, read_phototourism
 from ambiguous_wild.datasets.readers.transforms import read_blender, read_json, read_transforms
 
-LOADERS = {"colmap": read_plain, "nerfstudio": read_transforms, "blender": read_blender}
+COLMAP = {"colmap": read_plain, "phototourism": read_phototourism}
+LOADERS: dict[str, Callable[..., ForeignScene]] = {
+    **COLMAP,
+    "nerfstudio": read_transforms,
+    "blender": read_blender,
+}
 DATASETS = {
     "phototourism": "Photo Tourism",
     "nerfonthego": "NeRF On-the-go",
@@ -23,7 +29,7 @@ DATASETS = {
 PROTOCOLS: dict[str, Evaluation] = {"default": {}, "nerf": {}, "nerfw": NERF_W}
 
 
-def read_nerfbaselines(root: Path) -> ForeignScene:
+def read_nerfbaselines(root: Path, chosen: str = "") -> ForeignScene:
     """A folder with nb-info.json.
 
     Raises:
@@ -31,13 +37,14 @@ def read_nerfbaselines(root: Path) -> ForeignScene:
     """
     path = root / "nb-info.json"
     info = read_json(path)
-    loader = str(info.get("loader", "colmap"))
+    # a name, or where the function lies: nerfbaselines.datasets.phototourism:load_phototourism_dataset
+    loader = str(info.get("loader", "colmap")).partition(":")[0].rpartition(".")[2]
     if loader not in LOADERS:
         raise unknown(f"loader in {path}", loader[:60], LOADERS)
-    protocol = str(info.get("evaluation_protocol", "default"))
+    protocol = str(info.get("evaluation_protocol") or ("nerfw" if loader == "phototourism" else "default"))
     if protocol not in PROTOCOLS:
         raise unknown(f"evaluation_protocol in {path}", protocol[:60], PROTOCOLS)
-    scene = LOADERS[loader](root)
+    scene = LOADERS[loader](root, chosen) if loader in COLMAP else LOADERS[loader](root)
     kwargs = info.get("loader_kwargs")
     options: dict[str, Any] = kwargs if isinstance(kwargs, dict) else {}
     images = options.get("images_path", "images")

@@ -68,10 +68,10 @@ def read_split(path: Path, count: int) -> dict[str, list[int]]:
     return found
 
 
-def read_on_the_go(root: Path) -> ForeignScene:
+def read_on_the_go(root: Path, chosen: str = "") -> ForeignScene:
     """The original release, with or without a COLMAP model of one's own, or an undistorted copy."""
     if not (root / "split.json").is_file():
-        return _undistorted(root)
+        return _undistorted(root, chosen)
     path = root / "transforms.json"
     if not path.is_file():
         raise AwError(
@@ -89,7 +89,7 @@ def read_on_the_go(root: Path) -> ForeignScene:
     }
     notes = [f"{len(positions['clean'])} clean photos are left out"] if positions["clean"] else []
     if model_folder(root) is not None:
-        model, folder = read_named_model(root), photo_folder(root)
+        model, folder = read_named_model(root, chosen), photo_folder(root)
         notes.append("poses from the COLMAP model in the folder, names from transforms.json")
         source = "model"
     else:
@@ -111,8 +111,8 @@ def read_on_the_go(root: Path) -> ForeignScene:
     )
 
 
-def _undistorted(root: Path) -> ForeignScene:
-    model = read_named_model(root)
+def _undistorted(root: Path, chosen: str = "") -> ForeignScene:
+    model = read_named_model(root, chosen)
     odd = sorted({c.model for c in model.cameras.values()} - {"PINHOLE", "SIMPLE_PINHOLE"})
     split, missing = split_by_lists(model_names(model), read_lists(root), root)
     notes = (f"cameras are {shortlist(odd)}: undistorted here",) if odd else ()

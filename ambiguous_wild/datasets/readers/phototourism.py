@@ -27,12 +27,12 @@ LEAST_SHARE = 0.5  # of the table's photos in the model; below, the table is of 
 
 
 def find_table(root: Path) -> Path | None:
-    """The scene's .tsv; None without one.
+    """The scene's .tsv, or NerfBaselines' nerfw_split.csv; None without one.
 
     Raises:
         AwError: there are several.
     """
-    found = sorted(root.glob("*.tsv"))
+    found = sorted(root.glob("*.tsv")) or sorted(root.glob("nerfw_split.csv"))
     if len(found) > 1:
         raise AwError(
             f"{root} has {len(found)} tables: {shortlist(p.name for p in found)}; keep the scene's own"
@@ -72,9 +72,9 @@ def read_table(path: Path) -> dict[Split, list[str]]:
     return found
 
 
-def read_phototourism(root: Path) -> ForeignScene:
+def read_phototourism(root: Path, chosen: str = "") -> ForeignScene:
     """dense/images, dense/sparse and <name>.tsv, or the published lists."""
-    model = read_named_model(root)
+    model = read_named_model(root, chosen)
     names = model_names(model)
     table = find_table(root)
     if table is not None:

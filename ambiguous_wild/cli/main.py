@@ -113,9 +113,10 @@ def cli(ctx: click.Context, quiet: bool, verbose: bool) -> None:
     """Distractor-free 3D Gaussian Splatting where the distractor looks like the scene.
 
     \b
+    aw try photos/ -o out               all of this in one go
     aw simulate courtyard -o raw        a simulated capture; or use your own photos
     aw build-scene raw -o scene         check, COLMAP, downsample, split
-    aw bench --method 3dgs --method refinesplat --scene scene -o runs
+    aw bench --method 3dgs,refinesplat --scene scene -o runs
     aw table runs                       compare the methods
 
     --quiet and --verbose may also stand behind a command.

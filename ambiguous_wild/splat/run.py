@@ -8,7 +8,7 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -47,8 +47,9 @@ def deferred() -> Iterator[Callable[[], bool]]:
 
     def note(number: int, frame: Any) -> None:
         noted.set()
-        LOG.info("stopping: the model is measured and saved, Ctrl-C again to quit")
         signal.signal(signal.SIGINT, signal.default_int_handler)
+        with suppress(RuntimeError):  # the signal came while a line was written to the same place
+            LOG.info("stopping: the model is measured and saved, Ctrl-C again to quit")
 
     signal.signal(signal.SIGINT, note)
     try:

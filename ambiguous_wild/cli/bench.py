@@ -44,7 +44,7 @@ def parse_budget(text: str) -> float:
     "--method",
     "methods",
     multiple=True,
-    help="A name of 'aw methods', FILE.py:RECIPE, external:FILE.yaml or nerfbaselines:METHOD; repeatable.",
+    help="A name of 'aw methods', FILE.py:RECIPE, external:FILE.yaml or nerfbaselines:METHOD; several with commas.",
 )
 @click.option(
     "--scene",
@@ -163,10 +163,10 @@ def command(
     """Train METHODs on SCENEs and measure them on the test views.
 
     \b
-    aw bench --method 3dgs --method refinesplat --scene scene -o runs
+    aw bench --method 3dgs,refinesplat --scene scene -o runs
     aw bench --method refinesplat --scene scene --budget 10m --set refinesplat.mask_every=8
-    aw bench --method 3dgs --method refinesplat --scene scene --budget 1m --budget 3m --budget 10m -o runs
-    aw bench --method 3dgs --method robustsplat --mask refinesplat --scene scene -o runs
+    aw bench --method 3dgs,refinesplat --scene scene --budget 1m --budget 3m --budget 10m -o runs
+    aw bench --method 3dgs,robustsplat --mask refinesplat --scene scene -o runs
     aw bench --suite on-the-go --root datasets/on-the-go -o runs
 
     A run ("cell") is one method on one scene with one seed. --jobs 4 trains four runs at a time, --engine ray

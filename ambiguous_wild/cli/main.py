@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
+import io
+import logging
 import os
 import re
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import click
@@ -81,6 +85,11 @@ class _LazyGroup(click.Group):
         # a module of several commands names them
         return getattr(module, f"{name.replace('-', '_')}_command", None) or module.command
 
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        end = args.index("--") if "--" in args else len(args)
+        for_all = [word for word in args[:end] if word in ("--quiet", "-q", "--verbose", "-v")]
+        return super().parse_args(ctx, [*for_all, *(w for w in args[:end] if w not in for_all), *args[end:]])
+
     def resolve_command(self, ctx: click.Context, args: list[str]):
         args = with_new_names(args)
         if args and args[0] not in COMMANDS:
@@ -97,15 +106,42 @@ class _LazyGroup(click.Group):
     cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110}
 )
 @click.version_option(__version__, prog_name="aw")
-def cli() -> None:
+@click.option("--quiet", "-q", is_flag=True, help="Print results and errors only.")
+@click.option("--verbose", "-v", is_flag=True, help="Also print what a run does, as in its log.txt.")
+@click.pass_context
+def cli(ctx: click.Context, quiet: bool, verbose: bool) -> None:
     """Distractor-free 3D Gaussian Splatting where the distractor looks like the scene.
 
     \b
+    aw try photos/ -o out               all of this in one go
     aw simulate courtyard -o raw        a simulated capture; or use your own photos
     aw build-scene raw -o scene         check, COLMAP, downsample, split
-    aw bench --method 3dgs --method refinesplat --scene scene -o runs
+    aw bench --method 3dgs,refinesplat --scene scene -o runs
     aw table runs                       compare the methods
+
+    --quiet and --verbose may also stand behind a command.
     """
+    if quiet and verbose:
+        raise AwError("--quiet and --verbose exclude each other")
+    if quiet:  # errors are printed when the command has ended
+        ctx.with_resource(contextlib.redirect_stderr(io.StringIO()))
+    if verbose:
+        ctx.with_resource(_told())
+
+
+@contextlib.contextmanager
+def _told() -> Iterator[None]:
+    """Meanwhile what this package logs is printed, above a bar."""
+    from tqdm import tqdm
+
+    logger, handler = logging.getLogger("ambiguous_wild"), logging.Handler()
+    handler.emit = lambda record: tqdm.write(f"  {record.getMessage()}", file=sys.stderr)  # type: ignore[method-assign]
+    logger.setLevel(logging.DEBUG)
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
 
 
 def main() -> None:

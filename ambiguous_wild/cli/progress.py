@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import shlex
 import sys
 from collections.abc import Sequence
@@ -22,11 +23,16 @@ if TYPE_CHECKING:
 
 
 class ProgressBar(Callbacks):
-    """A bar for each run, for runs that are made one by one."""
+    """A bar for each run, for runs that are made one by one; it says what is done beside the steps."""
 
     def __init__(self, cells: int) -> None:
         self.cells, self.index = cells, 0
         self.bar: Any = None
+        self.phases = logging.Handler(logging.INFO)
+        self.phases.emit = self._phase  # type: ignore[method-assign]
+        context = click.get_current_context(silent=True)
+        if context is not None:  # none after Ctrl-C or an error
+            context.call_on_close(self._close)
 
     def say(self, text: str) -> None:
         say(text)
@@ -35,20 +41,32 @@ class ProgressBar(Callbacks):
         self.index += 1
         group = f", {cell.group}" if cell.group else ""
         say(f"[{self.index}/{self.cells}] {run_name(cell)}{group} -> {folder}")
-
-    def tick(self, trainer: Trainer) -> None:
         from tqdm import tqdm
 
-        if self.bar is None:
-            budget = trainer.config.budget_s
-            self.bar = tqdm(
-                total=100.0 if budget is not None else trainer.config.iterations,
-                unit="%" if budget is not None else "it",
-                bar_format="{l_bar}{bar}| {n:.0f}/{total:.0f}{unit} [{elapsed}<{remaining}]{postfix}",
-                mininterval=1.0,
-                disable=None if sys.stderr.isatty() else True,
-                file=sys.stderr,
-            )
+        self._close()
+        budget = cell.train.budget_s
+        self.bar = tqdm(
+            total=100.0 if budget is not None else cell.train.iterations,
+            unit="%" if budget is not None else "it",
+            bar_format="{desc}{percentage:3.0f}%|{bar}| {n:.0f}/{total:.0f}{unit} [{elapsed}<{remaining}]{postfix}",
+            mininterval=1.0,
+            disable=not sys.stderr.isatty(),
+            leave=False,
+            file=sys.stderr,
+        )
+        logging.getLogger("ambiguous_wild").addHandler(self.phases)
+
+    def _phase(self, record: logging.LogRecord) -> None:
+        if self.bar is not None:
+            self.bar.set_description(record.getMessage())
+
+    def _close(self) -> None:
+        logging.getLogger("ambiguous_wild").removeHandler(self.phases)
+        if self.bar is not None:
+            self.bar.close()
+            self.bar = None
+
+    def tick(self, trainer: Trainer) -> None:
         done = 100.0 * trainer.progress(trainer.iteration) if trainer.config.budget_s else trainer.iteration
         if trainer.iteration % 25 == 0 or trainer.done:
             self.bar.set_postfix_str(
@@ -57,9 +75,7 @@ class ProgressBar(Callbacks):
         self.bar.update(done - self.bar.n)
 
     def ended(self, cell: Cell, report: CellReport) -> None:
-        if self.bar is not None:
-            self.bar.close()
-            self.bar = None
+        self._close()
         if report.outcome != "failed" or self.cells > 1:  # a single failure is the command's one error line
             say(f"    {outcome_line(report)}")
 

@@ -71,9 +71,12 @@ def command(ctx: click.Context, source: Path, output: Path, budget: str, threads
     page = output / "view"
     step("view", runs, "-o", page)
     step("table", runs, "--sheet", output / "comparison.png")
+    longer = shlex.join(
+        ["aw", "bench", "--method", ",".join(METHODS), "--scene", str(scene), "--budget", "30m"]
+    )
     say(
-        f"\n{(time.monotonic() - begin) / 60:.1f} min. Look at {page / 'index.html'} and "
-        f"{output / 'comparison.png'}; train longer with --budget and another -o"
+        f"\n{_minutes(time.monotonic() - begin)}. Look at {page / 'index.html'} and "
+        f"{output / 'comparison.png'}. To train longer: {longer} -o longer"
     )
 
 

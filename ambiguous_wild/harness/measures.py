@@ -1,7 +1,7 @@
 """What can be measured of a run, as data: metrics of test images, built in or of one's own, masks and cost.
 
-A metric of one's own is a `Metric` in a file (`--metric-file my_metric.py`), of an installed package (entry points
-`ambiguous_wild.metrics`) or given to `register`. Its record is kept in each result, so that tables need
+A metric of one's own is a `Metric` in a file (`--metric-file my_metric.py`), of an installed package (entry
+points `ambiguous_wild.metrics`) or given to `register`. Its record is kept in each result, so that tables need
 neither.
 """
 

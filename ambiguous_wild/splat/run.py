@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 import signal
 import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -24,6 +25,7 @@ from ambiguous_wild.splat.rendered import Rendered
 from ambiguous_wild.splat.step import TrainData
 from ambiguous_wild.splat.watchdog import NonFinite, Sentinel, Watchdog
 
+LOG = logging.getLogger(__name__)
 Probe = Callable[[Callable[[Camera], Tensor]], float]
 
 
@@ -46,6 +48,8 @@ def deferred() -> Iterator[Callable[[], bool]]:
     def note(number: int, frame: Any) -> None:
         noted.set()
         signal.signal(signal.SIGINT, signal.default_int_handler)
+        with suppress(RuntimeError):  # the signal came while a line was written to the same place
+            LOG.info("stopping: the model is measured and saved, Ctrl-C again to quit")
 
     signal.signal(signal.SIGINT, note)
     try:
@@ -177,6 +181,7 @@ class Run(ABC):
         """
         if self.config.on_nonfinite == "rollback" and not self.checkpoint_path.exists():
             self.save()  # something to go back to, from the first iteration on
+        LOG.info("training")
         meter = None if self.done else self.meter
         if meter is not None:
             meter.begin(self.clock.now())
@@ -268,6 +273,10 @@ class Run(ABC):
             spent = dict(self.clock.parts_s)
             row["psnr_probe"] = self.probe(self.picture)
             self.clock.parts_s = spent
+            LOG.debug(
+                "iteration %d: test PSNR %.2f dB, %d Gaussians, %.1f ms/iteration",
+                self.iteration, row["psnr_probe"], len(self.gaussians), self.ms_per_iteration,
+            )  # fmt: skip
 
     @torch.no_grad()
     def picture(self, camera: Camera) -> Tensor:

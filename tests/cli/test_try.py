@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 
 from ambiguous_wild.harness.running.store import known_iterations
@@ -17,30 +18,34 @@ def _commands(text: str) -> list[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("video", [False, True])
-def test_photos_or_a_video_become_a_table_and_a_page(tmp_path: Path, video: bool) -> None:
+def test_photos_become_a_table_and_a_page(tmp_path: Path) -> None:
     raw, out = tmp_path / "walls", tmp_path / "out"
     write_capture(raw, 8)
-    source = raw
-    if video:
-        photos = [cv2.imread(str(path)) for path in sorted(raw.iterdir())]
-        source = tmp_path / "walls.avi"
-        height, width = photos[0].shape[:2]
-        film = cv2.VideoWriter(str(source), cv2.VideoWriter.fourcc(*"MJPG"), 5, (width, height))
-        for photo in photos:
-            film.write(photo)
-        film.release()
-    words = ("try", source, "-o", out, "--budget", "20s", "--threads", "1")
+    words = ("try", raw, "-o", out, "--budget", "20s", "--threads", "1")
     done = aw(*words)
     assert done.returncode == 0, done.stderr
     wanted = ["screen", "build-scene", "plan", "bench", "view", "table"]
-    assert _commands(done.stderr) == ["capture"] * video + wanted
+    assert _commands(done.stderr) == wanted
     assert (out / "view/index.html").is_file() and (out / "comparison.png").is_file()
     assert "3dgs" in done.stdout and "refinesplat" in done.stdout
     assert known_iterations(out / "runs") == 300 and "takes longer" in done.stderr
-    again = aw(*words[:-2], "--threads", "1")
+    again = aw(*words)
     assert again.returncode == 0 and again.stderr.count("finished before, kept") == 2
-    assert _commands(again.stderr) == ["capture"] * video + wanted[1:]
+    assert _commands(again.stderr) == wanted[1:]
+
+
+def test_a_video_is_captured_once(tmp_path: Path) -> None:
+    """It shows nothing, so that the scene cannot be built."""
+    film = cv2.VideoWriter(str(tmp_path / "dark.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 5, (64, 48))
+    for level in range(6):
+        film.write(np.full((48, 64, 3), 9 * level, np.uint8))
+    film.release()
+    for end in ("photos in out/photos", "done before: out/photos"):
+        done = aw("try", "dark.avi", "-o", "out", cwd=tmp_path)
+        assert done.returncode == 2 and done.stderr.count("error: ") == 1
+        assert _commands(done.stderr) == ["capture", "screen", "build-scene"]
+        assert end in done.stdout + done.stderr
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["photos"]
 
 
 def test_what_is_neither_photos_nor_a_video_is_refused_first(tmp_path: Path) -> None:

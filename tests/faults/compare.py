@@ -25,7 +25,7 @@ _CLOCK = {
     "timing", "meter", "first_pass_s",
     "cores",  # that the process may use: whoever shares the machine may change it between two starts
 }  # fmt: skip
-_MACHINE = {"env.json"}  # says when and on what a run was made
+_MACHINE = {"env.json", "log.txt"}  # say when and on what a run was made
 
 
 def without_clock(value: Any) -> Any:

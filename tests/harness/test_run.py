@@ -123,7 +123,7 @@ def test_a_run_folder_holds_everything_and_the_numbers_follow_from_it(scene, tmp
     run = cell_folder(tmp_path, cell)
     assert run == tmp_path / "scene" / "truth" / "seed0"
     names = {str(p.relative_to(run)) for p in run.rglob("*") if p.is_file()}
-    expected = {"config.yaml", "env.json", "timeline.csv", "point_cloud.ply", "metrics.json"}
+    expected = {"config.yaml", "env.json", "log.txt", "timeline.csv", "point_cloud.ply", "metrics.json"}
     expected |= {"checkpoint/last.safetensors"} | {f"renders/test/{n}" for n in TEST}
     assert names == expected | {f"masks/{n}" for n in TRAIN} | {"pictures/masks.jpg"}
 

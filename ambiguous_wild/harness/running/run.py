@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
+import logging
 import os
 import shutil
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import yaml
 
+from ambiguous_wild import __version__
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import flatten
+from ambiguous_wild.harness.running.callbacks import outcome_line, run_name
 from ambiguous_wild.harness.running.cell import (
     IGNORED,
     Cell,
@@ -43,9 +47,11 @@ from ambiguous_wild.methods.plugin_file import place_of
 CONFIG = "config.yaml"
 ENVIRONMENT = "env.json"
 TRACEBACK = "traceback.txt"
+LOG_FILE = "log.txt"
 EFFECTS = "effects.json"
 # What a run leaves before anything worth keeping exists in its folder.
-_WORTHLESS = {CONFIG, ENVIRONMENT, EFFECTS, FAILED, TRACEBACK}
+_WORTHLESS = {CONFIG, ENVIRONMENT, EFFECTS, FAILED, TRACEBACK, LOG_FILE}
+LOG = logging.getLogger(__name__)
 
 
 def is_finished(folder: Path) -> bool:
@@ -193,16 +199,38 @@ def _run(cell: Cell, folder: Path, options: RunOptions, tick: Tick | None) -> Ce
                 if is_finished(folder):
                     return CellReport(folder, "kept")
         _begin(cell, folder)
-        try:
-            if cell.method.program is not None:
-                result = run_program(cell, folder)
-            else:
-                result = train_and_measure(cell, folder, options, tick)
-            write_result(folder / RESULT, {**result, **model_hash(folder), **provenance(cell)})
-        except (Exception, SystemExit) as error:
-            record_failure(cell, folder, error)
-            raise
-    return CellReport(folder, "trained", result=result)
+        with _logged(folder / LOG_FILE):
+            LOG.debug("%s, configuration %s, version %s", run_name(cell), cell.identity[:12], __version__)
+            try:
+                if cell.method.program is not None:
+                    result = run_program(cell, folder)
+                else:
+                    result = train_and_measure(cell, folder, options, tick)
+                write_result(folder / RESULT, {**result, **model_hash(folder), **provenance(cell)})
+            except (Exception, SystemExit) as error:
+                record_failure(cell, folder, error)
+                LOG.debug("failed: %s", error_line(error))
+                raise
+            except KeyboardInterrupt as stop:
+                LOG.debug(str(stop) or "interrupted")
+                raise
+            report = CellReport(folder, "trained", result=result)
+            LOG.debug(outcome_line(report))
+    return report
+
+
+@contextlib.contextmanager
+def _logged(path: Path) -> Iterator[None]:
+    """Meanwhile what this package logs is added to a file, with the time."""
+    logger, handler = logging.getLogger("ambiguous_wild"), logging.FileHandler(path, encoding="utf-8")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(message)s", "%Y-%m-%d %H:%M:%S"))
+    logger.setLevel(logging.DEBUG)
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        handler.close()
 
 
 def _begin(cell: Cell, folder: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 import re
 import shutil
@@ -18,6 +19,7 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError, Camera
+from ambiguous_wild.core.errors import counted
 from ambiguous_wild.harness.pictures import training as pictures_of_training
 from ambiguous_wild.harness.running import evaluate
 from ambiguous_wild.harness.running.cell import Cell, RunOptions, asked_length
@@ -35,6 +37,7 @@ from ambiguous_wild.splat.parts import MaskPolicy, Parts
 from ambiguous_wild.splat.run import Stopped
 from ambiguous_wild.splat.trainer import Trainer
 
+LOG = logging.getLogger(__name__)
 _PROC = Path("/proc/self")
 _NO_MEMORY = ("CUDA out of memory", "CUDA error: out of memory")
 
@@ -291,6 +294,7 @@ def _make_trainer(
     def probe(draw: Callable[[Camera], torch.Tensor]) -> float:
         return evaluate.mean_psnr(truth, lambda camera: draw(camera).cpu().numpy())
 
+    LOG.info("finding start points" if "dense" in cell.chosen.effects else "setting up")
     before = time.perf_counter()
     trainer = Trainer(data, parts, of_one_pass(cell), folder=folder, probe=probe if truth else None)
     # Frozen inputs, instance masks and identities are part of what a method costs.
@@ -336,10 +340,12 @@ def _train_and_measure(
     write_splat_ply(
         folder / "point_cloud.ply", {k: v.cpu().numpy() for k, v in trainer.neutral_model().items()}
     )
+    LOG.info("measuring %s", counted(len(truth), "test view"))
     per_image, missing = evaluate.render_and_measure(
         trainer, truth, folder / "renders" / "test", half=cell.protocol == "half", scene=cell.scene
     )
     evaluate.refuse_empty(truth, folder / "renders" / "test")
+    LOG.info("drawing masks and pictures")
     masks = evaluate.write_masks(trainer, folder / "masks")
     if recorder is not None:
         pictures_of_training.draw_all(trainer, recorder, folder)

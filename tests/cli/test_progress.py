@@ -1,0 +1,98 @@
+"""What a person at a terminal sees while a run is made, and what is left of it."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+
+from ambiguous_wild.cli import main, progress
+from tests.command_line import aw
+from tests.tiny_scene import write_tiny_scene
+
+LENGTH = 30
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+    def left(self) -> str:
+        """What still stands there: after a carriage return a line is written over."""
+        lines = []
+        for line in self.getvalue().split("\n"):
+            shown = ""
+            for piece in line.split("\r"):
+                shown = piece + shown[len(piece) :]
+            lines.append(shown.rstrip())
+        return "\n".join(lines)
+
+
+@pytest.fixture
+def words(tmp_path: Path) -> list[str]:
+    scene = write_tiny_scene(tmp_path / "wall")
+    out = tmp_path / "runs"
+    return ["bench", "--method", "3dgs", "--scene", str(scene), "-o", str(out), "--iterations", str(LENGTH)]
+
+
+def seen(words: list[str], monkeypatch: pytest.MonkeyPatch) -> Terminal:
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "argv", ["aw", *words])
+    monkeypatch.setattr(sys, "stderr", terminal)
+    with contextlib.suppress(SystemExit):
+        main.main()
+    return terminal
+
+
+def test_a_bar_says_what_is_done_and_goes(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = seen([*words, "--effects", "dense"], monkeypatch)
+    phases = ["finding start points: ", "training: ", r"measuring \d+ test views: 100%", "drawing masks"]
+    assert re.search(".*".join(phases), shown.getvalue(), re.DOTALL)
+    assert "|" not in shown.left() and "PSNR" in shown.left()
+
+
+def test_ctrl_c_is_answered_at_once_and_leaves_no_bar(
+    words: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tick = progress.ProgressBar.tick
+
+    def pressing(self, trainer):
+        tick(self, trainer)
+        if trainer.iteration == 12:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(progress.ProgressBar, "tick", pressing)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        shown = seen([*words, "--effects", "none"], monkeypatch)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    text = shown.getvalue()
+    told = text.index("stopping: the model is measured and saved, Ctrl-C again to quit")
+    assert told < text.index("stopped after 12 iterations of 30")
+    assert "|" not in shown.left() and "measuring" not in text
+
+
+def test_quiet_verbose_and_the_log_of_a_run(words: list[str], tmp_path: Path) -> None:
+    effects = ["--effects", "none"]
+    quiet = aw("--quiet", *words, *effects)
+    assert (quiet.returncode, quiet.stdout, quiet.stderr) == (0, "", "")
+    log = (tmp_path / "runs/wall/3dgs/seed0/log.txt").read_text()
+    for expected in (
+        "3dgs on wall, seed 0, configuration",
+        "training",
+        "test PSNR",
+        "measuring",
+        " dB over ",
+    ):
+        assert re.search(rf"^\d{{4}}-\d\d-\d\d \d\d:\d\d:\d\d .*{expected}", log, re.MULTILINE), expected
+    told = aw(*words, *effects, "--seed", "1", "-v").stderr
+    assert "test PSNR" in told and "measuring" in told
+    wrong = aw("table", tmp_path / "none", "-q")
+    assert wrong.returncode == 2 and wrong.stderr.startswith("error: no folder of runs")
+    assert "exclude each other" in aw("-q", "-v", "doctor").stderr

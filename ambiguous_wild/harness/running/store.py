@@ -14,6 +14,7 @@ import pandas as pd
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import flatten
+from ambiguous_wild.core.errors import counted
 from ambiguous_wild.harness.measures import partial
 from ambiguous_wild.harness.running.result_file import FAILED, RESULT, RunResult, metrics_of, read_result
 from ambiguous_wild.harness.running.timing import timing_of
@@ -58,6 +59,10 @@ class Runs:
     runs: pd.DataFrame
     missing: pd.DataFrame
     incomplete: tuple[Incomplete, ...] = ()
+
+    def __repr__(self) -> str:
+        counts = [counted(self.runs[key].nunique(), key) for key in ("method", "scene")]
+        return f"Runs({counted(len(self.runs), 'run')} of {' on '.join(counts)})"
 
 
 def read_runs(*folders: Path | str) -> Runs:

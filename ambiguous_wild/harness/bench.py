@@ -69,9 +69,9 @@ class RunReport:
 
     def mean(self, metric: str) -> float | None:
         """Mean of an image metric over the test views, of the finite values; None where any is missing."""
-        from ambiguous_wild.harness.running.result_file import metric_mean
+        from ambiguous_wild.harness.running.result_file import mean_of
 
-        mean = metric_mean(self.result, metric)
+        mean = mean_of(self.result, metric)
         return None if math.isnan(mean) else mean
 
     def show(self, height: int = 640) -> Viewer:

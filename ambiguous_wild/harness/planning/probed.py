@@ -161,28 +161,9 @@ def _numbers(row: Mapping[str, Any]) -> dict[str, float]:
     return {name: float(value) for name, value in row.items()}
 
 
-def plan(
-    scene: Path | str,
-    *,
-    iterations: int = TrainConfig.iterations,
-    probe: bool = True,
-    factor: int | None = None,
-) -> Plan:
-    """Measure a scene and decide which effects it needs: what `aw plan` does, for `bench(plan=...)`.
-
-    Args:
-        scene: its folder.
-        iterations: length of the run that the plan is for.
-        probe: try effects in short trainings; False: by their limits alone.
-        factor: which images_N; None = what the scene was built for.
-
-    Raises:
-        AwError: no scene, or a photo that cannot be read.
-    """
-    loaded = load_scene(scene, factor=factor)
-    if not probe:
-        return untried(plan_without_training(loaded), "probe=False")
-    train = TrainConfig(iterations=iterations)
+def plan(scene: Path | str, *, iterations: int = TrainConfig.iterations) -> Plan:
+    """Which effects the scene in a folder needs in runs of this length: what `aw plan` does."""
+    loaded, train = load_scene(scene), TrainConfig(iterations=iterations)
     with tempfile.TemporaryDirectory(prefix="aw-plan-") as kept:
         return plan_with_probes(loaded, train, Path(kept), masks=True, prepare=lambda: prepare_cpu(None))
 

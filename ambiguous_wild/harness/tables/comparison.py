@@ -18,7 +18,7 @@ import pandas as pd
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist, unknown
-from ambiguous_wild.harness.measures import ALWAYS, COST, MEASURES, Measure, measure, partial
+from ambiguous_wild.harness.measures import ALWAYS, COST, MEASURES, Measure, measure
 from ambiguous_wild.harness.running.store import TEXT_OF_RUNS, Runs, read_runs
 from ambiguous_wild.harness.tables.notes import incomparable, notes, untimed
 from ambiguous_wild.harness.tables.plain_formats import to_text
@@ -173,7 +173,7 @@ class _Index:
 
     def can_have(self, scene: str, column: Measure, methods: Sequence[str]) -> bool:
         """Whether the measure is defined on the scene: some method has a value, or it always is."""
-        if not partial(column.key) and column.key not in (*MASK_COLUMNS, "mask_recall"):
+        if not column.partial and column.key not in (*MASK_COLUMNS, "mask_recall"):
             return True
         return any(
             (m, scene) in self.runs and bool(self.seeds(m, scene, column).notna().any()) for m in methods

@@ -19,19 +19,26 @@ _OFFERED = {
     "Metric": "harness.measures",
     "bench": "harness.bench",
     "build_scene": "builder.pipeline",
-    "plan": "harness.planning.decide",
+    "plan": "harness.planning.probed",
     "read_runs": "harness.running.store",
     "table": "harness.tables.comparison",
 }
-__all__ = ["Metric", "bench", "build_scene", "plan", "read_runs", "table"]
 
 if TYPE_CHECKING:
+    from ambiguous_wild.builder.pipeline import build_scene as build_scene
     from ambiguous_wild.harness.bench import bench as bench
     from ambiguous_wild.harness.measures import Metric as Metric
+    from ambiguous_wild.harness.planning.probed import plan as plan
+    from ambiguous_wild.harness.running.store import read_runs as read_runs
+    from ambiguous_wild.harness.tables.comparison import table as table
 
 
 def __getattr__(name: str) -> Any:
-    """One of `__all__`."""
+    """A function or class of `_OFFERED`, see docs/python.md."""
     if name in _OFFERED:
         return getattr(importlib.import_module(f"ambiguous_wild.{_OFFERED[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *_OFFERED]

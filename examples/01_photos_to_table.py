@@ -11,12 +11,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ambiguous_wild import bench
-from ambiguous_wild.builder.pipeline import build_scene
+from ambiguous_wild import bench, build_scene, table
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.harness.bench import Lines
-from ambiguous_wild.harness.tables.comparison import comparison
-from ambiguous_wild.harness.tables.plain_formats import to_markdown, to_text
+from ambiguous_wild.harness.tables.plain_formats import to_markdown
 from ambiguous_wild.simulate.capture import simulate
 from ambiguous_wild.simulate.presets import preset
 
@@ -56,8 +54,8 @@ def main() -> None:
         print(f"failed: {run.method}: {run.error}")
 
     # 4. The table: quality, cost and masks, a row for each method.
-    tables = comparison(report.read(), metrics=["psnr", "ssim", "mask_iou", "train_s", "gaussians"])
-    print(to_text(tables))
+    tables = table(report.read(), metrics=["psnr", "ssim", "mask_iou", "train_s", "gaussians"])
+    print(tables)
     path = wanted.output / "table.md"
     path.write_text(to_markdown(tables), encoding="utf-8")
     print(f"wrote {path}")

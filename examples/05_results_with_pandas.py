@@ -15,8 +15,8 @@ from pathlib import Path
 
 import pandas as pd
 
+from ambiguous_wild import read_runs
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.running.store import read_runs
 from ambiguous_wild.harness.tables.comparison import tidy
 
 

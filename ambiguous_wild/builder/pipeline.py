@@ -38,6 +38,10 @@ class BuildResult:
     seconds: float  # wall time of this call
     reused: tuple[str, ...] = ()  # stages that an earlier, interrupted call had finished
 
+    def __repr__(self) -> str:
+        counts = self.info["counts"]
+        return f"BuildResult({self.scene}: {counts['train']} train and {counts['test']} test photos)"
+
 
 def build_scene(
     raw: Path | str,

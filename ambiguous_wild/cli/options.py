@@ -30,13 +30,8 @@ plugin_option = click.option(
     type=PathName(),
     help="A Python file that registers your methods; repeatable.",
 )
-metric_file_option = click.option(
-    "--metric-file",
-    "metrics",
-    multiple=True,
-    type=PathName(),
-    help="A Python file with a metric of your own (docs/metrics.md); repeatable.",
-)
+metric_file_option = click.option("--metric-file", "metrics", multiple=True, type=PathName(),
+    help="A Python file with a metric of your own (docs/metrics.md); repeatable.")  # fmt: skip
 scene_folder_option = click.option(
     "--scene",
     "scene_folder",

@@ -64,11 +64,16 @@ class RunReport:
     error: str  # empty unless the outcome is "failed"
     result: RunResult | None  # as in metrics.json; None = no result that can be read
 
+    def __repr__(self) -> str:
+        psnr = self.mean("psnr")
+        what = f"{self.outcome}{'' if psnr is None else f', {psnr:.2f} dB'}{self.error and f': {self.error}'}"
+        return f"RunReport({self.method} on {self.scene}, seed {self.seed}: {what})"
+
     def mean(self, metric: str) -> float | None:
         """Mean of an image metric over the test views, of the finite values; None where any is missing."""
-        from ambiguous_wild.harness.running.result_file import metric_mean
+        from ambiguous_wild.harness.running.result_file import mean_of
 
-        mean = metric_mean(self.result, metric)
+        mean = mean_of(self.result, metric)
         return None if math.isnan(mean) else mean
 
     def show(self, height: int = 640) -> Viewer:
@@ -91,6 +96,10 @@ class BenchReport:
 
     output: Path
     runs: tuple[RunReport, ...]
+
+    def __repr__(self) -> str:
+        counts = ", ".join(f"{n} {outcome}" for outcome, n in self.outcomes.items())
+        return f"BenchReport({self.output}: {counts})"
 
     @property
     def failed(self) -> tuple[RunReport, ...]:

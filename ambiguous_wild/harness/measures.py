@@ -1,25 +1,25 @@
 """What can be measured of a run, as data: metrics of test images, built in or of one's own, masks and cost.
 
-A metric of one's own is a `Metric` in a file (`--metric-file my_metric.py`), of an installed package (entry
-points `ambiguous_wild.metrics`) or given to `register`. Its record is kept in each result, so that tables need
-neither.
+A metric of one's own is a `Metric` in a file (`--metric-file my_metric.py`) or of a package (entry points
+`ambiguous_wild.metrics`). Its record is kept in each result, so that tables need neither.
 """
 
 from __future__ import annotations
 
-import hashlib
 import importlib.metadata
 import math
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypedDict, cast
+from typing import TYPE_CHECKING, Any, Literal, Required, TypedDict, cast
 
 import numpy as np
 
 from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.methods.entry import resolve
 from ambiguous_wild.methods.plugin_file import import_file, place_of
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from ambiguous_wild.core import Scene
 
 Better = Literal["higher", "lower", None]  # None: not ranked
-ENTRY_POINTS = "ambiguous_wild.metrics"
 
 
 @dataclass(frozen=True)
@@ -41,6 +40,7 @@ class Measure:
     digits: int = 3
     per_image: bool = True  # else one number a run
     timed: bool = False  # a busy machine changes it: ranked only between runs that were alone
+    partial: bool = False  # of some pixels: an image without such has no value, and is no gap in a mean
 
     @property
     def quality(self) -> bool:
@@ -62,17 +62,12 @@ class Metric(Measure):
     low: float = -math.inf  # of its range
     high: float = math.inf
     infinite: bool = False  # inf for equal pictures is right
-    partial: bool = False  # of some pixels: an image without such has no value, and is no gap in a mean
     # by which a value may differ when it is computed again; None: it is not, as that takes a network
     tolerance: float | None = 1e-6
     source: str = ""  # sha256 of its file
 
     def value(self, render: np.ndarray, given: Mapping[str, Any]) -> float:
-        """Of one image; `given`: its photo, view and scene.
-
-        Raises:
-            AwError: this image cannot have it, or a function of one's own fails; names the line.
-        """
+        """Of one image; `given`: its photo, view and scene. AwError: it cannot have it; names the line."""
         try:
             return float(resolve(self.function)(render, *(given[name] for name in self.needs)))
         except Exception as error:
@@ -100,6 +95,7 @@ _IMAGE = "ambiguous_wild.metrics.image:"
 # thousands of them moves a little.
 _REGION_DB = 1e-2
 
+MASK_LABELS = {"iou": "IoU", "precision": "precision", "recall": "recall"}
 MEASURES: dict[str, Measure] = {
     m.key: m
     for m in (
@@ -115,9 +111,7 @@ MEASURES: dict[str, Measure] = {
         _region("psnr_covered", "PSNR covered", _REGION_DB),
         _region("psnr_uncovered", "PSNR uncovered", _REGION_DB),
         _region("psnr_supported", "PSNR supported", _REGION_DB),
-        Measure("mask_iou", "mask IoU", "higher", 3, per_image=False),
-        Measure("mask_precision", "mask precision", "higher", 3, per_image=False),
-        Measure("mask_recall", "mask recall", "higher", 3, per_image=False),
+        *(Measure(f"mask_{k}", f"mask {v}", "higher", per_image=False) for k, v in MASK_LABELS.items()),
         Measure("train_s", "train s", "lower", 1, per_image=False, timed=True),
         Measure("reference_s", "ref s", "lower", 1, per_image=False, timed=True),
         Measure("cpu_s", "cpu s", "lower", 1, per_image=False),
@@ -143,7 +137,9 @@ _own: dict[str, Metric] = {}  # registered; without a function: as a result that
 
 @cache
 def _installed() -> dict[str, Metric]:
-    return {point.name: point.load() for point in importlib.metadata.entry_points(group=ENTRY_POINTS)}
+    return {
+        point.name: point.load() for point in importlib.metadata.entry_points(group="ambiguous_wild.metrics")
+    }
 
 
 def metrics() -> dict[str, Metric]:
@@ -152,12 +148,6 @@ def metrics() -> dict[str, Metric]:
         if key not in _own or not _own[key].function:  # what a result describes has none
             register(metric)
     return {k: m for k, m in (MEASURES | _own).items() if isinstance(m, Metric) and m.function}
-
-
-def partial(key: str) -> bool:
-    """Whether an image may lack this metric without being a gap in its mean."""
-    found = measure(key)
-    return isinstance(found, Metric) and found.partial
 
 
 def measure(key: str) -> Measure:
@@ -171,11 +161,7 @@ def measure(key: str) -> Measure:
 
 
 def register(metric: Metric) -> Metric:
-    """Add a metric; a later one of the same key replaces the earlier.
-
-    Raises:
-        AwError: its key cannot stand in a table, or is that of a measure of ours.
-    """
+    """Add a metric; AwError where its key cannot stand in a table, or is that of a measure of ours."""
     if not isinstance(metric, Metric):
         raise AwError(f"{metric!r} is no Metric: see 'Your own metric' in docs/metrics.md")
     if not re.fullmatch(r"[a-z][a-z0-9_.]{0,60}", metric.key) or metric.key.startswith("cost_"):
@@ -187,18 +173,12 @@ def register(metric: Metric) -> Metric:
 
 
 def load_metrics(path: Path) -> None:
-    """Register every `Metric` of a Python file.
-
-    Raises:
-        AwError: no such file, none in it, or one that `register` refuses.
-    """
-    if not path.is_file():
-        raise AwError(f"no file {path} for --metric-file: give the path of a .py file with a Metric in it")
+    """Register every `Metric` of a Python file; AwError where it has none, or one that is refused."""
     found = [value for value in vars(import_file(path)).values() if isinstance(value, Metric)]
     if not found:
         raise AwError(f"{path} holds no Metric: see 'Your own metric' in docs/metrics.md")
     for metric in found:
-        register(replace(metric, source=hashlib.sha256(path.read_bytes()).hexdigest()))
+        register(replace(metric, source=sha256_file(path)))
 
 
 def own() -> dict[str, Metric]:
@@ -207,11 +187,7 @@ def own() -> dict[str, Metric]:
 
 
 def try_own(scene: Scene) -> None:
-    """Measure a test photo against itself: a metric of one's own that fails is found before training.
-
-    Raises:
-        AwError: one fails; names the line.
-    """
+    """Raise AwError if a metric of one's own fails on a test photo against itself, before training."""
     for view in scene.test[:1] if (mine := own()) else ():
         photo = read_png_rgb(view.image_path)
         for key, why in measure_images([(view.name, photo, photo)], mine.values(), scene)[1].items():
@@ -236,9 +212,15 @@ def records(keys: Iterable[str]) -> dict[str, MetricRecord]:
 
 def remember(known: Mapping[str, MetricRecord]) -> None:
     """Name the columns of a result's metrics as the run that measured them did."""
-    for key, record in known.items():
-        if key not in MEASURES:
-            _own.setdefault(key, Metric(key, function="", **record))
+    for key in known.keys() - MEASURES:
+        _own.setdefault(key, Metric(key, function="", **known[key]))
+
+
+class ImageRow(TypedDict, total=False):
+    """Metrics of one test image, PSNR and others (see `metrics_of`); None = undefined there."""
+
+    name: Required[str]  # of the test view
+    psnr: float | None
 
 
 def measure_images(
@@ -247,40 +229,34 @@ def measure_images(
     scene: Scene,
     *,
     half: bool = False,
-) -> tuple[list[dict[str, Any]], dict[str, str]]:
-    """Metrics of test images.
-
-    A metric that one image is refused by is missing for all: a mean is over every image or none.
+    around: Callable[[], AbstractContextManager[None]] = nullcontext,
+) -> tuple[list[ImageRow], dict[str, str]]:
+    """Metrics of test images; and why a metric that one image is refused by is missing for all.
 
     Args:
         pictures: name of the test view, render and photo, [H, W, 3] uint8.
         metrics: which.
         scene: of the views.
         half: of the right half of each picture alone.
-
-    Returns:
-        An `ImageRow` for each picture, and for each metric that is missing the reason.
-
-    Raises:
-        AwError: a render that is not of its photo's size.
+        around: a context to measure in.
     """
     views = {view.name: view for view in scene.test}
     rows: list[dict[str, Any]] = []
     missing: dict[str, str] = {}
-    for name, render, photo in pictures:
-        if render.shape != photo.shape:
+    for name, *pair in pictures:
+        if pair[0].shape != pair[1].shape:
             raise AwError(f"the render of {name} is not of its photo's size: render at the photo's size")
-        if half:
-            right = slice(photo.shape[1] // 2, None)
-            render, photo = (np.ascontiguousarray(picture[:, right]) for picture in (render, photo))
+        left = pair[1].shape[1] // 2 if half else 0
+        render, photo = (np.ascontiguousarray(picture[:, left:]) for picture in pair)
         given = {"photo": photo, "view": views[name], "scene": scene}
         rows.append({"name": name})
         for metric in metrics:
             try:
-                value = math.nan if metric.key in missing else metric.value(render, given)
+                with around():
+                    value = math.nan if metric.key in missing else metric.value(render, given)
             except AwError as error:
                 missing[metric.key] = str(error)
             else:
                 if not (metric.partial and math.isnan(value)):
                     rows[-1][metric.key] = value
-    return [{k: v for k, v in row.items() if k not in missing} for row in rows], missing
+    return [cast(ImageRow, {k: v for k, v in row.items() if k not in missing}) for row in rows], missing

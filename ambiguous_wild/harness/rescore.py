@@ -8,19 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any, Literal, cast
 
 from ambiguous_wild import __version__
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.errors import shortlist
-from ambiguous_wild.harness.leaderboard.verify import check_photos
-from ambiguous_wild.harness.measures import Metric, metrics, own, records
+from ambiguous_wild.harness.leaderboard.verify import check_photos, renders_of
+from ambiguous_wild.harness.measures import ImageRow, Metric, measure_images, metrics, own, records
 from ambiguous_wild.harness.running.cell import code_hash, config_identity, refuse_other_scene, scene_identity
-from ambiguous_wild.harness.running.evaluate import measure
+from ambiguous_wild.harness.running.evaluate import kernel_threads
 from ambiguous_wild.harness.running.result_file import (
     RESULT,
-    ImageRow,
     RunResult,
     metrics_of,
     read_result,
@@ -81,12 +80,10 @@ def rescore(
 
 def could_be_measured(results: Iterable[RunResult]) -> list[str]:
     """Metrics that these results lack and that can be measured now, as weights have come; and own ones."""
-    now = {name for name, reason in lpips.available().items() if reason is None} | set(own())
-    lacking: set[str] = set()
-    for result in results:
-        lacking |= {name for name, why in result["missing"].items() if lpips.TOO_SMALL not in why}
-        lacking |= {name for name in own() if _lacks(result, name)}
-    return sorted(lacking & now)
+    now = {name for name, reason in lpips.available().items() if reason is None}
+    listed = list(results)
+    lacking = {name for r in listed for name, why in r["missing"].items() if lpips.TOO_SMALL not in why}
+    return sorted(lacking & now | {name for r in listed for name in own() if _lacks(r, name)})
 
 
 def _lacks(result: RunResult, metric: str) -> bool:
@@ -136,7 +133,9 @@ def _rescore(run: Path, scenes: _Scenes) -> Rescored:
             return Rescored(run, "complete", missing=tuple(sorted(result["missing"])))
         half = config.get("protocol", "full") == "half"
         scene = scenes.find(run, result, config.get("scene"))
-        renders = _renders(run, result)
+        renders = renders_of(run, result)
+        if gone := shortlist(path.name for path in renders.values() if not path.is_file()):
+            raise AwError(f"{run} lacks its renders {gone}: restore them, or run it again")
         wanted = [metric for key, metric in metrics().items() if _lacks(result, key)]
         for row in result["per_image"]:
             for metric in wanted:
@@ -151,28 +150,13 @@ def _rescore(run: Path, scenes: _Scenes) -> Rescored:
     return Rescored(run, "rescored", added, missing)
 
 
-def _renders(run: Path, result: RunResult) -> dict[str, Path]:
-    found = {}
-    for row in result["per_image"]:
-        name = PurePosixPath(row["name"])
-        if name.is_absolute() or ".." in name.parts or "\\" in row["name"]:
-            raise AwError(
-                f"{run} names a test image outside itself: {row['name'][:60]!a}; it is no run of ours"
-            )
-        found[row["name"]] = run / "renders" / "test" / name.with_suffix(".png")
-    gone = [path.name for path in found.values() if not path.is_file()]
-    if gone:
-        raise AwError(f"{run} lacks its renders {shortlist(gone)}: restore them, or run it again")
-    return found
-
-
 def _add(
     result: RunResult, scene: Scene, wanted: Sequence[Metric], renders: dict[str, Path], *, half: bool
 ) -> tuple[str, ...]:
     """Put the metrics that the result lacks into it; those that no image has a value of stay missing."""
     photos = {view.name: view.image_path for view in scene.test}
     pictures = ((name, read_png_rgb(path), read_png_rgb(photos[name])) for name, path in renders.items())
-    rows, missing = measure(pictures, wanted, scene, half=half)
+    rows, missing = measure_images(pictures, wanted, scene, half=half, around=kernel_threads)
     result["per_image"] = [cast(ImageRow, {**old, **new}) for old, new in zip(result["per_image"], rows)]
     added = {key for row in rows for key in metrics_of(row)}
     result["missing"] = {key: why for key, why in (result["missing"] | missing).items() if key not in added}

@@ -60,15 +60,7 @@ def check_groups(method: str, groups: Sequence[Group]) -> None:
 
 
 def sweep_groups(options: Any, sweeps: Sequence[str]) -> tuple[Group, ...]:
-    """A group for each "KEY=V1,V2,...", a variant for each value.
-
-    Args:
-        options: the method's, at their defaults.
-        sweeps: as typed.
-
-    Raises:
-        AwError: not of that form, or a key or value that the options refuse.
-    """
+    """A group for each "KEY=V1,V2,...", a variant for each value; AwError for what the options refuse."""
     groups = []
     for key, values in ((k, v.split(",")) for k, _, v in (text.partition("=") for text in sweeps)):
         for value in values:
@@ -86,10 +78,7 @@ def choose_groups(method: str, groups: Sequence[Group], names: Sequence[str]) ->
         AwError: the method has no ablations, or none of that name.
     """
     if not groups:
-        raise AwError(
-            f"{method} declares no ablations: name an option's values, --sweep KEY=V1,V2, or see "
-            "'Options, ablations, sharing' in docs/add-a-method.md"
-        )
+        raise AwError(f"{method} declares no ablations: --sweep KEY=V1,V2 varies an option of any method")
     check_groups(method, groups)
     known = [group.name for group in groups]
     for name in names:

@@ -17,8 +17,10 @@ def import_file(path: Path) -> ModuleType:
     """The module of a Python file, run anew.
 
     Raises:
-        AwError: it is no Python file, or fails when it is loaded; names the line.
+        AwError: no such file, no Python file, or it fails when it is loaded; names the line.
     """
+    if not path.is_file():
+        raise AwError(f"no plugin file {path}: give the path of a .py file")
     name = f"aw_plugin_{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:

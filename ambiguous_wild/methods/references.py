@@ -82,8 +82,6 @@ def _recipe(name: str) -> MethodEntry:
     """A MethodEntry of the file, or one made of a function that returns `Parts`."""
     path_text, _, attribute = name.rpartition(":")
     path = Path(path_text)
-    if not path.is_file():
-        raise AwError(f"no file {path} for --method {name}: write PATH.py:NAME of a recipe in it")
     module = import_file(path)
     found = getattr(module, attribute, None)
     if found is None:

@@ -8,11 +8,11 @@ A method of one's own is found in four ways: `register(...)`, the entry-point gr
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import importlib.metadata
 from pathlib import Path
 
 from ambiguous_wild.core.errors import AwError, unknown
+from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.methods.builtin import BUILTIN
 from ambiguous_wild.methods.entry import MethodEntry
 from ambiguous_wild.methods.graft import grafted, knows_truth, refuse_parts_of_program, split_graft
@@ -101,12 +101,9 @@ def load_plugin(path: Path | str) -> list[str]:
     Raises:
         AwError: no such file, or it registers nothing.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise AwError(f"no plugin file {path}: give the path of a .py file that calls register(...)")
-    before = dict(_registered)
+    path, before = Path(path), dict(_registered)
     import_file(path)
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    digest = sha256_file(path)
     added = [key for key, entry in _registered.items() if before.get(key) is not entry]
     if not added:
         raise AwError(f"plugin {path} registers no method: call register(MethodEntry(...)) in it")

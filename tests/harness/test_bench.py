@@ -73,7 +73,9 @@ def test_a_run_that_fails_is_in_the_report_and_the_next_one_runs(scene, tmp_path
     )
     assert report.outcomes == {"failed": 1, "trained": 1}
     assert lines[0] == "begins: 3dgs on scene, seed 0"
-    assert lines[1].startswith("[1/2] 3dgs on scene, seed 0: failed: RuntimeError: shapes differ; traceback: ")
+    assert lines[1].startswith(
+        "[1/2] 3dgs on scene, seed 0: failed: RuntimeError: shapes differ; traceback: "
+    )
     assert lines[3].startswith("[2/2] 3dgs on scene, seed 1: PSNR ")
 
 

@@ -15,10 +15,10 @@ from ambiguous_wild.cli.table import rescore_command as command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness import bench as bench_module
 from ambiguous_wild.harness.bench import Callbacks, bench
-from ambiguous_wild.harness.measures import metrics
+from ambiguous_wild.harness.measures import ImageRow, measure_images, metrics
 from ambiguous_wild.harness.rescore import could_be_measured, rescore
 from ambiguous_wild.harness.running import evaluate
-from ambiguous_wild.harness.running.result_file import ImageRow, metrics_of, read_result
+from ambiguous_wild.harness.running.result_file import metrics_of, read_result
 from ambiguous_wild.io.images import read_png_rgb, write_png
 from ambiguous_wild.metrics import lpips
 from tests.harness.board_runs import write_run, write_scene
@@ -186,7 +186,8 @@ def measured_lpips(sizes: list[tuple[int, int]], half: bool = False) -> tuple[li
     pictures = [(str(k), np.zeros((h, w, 3), np.uint8)) for k, (h, w) in enumerate(sizes)]
     scene = SimpleNamespace(test=[SimpleNamespace(name=name) for name, _ in pictures])
     asked = [metric for key, metric in metrics().items() if key in lpips.VARIANTS]
-    return evaluate.measure([(name, image, image) for name, image in pictures], asked, scene, half=half)
+    given = [(name, image, image) for name, image in pictures]
+    return measure_images(given, asked, scene, half=half, around=evaluate.kernel_threads)
 
 
 def test_photos_too_small_for_a_network_leave_it_out(monkeypatch: pytest.MonkeyPatch) -> None:

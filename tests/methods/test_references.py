@@ -113,7 +113,7 @@ def test_what_is_no_recipe_is_one_clear_line(recipe, name, message):
 
 
 def test_a_file_that_is_not_there_or_is_broken(recipe, tmp_path):
-    with pytest.raises(AwError, match="no file"):
+    with pytest.raises(AwError, match="no plugin file"):
         registry.get_method(f"{tmp_path}/absent.py:plain")
     recipe.write_text("x = (")
     with pytest.raises(AwError, match=r"recipe.py, line 1"):

@@ -12,10 +12,10 @@ from typing import Any, Literal, NotRequired, TypedDict
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash, flatten, to_plain, with_options
-from ambiguous_wild.harness.measures import Measure, measure
+from ambiguous_wild.harness.measures import MASK_LABELS, Measure, measure
 from ambiguous_wild.harness.running.cell import Cell
 from ambiguous_wild.harness.running.grid import cell_folder, plan_cells
-from ambiguous_wild.harness.running.result_file import FAILED, RESULT, RunResult, metric_mean, read_result
+from ambiguous_wild.harness.running.result_file import FAILED, RESULT, RunResult, mean_of, read_result
 from ambiguous_wild.methods.ablation import DEFAULT, Group, Variant, choose_groups, folder_name
 from ambiguous_wild.methods.describe import BACK_ENDS
 from ambiguous_wild.methods.registry import MethodEntry, get_method
@@ -73,7 +73,6 @@ class StudyReport(StudyFacts):
 
 
 REPORT = "ablation.json"
-MASK_LABELS = {"iou": "IoU", "precision": "precision", "recall": "recall"}
 
 
 @dataclass(frozen=True)
@@ -284,7 +283,7 @@ class Outcome:
             return sum(known) if len(known) == len(parts) else None
         if metric in cost:
             return cost[metric]
-        mean = metric_mean(self.result, metric)
+        mean = mean_of(self.result, metric)
         return None if math.isnan(mean) else mean
 
 

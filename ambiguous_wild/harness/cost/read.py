@@ -18,14 +18,7 @@ import numpy as np
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash, flatten
-from ambiguous_wild.harness.running.result_file import (
-    FAILED,
-    RESULT,
-    Cost,
-    RunResult,
-    metric_mean,
-    read_result,
-)
+from ambiguous_wild.harness.running.result_file import FAILED, RESULT, Cost, RunResult, mean_of, read_result
 from ambiguous_wild.harness.running.store import read_config, run_folders
 from ambiguous_wild.harness.running.timing import Timing, in_reference_seconds, timing_of
 from ambiguous_wild.metrics import stats
@@ -214,7 +207,7 @@ def _run(folder: Path, result: RunResult) -> CostRun:
         train_s=train_s,
         setup_s=_number(cost.get("setup_s")),
         numbers={name: _number(cost.get(name)) for name in NUMBERS}
-        | {key: metric_mean(result, key) for key in result.get("metrics", {})},
+        | {key: mean_of(result, key) for key in result.get("metrics", {})},
         points=points,
         timing=timing_of(cost),
         samples=tuple((float(at), float(kernel)) for at, kernel in record.get("samples", ())),

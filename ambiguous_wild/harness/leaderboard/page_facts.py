@@ -17,7 +17,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.audit.checks import audit
 from ambiguous_wild.harness.audit.table import Finding, Number, read_tables
 from ambiguous_wild.harness.leaderboard.board import ALONE, CsvValue, Entry, board_csv, in_order, to_number
-from ambiguous_wild.harness.measures import measure, partial
+from ambiguous_wild.harness.measures import measure
 from ambiguous_wild.methods.registry import knows_truth
 
 COSTS = ("reference_s", "train_s", "model_mb", "fps", "gaussians", "peak_rss_mb")
@@ -82,7 +82,7 @@ def facts(
         "date": datetime.now(UTC).date().isoformat(),
         "version": __version__,
         "order": order,
-        "partial": [*filter(partial, (*order, *sorted(missing))), *MASKS],
+        "partial": [*(k for k in (*order, *sorted(missing)) if measure(k).partial), *MASKS],
         "times": list(TIMES),
         "references": sorted({e.method for e in entries if knows_truth(e.method)}),
         "methods": {name: _method(name) for name in sorted({e.method for e in entries})},

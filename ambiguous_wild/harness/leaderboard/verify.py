@@ -22,22 +22,21 @@ from ambiguous_wild.harness.leaderboard.reproduce import (
     preparation,
     setting,
 )
-from ambiguous_wild.harness.measures import Metric, measure, measure_images, metrics
+from ambiguous_wild.harness.measures import MASK_LABELS, ImageRow, Metric, measure, measure_images, metrics
 from ambiguous_wild.harness.running.cell import config_identity
 from ambiguous_wild.harness.running.choosing import mixed_tests
 from ambiguous_wild.harness.running.result_file import (
     FAILED,
     MODEL,
     RESULT,
-    ImageRow,
     RunConfig,
     RunResult,
     check_model,
-    metric_mean,
+    mean_of,
     metrics_of,
     read_result,
 )
-from ambiguous_wild.harness.running.store import MASK_SCORES, read_config
+from ambiguous_wild.harness.running.store import read_config
 from ambiguous_wild.harness.running.timing import timing_of
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import read_png_rgb
@@ -201,7 +200,7 @@ def _check_files(run: Path, result: RunResult, *, ours: bool) -> dict[str, Path]
     size = result["cost"].get("model_mb")
     needed = (ENVIRONMENT,) if size is None and not ours else (MODEL, ENVIRONMENT)
     lacking = [name for name in needed if not (run / name).is_file()]
-    renders = {row["name"]: run / RENDERS / _inside(run, row["name"]) for row in result["per_image"]}
+    renders = renders_of(run, result)
     lacking += [str(path.relative_to(run)) for path in renders.values() if not path.is_file()]
     if lacking:
         raise AwError(f"{run} is partial, it lacks {shortlist(lacking)}; {RESTORE}")
@@ -217,6 +216,11 @@ def _check_files(run: Path, result: RunResult, *, ours: bool) -> dict[str, Path]
     for path in renders.values():
         read_png_rgb(path)
     return renders
+
+
+def renders_of(run: Path, result: RunResult) -> dict[str, Path]:
+    """Where the render of each image lies, by its name."""
+    return {row["name"]: run / RENDERS / _inside(run, row["name"]) for row in result["per_image"]}
 
 
 def _inside(run: Path, name: str) -> str:
@@ -249,7 +253,7 @@ def _check_values(run: Path, result: RunResult, *, photos: bool) -> None:
                 why = f"{why}name them with --scene" if about.infinite else "is finite"
                 _impossible(run, f"{metric} of {row['name']}", value, why)
     masks: Mapping[str, Any] = result["masks"] or {}
-    for name in MASK_SCORES:
+    for name in MASK_LABELS:
         if masks.get(name) is not None and not 0.0 <= masks[name] <= 1.0 + ROUNDING:
             _impossible(run, f"masks.{name}", masks[name], "is a share, from 0 to 1")
     for name, amount in result["cost"].items():
@@ -272,9 +276,9 @@ def _qualities(run: Path, result: RunResult) -> tuple[dict[str, float], tuple[st
             or name.startswith(COST)
         ):
             raise AwError(f"{run}: {name[:60]!a} cannot name a metric: lower case, digits, '_' and '.'")
-    means = {name: metric_mean(result, name) for name in names}
+    means = {name: mean_of(result, name) for name in names}
     masks: Mapping[str, Any] = result["masks"] or {}
-    means |= {f"mask_{k}": float(masks[k]) for k in MASK_SCORES if masks.get(k) is not None}
+    means |= {f"mask_{k}": float(masks[k]) for k in MASK_LABELS if masks.get(k) is not None}
     missing = tuple(sorted(k for k, v in means.items() if math.isnan(v)))
     return {k: v for k, v in means.items() if not math.isnan(v)}, missing
 
@@ -316,8 +320,8 @@ def check_photos(
             f"{run} is partial: measured are {len(renders)} images, scene {scene.root} has {len(views)} test "
             f"photos ({shortlist(odd)} in one of them only); a mean over a part is no result"
         )
-    known = [m for m in metrics().values() if m.tolerance is not None and any(m.key in row for row in rows)]
-    known = [m for m in known if m.key == "psnr" or not quick]
+    asked = [m for m in metrics().values() if m.key == "psnr" or not (quick or m.tolerance is None)]
+    known = [m for m in asked if any(m.key in row for row in rows)]
     copies = []
     for row in rows:
         name = row["name"]
@@ -326,7 +330,7 @@ def check_photos(
             raise AwError(f"{renders[name]} is not of the size of {views[name].image_path}: it was changed")
         (computed,), _ = measure_images([(name, render, photo)], known, scene, half=half)
         for metric in known:
-            _compare(run, row, metric, metrics_of(cast(ImageRow, computed)))
+            _compare(run, row, metric, metrics_of(computed))
         right = slice(photo.shape[1] // 2 if half else 0, None)
         if np.array_equal(render[:, right], photo[:, right]):
             copies.append(name)

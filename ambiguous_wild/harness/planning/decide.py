@@ -83,6 +83,9 @@ class Plan:
     probed: bool = False  # masks were decided on too
     cost: Cost | None = None  # None: nothing was tried
 
+    def __repr__(self) -> str:
+        return f"Plan({self.scene}: --effects {','.join(self.effects()) or 'none'})"
+
     def effects(self, among: Iterable[str] | None = None) -> tuple[str, ...]:
         """Names for `--effects`: effects that were decided on, among those allowed.
 

@@ -43,6 +43,8 @@ from ambiguous_wild.harness.planning.tried import (
 from ambiguous_wild.harness.running.cell import scene_identity
 from ambiguous_wild.harness.running.timing import expected_s, slowness
 from ambiguous_wild.io.atomic import write_json
+from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.splat.calibration import prepare_cpu
 from ambiguous_wild.splat.pace import TrainConfig
 
 SHARE = 0.1
@@ -157,6 +159,13 @@ class Kept:
 
 def _numbers(row: Mapping[str, Any]) -> dict[str, float]:
     return {name: float(value) for name, value in row.items()}
+
+
+def plan(scene: Path | str, *, iterations: int = TrainConfig.iterations) -> Plan:
+    """Which effects the scene in a folder needs in runs of this length: what `aw plan` does."""
+    loaded, train = load_scene(scene), TrainConfig(iterations=iterations)
+    with tempfile.TemporaryDirectory(prefix="aw-plan-") as kept:
+        return plan_with_probes(loaded, train, Path(kept), masks=True, prepare=lambda: prepare_cpu(None))
 
 
 def plan_with_probes(

@@ -23,13 +23,12 @@ import ambiguous_wild
 from ambiguous_wild import __version__
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import config_hash, flatten, to_plain
-from ambiguous_wild.harness.measures import records
+from ambiguous_wild.harness.measures import ImageRow, records
 from ambiguous_wild.harness.running.choosing import Chosen, mixed_tests, scene_protocol
 from ambiguous_wild.harness.running.result_file import (
     SCHEMA,
     Cost,
     Environment,
-    ImageRow,
     MaskScores,
     Provenance,
     RunConfig,
@@ -384,16 +383,14 @@ def _plugins(method: MethodEntry) -> list[Path]:
     known = all_methods()
     members = [known[name] for _, name in method.places if name in known] or [method]
     # a reference is no plugin: its file need not call register
-    found = [_plugin(member) for member in members if not member.given_as]
+    found = [file_of(member) for member in members if not member.given_as]
     return [path for path in dict.fromkeys(found) if path is not None]
 
 
 def file_of(method: MethodEntry) -> Path | None:
     """The file of a method of one's own."""
-    return reference_file(method.given_as) if method.given_as else _plugin(method)
-
-
-def _plugin(method: MethodEntry) -> Path | None:
+    if method.given_as:
+        return reference_file(method.given_as)
     module = sys.modules.get(getattr(method.recipe, "__module__", "") or "")
     if module is None or not module.__name__.startswith("aw_plugin_") or module.__file__ is None:
         return None

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, cast
+from typing import Protocol
 
 import numpy as np
 import torch
 
 from ambiguous_wild.core import AwError, Camera, Scene, View
-from ambiguous_wild.harness.measures import Metric, measure_images, metrics
+from ambiguous_wild.harness.measures import ImageRow, measure_images, metrics
 from ambiguous_wild.harness.running.regions import true_distractor
-from ambiguous_wild.harness.running.result_file import Cost, ImageRow, MaskScores
+from ambiguous_wild.harness.running.result_file import Cost, MaskScores
 from ambiguous_wild.io.atomic import atomic_dir
 from ambiguous_wild.io.images import read_png_rgb, to_uint8, write_png
 from ambiguous_wild.metrics import image as image_metrics
@@ -113,7 +114,7 @@ def render_and_measure(
             yield t.view.name, read_png_rgb(path), t.photo
 
     with atomic_dir(folder) as temporary:
-        return measure(pictures(), list(metrics().values()), scene, half=half)
+        return measure_images(pictures(), metrics().values(), scene, half=half, around=kernel_threads)
 
 
 def refuse_empty(truth: Sequence[TestPhoto], folder: Path) -> None:
@@ -133,27 +134,15 @@ def refuse_empty(truth: Sequence[TestPhoto], folder: Path) -> None:
         )
 
 
-def measure(
-    pictures: Iterable[tuple[str, np.ndarray, np.ndarray]],
-    metrics: Collection[Metric],
-    scene: Scene,
-    *,
-    half: bool,
-) -> tuple[list[ImageRow], dict[str, str]]:
-    """`measure_images` with as many threads of torch as the CPU kernels have; drawing keeps those it had."""
+@contextmanager
+def kernel_threads() -> Iterator[None]:
+    """Let torch use as many threads as the CPU kernels; drawing keeps those it had."""
     before = torch.get_num_threads()
-
-    def drawn() -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-        for picture in pictures:
-            torch.set_num_threads(threads())
-            yield picture
-            torch.set_num_threads(before)
-
+    torch.set_num_threads(threads())
     try:
-        rows, missing = measure_images(drawn(), metrics, scene, half=half)
+        yield
     finally:
         torch.set_num_threads(before)
-    return cast(list[ImageRow], rows), missing
 
 
 def _fitted(model: Renderable, test: TestPhoto) -> torch.Tensor:

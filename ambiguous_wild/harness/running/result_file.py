@@ -19,7 +19,7 @@ import numpy as np
 from msgspec import Meta
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.measures import MetricRecord, partial, remember
+from ambiguous_wild.harness.measures import ImageRow, MetricRecord, measure, remember
 from ambiguous_wild.io.atomic import write_json
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.metrics import stats
@@ -31,22 +31,15 @@ Finite = Annotated[float, Meta(ge=-1e300, le=1e300)]
 Name = Annotated[str, Meta(pattern=r"\S")]
 
 
-class ImageRow(TypedDict, total=False):
-    """Metrics of one test image, PSNR and others (see `metrics_of`); None = undefined there."""
-
-    name: Required[str]  # of the test view
-    psnr: float | None
-
-
 def metrics_of(row: ImageRow) -> dict[str, float | None]:
     """Every metric of the row, by name."""
     return {key: cast("float | None", value) for key, value in row.items() if key != "name"}
 
 
-def metric_mean(result: RunResult | None, metric: str) -> float:
+def mean_of(result: RunResult | None, metric: str) -> float:
     """Mean of an image metric over the test views, of the finite values; NaN where any is missing."""
     rows = [] if result is None else [metrics_of(row) for row in result["per_image"]]
-    values = [row.get(metric) for row in rows if metric in row or not partial(metric)]
+    values = [row.get(metric) for row in rows if metric in row or not measure(metric).partial]
     return stats.mean([math.nan if value is None else value for value in values])
 
 

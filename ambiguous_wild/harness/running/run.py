@@ -28,14 +28,7 @@ from ambiguous_wild.harness.running.cell import (
     provenance,
 )
 from ambiguous_wild.harness.running.external import run_program
-from ambiguous_wild.harness.running.result_file import (
-    FAILED,
-    RESULT,
-    RunConfig,
-    model_hash,
-    read_result,
-    write_result,
-)
+from ambiguous_wild.harness.running.result_file import FAILED, RESULT, model_hash, read_result, write_result
 from ambiguous_wild.harness.running.store import read_config
 from ambiguous_wild.harness.running.training import Tick, train_and_measure
 from ambiguous_wild.io import plain_yaml
@@ -65,14 +58,16 @@ def is_finished(folder: Path) -> bool:
     return True
 
 
-def left_alone(folder: Path, overwrite: Overwrite, config: RunConfig) -> Literal["kept", "skipped"] | None:
+def left_alone(
+    folder: Path, overwrite: Overwrite, config: Mapping[str, Any]
+) -> Literal["kept", "skipped"] | None:
     """What a run becomes that need not be made: finished before, or to be left as it is; else None."""
     if overwrite == "never":
         return "skipped" if folder.exists() else None
     return "kept" if is_finished(folder) and not made_anew(folder, overwrite, config) else None
 
 
-def made_anew(folder: Path, overwrite: Overwrite, config: RunConfig) -> bool:
+def made_anew(folder: Path, overwrite: Overwrite, config: Mapping[str, Any]) -> bool:
     """Whether an earlier run of the folder is to be replaced: always, or where the method's file changed."""
     if overwrite != "changed":
         return overwrite == "always"
@@ -128,8 +123,7 @@ def _is_our_config(path: Path) -> bool:
 def _said(key: str, before: Mapping[str, Any], now: Mapping[str, Any], cell: Cell) -> str:
     """What changed, as the command line writes it: a config leaves out the full protocol."""
     if key == "source":
-        file = file_of(cell.method)
-        return f"{file.name if file else f'the code of {cell.method.name}'} has changed since this run"
+        return f"{getattr(file_of(cell.method), 'name', cell.method.name)} has changed since this run"
     was, is_now = (str(of.get(key, "full" if key == "protocol" else None)) for of in (before, now))
     return f"{key} was {was}, is {is_now}"
 
@@ -179,10 +173,8 @@ def run_cell(cell: Cell, folder: Path, options: RunOptions, tick: Tick | None = 
     try:
         return _run(cell, Path(os.path.realpath(folder)), options, tick)
     except (Exception, SystemExit) as error:  # a method of one's own may call sys.exit
-        where = folder / TRACEBACK
-        return CellReport(
-            folder, "failed", error=error_line(error) + (f"; traceback: {where}" if where.is_file() else "")
-        )
+        where = "" if isinstance(error, (AwError, OSError)) else f"; traceback: {folder / TRACEBACK}"
+        return CellReport(folder, "failed", error=error_line(error) + where)
 
 
 def _run(cell: Cell, folder: Path, options: RunOptions, tick: Tick | None) -> CellReport:

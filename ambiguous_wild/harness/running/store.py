@@ -14,14 +14,14 @@ import pandas as pd
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import flatten
-from ambiguous_wild.harness.measures import partial
+from ambiguous_wild.core.errors import counted
+from ambiguous_wild.harness.measures import MASK_LABELS, measure
 from ambiguous_wild.harness.running.result_file import FAILED, RESULT, RunResult, metrics_of, read_result
 from ambiguous_wild.harness.running.timing import timing_of
 from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.photos import PHOTO_SUFFIXES
 
 CONFIG = "config.yaml"
-MASK_SCORES = ("iou", "precision", "recall")
 # Columns of `Runs.runs` that hold words, beside scene and method.
 TEXT_OF_RUNS = (
     "status", "error", "folder", "device", "version", "config_hash", "scene_hash", "timing", "timing_reason",
@@ -59,6 +59,10 @@ class Runs:
     runs: pd.DataFrame
     missing: pd.DataFrame
     incomplete: tuple[Incomplete, ...] = ()
+
+    def __repr__(self) -> str:
+        counts = [counted(self.runs[key].nunique(), key) for key in ("method", "scene")]
+        return f"Runs({counted(len(self.runs), 'run')} of {' on '.join(counts)})"
 
 
 def read_runs(*folders: Path | str) -> Runs:
@@ -196,7 +200,7 @@ def _image_rows(results: list[FoundResult]) -> Iterator[dict[str, Any]]:
         metrics |= dict.fromkeys(result["missing"])
         for name, values in measured:
             for metric in metrics:
-                if metric not in values and partial(metric):
+                if metric not in values and measure(metric).partial:
                     continue
                 value = values.get(metric)
                 yield _key(result) | {
@@ -228,7 +232,7 @@ def _run_row(run: Path, result: RunResult) -> dict[str, Any]:
         | cost
         | {"timing": timing.verdict, "timing_reason": timing.reason, "timing_kernel": timing.kernel}
         | {"hardware": _hardware(result)}
-        | {f"mask_{k}": math.nan if masks.get(k) is None else masks[k] for k in MASK_SCORES}
+        | {f"mask_{k}": math.nan if masks.get(k) is None else masks[k] for k in MASK_LABELS}
     )
 
 

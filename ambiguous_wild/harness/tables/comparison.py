@@ -11,16 +11,19 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist, unknown
-from ambiguous_wild.harness.measures import ALWAYS, COST, MEASURES, Measure, measure, partial
-from ambiguous_wild.harness.running.store import TEXT_OF_RUNS, Runs
+from ambiguous_wild.harness.measures import ALWAYS, COST, MEASURES, Measure, measure
+from ambiguous_wild.harness.running.store import TEXT_OF_RUNS, Runs, read_runs
 from ambiguous_wild.harness.tables.notes import incomparable, notes, untimed
+from ambiguous_wild.harness.tables.plain_formats import to_text
 from ambiguous_wild.harness.tables.table import Cell, Column, Row, State, Table, ranks
+from ambiguous_wild.harness.tables.typeset import to_html
 from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.metrics import stats
 
@@ -84,6 +87,25 @@ def comparison(
         *notes(runs, columns, methods, chosen), *_undefined(columns, chosen, defined)
     )
     return _without_empty(tables) if drop_empty or (drop_empty is None and not metrics) else tables
+
+
+class Tables(tuple[Table, ...]):
+    """Tables that `print` and a notebook show as they are read."""
+
+    def __repr__(self) -> str:
+        return f"Tables({', '.join(table.title for table in self)})"
+
+    def __str__(self) -> str:
+        return to_text(self)
+
+    def _repr_html_(self) -> str:
+        return to_html(self)
+
+
+def table(runs: Runs | Path | str, *, metrics: Sequence[str] = (), scenes: Sequence[str] = ()) -> Tables:
+    """The `comparison` of runs, or of every run below a folder."""
+    found = runs if isinstance(runs, Runs) else read_runs(runs)
+    return Tables(comparison(found, metrics=metrics, scenes=scenes))
 
 
 EFFECTS = Measure("effects", "effects", None, 0, per_image=False)
@@ -151,7 +173,7 @@ class _Index:
 
     def can_have(self, scene: str, column: Measure, methods: Sequence[str]) -> bool:
         """Whether the measure is defined on the scene: some method has a value, or it always is."""
-        if not partial(column.key) and column.key not in (*MASK_COLUMNS, "mask_recall"):
+        if not column.partial and column.key not in (*MASK_COLUMNS, "mask_recall"):
             return True
         return any(
             (m, scene) in self.runs and bool(self.seeds(m, scene, column).notna().any()) for m in methods

@@ -15,7 +15,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import from_plain
@@ -41,7 +40,7 @@ class Source:
     """Code that a run needs: a plugin, metrics, or a reference such as ``recipe.py:my_recipe``."""
 
     text: str  # the reference as typed, or the file's path
-    kind: Literal["plugin", "metric", "method"]
+    kind: str  # "plugin", "metric" or "method"
     path: str = ""  # absolute path of its file, if it has one
     content: bytes = b""
 
@@ -79,7 +78,7 @@ def read_sources(
     return tuple(sources)
 
 
-def _source(text: str, kind: Literal["plugin", "metric", "method"], path: Path) -> Source:
+def _source(text: str, kind: str, path: Path) -> Source:
     return Source(text, kind, str(path.resolve()), path.read_bytes())
 
 

@@ -18,8 +18,8 @@ IN_3DGS = 1 + 1.2  # time of an iteration of both, in iterations of 3dgs (docs/r
 TRAINING = 0.7
 SHORTEST, LONGEST = 300, 30_000  # iterations; shorter runs show no difference of methods
 FRAMES = 60  # of a video
-# Screening and building take so long on two cores: 60 frames of 480 px and eleven photos of 24 MP.
-SCENE_S = (10.0, 2.5)  # for any scene, for every photo
+# `aw build-scene` on two idle cores, photos of about 1 MP: 11 take 9 to 11 s, 23 take 15, 40 take 43
+SCENE_S = (3.0, 1.0)  # for any scene, for every photo
 
 
 @click.command("try")

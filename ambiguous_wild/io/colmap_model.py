@@ -140,7 +140,7 @@ class _Reader:
 
 def _binary_cameras(path: Path) -> dict[int, ModelCamera]:
     """cameras.bin."""
-    reader, cameras = _Reader(path), {}
+    reader, cameras = _Reader(path), dict[int, ModelCamera]()
     for _ in range(reader.count(24)):
         camera_id, number, width, height = reader.unpack("<iiQQ")
         name, count = model_of_id(number, str(path))
@@ -151,7 +151,7 @@ def _binary_cameras(path: Path) -> dict[int, ModelCamera]:
 
 def _binary_images(path: Path) -> dict[int, ModelImage]:
     """images.bin."""
-    reader, images = _Reader(path), {}
+    reader, images = _Reader(path), dict[int, ModelImage]()
     for _ in range(reader.count(73)):
         image_id, *pose, camera_id = reader.unpack("<i7di")
         name = reader.text()
@@ -209,7 +209,7 @@ def _binary_points(path: Path) -> ModelPoints:
 
 def _text_cameras(path: Path) -> dict[int, ModelCamera]:
     """cameras.txt."""
-    cameras = {}
+    cameras: dict[int, ModelCamera] = {}
     for number, fields in _rows(path):
         try:
             camera_id, model = int(fields[0]), fields[1]
@@ -230,7 +230,7 @@ def _text_images(path: Path) -> dict[int, ModelImage]:
     lines = [(n, text) for n, text in enumerate(_lines(path), 1) if not text.startswith("#")]
     while lines and not lines[0][1].strip():
         lines.pop(0)
-    images = {}
+    images: dict[int, ModelImage] = {}
     for i in range(0, len(lines), 2):
         number, text = lines[i]
         if not text.strip():  # trailing empty lines

@@ -8,6 +8,7 @@ OpenImageIO's result to one level of 255, six times as fast.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -17,7 +18,9 @@ from PIL import Image
 
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import DownsampleResult
+from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
+from ambiguous_wild.io.photos import MIN_SIDE
 
 FACTORS = (1, 2, 4, 8)
 TARGET_SIDE = 480  # px; literature trains at about 504 x 378
@@ -49,6 +52,16 @@ def auto_factor(sizes: list[tuple[int, int]]) -> int:
 def downsampled_size(width: int, height: int, factor: int) -> tuple[int, int]:
     """(width, height) / factor, rounded; intrinsics follow the actual size."""
     return max(1, round(width / factor)), max(1, round(height / factor))
+
+
+def check_factor(factor: int, sizes: Iterable[tuple[int, int]]) -> None:
+    """Raise AwError where a factor leaves a photo of these sizes in px too small to train on."""
+    side = min(min(size) for size in sizes) / factor
+    if factor > 1 and side < MIN_SIDE:
+        raise AwError(
+            f"--factor {factor} leaves photos of {side:.0f} px a side, too small to train on (at least "
+            f"{MIN_SIDE}); choose a smaller factor"
+        )
 
 
 def downsample_photo(

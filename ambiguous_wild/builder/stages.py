@@ -10,7 +10,7 @@ import numpy as np
 
 from ambiguous_wild.builder import report
 from ambiguous_wild.builder.collect import Capture, read_test_list, split_photos
-from ambiguous_wild.builder.downsample import auto_factor, downsample
+from ambiguous_wild.builder.downsample import auto_factor, check_factor, downsample
 from ambiguous_wild.builder.masks import find_masks, lay_out_masks, mask_hashes, mask_warnings
 from ambiguous_wild.builder.moving import write_motion
 from ambiguous_wild.builder.package import SceneParts, package
@@ -112,6 +112,8 @@ class Stages:
             lambda f: screen(capture, f, strict=settings.strict, jobs=self.jobs, bar=bar),
         )
         facts = screened.facts["photos"]
+        if settings.factor is not None:
+            check_factor(settings.factor, [(f["width"], f["height"]) for f in facts])
         tests = read_test_list(self.test_list, facts) if self.test_list else None
         mask_stage = self._masks(work, screened)
         sfm = self._sfm(work, screened, mask_stage)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ambiguous_wild.builder.downsample import check_factor
 from ambiguous_wild.builder.package import list_files, nerfbaselines_info
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.report import point_checks
@@ -33,7 +34,6 @@ from ambiguous_wild.datasets.suites import differences, suite_of
 from ambiguous_wild.io.atomic import check_output, refuse_foreign_files, write_json, write_text
 from ambiguous_wild.io.colmap_model import write_model
 from ambiguous_wild.io.colmap_records import Model
-from ambiguous_wild.io.photos import MIN_SIDE
 from ambiguous_wild.io.scene_folder import SCENE_SCHEMA, read_scene_json, verify_files
 
 HIDDEN = "alpha hides pixels"
@@ -159,12 +159,8 @@ def _sized(foreign: ForeignScene, settings: ImportSettings) -> ForeignScene:
         foreign = dataclasses.replace(foreign, factor=factor, notes=(*foreign.notes, note))
     if settings.factor is None:
         return foreign
-    side = min(min(c.width, c.height) for c in foreign.model.cameras.values()) / settings.factor
-    if side < MIN_SIDE and settings.factor > 1:
-        raise AwError(
-            f"--factor {settings.factor} leaves photos of {side:.0f} px a side, too small to train on (at "
-            f"least {MIN_SIDE}); choose a smaller factor"
-        )
+    if not alone:
+        check_factor(settings.factor, [(c.width, c.height) for c in foreign.model.cameras.values()])
     return dataclasses.replace(foreign, factor=settings.factor)
 
 

@@ -157,9 +157,10 @@ def _black_and_white(grey: np.ndarray, slack: int) -> np.ndarray | None:
 
 
 def _varying_alpha(image: np.ndarray) -> np.ndarray | None:
-    if image.ndim != 3 or image.shape[2] != 4 or image[..., 3].min() == image[..., 3].max():
+    if image.ndim != 3 or image.shape[2] != 4:
         return None
-    return np.where(image[..., 3] >= 128, 255, 0).astype(np.uint8)
+    kept = np.where(image[..., 3] >= 128, 255, 0).astype(np.uint8)
+    return None if kept.min() == kept.max() else kept
 
 
 def read_alpha(

@@ -110,6 +110,7 @@ def test_masks_missing_and_of_the_wrong_size(aw, tmp_path):
 def test_options_that_cannot_be(aw, tmp_path):
     write_capture(tmp_path / "raw", 3)
     assert "does not exist" in fails(aw, "nowhere", "-o", "scene")
+    assert "px a side, too small to train on" in fails(aw, "raw", "-o", "scene", "--factor", 64)
     assert "--factor must be" in fails(aw, "raw", "-o", "scene", "--factor", 0)
     assert "--max-features" in fails(aw, "raw", "-o", "scene", "--max-features", 3)
     assert "--help" in fails(aw, "raw")

@@ -13,7 +13,7 @@ from ambiguous_wild.datasets.readers import recognise
 from ambiguous_wild.datasets.write import ImportSettings, import_scene
 from ambiguous_wild.harness.running.grid import plan_cells
 from ambiguous_wild.io.colmap_records import points_without_tracks
-from ambiguous_wild.io.images import read_mask
+from ambiguous_wild.io.images import read_mask, write_png
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.data import load_keep
 from ambiguous_wild.splat.pace import TrainConfig
@@ -220,3 +220,14 @@ def test_photo_tourism_as_nerfbaselines_hands_it_out(loader, tmp_path):
     assert sides == {n: "train" if n in layouts.TRAIN else "test" for n in layouts.NAMES}
     with pytest.raises(AwError, match=r"nerfw_split.csv is a table of splits"):
         import_scene(root, tmp_path / "wrong", ImportSettings(kind="colmap"))
+
+
+def test_masks_outside_the_dataset_are_nobody_s(tmp_path):
+    root = layouts.instant_ngp(tmp_path / "raw")
+    for photo in (root / "images").iterdir():
+        photo.rename(root / photo.name)
+    text = (root / "transforms.json").read_text().replace("images/", "")
+    (root / "transforms.json").write_text(text)
+    (tmp_path / "masks").mkdir()
+    write_png(tmp_path / "masks" / layouts.TRAIN[0], np.zeros((layouts.HEIGHT, layouts.WIDTH), np.uint8))
+    assert not any(v.keep_path for v in load_scene(import_scene(root, tmp_path / "scene").scene).train)

@@ -125,6 +125,7 @@ def _palette():
         _mask(np.where(LEFT, 0, 255).astype(np.uint8), suffix=".jpg", flags=[cv2.IMWRITE_JPEG_QUALITY, 60]),
         _mask(cv2.GaussianBlur(np.where(LEFT, 0, 255).astype(np.uint8), (3, 3), 0)),
         _mask(_rgba(np.where(LEFT, 0, 255), 255)),
+        _mask(np.dstack([np.where(LEFT, 0, 255)] * 3 + [np.where(LEFT, 250, 255)]).astype(np.uint8)),
         _mask(_rgba(255, 255)),
         _mask(_rgba(np.random.default_rng(0).integers(0, 256, (48, 64)), 255)),
         _mask(np.where(LEFT[..., None], [0, 0, 0, 7], [255, 255, 255, 7]).astype(np.uint8)),

@@ -130,7 +130,7 @@ def read_foreign(root: Path, kind: str | None = None, model: str = "") -> tuple[
 
 def _with_masks(scene: ForeignScene) -> ForeignScene:
     """The scene with the keep masks that lie in masks/ beside its photos, where its own files name none."""
-    folder = scene.photos.parent / "masks"
+    folder = (scene.photos.parent if scene.photos != scene.root else scene.root) / "masks"
     if scene.masks or scene.kind in ("drone", "dualsplat", "blender") or (folder / OWN_MASKS).is_file():
         return scene
     train = [name for name, side in scene.split.items() if side == "train"]

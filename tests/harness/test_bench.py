@@ -67,10 +67,15 @@ def test_a_run_that_fails_is_in_the_report_and_the_next_one_runs(scene, tmp_path
     lines = []
     report = small(scene, tmp_path / "runs", seeds=[0, 1], callbacks=Lines(lines.append))
     assert [run.outcome for run in report.runs] == ["failed", "trained"]
-    assert report.failed[0].error == "RuntimeError: shapes differ" and report.failed[0].result is None
+    assert (
+        report.failed[0].error.startswith("RuntimeError: shapes differ; traceback: ")
+        and report.failed[0].result is None
+    )
     assert report.outcomes == {"failed": 1, "trained": 1}
     assert lines[0] == "begins: 3dgs on scene, seed 0"
-    assert lines[1].startswith("[1/2] 3dgs on scene, seed 0: failed: RuntimeError: shapes differ -> ")
+    assert lines[1].startswith(
+        "[1/2] 3dgs on scene, seed 0: failed: RuntimeError: shapes differ; traceback: "
+    )
     assert lines[3].startswith("[2/2] 3dgs on scene, seed 1: PSNR ")
 
 

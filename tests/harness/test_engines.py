@@ -173,7 +173,7 @@ def test_a_scene_travels_and_a_run_folder_comes_back(scene, tmp_path, monkeypatc
     (cell,) = plan_cells([f"external:{method}"], [scene], [0], SHORT)
     sources = jobs.read_sources([], [f"external:{method}"])
     job = jobs.make_job(cell, cell_folder(tmp_path / "runs", cell), RunOptions(tmp_path / "c"), sources)
-    assert left_alone(Path(job.folder), "missing") is None
+    assert left_alone(Path(job.folder), "missing", job.config) is None
     key, content = send_scene(scene, 10.0)
     for _ in range(2):  # the second finds the scene unpacked
         report = receive(run_sent(job, key, content, 10.0), job, 10.0)
@@ -181,7 +181,10 @@ def test_a_scene_travels_and_a_run_folder_comes_back(scene, tmp_path, monkeypatc
     assert report.folder == Path(job.folder)
     assert read_result(report.folder / "metrics.json")["config_hash"] == cell.identity
     assert (report.folder / "renders/test/test_0.png").is_file()
-    assert left_alone(report.folder, "missing") == "kept" and left_alone(report.folder, "always") is None
+    assert left_alone(report.folder, "missing", job.config) == "kept"
+    assert left_alone(report.folder, "always", job.config) is None
+    assert left_alone(report.folder, "changed", job.config) == "kept"
+    assert left_alone(report.folder, "changed", {**job.config, "source": "0" * 64}) is None
     assert [p.name for p in (tmp_path / "node").rglob("scene")] == ["scene"]
     assert list((tmp_path / "node").rglob("run-*")) == []
     with pytest.raises(AwError, match="--transfer-limit"):

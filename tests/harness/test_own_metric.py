@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -28,8 +29,10 @@ CONTRAST = Metric("contrast", "contrast", "higher", function=lambda render: rend
 
 
 @pytest.fixture(autouse=True)
-def forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+def forgotten(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(measures, "_own", {})
+    measures._installed.cache_clear()
+    yield
     measures._installed.cache_clear()
 
 

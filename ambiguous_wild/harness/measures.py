@@ -91,7 +91,7 @@ def _lpips(key: str, label: str) -> Metric:
 
 
 _IMAGE = "ambiguous_wild.metrics.image:"
-# dB. Which pixels are covered is computed too: rounding may move one over the threshold, and the mean with it.
+# dB. Which pixels are covered is computed too: rounding may move one over the threshold.
 _REGION_DB = 1e-2
 
 MASK_LABELS = {"iou": "IoU", "precision": "precision", "recall": "recall"}

@@ -91,8 +91,7 @@ def _lpips(key: str, label: str) -> Metric:
 
 
 _IMAGE = "ambiguous_wild.metrics.image:"
-# Which pixels are covered is itself computed: where rounding moves a pixel over the threshold, the mean over
-# thousands of them moves a little.
+# dB. Which pixels are covered is computed too: rounding may move one over the threshold.
 _REGION_DB = 1e-2
 
 MASK_LABELS = {"iou": "IoU", "precision": "precision", "recall": "recall"}
@@ -231,14 +230,9 @@ def measure_images(
     half: bool = False,
     around: Callable[[], AbstractContextManager[None]] = nullcontext,
 ) -> tuple[list[ImageRow], dict[str, str]]:
-    """Metrics of test images; and why a metric that one image is refused by is missing for all.
+    """Rows of metrics, and why a metric that refuses one image is missing for all; measured in `around()`.
 
-    Args:
-        pictures: name of the test view, render and photo, [H, W, 3] uint8.
-        metrics: which.
-        scene: of the views.
-        half: of the right half of each picture alone.
-        around: a context to measure in.
+    `pictures`: name of a test view, render, photo, [H, W, 3] uint8; `half`: their right halves alone.
     """
     views = {view.name: view for view in scene.test}
     rows: list[dict[str, Any]] = []

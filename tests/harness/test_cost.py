@@ -256,9 +256,11 @@ def test_only_an_earlier_report_is_taken_away(tmp_path: Path) -> None:
     cost_run(tmp_path / "runs", "a")
     report = cost_report(read(tmp_path / "runs", tmp_path / "runs" / "yard"))  # a folder in a folder: one run
     assert [p.runs for p in report.points] == [1]
-    write_report(report, out)
-    assert (out / "changes.csv").read_text() == "mine"  # nothing here was a report of ours
+    with pytest.raises(AwError, match="changes.csv exists"):  # nothing here was a report of ours
+        write_report(report, out)
+    assert (out / "changes.csv").read_text() == "mine"
     (out / "changes.csv").unlink()
+    write_report(report, out)
     (out / "budgets.png").write_text("of a report")
     write_report(report, out)
     assert sorted(p.name for p in out.iterdir()) == ["cost.csv", "cost.json", "notes.txt", "time-to-psnr.csv",

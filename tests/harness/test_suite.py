@@ -14,7 +14,7 @@ from tests.command_line import aw
 from tests.datasets import layouts
 
 # Large enough to be measured at factor 8.
-SIZE = {"WIDTH": 160, "HEIGHT": 96, "FX": 170.0, "FY": 171.0, "CX": 79.5, "CY": 48.5}
+SIZE = {"WIDTH": 160, "HEIGHT": 128, "FX": 170.0, "FY": 171.0, "CX": 79.5, "CY": 64.5}
 SUITES = {
     "ambiguous-wild": (layouts.robustnerf, ["Humanoid", "porter", "Wood"]),
     "on-the-go": (layouts.on_the_go, ["mountain", "patio_high"]),

@@ -92,6 +92,11 @@ class _LazyGroup(click.Group):
 
     def resolve_command(self, ctx: click.Context, args: list[str]):
         args = with_new_names(args)
+        if args[:1] == ["help"]:  # as git has it
+            if not args[1:]:
+                click.echo(ctx.get_help())
+                ctx.exit()
+            args = [*args[1:], "--help"]
         if args and args[0] not in COMMANDS:
             raise unknown("command", args[0], COMMANDS, "'aw --help' lists them")
         return super().resolve_command(ctx, args)

@@ -14,7 +14,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Required, TypedDict, cast
+from typing import TYPE_CHECKING, Any, Literal, Required, TypedDict, cast, get_args
 
 import numpy as np
 
@@ -160,13 +160,25 @@ def measure(key: str) -> Measure:
 
 
 def register(metric: Metric) -> Metric:
-    """Add a metric; AwError where its key cannot stand in a table, or is that of a measure of ours."""
+    """Add a metric; AwError where its key cannot stand in a table or is taken, or a field is wrong."""
     if not isinstance(metric, Metric):
         raise AwError(f"{metric!r} is no Metric: see 'Your own metric' in docs/metrics.md")
     if not re.fullmatch(r"[a-z][a-z0-9_.]{0,60}", metric.key) or metric.key.startswith("cost_"):
         raise AwError(f"{metric.key[:60]!a} cannot name a metric: lower case, digits, '_' and '.'")
     if metric.key in MEASURES:
         raise AwError(f"metric {metric.key!r} is one of ours: give yours another key")
+    for field, value, right, form in (
+        ("better", metric.better, metric.better in get_args(Better), "'higher', 'lower' or None"),
+        ("digits", metric.digits, type(metric.digits) is int and metric.digits >= 0, "a whole number"),
+        (
+            "needs",
+            metric.needs,
+            type(metric.needs) is tuple and {*metric.needs} <= {"photo", "view", "scene"},
+            "a tuple of 'photo', 'view', 'scene', e.g. ('photo',)",
+        ),
+    ):
+        if not right:
+            raise AwError(f"metric {metric.key!r}: {field} is {value!r}: write {form}")
     _own[metric.key] = replace(metric, label=f"{metric.label} {metric.unit}".strip(), unit="")
     return metric
 

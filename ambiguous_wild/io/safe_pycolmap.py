@@ -2,10 +2,17 @@
 
 The pycolmap wheels (4.1.1 and 4.2.1 measured) export zlib's symbols. Imported first, they shadow the
 library that PNG writers link against, and the next PNG write crashes the process. zlib goes first.
+They also print a stack trace of 40 lines when a process is told to end (kill, a time limit of a cluster).
 """
+
+import signal
+import threading
 
 import zlib  # noqa: F401  isort: skip  before pycolmap, see above
 
 import pycolmap
+
+if threading.current_thread() is threading.main_thread():  # Python sets signals in no other
+    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
 
 __all__ = ["pycolmap"]

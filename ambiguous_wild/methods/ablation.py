@@ -64,6 +64,8 @@ def sweep_groups(options: Any, sweeps: Sequence[str]) -> tuple[Group, ...]:
     groups = []
     for key, values in ((k, v.split(",")) for k, _, v in (text.partition("=") for text in sweeps)):
         for value in values:
+            if not value:
+                raise AwError(f"--sweep {key!r}: write KEY=V1,V2, e.g. {key}=0.5,0.9")
             with_options(options, {key: value}, "option of --sweep")
         names = (re.sub(r"[^a-z0-9._-]+", "_", re.sub("^-", "minus", v.lower())) for v in values)
         variants = (Variant(name, (f"{key}={value}",)) for name, value in zip(names, values))

@@ -72,6 +72,11 @@ def get_method(name: str) -> MethodEntry:
         return grafted(name, host, all_methods())
     if name not in methods and name.endswith(".py"):
         raise without_recipe(Path(name))
+    module, _, recipe = name.partition(":")
+    if recipe:
+        raise AwError(
+            f"unknown method {name!r}: for one in a file write FILE.py:RECIPE, as {module}.py:{recipe}"
+        )
     in_any_case = [known for known in methods if known.casefold() == name.casefold()]
     if name not in methods and len(in_any_case) != 1:
         raise unknown("method", name, methods, "'aw methods' lists them")

@@ -61,6 +61,7 @@ def test_listing_shows_every_group_and_variant_and_imports_no_torch():
     [
         ([], "no scene"),
         (["--group", "maskz", "--list"], "did you mean 'masks'"),
+        (["--sweep", "lambda_cr", "--list"], "--sweep 'lambda_cr': write KEY=V1,V2"),
         (["--method", "3dgs", "--list"], "declares no ablations"),
         (["--scene", "SCENE", "--set", "mask.boxx=3"], "did you mean 'box'"),
         (["--scene", "SCENE", "--iterations", "5", "--budget", "1m"], "exclude each other"),

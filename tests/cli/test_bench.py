@@ -36,6 +36,7 @@ def test_what_is_no_budget(text):
         (["--method", "3dgs", "--iterations", "10k"], "'10k' is not a whole number"),
         (["--method", "3DGS", "--passes", "2", "refinesplat"], "did you mean --method refinesplat?"),
         (["--method", "3dgs", "./other"], "did you mean --scene ./other?"),
+        (["--method", "mine:trimmed"], "write FILE.py:RECIPE, as mine.py:trimmed"),
         (["--method", "3dgs,refinsplat"], "unknown method 'refinsplat': did you mean 'refinesplat'"),
         (["--method", "3dgs", "--overwrite", "perhaps"], "'never', 'missing', 'changed', 'always'"),
         (["--method", "3dgs", "--itterations", "5"], "--iterations"),

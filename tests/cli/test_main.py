@@ -37,7 +37,7 @@ def test_every_command_is_in_one_section() -> None:
 def test_a_group_alone_prints_its_help(words: tuple[str, ...]) -> None:
     done = typed(*words)
     assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout == typed(*words, "--help").stdout
+    assert done.stdout == typed(*words, "--help").stdout == typed("help", *words).stdout
     assert done.stdout.count("\n") > 5
 
 

@@ -145,13 +145,13 @@ def decide(scene: str, found: Evidence) -> Plan:
     lines: tuple[Decision, ...] = (
         Decision(
             "appearance", "spread at a point after gain and shine", by_place,
-            APPEARANCE, "of a code", local,
+            APPEARANCE, "of the colour range", local,
             "light differs by place" if local == "on" else "no more than texture and noise",
             "--effects appearance",
         ),
         Decision(
             "exposure", "spread of the photos' gains at the same points", found.exposure, EXPOSURE,
-            "of a code", "off" if local == "on" and globally == "on" else globally, globally_why,
+            "of the colour range", "off" if local == "on" and globally == "on" else globally, globally_why,
             "--effects exposure",
         ),
         Decision(

@@ -54,7 +54,7 @@ def orbit(scene: Scene, frames: int, size: tuple[int, int]) -> list[Camera]:
 
 
 def from_file(path: Path, scene: Scene, frames: int, size: tuple[int, int]) -> list[Camera]:
-    """A path that a viewer saved, in the scene's own coordinates.
+    """A path that a viewer saved, in the coordinates of the scene's files.
 
     Read are the page of `aw view` and nerfstudio ({"camera_path": [{"camera_to_world": 16 numbers, "fov":
     degrees}]}, OpenGL axes) and 3DGS viewers (cameras.json: [{"position", "rotation", "fx", "fy", "width",
@@ -80,7 +80,7 @@ def from_file(path: Path, scene: Scene, frames: int, size: tuple[int, int]) -> l
     cameras = []
     for number, row in enumerate(rows):
         try:
-            cameras.append(_camera(row, lens, size))
+            cameras.append(scene.place.inside(_camera(row, lens, size)))
         except (AwError, KeyError, TypeError, ValueError, OverflowError, np.linalg.LinAlgError) as error:
             raise AwError(f"{path}: camera {number} is none: {error}") from None
     return cameras if len(cameras) == frames else _smooth(cameras, frames, size)

@@ -10,6 +10,7 @@ from typing import Any, Literal, TypedDict
 import numpy as np
 
 from ambiguous_wild.core.camera import Camera
+from ambiguous_wild.core.errors import shortlist
 
 Split = Literal["train", "test"]
 _FEW_POINTS = 500  # no surface follows from fewer
@@ -94,11 +95,14 @@ class Place:
 
     def inside(self, camera: Camera) -> Camera:
         """A camera of the files' coordinates, moved along."""
-        if self == Place():
+        if self == UNMOVED:
             return camera
         pose = camera.cam_from_world.copy()
         pose[:3, 3] = (pose[:3, :3] @ self.centre + pose[:3, 3]) * self.scale
         return replace(camera, cam_from_world=pose)
+
+
+UNMOVED = Place()
 
 
 @dataclass(frozen=True)
@@ -110,7 +114,7 @@ class Scene:
     views: tuple[View, ...]
     points: Points
     info: SceneInfo = field(default_factory=SceneInfo, repr=False)
-    place: Place = Place()  # of the coordinates of views and points in those of the files
+    place: Place = UNMOVED  # of the coordinates of views and points in those of the files
 
     @cached_property
     def train(self) -> tuple[View, ...]:
@@ -124,12 +128,8 @@ class Scene:
 
     @cached_property
     def together(self) -> tuple[View, ...]:
-        """The training views (all, where there are none) without the few whose cameras lie far from the rest."""
-        views = self.train or self.views
-        away, usual = _away(np.array([v.camera.center for v in views]))
-        far = away > _FAR_CAMERA * usual
-        few = usual > 0.0 and 0 < far.sum() <= max(1, _FEW_CAMERAS * len(views))
-        return tuple(v for v, out in zip(views, far) if not out) if few else views
+        """The training views (all, where there are none), without the few that `together` leaves out."""
+        return together(self.train or self.views)
 
     @cached_property
     def extent(self) -> float:
@@ -161,11 +161,28 @@ def centred(scene: Scene) -> Scene:
     x, y, z = (np.round(middle / unit) * unit if far else np.zeros(3)).tolist()
     scale = 1.0 if _ORDINARY[0] <= size <= _ORDINARY[1] else float(2.0 ** np.round(np.log2(_SIZE / size)))
     place = Place((x, y, z), scale)
-    if place == Place():
+    if place == UNMOVED:
         return scene
     views = tuple(replace(v, camera=place.inside(v.camera)) for v in scene.views)
     points = replace(scene.points, xyz=(xyz - place.centre) * scale)
     return replace(scene, views=views, points=points, place=place)
+
+
+def together(views: tuple[View, ...]) -> tuple[View, ...]:
+    """The views without the few, if any, whose cameras lie far from the rest: their poses are wrong."""
+    away, usual = _away(np.array([v.camera.center for v in views]))
+    far = away > _FAR_CAMERA * usual
+    few = usual > 0.0 and 0 < far.sum() <= max(1, _FEW_CAMERAS * len(views))
+    return tuple(v for v, out in zip(views, far) if not out) if few else views
+
+
+def far_cameras(scene: Scene) -> list[str]:
+    """A warning that names training photos whose cameras `Scene.together` leaves out."""
+    near = {view.name for view in scene.together}
+    far = [view.name for view in scene.train if view.name not in near]
+    told = f"the cameras of {shortlist(far)} lie far from all others, so their poses are probably wrong; "
+    told += "the scene's size is measured without them: check them, or take them out of train_list.txt"
+    return [told] if far else []
 
 
 def _away(centers: np.ndarray) -> tuple[np.ndarray, float]:

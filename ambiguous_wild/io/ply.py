@@ -9,7 +9,7 @@ from typing import IO
 
 import numpy as np
 
-from ambiguous_wild.core import AwError, Place
+from ambiguous_wild.core import UNMOVED, AwError, Place
 from ambiguous_wild.io.atomic import atomic_path
 
 _MAX_HEADER = 64 * 1024  # bytes; a splat header has under 2 kB
@@ -29,7 +29,7 @@ def _columns(rest: int) -> list[str]:
     return [*names, "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
 
 
-def write_splat_ply(path: Path | str, gaussians: Mapping[str, np.ndarray], place: Place = Place()) -> None:
+def write_splat_ply(path: Path | str, gaussians: Mapping[str, np.ndarray], place: Place = UNMOVED) -> None:
     """Write Gaussians atomically.
 
     Of a scene that was moved, the file has the units of the scene's files; what is to be added to its
@@ -90,7 +90,7 @@ def place_comments(place: Place) -> list[str]:
     """Header lines of a PLY that tell where its scene lies."""
     x, y, z = place.centre
     told = [f"comment offset {x!r} {y!r} {z!r}", f"comment training_scale {place.scale!r}"]
-    return [] if place == Place() else told
+    return [] if place == UNMOVED else told
 
 
 def read_place(path: Path | str) -> Place:
@@ -104,7 +104,7 @@ def read_place(path: Path | str) -> Place:
             head = f.read(_MAX_HEADER).split(b"end_header")[0].decode("latin-1")
         told = {w[1]: w[2:] for w in map(str.split, head.splitlines()) if w[:1] == ["comment"] and len(w) > 2}
         if "training_scale" not in told:
-            return Place()
+            return UNMOVED
         x, y, z, scale = map(float, [*told["offset"], *told["training_scale"]])
         if not (np.isfinite([x, y, z, scale]).all() and scale > 0):
             raise ValueError

@@ -14,7 +14,7 @@ import numpy as np
 from ambiguous_wild.core import AwError, Camera, Points, Scene, View
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.core.names import check_name
-from ambiguous_wild.core.scene import SceneInfo, Split, centred
+from ambiguous_wild.core.scene import SceneInfo, Split, centred, far_cameras
 from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.colmap_records import Model, ModelImage
 from ambiguous_wild.io.hashing import sha256_file
@@ -97,13 +97,7 @@ def load_scene(
     if not any(v.split == "train" for v in views):
         raise AwError(f"{root} has no training photo: none of train_list.txt is in the model; build it again")
     scene = Scene(root, name, views, _points(model, views), info)
-    near = {view.name for view in scene.together}
-    far = [view.name for view in scene.train if view.name not in near]
-    if far:
-        info["warnings"].append(
-            f"the cameras of {shortlist(far)} lie far from all others, so their poses are probably wrong; "
-            "the scene's size is measured without them: check them, or take them out of train_list.txt"
-        )
+    info["warnings"] += far_cameras(scene)
     return scene if raw else centred(scene)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ambiguous_wild.core import AwError, Camera, Place, Scene, View
+from ambiguous_wild.core import UNMOVED, AwError, Camera, Place, Scene, View
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.io.images import read_png_rgb, to_uint8
 from ambiguous_wild.io.ply import read_place, read_splat_ply, rescaled, splat_count
@@ -154,7 +154,7 @@ class Exported:
     psnr_to_model: float | None  # its renders against the model's, dB; inf = the same pictures
     psnr: float | None  # its renders against the photos, dB
     lost_db: float | None  # the model's PSNR against the photos minus that
-    place: Place = Place()  # user's coordinates are the file's / scale + centre; glTF holds them itself
+    place: Place = UNMOVED  # user's coordinates are the file's / scale + centre; glTF holds them itself
 
 
 def export(
@@ -211,7 +211,7 @@ def export(
                 psnr_to_model=_mean(after, before),
                 psnr=new,
                 lost_db=None if old is None or new is None else old - new,
-                place=Place() if wanted == "gltf" else left,
+                place=UNMOVED if wanted == "gltf" else left,
             )
         )
     return found

@@ -149,7 +149,7 @@ def _rounding_cost(model: Model, gaussians: Mapping[str, np.ndarray], packed: by
     sizes = np.exp(gaussians["log_scales"].max(axis=1, initial=-np.inf).astype(np.float64))
     stored = spz_arrays(packed, model.ply)
     held = np.exp(stored["log_scales"].max(axis=1, initial=-np.inf).astype(np.float64))
-    if not len(sizes) or sizes.max() < 1.1 * held.max() and np.median(sizes) > 0.9 * np.median(held):
+    if not len(sizes) or (sizes.max() < 1.1 * held.max() and np.median(sizes) > 0.9 * np.median(held)):
         return ""
     pictures = [Renderer(arrays, model.look)(camera) for arrays in (gaussians, stored)]
     return (

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ambiguous_wild.core import AwError, Camera, Scene
+from ambiguous_wild.core.scene import together
 from ambiguous_wild.io.atomic import atomic_path
 from ambiguous_wild.viewing.model import Model, Renderer, space_of
 
@@ -27,7 +28,7 @@ def through_views(scene: Scene, frames: int, size: tuple[int, int]) -> list[Came
         frames: number of cameras, evenly spaced in length of the path.
         size: width and height, px; the lens is the views' own, fitted into it.
     """
-    views = scene.test or scene.train
+    views = together(scene.test or scene.train)
     keys = [view.camera for view in views]
     order = _nearest_next(np.array([camera.center for camera in keys]))
     return _smooth([keys[i] for i in order], frames, size)

@@ -1,4 +1,4 @@
-"""Scenes in coordinates of maps, and in tiny and huge units: trained near the origin, given back where they lie."""
+"""Scenes in coordinates of maps, in tiny and huge units, with a camera or points far away."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from ambiguous_wild.core import Camera, Place
 from ambiguous_wild.datasets.export import export_scene
 from ambiguous_wild.io.ply import read_place, read_point_ply, read_splat_ply, write_splat_ply
 from ambiguous_wild.io.scene_folder import load_scene
-from ambiguous_wild.viewing.model import FORMATS, Model, Renderer, export
+from ambiguous_wild.viewing.model import FORMATS, Model, Renderer, export, space_of
 from ambiguous_wild.viewing.page_file import page_text
-from ambiguous_wild.viewing.video import from_file
+from ambiguous_wild.viewing.video import from_file, orbit, through_views
 from tests.tiny_scene import write_tiny_scene
 from tests.viewing.wall_runs import wall_model
 
@@ -128,6 +128,32 @@ def test_the_page_says_what_sizes_cost_that_its_format_does_not_hold(tmp_path: P
     write_splat_ply(tmp_path / "large.ply", wall)
     (note,) = page_text(scene, [Model("m", tmp_path / "large.ply")], title="t")[2]
     assert "dB to the model" in note and "gltf" in note
+
+
+@pytest.mark.parametrize("side", ["train", "test"])
+def test_one_camera_far_away_is_named_and_changes_no_size(tmp_path: Path, side: str) -> None:
+    usual = load_scene(write_tiny_scene(tmp_path / "usual"))
+    model = write_tiny_scene(tmp_path / "far") / "sparse" / "0"
+    name = f"{side}_1.png"
+    images = (model / "images.txt").read_text().splitlines()
+    at = next(i for i, line in enumerate(images) if line.endswith(name))
+    row = images[at].split()
+    images[at] = " ".join([*row[:5], "5000", *row[6:]])
+    (model / "images.txt").write_text("\n".join(images) + "\n")
+    rng = np.random.default_rng(0)
+    with open(model / "points3D.txt", "a") as f:  # and points
+        f.writelines(
+            f"{900 + i} {x} {y} {z} 9 9 9 1\n" for i, (x, y, z) in enumerate(5e4 * rng.normal(size=(50, 3)))
+        )
+    scene = load_scene(tmp_path / "far")
+    named = [w for w in scene.info["warnings"] if "far from all others" in w]
+    assert len(named) == (side == "train") and all(name in w for w in named)
+    assert scene.place == Place() and scene.extent == pytest.approx(usual.extent, rel=0.3)
+    assert space_of(scene).distance == pytest.approx(space_of(usual).distance, rel=0.2)
+    for film in (orbit, through_views):
+        if (film, side) != (through_views, "test"):  # one of two test cameras: no telling which is wrong
+            centers = np.array([c.center for c in film(scene, 8, (64, 48))])
+            assert np.abs(centers).max() < 10
 
 
 def test_damaged_places_are_refused(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from typing import Any, cast
 import numpy as np
 import torch
 
-from ambiguous_wild.core import AwError, Camera, Place, Scene, View
+from ambiguous_wild.core import UNMOVED, AwError, Camera, Place, Scene, View
 from ambiguous_wild.harness.running import evaluate
 from ambiguous_wild.harness.running.cell import Cell
 from ambiguous_wild.harness.running.choosing import NOT_OURS
@@ -196,7 +196,7 @@ def _model(produced: Produced, folder: Path, place: Place) -> dict[str, float]:
         return {}
     target = folder / "point_cloud.ply"
     with atomic_path(target) as temporary:
-        if place != Place():
+        if place != UNMOVED:
             write_splat_ply(temporary, read_splat_ply(produced.ply), place)
             return {"gaussians": splat_count(temporary), "model_mb": temporary.stat().st_size / 1e6}
         temporary.unlink()

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ambiguous_wild.core import AwError, Place
+from ambiguous_wild.core import UNMOVED, AwError, Place
 
 Arrays = Mapping[str, np.ndarray]  # raw parameters as `io.ply.read_splat_ply` gives them
 SH_C0 = 0.28209479177387814
@@ -106,4 +106,4 @@ def read_bytes(path: Path | str, most: int) -> bytes:
 
 def place_facts(place: Place) -> dict[str, Any]:
     """What a file tells of its scene's place: the user's coordinates are its positions / scale + offset."""
-    return {} if place == Place() else {"offset": list(place.centre), "scale": place.scale}
+    return {} if place == UNMOVED else {"offset": list(place.centre), "scale": place.scale}

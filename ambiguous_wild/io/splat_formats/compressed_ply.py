@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ambiguous_wild.core import AwError, Place
+from ambiguous_wild.core import UNMOVED, AwError, Place
 from ambiguous_wild.io.atomic import atomic_path
 from ambiguous_wild.io.ply import place_comments
 from ambiguous_wild.io.splat_formats.arrays import (
@@ -40,7 +40,7 @@ _SQRT_2 = 2.0**0.5
 _MOST_BYTES = 1 << 33
 
 
-def write_compressed_ply(path: Path | str, gaussians: Arrays, *, place: Place = Place()) -> int:
+def write_compressed_ply(path: Path | str, gaussians: Arrays, *, place: Place = UNMOVED) -> int:
     """Write atomically; Gaussians lie along a Morton curve afterwards. Returns how many were written.
 
     Args:

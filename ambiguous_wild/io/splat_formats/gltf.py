@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ambiguous_wild.core import AwError, Place
+from ambiguous_wild.core import UNMOVED, AwError, Place
 from ambiguous_wild.io.atomic import atomic_path
 from ambiguous_wild.io.splat_formats.arrays import SH_C0, Arrays, finite, logit, read_bytes, rounded, sigmoid
 
@@ -30,7 +30,7 @@ def _harmonics(rest: int) -> list[str]:
     return [f"SH_DEGREE_{d}_COEF_{c}" for d in range(1, degree + 1) for c in range(2 * d + 1)]
 
 
-def write_gltf(path: Path | str, gaussians: Arrays, *, place: Place = Place()) -> int:
+def write_gltf(path: Path | str, gaussians: Arrays, *, place: Place = UNMOVED) -> int:
     """Write a .glb atomically. Returns how many Gaussians were written.
 
     Args:

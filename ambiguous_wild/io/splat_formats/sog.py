@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ambiguous_wild.core import AwError, Place
+from ambiguous_wild.core import UNMOVED, AwError, Place
 from ambiguous_wild.io.atomic import atomic_path
 from ambiguous_wild.io.splat_formats.arrays import (
     Arrays,
@@ -40,7 +40,7 @@ _MOST_BYTES, _MOST_TEXTURE = 1 << 32, 1 << 28
 _LOSSLESS = 101  # WebP quality above 100
 
 
-def write_sog(path: Path | str, gaussians: Arrays, *, place: Place = Place()) -> int:
+def write_sog(path: Path | str, gaussians: Arrays, *, place: Place = UNMOVED) -> int:
     """Write atomically; Gaussians lie along a Morton curve afterwards. Returns how many were written.
 
     Args:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ambiguous_wild.core import AwError, Place
+from ambiguous_wild.core import UNMOVED, AwError, Place
 from ambiguous_wild.io.atomic import atomic_path
 from ambiguous_wild.io.splat_formats.arrays import (
     Arrays,
@@ -41,7 +41,7 @@ FLIP = np.array([1.0, -1.0, -1.0], np.float32)  # of positions, PLY's axes to th
 SH_FLIP = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 
 
-def write_spz(path: Path | str, gaussians: Arrays, *, antialias: bool = False, place: Place = Place()) -> int:
+def write_spz(path: Path | str, gaussians: Arrays, *, antialias: bool = False, place: Place = UNMOVED) -> int:
     """Write atomically; Gaussians lie along a Morton curve afterwards. Returns how many were written.
 
     Args:
@@ -55,7 +55,7 @@ def write_spz(path: Path | str, gaussians: Arrays, *, antialias: bool = False, p
     """
     with atomic_path(path) as temporary:
         data, count = spz_bytes(gaussians, antialias=antialias)
-        if told := json.dumps(place_facts(place)) if place != Place() else "":
+        if told := json.dumps(place_facts(place)) if place != UNMOVED else "":
             # the flag of a comment, which follows the 10 bytes of a gzip header
             data = data[:3] + b"\x10" + data[4:10] + told.encode("ascii") + b"\0" + data[10:]
         temporary.write_bytes(data)

@@ -6,14 +6,16 @@ Both are refused here, by name. White = keep, black = ignore, as in COLMAP.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from ambiguous_wild.builder.records import MaskResult, ScreenedPhoto
-from ambiguous_wild.core.errors import AwError, shortlist
+from ambiguous_wild.core.errors import AwError, counted, shortlist
 from ambiguous_wild.io.hashing import sha256_file
-from ambiguous_wild.io.images import read_mask, write_png
+from ambiguous_wild.io.images import read_alpha, read_mask, write_png
+from ambiguous_wild.io.photos import TRANSPARENT
 from ambiguous_wild.io.scene_folder import find_masks as by_name
 
 LITTLE_KEPT = 0.3  # share of a photo; distractors rarely cover more than the rest
@@ -61,8 +63,22 @@ def find_masks(folder: Path, facts: list[ScreenedPhoto], missing: str) -> dict[s
     return found
 
 
-def lay_out_masks(folder: Path, found: dict[str, Path], facts: list[ScreenedPhoto]) -> MaskResult:
-    """Write every photo's mask for COLMAP, `folder/masks/<work name>.png`, values 0 and 255."""
+def alphas(capture: Path, facts: list[ScreenedPhoto]) -> dict[str, np.ndarray]:
+    """What the photos' own alpha keeps, [H, W] uint8 in {0, 255}, by stem; opaque photos are absent."""
+    found = {}
+    for fact in facts:
+        if TRANSPARENT not in fact["notes"]:
+            continue
+        alpha = read_alpha(capture / fact["source"])
+        if alpha is not None and alpha.shape == (fact["height"], fact["width"]):
+            found[fact["stem"]] = alpha
+    return found
+
+
+def lay_out_masks(
+    folder: Path, found: dict[str, Path], facts: list[ScreenedPhoto], alpha: Mapping[str, np.ndarray]
+) -> MaskResult:
+    """Write every photo's mask, times its alpha, for COLMAP, `folder/masks/<work name>.png`, 0 and 255."""
     (folder / "masks").mkdir()
     shares = {}
     for fact in facts:
@@ -71,17 +87,25 @@ def lay_out_masks(folder: Path, found: dict[str, Path], facts: list[ScreenedPhot
             mask = np.full((fact["height"], fact["width"]), 255, np.uint8)
         else:
             mask = read_mask(path)
+        if fact["stem"] in alpha:
+            mask = np.minimum(mask, alpha[fact["stem"]])
+        if path is not None or fact["stem"] in alpha:
             shares[fact["stem"]] = round(float((mask > 0).mean()), 4)
         write_png(folder / "masks" / f"{fact['work_name']}.png", mask)
-    return {"kept_share": shares}
+    return {"kept_share": shares, "alpha": sorted(alpha)}
 
 
 def mask_warnings(facts: MaskResult | None) -> list[str]:
-    """A warning where the masks keep so little of the photos that they may be inverted."""
+    """Warnings: alpha that hides pixels; masks that keep so little that they may be inverted."""
     shares = list(facts["kept_share"].values()) if facts else []
+    hidden = len(facts.get("alpha", ())) if facts else 0
+    told = (
+        f"alpha of {counted(hidden, 'photo')} hides pixels: they are not learnt from, and psnr_valid of test "
+    )
+    warnings = [told + "photos leaves them out"] if hidden else []
     if not shares or np.median(shares) >= LITTLE_KEPT:
-        return []
-    return [
+        return warnings
+    return warnings + [
         f"the masks keep only {100 * np.median(shares):.0f} % of a photo (median): white = keep, black = "
         "ignore; are they inverted?"
     ]

@@ -28,6 +28,7 @@ class SceneParts:
     test: list[str]
     truth_files: list[Path]  # cameras.json and capture.json of a simulated capture
     motion: Path  # file of the motion points
+    hidden: list[str]  # test photos whose alpha hides pixels
 
 
 def package(folder: Path, parts: SceneParts, record: KeyedRecord, *, link: bool, jobs: int) -> PackageResult:
@@ -50,6 +51,8 @@ def package(folder: Path, parts: SceneParts, record: KeyedRecord, *, link: bool,
     if (small / "masks").is_dir():
         # Not for test photos: NerfBaselines would leave the masked pixels out of the score.
         _place(small / "masks", folder / "masks" / "train", link, set(parts.train))
+        # Pixels that alpha hides were never seen: psnr_valid leaves them out.
+        _place(small / "masks", folder / "masks" / "test", link, set(parts.hidden))
     for part in ("distractor", "clean"):
         if (small / "truth" / part).is_dir():
             _place(small / "truth" / part, folder / "truth" / part, link)

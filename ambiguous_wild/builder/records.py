@@ -76,6 +76,7 @@ class MaskResult(TypedDict):
     """Of the stage `masks`."""
 
     kept_share: dict[str, float]  # stem -> share of white pixels
+    alpha: list[str]  # stems of photos whose alpha hides pixels
 
 
 class FeatureResult(TypedDict):

@@ -11,7 +11,7 @@ import numpy as np
 from ambiguous_wild.builder import report
 from ambiguous_wild.builder.collect import Capture, read_test_list, split_photos
 from ambiguous_wild.builder.downsample import auto_factor, check_factor, downsample
-from ambiguous_wild.builder.masks import find_masks, lay_out_masks, mask_hashes, mask_warnings
+from ambiguous_wild.builder.masks import alphas, find_masks, lay_out_masks, mask_hashes, mask_warnings
 from ambiguous_wild.builder.moving import write_motion
 from ambiguous_wild.builder.package import SceneParts, package
 from ambiguous_wild.builder.progress import Bar
@@ -175,6 +175,7 @@ class Stages:
             test,
             [p for p in truth_files if p.is_file()],
             motion.folder / FILE,
+            [n for n in test if mask_stage and n.removesuffix(".png") in mask_stage.facts.get("alpha", ())],
         )
         return self._package(work, small_key, parts, record)
 
@@ -194,11 +195,14 @@ class Stages:
         return done.folder / "scene"
 
     def _masks(self, work: Workspace, screened: StageResult[ScreenResult]) -> StageResult[MaskResult] | None:
-        if self.mask_folder is None:
+        facts, found = screened.facts["photos"], {}
+        alpha = alphas(self.capture.root, facts)
+        if self.mask_folder is not None:
+            found = find_masks(self.mask_folder, facts, self.settings.masks_missing)
+        elif not alpha:
             return None
-        facts = screened.facts["photos"]
-        found = find_masks(self.mask_folder, facts, self.settings.masks_missing)
-        return work.run("masks", [screened.key, mask_hashes(found)], lambda f: lay_out_masks(f, found, facts))
+        key = [screened.key, mask_hashes(found)]
+        return work.run("masks", key, lambda f: lay_out_masks(f, found, facts, alpha))
 
     def _sfm(
         self,

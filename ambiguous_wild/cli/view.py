@@ -264,8 +264,16 @@ def export_command(
         return
     for label, files in reports:
         click.echo(f"{label}: {files[0].gaussians:,} Gaussians")
+        if told := [f"{e.format}: {_place(e)}" for e in files if e.place != type(e.place)()]:
+            click.echo(f"  for the scene's coordinates (each file says so too): {'; '.join(told)}")
         for e in files:
             click.echo(f"  {_line(e)}")
+
+
+def _place(e: Exported) -> str:
+    x, y, z = e.place.centre
+    smaller = "" if e.place.scale == 1 else f"divide by {e.place.scale:g}, then "
+    return f"{smaller}add ({x:.15g}, {y:.15g}, {z:.15g})"
 
 
 def _plain(value: object) -> object:

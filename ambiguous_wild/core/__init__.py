@@ -2,6 +2,6 @@
 
 from ambiguous_wild.core.camera import Camera
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.core.scene import Points, Scene, View
+from ambiguous_wild.core.scene import UNMOVED, Place, Points, Scene, View
 
-__all__ = ["AwError", "Camera", "Points", "Scene", "View"]
+__all__ = ["UNMOVED", "AwError", "Camera", "Place", "Points", "Scene", "View"]

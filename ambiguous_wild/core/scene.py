@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, TypedDict
@@ -10,9 +10,15 @@ from typing import Any, Literal, TypedDict
 import numpy as np
 
 from ambiguous_wild.core.camera import Camera
+from ambiguous_wild.core.errors import shortlist
 
 Split = Literal["train", "test"]
 _FEW_POINTS = 500  # no surface follows from fewer
+_FAR_CAMERA = 30.0  # times the median distance of the cameras from their middle: a wrong pose
+_FEW_CAMERAS = 0.1  # of the cameras: more of them are another part of the capture
+_FAR_PLACE = 100.0  # times a scene's size from the origin: float32 still has a hundredth of a pixel
+_ORDINARY = (0.1, 1000.0)  # sizes at which the nearest depth and the formats' ranges fit
+_SIZE = 4.0  # about that of scenes of structure from motion
 
 
 class FileEntry(TypedDict):
@@ -81,6 +87,25 @@ class Points:
 
 
 @dataclass(frozen=True)
+class Place:
+    """Where a scene lies in its files' coordinates: inside, a position x is ``(x - centre) * scale``."""
+
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    scale: float = 1.0  # a power of two, so that positions lose no bit
+
+    def inside(self, camera: Camera) -> Camera:
+        """A camera of the files' coordinates, moved along."""
+        if self == UNMOVED:
+            return camera
+        pose = camera.cam_from_world.copy()
+        pose[:3, 3] = (pose[:3, :3] @ self.centre + pose[:3, 3]) * self.scale
+        return replace(camera, cam_from_world=pose)
+
+
+UNMOVED = Place()
+
+
+@dataclass(frozen=True)
 class Scene:
     """Views ordered by name, sparse points, and scene.json."""
 
@@ -89,6 +114,7 @@ class Scene:
     views: tuple[View, ...]
     points: Points
     info: SceneInfo = field(default_factory=SceneInfo, repr=False)
+    place: Place = UNMOVED  # of the coordinates of views and points in those of the files
 
     @cached_property
     def train(self) -> tuple[View, ...]:
@@ -101,14 +127,65 @@ class Scene:
         return tuple(v for v in self.views if v.split == "test")
 
     @cached_property
+    def together(self) -> tuple[View, ...]:
+        """The training views (all, where there are none), without the few that `together` leaves out."""
+        return together(self.train or self.views)
+
+    @cached_property
     def extent(self) -> float:
         """1.1 times the largest distance of a training camera from their mean (3DGS's scene extent).
 
         Test cameras do not enter: their poses are not known to a method that trains.
         """
-        centers = np.array([v.camera.center for v in (self.train or self.views)])
+        centers = np.array([v.camera.center for v in self.together])
         radius = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max(initial=0.0))
         # A capture from one spot has no baseline: the points keep the learning rates finite.
         if radius <= 0.0 and len(self.points):
             radius = float(np.median(np.linalg.norm(self.points.xyz - centers.mean(axis=0), axis=1)))
         return 1.1 * radius if radius > 0.0 else 1.0
+
+
+def centred(scene: Scene) -> Scene:
+    """The scene near the origin and of ordinary size, with its place; as it is where it lies so already.
+
+    What trains and draws counts in float32, from a nearest depth of 0.01 on.
+    """
+    centers = np.array([v.camera.center for v in scene.together])
+    xyz, middle = scene.points.xyz, np.median(centers, axis=0)
+    depth = float(np.median(np.linalg.norm(xyz - middle, axis=1))) if len(xyz) else 0.0
+    size = max(_away(centers)[1], depth)
+    if not (np.isfinite(size) and size > 0.0):
+        return scene
+    unit = 10.0 ** np.floor(np.log10(size))
+    far = np.abs(middle).max() > _FAR_PLACE * size
+    x, y, z = (np.round(middle / unit) * unit if far else np.zeros(3)).tolist()
+    scale = 1.0 if _ORDINARY[0] <= size <= _ORDINARY[1] else float(2.0 ** np.round(np.log2(_SIZE / size)))
+    place = Place((x, y, z), scale)
+    if place == UNMOVED:
+        return scene
+    views = tuple(replace(v, camera=place.inside(v.camera)) for v in scene.views)
+    points = replace(scene.points, xyz=(xyz - place.centre) * scale)
+    return replace(scene, views=views, points=points, place=place)
+
+
+def together(views: tuple[View, ...]) -> tuple[View, ...]:
+    """The views without the few, if any, whose cameras lie far from the rest: their poses are wrong."""
+    away, usual = _away(np.array([v.camera.center for v in views]))
+    far = away > _FAR_CAMERA * usual
+    few = usual > 0.0 and 0 < far.sum() <= max(1, _FEW_CAMERAS * len(views))
+    return tuple(v for v, out in zip(views, far) if not out) if few else views
+
+
+def far_cameras(scene: Scene) -> list[str]:
+    """A warning that names training photos whose cameras `Scene.together` leaves out."""
+    near = {view.name for view in scene.together}
+    far = [view.name for view in scene.train if view.name not in near]
+    told = f"the cameras of {shortlist(far)} lie far from all others, so their poses are probably wrong; "
+    told += "the scene's size is measured without them: check them, or take them out of train_list.txt"
+    return [told] if far else []
+
+
+def _away(centers: np.ndarray) -> tuple[np.ndarray, float]:
+    """Distances [N] of positions [N, 3] from their median, and the median of these."""
+    away = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
+    return away, float(np.median(away))

@@ -54,7 +54,7 @@ def export_scene(path: Path, form: str, output: Path, *, copy: bool = False) -> 
     """
     if form not in WRITERS:
         raise unknown("layout", form, WRITERS)
-    scene = load_scene(path)
+    scene = load_scene(path, raw=True)
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise AwError(f"{output} exists; nothing is overwritten: choose another -o or remove it")
     if output.resolve().is_relative_to(scene.root.resolve()):
@@ -191,7 +191,7 @@ def _on_the_go(scene: Scene, folder: Path, place: Place) -> list[str]:
         for view in scene.views:
             name = PurePosixPath(_stored(view)).name
             place(view.image_path, folder / f"images_{factor}" / name)
-        scene = load_scene(scene.root, factor=1, verify=False)
+        scene = load_scene(scene.root, factor=1, verify=False, raw=True)
     bases = [PurePosixPath(v.name).stem for v in scene.views]
     if len(set(bases)) < len(bases):
         raise AwError(

@@ -23,6 +23,7 @@ from ambiguous_wild.io.images import MAX_PIXELS, pillow
 PHOTO_SUFFIXES = (
     ".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".jp2", ".heic", ".heif", ".dng",
 )  # fmt: skip
+TRANSPARENT = "transparency composited over black"  # its alpha may be a keep mask, see `images.read_alpha`
 MIN_SIDE = 16  # px; smaller photos have no features
 
 # Diagonal of a 36 x 24 mm frame: "35 mm equivalent" focal lengths refer to it (CIPA DCG-001).
@@ -288,7 +289,7 @@ def _to_rgb(path: Path, pixels: np.ndarray, spec: Any) -> tuple[np.ndarray, list
 
 
 def _alpha_note(alpha: np.ndarray) -> str:
-    return "transparency composited over black" if alpha.min() < 255 else "opaque alpha channel dropped"
+    return TRANSPARENT if alpha.min() < 255 else "opaque alpha channel dropped"
 
 
 def _three_channels(

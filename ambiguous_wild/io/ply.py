@@ -9,7 +9,7 @@ from typing import IO
 
 import numpy as np
 
-from ambiguous_wild.core import AwError
+from ambiguous_wild.core import UNMOVED, AwError, Place
 from ambiguous_wild.io.atomic import atomic_path
 
 _MAX_HEADER = 64 * 1024  # bytes; a splat header has under 2 kB
@@ -29,13 +29,17 @@ def _columns(rest: int) -> list[str]:
     return [*names, "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
 
 
-def write_splat_ply(path: Path | str, gaussians: Mapping[str, np.ndarray]) -> None:
+def write_splat_ply(path: Path | str, gaussians: Mapping[str, np.ndarray], place: Place = UNMOVED) -> None:
     """Write Gaussians atomically.
+
+    Of a scene that was moved, the file has the units of the scene's files; what is to be added to its
+    positions for their coordinates, which float32 does not hold, is a comment of the header.
 
     Args:
         path: the file.
         gaussians: raw parameters as `splat.Gaussians` holds them: means [N, 3], quats [N, 4] (w, x, y,
             z), log_scales [N, 3], opacity_logits [N], sh0 [N, 3], sh_rest [N, K, 3] with K of 0, 3, 8, 15.
+        place: of the scene that they were trained on, in whose inner coordinates they are.
 
     Raises:
         AwError: an array is missing or has another shape.
@@ -51,6 +55,7 @@ def write_splat_ply(path: Path | str, gaussians: Mapping[str, np.ndarray]) -> No
     if rest.ndim != 3 or rest.shape[0] != n or rest.shape[1] not in (0, 3, 8, 15) or rest.shape[2] != 3:
         raise AwError(f"cannot write {path}: sh_rest is {list(rest.shape)}, not [{n}, 0|3|8|15, 3]")
     names = _columns(rest.shape[1])
+    gaussians = rescaled(gaussians, 1 / place.scale)
     table = np.concatenate(
         [
             gaussians["means"],
@@ -65,15 +70,55 @@ def write_splat_ply(path: Path | str, gaussians: Mapping[str, np.ndarray]) -> No
         dtype="<f4",
         casting="same_kind",
     )
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {n}"]
+    header = ["ply", "format binary_little_endian 1.0", *place_comments(place), f"element vertex {n}"]
     header += [f"property float {name}" for name in names] + ["end_header", ""]
     with atomic_path(path) as temporary, open(temporary, "wb") as f:
         f.write("\n".join(header).encode("ascii"))
         f.write(table.tobytes())
 
 
+def rescaled(gaussians: Mapping[str, np.ndarray], factor: float) -> Mapping[str, np.ndarray]:
+    """Gaussians in other units: means and scales times `factor`."""
+    if factor == 1.0:
+        return gaussians
+    means, log_scales = gaussians["means"], gaussians["log_scales"]
+    sizes = {"log_scales": (log_scales + np.log(factor)).astype(log_scales.dtype)}
+    return {**gaussians, "means": (means * factor).astype(means.dtype), **sizes}
+
+
+def place_comments(place: Place) -> list[str]:
+    """Header lines of a PLY that tell where its scene lies."""
+    x, y, z = place.centre
+    told = [f"comment offset {x!r} {y!r} {z!r}", f"comment training_scale {place.scale!r}"]
+    return [] if place == UNMOVED else told
+
+
+def read_place(path: Path | str) -> Place:
+    """Where the scene of a splat PLY of `write_splat_ply` lies; another tool's: where it is.
+
+    Raises:
+        AwError: the file cannot be read, or its numbers are none.
+    """
+    try:
+        with open(path, "rb") as f:
+            head = f.read(_MAX_HEADER).split(b"end_header")[0].decode("latin-1")
+        told = {w[1]: w[2:] for w in map(str.split, head.splitlines()) if w[:1] == ["comment"] and len(w) > 2}
+        if "training_scale" not in told:
+            return UNMOVED
+        x, y, z, scale = map(float, [*told["offset"], *told["training_scale"]])
+        if not (np.isfinite([x, y, z, scale]).all() and scale > 0):
+            raise ValueError
+    except OSError as error:
+        raise AwError(f"cannot read {path}: {error.strerror or error}") from None
+    except (KeyError, ValueError):
+        raise AwError(f"{path}: its comments offset and training_scale are damaged; train again") from None
+    return Place((x, y, z), scale)
+
+
 def read_splat_ply(path: Path | str) -> dict[str, np.ndarray]:
     """Read a splat PLY, ours or another tool's; arrays as `write_splat_ply` takes them, float32.
+
+    A model of a scene that was moved comes back in the scene's inner coordinates.
 
     Columns may have any order and scalar type; unknown ones are ignored.
 
@@ -98,7 +143,7 @@ def read_splat_ply(path: Path | str) -> dict[str, np.ndarray]:
     if rest:
         channels = columns([f"f_rest_{i}" for i in range(rest)]).reshape(count, 3, rest // 3)
         higher = np.ascontiguousarray(channels.transpose(0, 2, 1))
-    return {
+    found = {
         "means": columns(["x", "y", "z"]),
         "quats": columns([f"rot_{i}" for i in range(4)]),
         "log_scales": columns([f"scale_{i}" for i in range(3)]),
@@ -106,6 +151,7 @@ def read_splat_ply(path: Path | str) -> dict[str, np.ndarray]:
         "sh0": columns([f"f_dc_{i}" for i in range(3)]),
         "sh_rest": higher,
     }
+    return dict(rescaled(found, read_place(path).scale))
 
 
 def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -135,12 +181,15 @@ def write_point_ply(
     rgb: np.ndarray,  # [M, 3] uint8
 ) -> None:
     """Write a point cloud, binary."""
-    table = np.empty(len(xyz), [*((axis, "<f4") for axis in "xyz"), *((c, "u1") for c in _COLOURS)])
+    # Coordinates of a map have more digits than float32.
+    far = len(xyz) and np.abs(xyz).max() > 1e3 * np.ptp(xyz, axis=0).max()
+    form, kind = ("<f8", "double") if far else ("<f4", "float")
+    table = np.empty(len(xyz), [*((axis, form) for axis in "xyz"), *((c, "u1") for c in _COLOURS)])
     for names, values in (("xyz", xyz), (_COLOURS, rgb)):
         for index, name in enumerate(names):
             table[name] = values[:, index]
     head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(xyz)}"]
-    head += [f"property float {axis}" for axis in "xyz"] + [f"property uchar {c}" for c in _COLOURS]
+    head += [f"property {kind} {axis}" for axis in "xyz"] + [f"property uchar {c}" for c in _COLOURS]
     path.write_bytes("\n".join([*head, "end_header\n"]).encode() + table.tobytes())
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from ambiguous_wild.core import AwError, Camera, Points, Scene, View
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.core.names import check_name
-from ambiguous_wild.core.scene import SceneInfo, Split
+from ambiguous_wild.core.scene import SceneInfo, Split, centred, far_cameras
 from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.colmap_records import Model, ModelImage
 from ambiguous_wild.io.hashing import sha256_file
@@ -35,6 +35,7 @@ def load_scene(
     *,
     factor: int | None = None,
     verify: bool | Literal["quick"] = True,
+    raw: bool = False,
 ) -> Scene:
     """Open a scene folder; no pixels are read.
 
@@ -42,6 +43,8 @@ def load_scene(
         path: our scene folder, or a plain COLMAP scene (``images/`` and ``sparse/0``).
         factor: 1 opens ``images/``, n opens ``images_n/``; None: the factor of scene.json.
         verify: True compares the sha256 of every file in scene.json, "quick" the sizes, False nothing.
+        raw: the files' own coordinates; else a scene far from the origin, or of a size that float32 and the
+            nearest depth do not suit, is moved and scaled (`Scene.place`).
 
     Returns:
         The scene: views ordered by name, intrinsics at the size of the loaded files, tracks in px of these
@@ -93,7 +96,9 @@ def load_scene(
     _refuse_same_stems(root, views)
     if not any(v.split == "train" for v in views):
         raise AwError(f"{root} has no training photo: none of train_list.txt is in the model; build it again")
-    return Scene(root, name, views, _points(model, views), info)
+    scene = Scene(root, name, views, _points(model, views), info)
+    info["warnings"] += far_cameras(scene)
+    return scene if raw else centred(scene)
 
 
 def read_scene_json(root: Path | str) -> SceneInfo | None:

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from ambiguous_wild.core import AwError, Camera, Scene, View
+from ambiguous_wild.core import UNMOVED, AwError, Camera, Place, Scene, View
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.io.images import read_png_rgb, to_uint8
-from ambiguous_wild.io.ply import read_splat_ply, splat_count
+from ambiguous_wild.io.ply import read_place, read_splat_ply, rescaled, splat_count
 from ambiguous_wild.io.splat_formats import compressed_ply, gltf, sog, spz
 from ambiguous_wild.metrics.image import psnr
 
@@ -30,7 +30,7 @@ class Space:
 
 def space_of(scene: Scene) -> Space:
     """Up is the mean of the photos' own up; the middle lies at the median depth of what each photo shows."""
-    views = scene.train or scene.views
+    views = scene.together
     poses = np.array([v.camera.cam_from_world for v in views])
     up = -poses[:, 1, :3].mean(axis=0)
     size = np.linalg.norm(up)
@@ -154,6 +154,7 @@ class Exported:
     psnr_to_model: float | None  # its renders against the model's, dB; inf = the same pictures
     psnr: float | None  # its renders against the photos, dB
     lost_db: float | None  # the model's PSNR against the photos minus that
+    place: Place = UNMOVED  # user's coordinates are the file's / scale + centre; glTF holds them itself
 
 
 def export(
@@ -165,6 +166,9 @@ def export(
     name: str = "point_cloud",
 ) -> list[Exported]:
     """Write the formats into a folder, each atomically, read them back and measure them.
+
+    Files are in the units of the scene's files, where their format holds these: SPZ's sizes and, of large
+    units, SOG's positions do not. What remains to be done stands in each file (`Exported.place`).
 
     Args:
         model: its PLY stays as it is.
@@ -179,7 +183,7 @@ def export(
     for wanted in formats:
         if wanted not in FORMATS:
             raise unknown("format", wanted, FORMATS)
-    gaussians = model.read()
+    gaussians, place = model.read(), read_place(model.ply)
     plain = model.ply.stat().st_size
     photos = [read_png_rgb(view.image_path) for view in views]
     before = _renders(gaussians, model.look, views)
@@ -187,10 +191,14 @@ def export(
     for wanted in dict.fromkeys(formats):
         ending, read = FORMATS[wanted]
         path = folder / f"{name}{ending}"
-        count = _write(wanted, path, gaussians, model.look)
+        units = place.scale
+        if wanted == "spz" or (wanted == "sog" and units < 1):
+            units = 1.0
+        left = Place(place.centre, place.scale / units)
+        count = _write(wanted, path, rescaled(gaussians, 1 / units), model.look, left)
         if not count:
             raise AwError(f"{model.ply} holds no Gaussian that is finite: there is nothing to export")
-        after = _renders(read(path), model.look, views)
+        after = _renders(rescaled(read(path), units), model.look, views)
         old, new = _mean(before, photos), _mean(after, photos)
         size = path.stat().st_size
         found.append(
@@ -203,20 +211,21 @@ def export(
                 psnr_to_model=_mean(after, before),
                 psnr=new,
                 lost_db=None if old is None or new is None else old - new,
+                place=UNMOVED if wanted == "gltf" else left,
             )
         )
     return found
 
 
-def _write(wanted: str, path: Path, gaussians: Mapping[str, np.ndarray], look: Look) -> int:
+def _write(wanted: str, path: Path, gaussians: Arrays, look: Look, place: Place) -> int:
     if wanted == "spz":
-        return spz.write_spz(path, gaussians, antialias=look.antialias)
+        return spz.write_spz(path, gaussians, antialias=look.antialias, place=place)
     write = {
         "compressed-ply": compressed_ply.write_compressed_ply,
         "sog": sog.write_sog,
         "gltf": gltf.write_gltf,
     }
-    return write[wanted](path, gaussians)
+    return write[wanted](path, gaussians, place=place)
 
 
 def _renders(gaussians: Mapping[str, np.ndarray], look: Look, views: Sequence[View]) -> list[np.ndarray]:

@@ -17,8 +17,9 @@ from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.motion_points import read_motion_points
 from ambiguous_wild.io.page_parts import data_uri, fill_page, jpeg_bytes, narrowed
 from ambiguous_wild.io.splat_formats.arrays import finite, sigmoid
-from ambiguous_wild.io.splat_formats.spz import spz_bytes
-from ambiguous_wild.viewing.model import Model, space_of
+from ambiguous_wild.io.splat_formats.spz import spz_arrays, spz_bytes
+from ambiguous_wild.metrics.image import psnr
+from ambiguous_wild.viewing.model import Model, Renderer, space_of
 
 PAGE = "index.html"
 GENERATOR = '<meta name="generator" content="aw view">'
@@ -117,6 +118,7 @@ def page_text(
                 "its PSNR is that of the whole model"
             )
         packed, _ = spz_bytes(fewer, antialias=model.look.antialias)
+        told += [cost] if (cost := _rounding_cost(model, fewer, packed, cameras[0])) else []
         element = f"model-{number}"
         elements.append(
             f'<script id="{element}" type="text/plain">{base64.b64encode(packed).decode("ascii")}</script>'
@@ -130,6 +132,8 @@ def page_text(
         "middle": space.middle.tolist(),
         "extent": space.extent,
         "frustum": 0.08 * space.extent,
+        "centre": scene.place.centre,  # of saved paths, in the coordinates of the scene's files
+        "scale": scene.place.scale,
         "views": [
             _view_facts(v, uri, points)
             for v, uri, points in zip(views, photo_uris(views, MOST_PHOTO_BYTES), _points(scene, views))
@@ -138,6 +142,20 @@ def page_text(
         "notes": told,
     }
     return _fill(title, data, "\n".join(elements)), sum(map(len, elements)), tuple(told)
+
+
+def _rounding_cost(model: Model, gaussians: Mapping[str, np.ndarray], packed: bytes, camera: Camera) -> str:
+    """What the page's format costs a model with sizes that it does not hold; empty for others."""
+    sizes = np.exp(gaussians["log_scales"].max(axis=1, initial=-np.inf).astype(np.float64))
+    stored = spz_arrays(packed, model.ply)
+    held = np.exp(stored["log_scales"].max(axis=1, initial=-np.inf).astype(np.float64))
+    if not len(sizes) or (sizes.max() < 1.1 * held.max() and np.median(sizes) > 0.9 * np.median(held)):
+        return ""
+    pictures = [Renderer(arrays, model.look)(camera) for arrays in (gaussians, stored)]
+    return (
+        f"{model.label}: some of its Gaussians are larger or smaller than the page's format (SPZ) holds: the "
+        f"first photo's view is {psnr(*pictures):.1f} dB to the model; 'aw export --format gltf' holds them"
+    )
 
 
 def _model_facts(

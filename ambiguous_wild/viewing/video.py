@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ambiguous_wild.core import AwError, Camera, Scene
+from ambiguous_wild.core.scene import together
 from ambiguous_wild.io.atomic import atomic_path
 from ambiguous_wild.viewing.model import Model, Renderer, space_of
 
@@ -27,7 +28,7 @@ def through_views(scene: Scene, frames: int, size: tuple[int, int]) -> list[Came
         frames: number of cameras, evenly spaced in length of the path.
         size: width and height, px; the lens is the views' own, fitted into it.
     """
-    views = scene.test or scene.train
+    views = together(scene.test or scene.train)
     keys = [view.camera for view in views]
     order = _nearest_next(np.array([camera.center for camera in keys]))
     return _smooth([keys[i] for i in order], frames, size)
@@ -54,7 +55,7 @@ def orbit(scene: Scene, frames: int, size: tuple[int, int]) -> list[Camera]:
 
 
 def from_file(path: Path, scene: Scene, frames: int, size: tuple[int, int]) -> list[Camera]:
-    """A path that a viewer saved, in the scene's own coordinates.
+    """A path that a viewer saved, in the coordinates of the scene's files.
 
     Read are the page of `aw view` and nerfstudio ({"camera_path": [{"camera_to_world": 16 numbers, "fov":
     degrees}]}, OpenGL axes) and 3DGS viewers (cameras.json: [{"position", "rotation", "fx", "fy", "width",
@@ -80,7 +81,7 @@ def from_file(path: Path, scene: Scene, frames: int, size: tuple[int, int]) -> l
     cameras = []
     for number, row in enumerate(rows):
         try:
-            cameras.append(_camera(row, lens, size))
+            cameras.append(scene.place.inside(_camera(row, lens, size)))
         except (AwError, KeyError, TypeError, ValueError, OverflowError, np.linalg.LinAlgError) as error:
             raise AwError(f"{path}: camera {number} is none: {error}") from None
     return cameras if len(cameras) == frames else _smooth(cameras, frames, size)

@@ -191,14 +191,32 @@ def test_a_damaged_scene_is_noticed_and_mended(scene, raw, tmp_path):
         build_scene(raw, copy, SETTINGS)
 
 
-def test_masks_are_used_and_carried_to_training_photos_only(raw, tmp_path):
-    """And similar photos are matched, not all."""
+@pytest.mark.parametrize("alpha", [False, True])
+def test_masks_are_used_and_carried_to_training_photos_only(raw, tmp_path, alpha):
+    """And similar photos are matched, not all. Alpha is a mask, in test photos too: nobody saw what it hides."""
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
     mask[:, :100] = 0
+    masks, noise = (
+        None if alpha else tmp_path / "masks",
+        np.random.default_rng(0).integers(0, 255, (240, 100, 3)),
+    )
+    if alpha:
+        raw = shutil.copytree(raw, tmp_path / "raw")
     for i in range(COUNT):
-        write_png(tmp_path / "masks" / f"p{i:02d}.png", mask)
+        name = f"p{i:02d}.png"
+        if masks is not None:
+            write_png(masks / name, mask)
+            continue
+        (source,) = raw.glob(f"*/p{i:02d}.jpg")
+        photo = np.dstack([cv2.imread(str(source)), mask])
+        photo[:, :100, :3] = noise
+        source.unlink()
+        cv2.imwrite(str(source.with_suffix(".png")), photo)
     settings = replace(SETTINGS, matcher="retrieval")
-    result = build_scene(raw, tmp_path / "scene", settings, masks=tmp_path / "masks", keep_work=True)
+    result = build_scene(raw, tmp_path / "scene", settings, masks=masks, keep_work=True)
+    tests = [p.name for p in (result.scene / "masks").glob("test/*")]
+    assert sorted(tests) == (["p01.png", "p04.png"] if alpha else [])
+    assert any("alpha of 6 photos" in w for w in result.info["warnings"]) == alpha
     assert result.info["chosen"]["matcher"] == "retrieval" and 0 < result.info["counts"]["pairs"] <= 15
     carried = sorted(p.name for p in (result.scene / "masks" / "train").iterdir())
     assert carried == ["p00.png", "p02.png", "p03.png", "p05.png"]

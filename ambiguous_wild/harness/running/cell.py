@@ -21,7 +21,7 @@ import numpy as np
 
 import ambiguous_wild
 from ambiguous_wild import __version__
-from ambiguous_wild.core import AwError, Scene
+from ambiguous_wild.core import UNMOVED, AwError, Scene
 from ambiguous_wild.core.config import config_hash, flatten, to_plain
 from ambiguous_wild.harness.measures import ImageRow, records
 from ambiguous_wild.harness.running.choosing import Chosen, mixed_tests, scene_protocol
@@ -131,7 +131,8 @@ def scene_identity(scene: Scene) -> str:
                 known[name] = _digest(view.keep_path)
     if MOTION not in known and (scene.root / MOTION).is_file():
         known[MOTION] = _digest(scene.root / MOTION)
-    return config_hash({"files": known, "split": split})
+    moved = {} if scene.place == UNMOVED else {"place": [*scene.place.centre, scene.place.scale]}
+    return config_hash({"files": known, "split": split, **moved})
 
 
 def asked_length(train: TrainConfig) -> str:

@@ -13,7 +13,7 @@ from typing import Any, cast
 import numpy as np
 import torch
 
-from ambiguous_wild.core import AwError, Camera, Scene, View
+from ambiguous_wild.core import UNMOVED, AwError, Camera, Place, Scene, View
 from ambiguous_wild.harness.running import evaluate
 from ambiguous_wild.harness.running.cell import Cell
 from ambiguous_wild.harness.running.choosing import NOT_OURS
@@ -21,7 +21,7 @@ from ambiguous_wild.harness.running.meter import Meter, cores, own_s
 from ambiguous_wild.harness.running.result_file import Cost, MaskScores, RunResult
 from ambiguous_wild.io.atomic import atomic_path
 from ambiguous_wild.io.images import image_size, read_gray, read_png_rgb
-from ambiguous_wild.io.ply import read_splat_ply, splat_count
+from ambiguous_wild.io.ply import read_splat_ply, splat_count, write_splat_ply
 from ambiguous_wild.methods.external.program import LOGS, WORK, Produced, Program, Task
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.render import render
@@ -69,7 +69,15 @@ def run_program(cell: Cell, folder: Path) -> RunResult:
         | {"no_effects": NOT_OURS}
         | ({"drawn_by": "ambiguous_wild"} if produced.drawn_by_us else {})
         | ({} if cell.protocol == "full" else {"protocol": cell.protocol}),
-        cost=cast(Cost, {"device": cell.device, **produced.cost, **time_cost, **_model(produced, folder)}),
+        cost=cast(
+            Cost,
+            {
+                "device": cell.device,
+                **produced.cost,
+                **time_cost,
+                **_model(produced, folder, cell.scene.place),
+            },
+        ),
     )
 
 
@@ -182,12 +190,15 @@ def _masks(scene: Scene, masks: Mapping[str, Path], folder: Path) -> MaskScores 
     return evaluate.write_keeps(scene, keeps(), folder)
 
 
-def _model(produced: Produced, folder: Path) -> dict[str, float]:
+def _model(produced: Produced, folder: Path, place: Place) -> dict[str, float]:
     """Number and size of the splats, which become point_cloud.ply of the run."""
     if produced.ply is None:
         return {}
     target = folder / "point_cloud.ply"
     with atomic_path(target) as temporary:
+        if place != UNMOVED:
+            write_splat_ply(temporary, read_splat_ply(produced.ply), place)
+            return {"gaussians": splat_count(temporary), "model_mb": temporary.stat().st_size / 1e6}
         temporary.unlink()
         try:
             os.link(produced.ply, temporary)

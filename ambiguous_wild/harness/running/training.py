@@ -338,7 +338,9 @@ def _train_and_measure(
     if first is not None:
         cost = both_passes(first.cost, cost)
     write_splat_ply(
-        folder / "point_cloud.ply", {k: v.cpu().numpy() for k, v in trainer.neutral_model().items()}
+        folder / "point_cloud.ply",
+        {k: v.cpu().numpy() for k, v in trainer.neutral_model().items()},
+        trainer.data.scene.place,
     )
     LOG.info("measuring %s", counted(len(truth), "test view"))
     per_image, missing = evaluate.render_and_measure(
@@ -370,7 +372,7 @@ def _keep_stopped(cell: Cell, trainer: Trainer, truth: list[evaluate.TestPhoto])
     try:
         with atomic_dir(folder / STOPPED) as kept:
             model = {k: v.cpu().numpy() for k, v in trainer.neutral_model().items()}
-            write_splat_ply(kept / "point_cloud.ply", model)
+            write_splat_ply(kept / "point_cloud.ply", model, trainer.data.scene.place)
             half = cell.protocol == "half"
             rows, missing = evaluate.render_and_measure(
                 trainer, truth, kept / "renders", half=half, scene=cell.scene

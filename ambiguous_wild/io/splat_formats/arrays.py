@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from ambiguous_wild.core import AwError
+from ambiguous_wild.core import UNMOVED, AwError, Place
 
 Arrays = Mapping[str, np.ndarray]  # raw parameters as `io.ply.read_splat_ply` gives them
 SH_C0 = 0.28209479177387814
@@ -101,3 +102,8 @@ def read_bytes(path: Path | str, most: int) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise AwError(f"cannot read {path}: {error.strerror or error}") from None
+
+
+def place_facts(place: Place) -> dict[str, Any]:
+    """What a file tells of its scene's place: the user's coordinates are its positions / scale + offset."""
+    return {} if place == UNMOVED else {"offset": list(place.centre), "scale": place.scale}

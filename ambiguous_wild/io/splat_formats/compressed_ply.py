@@ -10,8 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ambiguous_wild.core import AwError
+from ambiguous_wild.core import UNMOVED, AwError, Place
 from ambiguous_wild.io.atomic import atomic_path
+from ambiguous_wild.io.ply import place_comments
 from ambiguous_wild.io.splat_formats.arrays import (
     SH_C0,
     Arrays,
@@ -39,12 +40,13 @@ _SQRT_2 = 2.0**0.5
 _MOST_BYTES = 1 << 33
 
 
-def write_compressed_ply(path: Path | str, gaussians: Arrays) -> int:
+def write_compressed_ply(path: Path | str, gaussians: Arrays, *, place: Place = UNMOVED) -> int:
     """Write atomically; Gaussians lie along a Morton curve afterwards. Returns how many were written.
 
     Args:
         path: the file, by custom NAME.compressed.ply.
         gaussians: raw parameters, see `io.ply.write_splat_ply`; rows that are not finite are left out.
+        place: of their scene, told in comments.
     """
     kept = finite(gaussians)
     order = along_curve(kept["means"])
@@ -61,7 +63,8 @@ def write_compressed_ply(path: Path | str, gaussians: Arrays) -> int:
     with_alpha = np.column_stack([tint, sigmoid(kept["opacity_logits"])])
     words = [_pack(position, _POSITION_BITS), rotation, _pack(scale, _POSITION_BITS)]
     packed = np.column_stack([*words, _pack(with_alpha, _COLOUR_BITS)]).astype("<u4")
-    header = ["ply", "format binary_little_endian 1.0", f"element chunk {-(-n // _CHUNK)}"]
+    header = ["ply", "format binary_little_endian 1.0", *place_comments(place)]
+    header += [f"element chunk {-(-n // _CHUNK)}"]
     header += [f"property float {name}" for name in _BOUNDS] + [f"element vertex {n}"]
     header += [f"property uint {name}" for name in _PACKED]
     if rest:

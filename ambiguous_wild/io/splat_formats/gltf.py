@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ambiguous_wild.core import AwError
+from ambiguous_wild.core import UNMOVED, AwError, Place
 from ambiguous_wild.io.atomic import atomic_path
 from ambiguous_wild.io.splat_formats.arrays import SH_C0, Arrays, finite, logit, read_bytes, rounded, sigmoid
 
@@ -30,12 +30,13 @@ def _harmonics(rest: int) -> list[str]:
     return [f"SH_DEGREE_{d}_COEF_{c}" for d in range(1, degree + 1) for c in range(2 * d + 1)]
 
 
-def write_gltf(path: Path | str, gaussians: Arrays) -> int:
+def write_gltf(path: Path | str, gaussians: Arrays, *, place: Place = UNMOVED) -> int:
     """Write a .glb atomically. Returns how many Gaussians were written.
 
     Args:
         path: the file, NAME.glb.
         gaussians: raw parameters, see `io.ply.write_splat_ply`; rows that are not finite are left out.
+        place: of their scene; its offset becomes the node's translation.
     """
     kept = finite(gaussians)
     n, rest = kept["sh_rest"].shape[:2]
@@ -81,12 +82,14 @@ def write_gltf(path: Path | str, gaussians: Arrays) -> int:
         "sortingMethod": "cameraDistance",
         "projection": "perspective",
     }
+    x, y, z = place.centre
+    node = {"mesh": 0, "rotation": _HALF_TURN} | ({"translation": [-x, -y, z]} if any(place.centre) else {})
     head = {
         "asset": {"version": "2.0", "generator": "ambiguous_wild"},
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "rotation": _HALF_TURN}],
+        "nodes": [node],
         "buffers": [{"byteLength": len(body)}],
         "bufferViews": views,
         "accessors": accessors,

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ambiguous_wild.core import AwError
+from ambiguous_wild.core import UNMOVED, AwError, Place
 from ambiguous_wild.io.atomic import atomic_path
 from ambiguous_wild.io.splat_formats.arrays import (
     Arrays,
@@ -24,6 +24,7 @@ from ambiguous_wild.io.splat_formats.arrays import (
     from_largest,
     largest_first,
     logit,
+    place_facts,
     read_bytes,
     rounded,
     sigmoid,
@@ -39,12 +40,13 @@ _MOST_BYTES, _MOST_TEXTURE = 1 << 32, 1 << 28
 _LOSSLESS = 101  # WebP quality above 100
 
 
-def write_sog(path: Path | str, gaussians: Arrays) -> int:
+def write_sog(path: Path | str, gaussians: Arrays, *, place: Place = UNMOVED) -> int:
     """Write atomically; Gaussians lie along a Morton curve afterwards. Returns how many were written.
 
     Args:
         path: the file, NAME.sog.
         gaussians: raw parameters, see `io.ply.write_splat_ply`; rows that are not finite are left out.
+        place: of their scene, told in meta.json.
     """
     kept = finite(gaussians)
     order = along_curve(kept["means"])
@@ -70,7 +72,7 @@ def write_sog(path: Path | str, gaussians: Arrays) -> int:
     }
     meta: dict[str, Any] = {
         "version": 2,
-        "asset": {"generator": "ambiguous_wild"},
+        "asset": {"generator": "ambiguous_wild", **place_facts(place)},
         "count": n,
         "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
         "scales": {"codebook": scales.tolist(), "files": ["scales.webp"]},

@@ -7,13 +7,14 @@ Layout and quantisation as in Niantic's reference (load-spz.cc). The file's axes
 from __future__ import annotations
 
 import gzip
+import json
 import struct
 import zlib
 from pathlib import Path
 
 import numpy as np
 
-from ambiguous_wild.core import AwError
+from ambiguous_wild.core import UNMOVED, AwError, Place
 from ambiguous_wild.io.atomic import atomic_path
 from ambiguous_wild.io.splat_formats.arrays import (
     Arrays,
@@ -22,6 +23,7 @@ from ambiguous_wild.io.splat_formats.arrays import (
     from_largest,
     largest_first,
     logit,
+    place_facts,
     read_bytes,
     rounded,
     sigmoid,
@@ -39,19 +41,23 @@ FLIP = np.array([1.0, -1.0, -1.0], np.float32)  # of positions, PLY's axes to th
 SH_FLIP = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 
 
-def write_spz(path: Path | str, gaussians: Arrays, *, antialias: bool = False) -> int:
+def write_spz(path: Path | str, gaussians: Arrays, *, antialias: bool = False, place: Place = UNMOVED) -> int:
     """Write atomically; Gaussians lie along a Morton curve afterwards. Returns how many were written.
 
     Args:
         path: the file, NAME.spz.
         gaussians: raw parameters, see `io.ply.write_splat_ply`; rows that are not finite are left out.
         antialias: the model is drawn with Mip-Splatting's 2D filter; a flag in the file.
+        place: of their scene, told in the comment of the gzip stream.
 
     Raises:
         AwError: positions of more than 8 million units.
     """
     with atomic_path(path) as temporary:
         data, count = spz_bytes(gaussians, antialias=antialias)
+        if told := json.dumps(place_facts(place)) if place != UNMOVED else "":
+            # the flag of a comment, which follows the 10 bytes of a gzip header
+            data = data[:3] + b"\x10" + data[4:10] + told.encode("ascii") + b"\0" + data[10:]
         temporary.write_bytes(data)
     return count
 
@@ -87,7 +93,11 @@ def read_spz(path: Path | str) -> dict[str, np.ndarray]:
     Raises:
         AwError: no SPZ, another version, or damaged.
     """
-    packed = read_bytes(path, _MOST_BYTES)
+    return spz_arrays(read_bytes(path, _MOST_BYTES), path)
+
+
+def spz_arrays(packed: bytes, path: Path | str) -> dict[str, np.ndarray]:
+    """As `read_spz`, of a file's bytes; errors name `path`."""
     inflater = zlib.decompressobj(wbits=31)
     try:
         head = inflater.decompress(packed, _HEADER.size)

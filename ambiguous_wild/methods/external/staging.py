@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
-from ambiguous_wild.core import AwError, Scene, View
+from ambiguous_wild.core import UNMOVED, AwError, Scene, View
 from ambiguous_wild.io.colmap_model import write_views
 from ambiguous_wild.io.images import image_size
 
@@ -43,8 +43,10 @@ def stage(scene: Scene, folder: Path, files: Mapping[str, str], *, photos: Photo
         _link_views(scene.train, {v.name: v.image_path for v in scene.train}, folder, scene)
     elif photos == "nerf-w":
         _stage_nerfw(scene, folder)
+    elif scene.place != UNMOVED:
+        write_views(folder / "sparse" / "0", scene.views, scene.points)
     for path in () if photos != "all" else sorted(scene.root.resolve().iterdir()):
-        if path.name in _LEFT_OUT or path.name.startswith("."):
+        if path.name in _LEFT_OUT or path.name.startswith(".") or (folder / path.name).exists():
             continue
         if path.is_dir() and path.name != "sparse":
             os.symlink(path, folder / path.name, target_is_directory=True)

@@ -45,6 +45,7 @@ function freeProjection(camera, width, height) {
 function pathEntry(camera) {
   const m = camera.matrixWorld.elements;
   const rows = [0, 1, 2, 3].flatMap((row) => [0, 1, 2, 3].map((column) => m[4 * column + row]));
+  DATA.centre.forEach((value, axis) => { rows[4 * axis + 3] = rows[4 * axis + 3] / DATA.scale + value; });
   const fov = (2 * Math.atan(1 / camera.projectionMatrix.elements[5]) * 180) / Math.PI;
   return { camera_to_world: rows, fov, aspect: camera.projectionMatrix.elements[5] / camera.projectionMatrix.elements[0] };
 }

@@ -256,7 +256,7 @@ def test_only_an_earlier_report_is_taken_away(tmp_path: Path) -> None:
     cost_run(tmp_path / "runs", "a")
     report = cost_report(read(tmp_path / "runs", tmp_path / "runs" / "yard"))  # a folder in a folder: one run
     assert [p.runs for p in report.points] == [1]
-    with pytest.raises(AwError, match="changes.csv exists"):  # nothing here was a report of ours
+    with pytest.raises(AwError, match=r"changes\.csv exists"):  # nothing here was a report of ours
         write_report(report, out)
     assert (out / "changes.csv").read_text() == "mine"
     (out / "changes.csv").unlink()

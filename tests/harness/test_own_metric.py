@@ -97,7 +97,7 @@ def test_what_is_wrong_with_it_is_said_before_anything_is_trained(
     own.write_text(text)
     scene = write_scene(tmp_path / "scene")
     with pytest.raises(AwError) as error:
-        bench("3dgs", scene, metrics=[own], output=tmp_path / "runs", iterations=2, device="cpu")
+        bench("3dgs", scene, metrics=own, output=tmp_path / "runs", iterations=2, device="cpu")
     assert said in str(error.value) and not list((tmp_path / "runs").glob("**/config.yaml"))
 
 

@@ -67,8 +67,8 @@ def test_it_is_measured_and_stands_in_table_cost_and_board_without_its_file(
     assert again["grey_error"] == 2 * result["per_image"][0]["grey_error"]  # type: ignore[typeddict-item]
 
     own.unlink()
-    table = aw("table", tmp_path / "runs", "--all").stdout
-    assert "grey error levels↓" in table and "contrast↑" in table
+    table = aw("table", tmp_path / "runs").stdout
+    assert "not shown" in table and "grey error levels↓" in table and "contrast↑" in table
     assert aw("cost", tmp_path / "runs", "-o", tmp_path / "cost").returncode == 0
     head = (tmp_path / "cost/cost.csv").read_text().splitlines()[0].split(",")
     assert {"grey_error", "contrast"} <= set(head)

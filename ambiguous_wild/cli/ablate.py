@@ -112,7 +112,8 @@ def command(
         prepare_cpu(threads)
     cells = study.cells
     absent = sum(1 for row in study.rows if row.missing)
-    click.echo(f"{len(study.rows)} rows: {len(cells)} runs to have, {absent} variants missing", err=True)
+    more = f", {absent} variants cannot run here" if absent else ""
+    click.echo(f"{len(study.rows)} rows: {len(cells)} runs{more}", err=True)
     progress = ProgressBar(len(cells))
     reports = run_cells(
         cells, output, overwrite=overwrite, cache_dir=cache, tick=progress.tick, pictures=pictures,  # type: ignore[arg-type]

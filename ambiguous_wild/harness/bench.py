@@ -147,7 +147,7 @@ def bench(
     passes: int = 1,
     train: TrainSettings | None = None,
     plugins: Sequence[Words] = (),
-    metrics: Sequence[Words] = (),
+    metrics: Words | Sequence[Words] = (),
     device: Literal["auto", "cpu", "cuda"] = "auto",
     threads: int | None = None,
     jobs: int | None = None,
@@ -201,6 +201,7 @@ def bench(
     where = Engine() if engine is None else engine
     where = where if jobs is None else dataclasses.replace(where, jobs=jobs)
     where.check()
+    metrics = [metrics] if isinstance(metrics, str | Path) else metrics
     for file in metrics:
         load_metrics(Path(file))
     names = _check_methods([methods] if isinstance(methods, str) else methods, plugins, parts or {}, passes)

@@ -69,7 +69,10 @@ class Metric(Measure):
     def value(self, render: np.ndarray, given: Mapping[str, Any]) -> float:
         """Of one image; `given`: its photo, view and scene. AwError: it cannot have it; names the line."""
         try:
-            return float(resolve(self.function)(render, *(given[name] for name in self.needs)))
+            value = resolve(self.function)(render, *(given[name] for name in self.needs))
+            if np.ndim(value) or value is None:
+                raise AwError(f"it returned {type(value).__name__}, not one number")
+            return float(value)
         except Exception as error:
             if isinstance(self.function, str) or isinstance(error, AwError):
                 raise

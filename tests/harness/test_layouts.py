@@ -132,19 +132,19 @@ def test_an_interval_over_scenes_weighs_each_scene_alike() -> None:
 
 
 def test_who_is_not_told_apart_from_the_best_is_marked(tmp_path: Path) -> None:
-    best = np.array([20.0, 25.0, 30.0, 22.0, 27.0])
+    best = np.array([20.0, 25.0, 30.0, 22.0, 27.0, 24.0])
     values = {
         "best": best,
-        "close": best + np.array([0.4, -0.5, 0.3, -0.4, -0.2]),
+        "close": best + np.array([0.4, -0.5, 0.3, -0.4, -0.2, 0.1]),
         "below": best - 1.0,  # pictures differ more than methods: only pairs tell them apart
     }
     (layout,) = papers.paper(runs_of(tmp_path, *(fake_result(m, psnr=tuple(v)) for m, v in values.items())))
     assert [entry(layout, m, "yard").tie for m in values] == [False, True, False]
     assert "paired bootstrap" in layout.legend[0] and "≈" in plain_formats.to_text([layout])
-    (alone,) = papers.paper(
-        runs_of(tmp_path / "one", *(fake_result(m, psnr=(p,)) for m, p in (("a", 20.0), ("b", 20.5))))
-    )
-    assert not entry(alone, "a", "yard").tie  # one picture says nothing
+    for count, tie in ((1, False), (2, True), (5, True), (6, False)):  # up to five tell no methods apart
+        few = (fake_result(m, psnr=(p,) * count) for m, p in (("a", 20.0), ("b", 20.5)))
+        (layout,) = papers.paper(runs_of(tmp_path / str(count), *few))
+        assert entry(layout, "a", "yard").tie == tie
 
 
 def test_other_pictures_are_not_paired(tmp_path: Path) -> None:

@@ -67,8 +67,8 @@ def test_it_is_measured_and_stands_in_table_cost_and_board_without_its_file(
     assert again["grey_error"] == 2 * result["per_image"][0]["grey_error"]  # type: ignore[typeddict-item]
 
     own.unlink()
-    table = aw("table", tmp_path / "runs", "--all").stdout
-    assert "grey error levels↓" in table and "contrast↑" in table
+    table = aw("table", tmp_path / "runs").stdout
+    assert "not shown" in table and "grey error levels↓" in table and "contrast↑" in table
     assert aw("cost", tmp_path / "runs", "-o", tmp_path / "cost").returncode == 0
     head = (tmp_path / "cost/cost.csv").read_text().splitlines()[0].split(",")
     assert {"grey_error", "contrast"} <= set(head)
@@ -82,6 +82,8 @@ def test_it_is_measured_and_stands_in_table_cost_and_board_without_its_file(
     ("text", "said"),
     [
         (OWN.replace("* 1", "* wrong"), "NameError: name 'wrong' is not defined (my_metric.py, line 5)"),
+        (OWN.replace("return", "x ="), "metric grey_error: it returned NoneType, not one number"),
+        (OWN.replace("render.std()", "render - 1"), "metric contrast: it returned ndarray, not one number"),
         (OWN.replace('"grey_error", "grey', '"psnr", "grey'), "metric 'psnr' is one of ours"),
         (OWN.replace('"grey_error", "grey', '"Grey error", "grey'), "'Grey error' cannot name a metric"),
         (OWN.replace('"lower"', '"low"'), "'grey_error': better is 'low': write 'higher', 'lower' or None"),
@@ -97,7 +99,7 @@ def test_what_is_wrong_with_it_is_said_before_anything_is_trained(
     own.write_text(text)
     scene = write_scene(tmp_path / "scene")
     with pytest.raises(AwError) as error:
-        bench("3dgs", scene, metrics=[own], output=tmp_path / "runs", iterations=2, device="cpu")
+        bench("3dgs", scene, metrics=own, output=tmp_path / "runs", iterations=2, device="cpu")
     assert said in str(error.value) and not list((tmp_path / "runs").glob("**/config.yaml"))
 
 

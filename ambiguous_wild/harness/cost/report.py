@@ -72,10 +72,7 @@ def _unranked(curves: Sequence[Curve]) -> list[str]:
     for curve in curves:
         if why := why_unranked(curve.runs):
             reasons.setdefault(why, []).append(f"{curve.name}, {curve.length.text}")
-    return [
-        f"times not ranked, shown from the fastest to the slowest run: {shortlist(names)}: {why}"
-        for why, names in reasons.items()
-    ]
+    return [f"times not ranked: {shortlist(names)} ({why})" for why, names in reasons.items()]
 
 
 def _gaps(curves: Sequence[Curve], scenes: Sequence[str]) -> list[str]:

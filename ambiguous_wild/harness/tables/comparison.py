@@ -102,10 +102,13 @@ class Tables(tuple[Table, ...]):
         return to_html(self)
 
 
-def table(runs: Runs | Path | str, *, metrics: Sequence[str] = (), scenes: Sequence[str] = ()) -> Tables:
-    """The `comparison` of runs, or of every run below a folder."""
+def table(
+    runs: Runs | Path | str, *, metrics: str | Sequence[str] = (), scenes: str | Sequence[str] = ()
+) -> Tables:
+    """The `comparison` of runs, or of every run below a folder; one name needs no list."""
     found = runs if isinstance(runs, Runs) else read_runs(runs)
-    return Tables(comparison(found, metrics=metrics, scenes=scenes))
+    columns, only = ([names] if isinstance(names, str) else names for names in (metrics, scenes))
+    return Tables(comparison(found, metrics=columns, scenes=only))
 
 
 EFFECTS = Measure("effects", "effects", None, 0, per_image=False)

@@ -266,7 +266,7 @@ def time_notes(frame: pd.DataFrame, columns: Sequence[Measure]) -> list[str]:
         reasons.setdefault(reason, []).append(f"{method} on {scene}")
     total = len(frame[frame["status"] == "ok"].groupby(["method", "scene"]))
     lines = [
-        f"times not ranked, lowest to highest run: {'all' if len(who) == total else shortlist(who)}: {reason}"
+        f"times not ranked: {'all' if len(who) == total else shortlist(who)} ({reason})"
         for reason, who in reasons.items()
     ]
     unranked = incomparable(frame, columns)

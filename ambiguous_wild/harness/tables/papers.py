@@ -169,6 +169,7 @@ def _cells(part: Table, method: str) -> tuple[Cell, ...]:
 
 LEVEL = 0.95
 RESAMPLES = 2000
+LEAST = 6  # images: five differences all have the same sign by chance once in 16
 
 
 def difference_interval(
@@ -241,7 +242,8 @@ class Ties:
         return replace(row, cells=tuple(cells))
 
     def tied(self, best: str, other: str, scenes: Sequence[str], metric: str) -> bool:
-        """Whether the interval of their difference holds zero; False where it is not known."""
+        """Whether the interval of their difference holds zero, or it is of too few images to tell; False
+        where it is not known."""
         differences = []
         for scene in scenes:
             values = self.values(scene, metric)
@@ -251,7 +253,8 @@ class Ties:
             finite = ~(np.isinf(a) | np.isinf(b))  # what enters no mean decides no difference of means
             differences.append((a - b)[finite])
         low, high = difference_interval(differences)
-        return low <= 0.0 <= high
+        few = sum(map(len, differences)) < LEAST and not math.isnan(low)
+        return few or low <= 0.0 <= high
 
 
 FAMILIES = ("psnr", "ssim", "lpips")

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from ambiguous_wild.core.errors import AwError, shortlist
-from ambiguous_wild.harness.measures import Measure
+from ambiguous_wild.harness.measures import MEASURES, Measure
 from ambiguous_wild.harness.tables.table import ARROWS, TIE, Cell, Column, Row, Table
 
 RANKS = "(1) (2) (3): first, second and third in the column"
@@ -329,6 +329,8 @@ def fitted(tables: Sequence[Table], width: int = WIDTH) -> list[Table]:
 
 
 def _importance(column: Measure) -> int:
+    if column.per_image and column.key not in MEASURES:
+        return 0  # who measures by a metric of their own wants to see it
     return FIRST.index(column.key) if column.key in FIRST else len(FIRST)
 
 

@@ -105,9 +105,10 @@ def mask_warnings(facts: MaskResult | None) -> list[str]:
     warnings = [told + "photos leaves them out"] if hidden else []
     if not shares or np.median(shares) >= LITTLE_KEPT:
         return warnings
-    return warnings + [
+    return [
+        *warnings,
         f"the masks keep only {100 * np.median(shares):.0f} % of a photo (median): white = keep, black = "
-        "ignore; are they inverted?"
+        "ignore; are they inverted?",
     ]
 
 

@@ -58,7 +58,7 @@ def photos_from_folder(folder: Path, out: Path, *, jobs: int = 1, bar: Bar | Non
     left: list[LeftOut] = [{"source": c, "why": f"the same file as {kept}"} for c, kept in copies.items()]
     photos: list[CapturedPhoto] = []
     bar.start("photos", len(sources))
-    with atomic_dir(out) as folder_:
+    with atomic_dir(out, replace=False) as folder_:
         for source in sources:
             bar.step()
             try:
@@ -96,7 +96,7 @@ def photos_from_video(video: Path, out: Path, *, frames: int, bar: Bar | None = 
     frames = min(frames, total)
     bar.start("frames", total)
     parts = [round(k * total / frames) for k in range(frames + 1)]
-    with atomic_dir(out) as folder:
+    with atomic_dir(out, replace=False) as folder:
         photos = _write(sharpest(_read(video, bar), parts), folder)
         bar.finish()
         if len(photos) < frames:
@@ -129,7 +129,7 @@ def photos_from_camera(
             reader.grab()
         step = max(round(fps * every_s), 1)
         bar.start("frames", frames * step)
-        with atomic_dir(out) as folder:
+        with atomic_dir(out, replace=False) as folder:
             parts = [k * step for k in range(frames + 1)]
             photos = _write(sharpest(_frames(reader, fps, bar, frames * step), parts), folder)
             bar.finish()

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ambiguous_wild.cli.options import PathName, threads_option
+from ambiguous_wild.cli.options import Number, PathName, threads_option
 
 if TYPE_CHECKING:
     from ambiguous_wild.builder.checks import CaptureReport
@@ -31,7 +31,7 @@ BROKEN_BELOW = 0.9  # of the frames in a video's header, which is often wrong by
 )
 @click.option(
     "--every",
-    type=click.FloatRange(0.05, 3600),
+    type=Number(0.05, 3600),
     default=1.0,
     show_default=True,
     help="Seconds between photos of a camera.",

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ambiguous_wild.cli.options import PathName, only_option
+from ambiguous_wild.cli.options import Number, PathName, only_option
 from ambiguous_wild.core.errors import AwError
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     help="Folder for plots, CSV and JSON.",
 )  # fmt: skip
 @click.option(
-    "--target", "targets", multiple=True, type=float, metavar="DB",
+    "--target", "targets", multiple=True, type=Number(), metavar="DB",
     help="A test PSNR to reach; repeatable.  [default: 3, 1 and 0.5 dB below the best of each scene]",
 )  # fmt: skip
 @only_option

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import importlib
 import io
 import logging
@@ -151,7 +152,11 @@ def _told() -> Iterator[None]:
 
 def main() -> None:
     """Run the command line: one red line and exit code 2 for errors that the user can fix."""
+    # a closed standard output (`>&-`) is None in Python
+    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115 - until the process ends
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
     try:
+        _check_threads()
         cli.main(standalone_mode=False)
     except AwError as error:
         _fail(str(error))
@@ -170,7 +175,28 @@ def main() -> None:
         sys.exit(0)
     except OSError as error:
         # Disk full, no permission, a file in place of a folder: the user can fix these.
-        _fail(f"{error.filename or 'input or output'}: {error.strerror or error}")
+        if error.errno == errno.ENOMEM:
+            _fail(f"{error.filename or 'memory'}: {_LITTLE}")
+        room = "; free space, or choose another folder" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
+        _fail(f"{error.filename or 'input or output'}: {error.strerror or error}{room}")
+    except MemoryError:
+        _fail(_LITTLE)
+    except ImportError as error:
+        if not re.search("cannot allocate memory|failed to map segment", str(error).lower()):
+            raise
+        _fail(f"{_LITTLE} ({error})")
+
+
+_LITTLE = "too little memory; close other programs, raise ulimit -v, or use fewer or smaller photos"
+_THREADS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+
+
+def _check_threads() -> None:
+    """Raise AwError where a variable that the libraries count threads by is no number from 1 on."""
+    for name in _THREADS:
+        words = os.environ.get(name, "").strip()
+        if words and not re.fullmatch(r"[0 ]*[1-9]\d{0,5}( *, *\d{1,6})*", words):
+            raise AwError(f"{name} is {words!r}: set it to a number of threads from 1 on, or unset it")
 
 
 def _click_message(error: click.ClickException) -> str:
@@ -192,7 +218,8 @@ def _click_message(error: click.ClickException) -> str:
 
 
 def _fail(message: str) -> None:
-    click.secho("error: " + " ".join(message.split()), fg="red", err=True)
+    shown = message.encode("utf-8", "backslashreplace").decode()  # names of files may be no text
+    click.secho("error: " + " ".join(shown.split()), fg="red", err=True)
     sys.exit(AwError.exit_code)
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.core import ParameterSource
 
-from ambiguous_wild.cli.options import PathName
+from ambiguous_wild.cli.options import Number, PathName
 
 if TYPE_CHECKING:
     from ambiguous_wild.simulate.records import PhotoTruth
@@ -159,10 +159,12 @@ def _print_list(specs: Iterable[CaptureSpec], as_json: bool) -> None:
 @click.option("-o", "--output", required=True, type=PathName(), help="Scene or capture folder to make.")
 @click.option("--cutouts", type=PathName(), help="Folder of PNG files with alpha as the mask.")
 @click.option("--patches", is_flag=True, help="Fill the shapes with pieces of the photos.")
-@click.option("--coverage", type=float, default=0.15, show_default=True, help="Mean covered share of photos.")
+@click.option(
+    "--coverage", type=Number(), default=0.15, show_default=True, help="Mean covered share of photos."
+)
 @click.option(
     "--presence",
-    type=float,
+    type=Number(),
     default=0.8,
     show_default=True,
     help="Share of the train photos that show each distractor; of plain photos: any distractor.",
@@ -176,7 +178,7 @@ def _print_list(specs: Iterable[CaptureSpec], as_json: bool) -> None:
 )
 @click.option(
     "--shadow",
-    type=float,
+    type=Number(),
     default=0.0,
     show_default=True,
     help="Darkness of the shadows: 0 none, 1 black. Scenes only.",

@@ -94,9 +94,11 @@ def read_tensors(path: Path, advice: str = "download it again") -> dict[str, Ten
             raise AwError(f"{path} holds no dictionary of tensors; {advice}")
         tensors = {str(key): value.detach() for key, value in data.items()}
         broken = not_finite(tensors)
-    except AwError:
+    except (AwError, MemoryError):
         raise
     except Exception as error:  # torch raises many undocumented types for a damaged file
+        if "allocate memory" in str(error):  # of the system, as OSError or RuntimeError
+            raise MemoryError from None
         raise AwError(f"{path} cannot be read as weights ({_reason(path, error)}); {advice}") from None
     if broken is not None:
         raise AwError(f"{path} holds values that are not finite, in tensor {broken}; {advice}")

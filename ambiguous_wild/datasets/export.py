@@ -60,7 +60,7 @@ def export_scene(path: Path, form: str, output: Path, *, copy: bool = False) -> 
     if output.resolve().is_relative_to(scene.root.resolve()):
         raise AwError(f"{output} lies inside the scene {path}; choose a folder outside it for -o")
     check_output(output)
-    with atomic_dir(output) as folder:
+    with atomic_dir(output, replace=False) as folder:
         place = _copy if copy else link_file
         left_out = [*WRITERS[form](scene, folder, place)]
     if (scene.root / motion_points.FILE).is_file():

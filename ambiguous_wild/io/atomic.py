@@ -10,11 +10,12 @@ import errno
 import glob
 import json
 import os
+import re
 import shutil
 import stat
 import tempfile
 from collections.abc import Collection, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +59,8 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
     folder = Path(tempfile.gettempdir()) if into else target.parent
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        handle, name = tempfile.mkstemp(prefix=f".{target.stem}.", suffix=f".tmp{target.suffix}", dir=folder)
+        start = f".{target.stem}.{os.getpid()}-"
+        handle, name = tempfile.mkstemp(prefix=start, suffix=f".tmp{target.suffix}", dir=folder)
     except OSError as error:
         raise _named(error, target) from None
     os.close(handle)
@@ -78,8 +80,10 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
             os.replace(temporary, target)
     except BaseException as error:
         temporary.unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.filename in (name, temporary):
+        if isinstance(error, OSError) and error.errno and error.filename in (None, name, temporary):
             raise _named(error, target) from error
+        if full := re.search(r"Os \{ code: (\d+)", str(error)):  # safetensors' own class
+            raise OSError(int(full[1]), os.strerror(int(full[1])), str(target)) from error
         raise
 
 
@@ -105,13 +109,13 @@ def _named(error: OSError, target: Path) -> OSError:
 
 
 @contextmanager
-def atomic_dir(path: Path | str) -> Iterator[Path]:
+def atomic_dir(path: Path | str, *, replace: bool = True) -> Iterator[Path]:
     """Yield a temporary folder beside `path`; rename it to `path` on success, replacing an older folder.
 
     If `path` is a link, its target is replaced, not the link.
 
     Raises:
-        AwError: `path` is a file or a link to nowhere.
+        AwError: `path` is a file or a link to nowhere; without `replace`, somebody made it meanwhile.
     """
     target = Path(os.path.realpath(place_of(path)[0]))
     refuse_file(path)
@@ -122,7 +126,16 @@ def atomic_dir(path: Path | str) -> Iterator[Path]:
     os.chmod(temporary, 0o777 & ~umask)
     try:
         yield temporary
-        if target.exists():
+        if not replace:
+            try:
+                os.rename(temporary, target)  # onto an empty folder at most
+            except OSError as error:
+                if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                    raise
+                raise AwError(
+                    f"another command made {path} meanwhile; nothing of it is replaced: choose another -o"
+                ) from None
+        elif target.exists():
             old = Path(tempfile.mkdtemp(prefix=f".{target.name}.old-", dir=target.parent))
             os.replace(target, old / target.name)
             os.replace(temporary, target)
@@ -147,6 +160,20 @@ def sweep(folder: Path | str) -> None:
             shutil.rmtree(left, ignore_errors=True)
         else:
             left.unlink(missing_ok=True)
+
+
+def sweep_killed(path: Path | str) -> None:
+    """Remove temporary files of `atomic_path(path)` whose processes are gone; the folder may be a user's."""
+    target = Path(path)
+    start = f".{target.stem}."
+    for left in target.parent.glob(glob.escape(start) + "*-*.tmp" + glob.escape(target.suffix)):
+        number = left.name.removeprefix(start).partition("-")[0]
+        with suppress(PermissionError):  # another user's process
+            try:
+                if number.isdecimal():
+                    os.kill(int(number), 0)
+            except (ProcessLookupError, OverflowError):
+                left.unlink(missing_ok=True)
 
 
 def sweep_siblings(path: Path | str) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 
 from ambiguous_wild.core import UNMOVED, AwError, Camera, Place, Scene, View
 from ambiguous_wild.core.errors import unknown
+from ambiguous_wild.io.atomic import sweep_killed
 from ambiguous_wild.io.images import read_png_rgb, to_uint8
 from ambiguous_wild.io.ply import read_place, read_splat_ply, rescaled, splat_count
 from ambiguous_wild.io.splat_formats import compressed_ply, gltf, sog, spz
@@ -191,6 +192,7 @@ def export(
     for wanted in dict.fromkeys(formats):
         ending, read = FORMATS[wanted]
         path = folder / f"{name}{ending}"
+        sweep_killed(path)
         units = place.scale
         if wanted == "spz" or (wanted == "sog" and units < 1):
             units = 1.0

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import subprocess
 import sys
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from ambiguous_wild import __version__
 from ambiguous_wild.cli.main import COMMANDS, SECTIONS
+from ambiguous_wild.core.weight_files import read_tensors
 from tests.command_line import aw
 
 
@@ -71,3 +76,63 @@ def test_a_reader_that_leaves_is_no_error() -> None:
     code = f"{sys.executable} -m ambiguous_wild.cli.main methods --json | head -n 1; echo ${{PIPESTATUS[0]}}"
     done = subprocess.run(["bash", "-c", code], capture_output=True, text=True, check=False)
     assert done.stdout.splitlines() == ["[", "0"] and done.stderr == ""
+
+
+@pytest.mark.parametrize(
+    ("line", "code", "expected"),
+    [
+        ("table . >&-", 2, "error: "),
+        ("methods >&-", 0, ""),
+        ("methods >&- 2>&-", 0, ""),
+        ("table . > /dev/full", 2, "error: "),
+        ("methods > /dev/full", 2, "No space left on device; free space"),
+    ],
+)
+def test_a_closed_or_full_output_is_no_traceback(line: str, code: int, expected: str) -> None:
+    command = f"{sys.executable} -m ambiguous_wild.cli.main {line}"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
+    assert done.returncode == code and expected in done.stderr and done.stderr.count("\n") <= 1, done.stderr
+
+
+@pytest.mark.parametrize("value", ["abc", "0", "-1", "1.5"])
+def test_a_number_of_threads_that_is_none_is_named(value: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", value)
+    done = aw("methods")
+    assert done.returncode == 2 and f"OMP_NUM_THREADS is '{value}'" in done.stderr
+    monkeypatch.setenv("OMP_NUM_THREADS", "4,2")
+    assert aw("methods").returncode == 0
+
+
+FULL = OSError(errno.ENOMEM, os.strerror(errno.ENOMEM))
+
+
+@pytest.mark.parametrize("error", [MemoryError(), FULL, ImportError("failed to map segment")])
+def test_too_little_memory_is_said_so(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr("safetensors.torch.load_file", fails)
+    if not isinstance(error, ImportError):
+        with pytest.raises(MemoryError):  # the file of weights is whole
+            read_tensors(Path("a.safetensors"))
+    monkeypatch.setattr("ambiguous_wild.cli.main.cli.main", fails)
+    done = aw("methods")
+    assert done.returncode == 2 and "too little memory" in done.stderr and done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("words", ["--fps nan", "--seconds nan", "--gif-seconds nan", "--seconds inf"])
+def test_a_number_that_is_none_is_refused(words: str, tmp_path: Path) -> None:
+    done = aw("video", tmp_path, *words.split())
+    assert done.returncode == 2 and words.split()[0] in done.stderr and done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("command", ["screen", "build-scene", "capture"])
+def test_photos_whose_names_are_no_text_are_named(command: str, tmp_path: Path) -> None:
+    for i in range(4):
+        name = os.fsencode(tmp_path) + b"/raw/\xff%d.png" % i
+        (tmp_path / "raw").mkdir(exist_ok=True)
+        Path(os.fsdecode(name)).write_bytes(
+            cv2.imencode(".png", np.full((40, 40, 3), i, np.uint8))[1].tobytes()
+        )
+    done = aw(command, tmp_path / "raw", *([] if command == "screen" else ["-o", tmp_path / "out"]))
+    assert done.returncode == 2 and "not UTF-8: '\\udcff0.png'" in done.stderr and "rename" in done.stderr

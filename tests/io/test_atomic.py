@@ -14,7 +14,15 @@ import threading
 import pytest
 
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.io.atomic import atomic_dir, atomic_path, check_output, sweep, write_json, write_text
+from ambiguous_wild.io.atomic import (
+    atomic_dir,
+    atomic_path,
+    check_output,
+    sweep,
+    sweep_killed,
+    write_json,
+    write_text,
+)
 from ambiguous_wild.io.lock import folder_lock
 
 
@@ -192,3 +200,42 @@ def test_what_is_neither_file_nor_pipe_is_refused_and_stays(tmp_path):
         with pytest.raises(AwError) if name != "d" else contextlib.nullcontext(), atomic_dir(tmp_path / name):
             pass
     assert {p.name: p.lstat().st_mode for p in tmp_path.iterdir()} == before
+
+
+def test_a_full_disk_names_the_file_whoever_found_it_full(tmp_path):
+    told = "Error while serializing: IoError(Os { code: 28, kind: StorageFull })"
+    for error in (OSError(28, "No space left on device"), ValueError(told)):
+        with pytest.raises(OSError, match="No space left") as raised, atomic_path(tmp_path / "a.bin"):
+            raise error
+        assert raised.value.filename == str(tmp_path / "a.bin") and not list(tmp_path.iterdir())
+
+
+def test_what_killed_writers_of_a_file_left_goes_and_nothing_else(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True
+    )
+    names = {
+        ".3dgs.{}-ab.tmp.sog": False,
+        ".3dgs.{}-ab.tmp.spz": True,
+        ".other.{}-ab.tmp.sog": True,
+        "{}.sog": True,
+    }
+    for name in names:
+        (tmp_path / name.format(done.stdout.strip())).write_text("x")
+    (tmp_path / f".3dgs.{os.getpid()}-ab.tmp.sog").write_text("alive")
+    sweep_killed(tmp_path / "3dgs.sog")
+    assert {n: (tmp_path / n.format(done.stdout.strip())).exists() for n in names} == names
+    assert (tmp_path / f".3dgs.{os.getpid()}-ab.tmp.sog").exists()
+    with atomic_path(tmp_path / "3dgs.sog") as temporary:  # writers have names of this kind
+        assert temporary.name.startswith(f".3dgs.{os.getpid()}-")
+
+
+def test_of_two_who_make_one_folder_the_second_is_told(tmp_path):
+    with (
+        pytest.raises(AwError, match="another command made"),
+        atomic_dir(tmp_path / "out", replace=False) as second,
+    ):
+        (second / "b").write_text("second")
+        with atomic_dir(tmp_path / "out", replace=False) as first:
+            (first / "a").write_text("first")
+    assert [p.name for p in tmp_path.rglob("*")] == ["out", "a"]

@@ -142,7 +142,7 @@ def composite_photos(
     order = np.random.default_rng(choice_seed).permutation(len(train))
     chosen = {train[i] for i in order[: max(1, round(config.presence * len(train)))]}
     photos: dict[str, PastedPhoto] = {}
-    with atomic_dir(target) as folder:
+    with atomic_dir(target, replace=False) as folder:
         for part in ("train", "test"):
             (folder / part).mkdir()
         for path, test, seed in zip(progress(paths), is_test, seeds, strict=True):

@@ -139,7 +139,7 @@ def composite(
     scene = load_scene(root)
     _check_scene(scene)
     plan = _plan(scene, shapes, config, place_rng, patch_rng)
-    with atomic_dir(target) as folder:
+    with atomic_dir(target, replace=False) as folder:
         photos = _write_photos(scene, plan, config, folder, progress)
         _copy_rest(scene, folder)
         facts = _facts(scene, plan, config, photos)

@@ -193,11 +193,7 @@ def test_a_damaged_scene_is_noticed_and_mended(scene, raw, tmp_path):
 
 @pytest.mark.parametrize("alpha", [False, True])
 def test_masks_are_used_and_carried_to_training_photos_only(raw, tmp_path, alpha):
-<<<<<<< HEAD
-    """Similar photos are matched, not all. Alpha is a mask, in test photos too: nobody saw what it hides."""
-=======
     """And similar photos are matched, not all. Alpha is a mask, of test photos too."""
->>>>>>> hE
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
     mask[:, :100] = 0
     masks, noise = (

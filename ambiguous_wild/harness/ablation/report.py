@@ -277,7 +277,9 @@ def _tables(data: StudyReport, columns: Sequence[Measure], *, differences: bool 
     tables = []
     for group in data["groups"]:
         members = [row for row in data["rows"] if row["group"] == group["name"]]
-        untimed = {r["variant"]: why for r in members for run in r["runs"] if (why := run.get("untimed"))}
+        untimed = {
+            r["variant"]: why for r in members for run in r.get("runs", ()) if (why := run.get("untimed"))
+        }
         by_column = [
             ranks(
                 [

@@ -114,6 +114,8 @@ def save(cells, output, **values):
         result = fake_result(cell.method.name, cell.scene.name, cell.train.seed, (values["psnr"](cell),))
         result["masks"] = {"iou": values["iou"](cell), "precision": 0.5, "recall": 0.25}
         result["cost"] |= {"setup_s": 2.0, "ms_per_iteration": values["ms"](cell)}
+        if cell.method.name == values.get("contended"):
+            result["cost"]["timing"] |= {"verdict": "contended", "reason": "2 runs at once"}
         write_result(cell_folder(output, cell) / "metrics.json", result)
 
 
@@ -127,6 +129,7 @@ def test_means_spreads_and_paired_differences(scene, tmp_path):
         psnr=lambda c: base[c.train.seed] + gain[c.method.name][c.train.seed],
         iou=lambda c: 0.5 + 0.1 * (c.method.name == "mine@size-small"),
         ms=lambda c: 10.0 * (1 + (c.method.name == "3dgs")),
+        contended="3dgs",
     )
     data = report(plan, tmp_path)
     rows = {(r["group"], r["variant"]): r for r in data["rows"]}
@@ -140,6 +143,8 @@ def test_means_spreads_and_paired_differences(scene, tmp_path):
     assert rows["other", "plain"]["differences"]["ms_per_iteration"]["mean"] == pytest.approx(10.0)
     assert rows["size", "same"]["differences"]["psnr"]["mean"] == 0.0
     assert rows["size", "default"]["values"]["recall"]["mean"] == 0.25
+    text = markdown_of(data)  # the slower run was not alone: nothing is left to rank
+    assert "times not ranked: plain (contended: 2 runs at once)" in text and "**10.0** (1)" not in text
 
 
 def test_what_is_missing_or_failed_is_told_never_dropped(scene, tmp_path):

@@ -131,7 +131,7 @@ def test_unequal_features_and_protocols_are_named(tmp_path: Path) -> None:
     )
     notes = "\n".join(table[-1].notes)
     assert "not comparable: features differ on yard: a: dino, b: none;" in notes
-    assert "not comparable: protocol differ on yard" in notes
+    assert "not comparable: protocols differ on yard" in notes
 
 
 def test_test_photos_that_may_hold_distractors_are_named_in_every_format(tmp_path: Path) -> None:
@@ -301,8 +301,10 @@ def test_a_reason_that_concerns_some_names_them(tmp_path: Path) -> None:
 
 def test_a_null_without_a_reason_is_noted(tmp_path: Path) -> None:
     images = [{"name": "0.png", "psnr": 20.0, "ssim": 0.5}, {"name": "1.png", "psnr": 21.0, "ssim": None}]
-    table = table_of(tmp_path, fake_result("a", per_image=images, missing={}), fake_result("b"))
-    assert cell(table, "a", "ssim").state == "missing"
+    older = fake_result("c", per_image=[{"name": "0.png", "psnr": 20.0}], missing={})
+    table = table_of(tmp_path, fake_result("a", per_image=images, missing={}), fake_result("b"), older)
+    assert cell(table, "a", "ssim").state == cell(table, "c", "ssim").state == "missing"
+    assert "missing: ssim for c on yard: not measured there; 'aw rescore' adds it" in table[-1].notes
     assert "missing: ssim, no reason given, for 1.png (a on yard)" in table[-1].notes
 
 

@@ -16,6 +16,7 @@ from ambiguous_wild.harness.measures import MASK_LABELS, Measure, measure
 from ambiguous_wild.harness.running.cell import Cell
 from ambiguous_wild.harness.running.grid import cell_folder, plan_cells
 from ambiguous_wild.harness.running.result_file import FAILED, RESULT, RunResult, mean_of, read_result
+from ambiguous_wild.harness.running.timing import timing_of
 from ambiguous_wild.methods.ablation import DEFAULT, Group, Variant, choose_groups, folder_name
 from ambiguous_wild.methods.describe import BACK_ENDS
 from ambiguous_wild.methods.registry import MethodEntry, get_method
@@ -59,7 +60,7 @@ class VariantRow(TypedDict):
     same_as: str
     values: dict[str, Summary]  # by key of `plan.METRICS`
     differences: dict[str, Summary]  # by key of `plan.DIFFERENCES`
-    runs: list[dict[str, Any]]  # scene, seed, folder, error, and every key of `plan.METRICS`
+    runs: list[dict[str, Any]]  # scene, seed, folder, error, untimed, and `plan.METRICS`
 
 
 class StudyReport(StudyFacts):
@@ -285,6 +286,12 @@ class Outcome:
             return cost[metric]
         mean = mean_of(self.result, metric)
         return None if math.isnan(mean) else mean
+
+    @property
+    def untimed(self) -> str:
+        """Why its times are not ranked; empty for a run that was alone, or has none."""
+        timing = timing_of(self.result["cost"]) if self.result else None
+        return f"{timing.verdict}: {timing.reason}" if timing and timing.verdict != "alone" else ""
 
 
 # What is tabulated of every variant; keys as in ablation.json.

@@ -16,6 +16,7 @@ from typing import Any, Literal
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import to_plain
+from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.harness.ablation.plan import (
     DIFFERENCES,
     METRICS,
@@ -81,6 +82,7 @@ def _row(row: Planned, outcomes: list[Outcome], default: list[Outcome]) -> Varia
         "differences": differences,
         "runs": [
             {"scene": o.scene, "seed": o.seed, "folder": str(o.folder), "error": o.error or None}
+            | {"untimed": o.untimed}
             | {key: o.value(key) for key in KEYS}
             for o in outcomes
         ],
@@ -275,7 +277,19 @@ def _tables(data: StudyReport, columns: Sequence[Measure], *, differences: bool 
     tables = []
     for group in data["groups"]:
         members = [row for row in data["rows"] if row["group"] == group["name"]]
-        by_column = [ranks([_mean(row, "values", c.key) for row in members], c) for c in columns]
+        untimed = {
+            r["variant"]: why for r in members for run in r.get("runs", ()) if (why := run.get("untimed"))
+        }
+        by_column = [
+            ranks(
+                [
+                    math.nan if c.timed and row["variant"] in untimed else _mean(row, "values", c.key)
+                    for row in members
+                ],
+                c,
+            )
+            for c in columns
+        ]
         lines = []
         for k, row in enumerate(members):
             cells = [_cell(row, c, rank[k]) for c, rank in zip(columns, by_column)]
@@ -283,6 +297,9 @@ def _tables(data: StudyReport, columns: Sequence[Measure], *, differences: bool 
                 cells = [*(_difference(row, c) for c in DIFFERENCES), *cells, _what(row)]
             lines.append(Row(str(row["variant"]), tuple(cells), note=str(row["text"])))
         notes = [f"{r['variant']} {r['status']}: {r['reason']}" for r in members if r["status"] != "ok"]
+        for reason in dict.fromkeys(untimed.values()):
+            names = shortlist(name for name, why in untimed.items() if why == reason)
+            notes.append(f"times not ranked: {names} ({reason})")
         heads = [Column("", c) for c in columns]
         if differences:
             first = (Column("", replace(c, label=f"d {c.label}", better=None)) for c in DIFFERENCES)

@@ -45,8 +45,8 @@ def notes(
 UNEQUAL = "not comparable"  # begins a note that every format shows where it shows ranks
 CONDITIONS = {
     "effects": "effects",
-    "length": "length",
-    "fit": "protocol",
+    "length": "lengths",
+    "fit": "protocols",
     "features": "features",
 }
 
@@ -185,7 +185,13 @@ def _missing(runs: Runs, columns: Sequence[Measure]) -> list[str]:
             lines.append(f"missing: {column.key}{who}: {reason}")
         # A null without a reason must not pass in silence.
         told = set(zip(rows["scene"], rows["method"], rows["seed"]))
-        gaps = runs.images[(runs.images["metric"] == column.key) & runs.images["value"].isna()]
+        images = runs.images[runs.images["metric"] == column.key]
+        have = told | set(zip(images["scene"], images["method"], images["seed"]))
+        others = [r for r in ok.itertuples() if (r.scene, r.method, r.seed) not in have]
+        if len(images) and others:
+            who = shortlist(dict.fromkeys(f"{r.method} on {r.scene}" for r in others))
+            lines.append(f"missing: {column.key} for {who}: not measured there; 'aw rescore' adds it")
+        gaps = images[images["value"].isna()]
         silent = [r for r in gaps.itertuples() if (r.scene, r.method, r.seed) not in told]
         if silent:
             names = [f"{r.image} ({r.method} on {r.scene})" for r in silent]
@@ -217,7 +223,7 @@ def _not_comparable(runs: Runs, columns: Sequence[Measure]) -> list[str]:
         images = runs.images[runs.images["scene"] == scene].groupby(["method", "seed"])["image"]
         if len({frozenset(names) for _, names in images}) > 1:
             lines.append(f"{UNEQUAL}: methods were measured on different test images of {scene}")
-    if "iterations" in ok:
+    if "iterations" in ok and not any("lengths differ" in line for line in unequal(ok)):
         lengths = ok["iterations"].astype(float)
         longest = lengths[np.isfinite(lengths)].groupby(ok["method"]).max()
         if len(longest) and longest.max() > LENGTHS_DIFFER * longest.min():

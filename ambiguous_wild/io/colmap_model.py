@@ -13,15 +13,16 @@ from typing import TypeVar
 
 import numpy as np
 
-from ambiguous_wild.core.errors import AwError, unknown
+from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.scene import Points, View
 from ambiguous_wild.io.atomic import atomic_path
 from ambiguous_wild.io.colmap_records import (
-    _TWO_FOCALS,
     FOCAL_RANGE,
     LARGEST_COORDINATE,
     LARGEST_SIDE,
     MODELS,
+    ONE_FOCAL,
+    SPLIT_PANORAMAS,
     Model,
     ModelCamera,
     ModelImage,
@@ -94,7 +95,9 @@ def check_camera(root: Path, camera: ModelCamera) -> None:
     """
     size = (camera.width, camera.height)
     whole = all(0 < side <= LARGEST_SIDE for side in size) and bool(np.isfinite(camera.params).all())
-    focal = camera.params[:2] if camera.model in _TWO_FOCALS else camera.params[:1]
+    if camera.model == "EQUIRECTANGULAR":
+        raise AwError(f"{root}: camera {camera.camera_id} is EQUIRECTANGULAR; {SPLIT_PANORAMAS}")
+    focal = camera.params[:1] if camera.model in ONE_FOCAL else camera.params[:2]
     if not whole or not all(FOCAL_RANGE[0] <= f / max(size) <= FOCAL_RANGE[1] for f in focal):
         raise AwError(
             f"{root}: camera {camera.camera_id} is {size[0]}x{size[1]} px with the parameters "
@@ -220,9 +223,13 @@ def _text_cameras(path: Path) -> dict[int, ModelCamera]:
         except (ValueError, IndexError) as error:
             raise _damaged(path, number) from error
         if model not in MODELS:
-            raise unknown(f"camera model in {path}", model, MODELS)
+            raise AwError(
+                f"{path}, line {number}: camera model {model[:40]!r} is not known; convert it with COLMAP's "
+                f"model_converter to one of {', '.join(MODELS)}"
+            )
         if len(params) != MODELS[model][1]:
-            raise _damaged(path, number)
+            told = f"{model} has {MODELS[model][1]} parameters, not {len(params)}"
+            raise AwError(f"{path}, line {number}: {told}; copy or build the model again")
         _add(path, cameras, camera_id, ModelCamera(camera_id, model, width, height, params))
     return cameras
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.extras import install_command
+from ambiguous_wild.io.colmap_records import SPLIT_PANORAMAS
 from ambiguous_wild.io.images import MAX_PIXELS, pillow
 
 PHOTO_SUFFIXES = (
@@ -113,6 +114,8 @@ def read_photo(
     try:
         spec = reader.spec()
         _check_size(source, spec.width, spec.height)
+        if spec.getattribute("GPano:ProjectionType") == "equirectangular":
+            raise UnreadablePhoto(source, f"a 360 degree photo; {SPLIT_PANORAMAS}")
         if str(spec.format) not in ("uint8", "uint16"):
             raise UnreadablePhoto(
                 source, f"pixels of type {spec.format} are not supported; export 8 or 16 bits"

@@ -13,6 +13,7 @@ from typing import Literal
 
 import numpy as np
 
+from ambiguous_wild.core import AwError
 from ambiguous_wild.splat.parts import Schedule
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, TrainData
 from ambiguous_wild.splat.watchdog import OnNonFinite
@@ -91,6 +92,9 @@ def _spectrum_share(photo: np.ndarray, divisor: int) -> float:
 COARSE_UNTIL = 0.4  # share of the run; measured on simulated captures, see docs/training.md
 
 
+MOST_ITERATIONS = 100_000_000  # months on a GPU
+
+
 @dataclass(frozen=True)
 class TrainConfig:
     """How long, on what, how often saved. What is learnt how is the method's (`Parts`)."""
@@ -106,6 +110,10 @@ class TrainConfig:
     on_nonfinite: OnNonFinite = (
         "stop"  # or go back to the last checkpoint and leave the photo out, see watchdog.py
     )
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.iterations <= MOST_ITERATIONS:
+            raise AwError(f"--iterations {self.iterations} is not from 1 to {MOST_ITERATIONS:,}")
 
 
 class Pace:

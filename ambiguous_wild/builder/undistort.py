@@ -84,8 +84,8 @@ def make_lens(camera: ModelCamera) -> Lens:
     share = float(abs(x @ np.roll(y, 1) - y @ np.roll(x, 1)) / 2 / (camera.width * camera.height))
     if not LEAST_SHARE < share < MOST_SHARE:
         raise AwError(
-            f"camera {camera.camera_id} ({camera.model}, parameters {list(camera.params)}): undistorted, it sees "
-            f"{100 * share:.3g} % of its photo: check the parameters, or split the photos into pinhole views"
+            f"camera {camera.camera_id} ({camera.model}, parameters {list(camera.params)}): undistorted, it "
+            f"sees {100 * share:.3g} % of its photo: check the parameters, or split the photos"
         )
     return Lens(
         lens, pinhole, (np.ascontiguousarray(index[..., 0]), np.ascontiguousarray(index[..., 1])), share

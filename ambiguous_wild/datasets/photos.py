@@ -101,7 +101,9 @@ def plan_photos(scene: ForeignScene) -> list[PhotoPlan]:
                 f"{image.name} ({size[0]}x{size[1]}, more than {MAX_PIXELS // 1_000_000} megapixels)"
             )
         elif not _same_shape(size, (camera.width, camera.height)):
-            wrong.append(f"{image.name} ({size[0]}x{size[1]}, its camera {camera.width}x{camera.height})")
+            turned = ", turned as by EXIF" if _same_shape(size[::-1], (camera.width, camera.height)) else ""
+            told = f"its camera {camera.width}x{camera.height}{turned}"
+            wrong.append(f"{image.name} ({size[0]}x{size[1]}, {told})")
         else:
             plans.append(_plan(scene, image, source, camera, size, only_small))
     _refuse_same_stems(scene)

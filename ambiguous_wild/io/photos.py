@@ -130,7 +130,7 @@ def read_photo(
     exif = exif_from_spec(spec)
     if exif.orientation != 1:
         notes.append(f"turned upright (EXIF orientation {exif.orientation})")
-        rgb = _upright(rgb, exif.orientation)
+        rgb = upright(rgb, exif.orientation)
     notes += _misnamed(source, form)
     height, width = rgb.shape[:2]
     plain = not notes and form in ("jpeg", "png")
@@ -318,7 +318,7 @@ def _three_channels(
     return pixels, ["CMYK converted to RGB without its profile"] if space == "CMYK" else []
 
 
-def _upright(image: np.ndarray, orientation: int) -> np.ndarray:
+def upright(image: np.ndarray, orientation: int) -> np.ndarray:
     """Apply EXIF orientation 1..8 (EXIF 2.32, tag 274)."""
     if orientation in (5, 6, 7, 8):
         image = image.transpose(1, 0, 2)

@@ -15,7 +15,7 @@ from ambiguous_wild.builder.records import MaskResult, ScreenedPhoto
 from ambiguous_wild.core.errors import AwError, counted, shortlist
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import read_alpha, read_mask, write_png
-from ambiguous_wild.io.photos import TRANSPARENT
+from ambiguous_wild.io.photos import TRANSPARENT, upright
 from ambiguous_wild.io.scene_folder import find_masks as by_name
 
 LITTLE_KEPT = 0.3  # share of a photo; distractors rarely cover more than the rest
@@ -70,8 +70,8 @@ def alphas(capture: Path, facts: list[ScreenedPhoto]) -> dict[str, np.ndarray]:
         if TRANSPARENT not in fact["notes"]:
             continue
         alpha = read_alpha(capture / fact["source"])
-        if alpha is not None and alpha.shape == (fact["height"], fact["width"]):
-            found[fact["stem"]] = alpha
+        if alpha is not None:
+            found[fact["stem"]] = upright(alpha, fact["exif"].get("orientation", 1))
     return found
 
 

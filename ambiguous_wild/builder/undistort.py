@@ -87,9 +87,8 @@ def make_lens(camera: ModelCamera) -> Lens:
             f"camera {camera.camera_id} ({camera.model}, parameters {list(camera.params)}): undistorted, it "
             f"sees {100 * share:.3g} % of its photo: check the parameters, or split the photos"
         )
-    return Lens(
-        lens, pinhole, (np.ascontiguousarray(index[..., 0]), np.ascontiguousarray(index[..., 1])), share
-    )
+    maps = np.ascontiguousarray(index[..., 0]), np.ascontiguousarray(index[..., 1])
+    return Lens(lens, pinhole, maps, share)
 
 
 def _source_pixels(lens: Any, pinhole: ModelCamera) -> tuple[np.ndarray, np.ndarray]:

@@ -65,11 +65,6 @@ class Exif:
         return self.focal_35mm * math.hypot(width, height) / _DIAGONAL_35MM
 
 
-def is_utf8(name: str) -> bool:
-    """Whether lists and other programs can hold a file's name; Python keeps other bytes as surrogates."""
-    return not any("\ud800" <= c <= "\udfff" for c in name)
-
-
 class UnreadablePhoto(AwError):
     """A photo that cannot be used; `reason` is the message without the name."""
 
@@ -102,8 +97,6 @@ def read_photo(
     import OpenImageIO as oiio
 
     source = Path(path)
-    if not is_utf8(str(source)):
-        raise UnreadablePhoto(ascii(str(source)), "its name is not UTF-8; rename it")
     form = _sniff(source)
     if form == "heic":
         return _read_heic(source)

@@ -92,9 +92,6 @@ def _spectrum_share(photo: np.ndarray, divisor: int) -> float:
 COARSE_UNTIL = 0.4  # share of the run; measured on simulated captures, see docs/training.md
 
 
-MOST_ITERATIONS = 100_000_000  # months on a GPU
-
-
 @dataclass(frozen=True)
 class TrainConfig:
     """How long, on what, how often saved. What is learnt how is the method's (`Parts`)."""
@@ -112,8 +109,8 @@ class TrainConfig:
     )
 
     def __post_init__(self) -> None:
-        if not 1 <= self.iterations <= MOST_ITERATIONS:
-            raise AwError(f"--iterations {self.iterations} is not from 1 to {MOST_ITERATIONS:,}")
+        if not 1 <= self.iterations <= 100_000_000:  # months on a GPU
+            raise AwError(f"--iterations {self.iterations} is not from 1 to 100 000 000")
 
 
 class Pace:

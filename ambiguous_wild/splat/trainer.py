@@ -196,14 +196,11 @@ class Trainer(Run):
                 f"keep(step) of the method's mask policy gave a {type(keep).__name__}; it must give a torch "
                 "tensor [H, W], or None (docs/add-a-method.md)"
             )
-        if (
-            self.sentinel is None
-            and keep is not None
-            and bool((keep.min() < -0.01) | (keep.max() > MOST_KEEP))
-        ):
+        on_cpu = self.sentinel is None and keep is not None
+        if on_cpu and ((low := float(keep.min())) < -0.01 or float(keep.max()) > MOST_KEEP):
             raise AwError(
-                f"keep(step) of the method's mask policy gave values from {keep.min():.3g} to "
-                f"{keep.max():.3g}; they are weights of pixels, 0 = masked, 1 = kept, at most {MOST_KEEP:g}"
+                f"keep(step) of the method's mask policy gave values from {low:.3g} to {keep.max():.3g}: "
+                f"weights of pixels are 0 where masked, 1 where kept, and at most {MOST_KEEP:g}"
             )
         user = self.data.user_keep[step.view]
         if user is None:

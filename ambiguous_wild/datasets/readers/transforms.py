@@ -23,13 +23,7 @@ from ambiguous_wild.datasets.foreign import (
 )
 from ambiguous_wild.datasets.readers.colmap import has_lists, read_lists
 from ambiguous_wild.io.colmap_model import check_camera
-from ambiguous_wild.io.colmap_records import (
-    SPLIT_PANORAMAS,
-    Model,
-    ModelCamera,
-    ModelImage,
-    points_without_tracks,
-)
+from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage, points_without_tracks
 from ambiguous_wild.io.images import header_size
 from ambiguous_wild.io.ply import read_point_ply
 
@@ -131,8 +125,9 @@ def frame_camera(
         "RADIAL",
         "PERSPECTIVE",
     ):
-        how = SPLIT_PANORAMAS if model == "EQUIRECTANGULAR" else "undistort the photos to PINHOLE"
-        raise AwError(f"{path}: camera_model {model[:40]!r} is not supported; {how}")
+        raise AwError(
+            f"{path}: camera_model {model[:40]!r} is not supported; undistort the photos to PINHOLE"
+        )
     size_px = (round(width), round(height))
     if fisheye:
         return ModelCamera(number, "OPENCV_FISHEYE", *size_px, (fx, fy, cx, cy, lens[0], lens[1], *third))

@@ -18,7 +18,7 @@ from typing import Literal
 from ambiguous_wild.builder.records import ScreenedPhoto
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.io.hashing import sha256_file
-from ambiguous_wild.io.photos import PHOTO_SUFFIXES, is_utf8
+from ambiguous_wild.io.photos import PHOTO_SUFFIXES
 from ambiguous_wild.io.scene_folder import TEST_EVERY, read_list
 
 MIN_PHOTOS = 3  # COLMAP's smallest useful model
@@ -73,7 +73,8 @@ def collect(raw: Path | str, jobs: int = 1) -> Capture:
                 files.append((path, side))
             else:
                 ignored.append(path.name)
-    if odd := [ascii(path.name) for path, _ in files if not is_utf8(path.name)]:
+    # Python keeps other bytes as surrogates, which no list and no other program can hold.
+    if odd := [ascii(p.name) for p, _ in files if str(p) != str(p).encode(errors="ignore").decode()]:
         raise AwError(f"names of photos in {root} are not UTF-8: {shortlist(odd)}; rename them")
     if len(files) < MIN_PHOTOS:
         raise AwError(_too_few(root, len(files), ignored))

@@ -15,7 +15,7 @@ from ambiguous_wild.builder.records import MaskResult, ScreenedPhoto
 from ambiguous_wild.core.errors import AwError, counted, shortlist
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import read_alpha, read_mask, write_png
-from ambiguous_wild.io.photos import TRANSPARENT
+from ambiguous_wild.io.photos import TRANSPARENT, upright
 from ambiguous_wild.io.scene_folder import find_masks as by_name
 
 LITTLE_KEPT = 0.3  # share of a photo; distractors rarely cover more than the rest
@@ -67,11 +67,8 @@ def alphas(capture: Path, facts: list[ScreenedPhoto]) -> dict[str, np.ndarray]:
     """What the photos' own alpha keeps, [H, W] uint8 in {0, 255}, by stem; opaque photos are absent."""
     found = {}
     for fact in facts:
-        if TRANSPARENT not in fact["notes"]:
-            continue
-        alpha = read_alpha(capture / fact["source"])
-        if alpha is not None and alpha.shape == (fact["height"], fact["width"]):
-            found[fact["stem"]] = alpha
+        if TRANSPARENT in fact["notes"] and (alpha := read_alpha(capture / fact["source"])) is not None:
+            found[fact["stem"]] = upright(alpha, fact["exif"].get("orientation", 1))
     return found
 
 
@@ -99,10 +96,8 @@ def mask_warnings(facts: MaskResult | None) -> list[str]:
     """Warnings: alpha that hides pixels; masks that keep so little that they may be inverted."""
     shares = list(facts["kept_share"].values()) if facts else []
     hidden = len(facts.get("alpha", ())) if facts else 0
-    told = (
-        f"alpha of {counted(hidden, 'photo')} hides pixels: they are not learnt from, and psnr_valid of test "
-    )
-    warnings = [told + "photos leaves them out"] if hidden else []
+    told = f"alpha of {counted(hidden, 'photo')} hides pixels: nothing is learnt from them (docs/datasets.md)"
+    warnings = [told] if hidden else []
     if not shares or np.median(shares) >= LITTLE_KEPT:
         return warnings
     return [

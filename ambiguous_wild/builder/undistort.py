@@ -24,6 +24,8 @@ from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 TRUTH_PARTS = ("distractor", "clean")
+MOST_LOST = 0.9  # of the photo; what is lost beyond is said
+LEAST_SHARE, MOST_SHARE = 0.1, 1.1  # of the photo; less is no picture of it, more lies outside
 NEGLIGIBLE_PX = 0.1  # distortion below this everywhere is ignored
 
 
@@ -36,6 +38,7 @@ class Lens:
     map_xy: (
         tuple[np.ndarray, np.ndarray] | None
     )  # [H, W] float32 each: source of every pixel; None: no map needed
+    share: float = 1.0  # of the photo that the pinhole camera sees
 
     def remap(self, image: np.ndarray, *, nearest: bool) -> np.ndarray:
         """The image [H, W] or [H, W, 3] of the distorted camera as the pinhole camera sees it."""
@@ -60,9 +63,12 @@ def make_lens(camera: ModelCamera) -> Lens:
     Where the distortion is negligible the photo stays as it is: COLMAP would shrink the camera by a pixel
     and shift it by half a pixel, which blurs.
     """
-    lens = pycolmap.Camera(
-        model=camera.model, width=camera.width, height=camera.height, params=list(camera.params)
-    )
+    try:
+        lens = pycolmap.Camera(
+            model=camera.model, width=camera.width, height=camera.height, params=list(camera.params)
+        )
+    except ValueError as error:
+        raise AwError(f"this pycolmap has no camera model {camera.model}; update it ({error})") from None
     fx, fy = lens.focal_length_x, lens.focal_length_y
     same = (fx, fy, lens.principal_point_x, lens.principal_point_y)
     plain = ModelCamera(camera.camera_id, "PINHOLE", camera.width, camera.height, same)
@@ -74,7 +80,15 @@ def make_lens(camera: ModelCamera) -> Lens:
     pinhole = ModelCamera(camera.camera_id, "PINHOLE", flat.width, flat.height, params)
     _, source = _source_pixels(lens, pinhole)
     index = (source - 0.5).astype(np.float32)  # OpenCV counts from pixel centres
-    return Lens(lens, pinhole, (np.ascontiguousarray(index[..., 0]), np.ascontiguousarray(index[..., 1])))
+    x, y = np.concatenate([source[0], source[:, -1], source[-1, ::-1], source[::-1, 0]]).T
+    share = float(abs(x @ np.roll(y, 1) - y @ np.roll(x, 1)) / 2 / (camera.width * camera.height))
+    if not LEAST_SHARE < share < MOST_SHARE:
+        raise AwError(
+            f"camera {camera.camera_id} ({camera.model}, parameters {list(camera.params)}): undistorted, it "
+            f"sees {100 * share:.3g} % of its photo: check the parameters, or split the photos"
+        )
+    maps = np.ascontiguousarray(index[..., 0]), np.ascontiguousarray(index[..., 1])
+    return Lens(lens, pinhole, maps, share)
 
 
 def _source_pixels(lens: Any, pinhole: ModelCamera) -> tuple[np.ndarray, np.ndarray]:
@@ -132,6 +146,8 @@ def undistort(
     with ThreadPoolExecutor(jobs) as pool:
         done = list(pool.map(one, model.images.values()))
     bar.finish()
+    if lenses and (least := min(lens.share for lens in lenses.values())) < MOST_LOST:
+        bar.say(f"undistortion leaves {least:.0%} of the photos, the middle of what the lens sees")
     cameras, images = {c.camera_id: c for _, c, _ in done}, {image.image_id: image for image, _, _ in done}
     write_model(folder / "sparse" / "0", Model(cameras, images, model.points))
     found = {part: sum(part in parts for _, _, parts in done) for part in TRUTH_PARTS}

@@ -179,12 +179,10 @@ def main() -> None:
             _fail(f"{error.filename or 'memory'}: {_LITTLE}")
         room = "; free space, or choose another folder" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
         _fail(f"{error.filename or 'input or output'}: {error.strerror or error}{room}")
-    except MemoryError:
-        _fail(_LITTLE)
-    except ImportError as error:
-        if not re.search("cannot allocate memory|failed to map segment", str(error).lower()):
+    except (MemoryError, ImportError) as error:
+        if isinstance(error, ImportError) and not re.search("allocate memory|failed to map", str(error)):
             raise
-        _fail(f"{_LITTLE} ({error})")
+        _fail(_LITTLE)
 
 
 _LITTLE = "too little memory; close other programs, raise ulimit -v, or use fewer or smaller photos"

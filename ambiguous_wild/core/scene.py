@@ -127,17 +127,12 @@ class Scene:
         return tuple(v for v in self.views if v.split == "test")
 
     @cached_property
-    def together(self) -> tuple[View, ...]:
-        """The training views (all, where there are none), without the few that `together` leaves out."""
-        return together(self.train or self.views)
-
-    @cached_property
     def extent(self) -> float:
         """1.1 times the largest distance of a training camera from their mean (3DGS's scene extent).
 
         Test cameras do not enter: their poses are not known to a method that trains.
         """
-        centers = np.array([v.camera.center for v in self.together])
+        centers = np.array([v.camera.center for v in together(self.train or self.views)])
         radius = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max(initial=0.0))
         # A capture from one spot has no baseline: the points keep the learning rates finite.
         if radius <= 0.0 and len(self.points):
@@ -150,7 +145,7 @@ def centred(scene: Scene) -> Scene:
 
     What trains and draws counts in float32, from a nearest depth of 0.01 on.
     """
-    centers = np.array([v.camera.center for v in scene.together])
+    centers = np.array([v.camera.center for v in together(scene.train or scene.views)])
     xyz, middle = scene.points.xyz, np.median(centers, axis=0)
     depth = float(np.median(np.linalg.norm(xyz - middle, axis=1))) if len(xyz) else 0.0
     size = max(_away(centers)[1], depth)
@@ -177,11 +172,10 @@ def together(views: tuple[View, ...]) -> tuple[View, ...]:
 
 
 def far_cameras(scene: Scene) -> list[str]:
-    """A warning that names training photos whose cameras `Scene.together` leaves out."""
-    near = {view.name for view in scene.together}
-    far = [view.name for view in scene.train if view.name not in near]
-    told = f"the cameras of {shortlist(far)} lie far from all others, so their poses are probably wrong; "
-    told += "the scene's size is measured without them: check them, or take them out of train_list.txt"
+    """A warning that names the training photos that `together` leaves out."""
+    far = {view.name for view in scene.train} - {view.name for view in together(scene.train)}
+    told = f"the cameras of {shortlist(sorted(far))} lie far from all others, so their poses are probably "
+    told += "wrong; the scene's size is measured without them: check them, or take them out of train_list.txt"
     return [told] if far else []
 
 

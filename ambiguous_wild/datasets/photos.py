@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 
 from ambiguous_wild.builder.downsample import downsample_mask, downsample_photo, downsampled_size
-from ambiguous_wild.builder.undistort import Lens, make_lens
+from ambiguous_wild.builder.undistort import MOST_LOST, Lens, make_lens
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.datasets.foreign import ForeignScene, find_photo, without_suffix
-from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage
+from ambiguous_wild.io.colmap_records import ONE_FOCAL, Model, ModelCamera, ModelImage
 from ambiguous_wild.io.images import MAX_PIXELS, header_size, read_alpha, read_mask, read_png_rgb, write_png
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
@@ -101,7 +101,9 @@ def plan_photos(scene: ForeignScene) -> list[PhotoPlan]:
                 f"{image.name} ({size[0]}x{size[1]}, more than {MAX_PIXELS // 1_000_000} megapixels)"
             )
         elif not _same_shape(size, (camera.width, camera.height)):
-            wrong.append(f"{image.name} ({size[0]}x{size[1]}, its camera {camera.width}x{camera.height})")
+            turned = ", turned as by EXIF" if _same_shape(size[::-1], (camera.width, camera.height)) else ""
+            told = f"its camera {camera.width}x{camera.height}{turned}"
+            wrong.append(f"{image.name} ({size[0]}x{size[1]}, {told})")
         else:
             plans.append(_plan(scene, image, source, camera, size, only_small))
     _refuse_same_stems(scene)
@@ -176,13 +178,7 @@ def resized(camera: ModelCamera, width: int, height: int) -> ModelCamera:
         return camera
     sx, sy = width / camera.width, height / camera.height
     values = list(camera.params)
-    if camera.model in (
-        "SIMPLE_PINHOLE",
-        "SIMPLE_RADIAL",
-        "RADIAL",
-        "SIMPLE_RADIAL_FISHEYE",
-        "RADIAL_FISHEYE",
-    ):
+    if camera.model in ONE_FOCAL:
         # One focal length for both axes: their sizes differ by rounding only.
         values[0] *= (sx + sy) / 2
         values[1], values[2] = values[1] * sx, values[2] * sy
@@ -225,7 +221,8 @@ def place_photo(plan: PhotoPlan, scene: ForeignScene, folder: Path) -> PlacedPho
         target = resized(pinhole, scene.max_width, height)
         notes.append(f"reduced to {scene.max_width} px")
     if lens.map_xy is not None:
-        notes.insert(0, "undistorted")
+        lost = f" without {100 * (1 - lens.share):.0f} % of the photo" if lens.share < MOST_LOST else ""
+        notes.insert(0, f"undistorted{lost}")
     if scene.background is not None:
         notes.insert(0, "put before a background of {}, {}, {}".format(*scene.background))
     small = folder / f"images_{factor}" / name

@@ -236,6 +236,8 @@ def _fill(
             f"alpha of {counted(hidden, 'photo')} hides pixels: they are not learnt from, and psnr_valid of "
             "test photos leaves them out"
         )
+    if lost := [note for p in placed for note in p.notes if note.startswith("undistorted without")]:
+        notes.append(f"{counted(len(lost), 'photo')} {max(lost)}: the lens sees more than a pinhole camera")
     sides = {p.image.name: foreign.split[plan.image.name] for plan, p in zip(plans, placed)}
     scene_model = _write_model(folder, model, placed)
     if settings.motion:

@@ -15,7 +15,7 @@ import shutil
 import stat
 import tempfile
 from collections.abc import Collection, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -168,12 +168,12 @@ def sweep_killed(path: Path | str) -> None:
     start = f".{target.stem}."
     for left in target.parent.glob(glob.escape(start) + "*-*.tmp" + glob.escape(target.suffix)):
         number = left.name.removeprefix(start).partition("-")[0]
-        with suppress(PermissionError):  # another user's process
-            try:
-                if number.isdecimal():
-                    os.kill(int(number), 0)
-            except (ProcessLookupError, OverflowError):
-                left.unlink(missing_ok=True)
+        try:
+            os.kill(int(number), 0)
+        except (ProcessLookupError, OverflowError):
+            left.unlink(missing_ok=True)
+        except (PermissionError, ValueError):  # another user's process, another program's file
+            continue
 
 
 def sweep_siblings(path: Path | str) -> None:

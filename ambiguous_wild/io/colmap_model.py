@@ -6,6 +6,7 @@ memory is allocated: pycolmap takes cut files for whole ones, and allocates what
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path, PurePosixPath
@@ -13,15 +14,16 @@ from typing import TypeVar
 
 import numpy as np
 
-from ambiguous_wild.core.errors import AwError, unknown
+from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.scene import Points, View
 from ambiguous_wild.io.atomic import atomic_path
 from ambiguous_wild.io.colmap_records import (
-    _TWO_FOCALS,
     FOCAL_RANGE,
     LARGEST_COORDINATE,
     LARGEST_SIDE,
     MODELS,
+    ONE_FOCAL,
+    SPLIT_PANORAMAS,
     Model,
     ModelCamera,
     ModelImage,
@@ -32,13 +34,15 @@ from ambiguous_wild.io.colmap_records import (
 
 _OBSERVATION = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 _POINT = struct.Struct("<Q3d3BdQ")  # id, xyz, rgb, error, track length
+# id, seven numbers, id of the camera, and a name that is no number; observations are x, y, id of a point
+_IMAGE_LINE = re.compile(r"\s*\d+(\s+\S+){7}\s+\d+\s+(?![-+.\d]+(\s|$))\S")
 _POINT_ROW = np.dtype(
     [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")]
 )
 
 
 def read_model(folder: Path | str) -> Model:
-    """Read cameras, images and points3D of a model folder: .bin if there, else .txt.
+    """Read cameras, images and points3D, which may be absent, of a model folder: .bin if there, else .txt.
 
     Raises:
         AwError: files are missing, damaged or contradictory.
@@ -46,12 +50,13 @@ def read_model(folder: Path | str) -> Model:
     root = Path(folder)
     for suffix in (".bin", ".txt"):
         paths = [root / (stem + suffix) for stem in ("cameras", "images", "points3D")]
-        if all(p.is_file() for p in paths):
+        if all(p.is_file() for p in paths[:2]):
             break
     else:
-        raise AwError(f"{root} holds no COLMAP model: cameras, images and points3D (.bin or .txt) are needed")
+        raise AwError(f"{root} holds no COLMAP model: cameras and images (.bin or .txt) are needed")
     cameras, images, points = _BINARY if suffix == ".bin" else _TEXT
-    model = Model(cameras(paths[0]), images(paths[1]), points(paths[2]))
+    none = points_without_tracks(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+    model = Model(cameras(paths[0]), images(paths[1]), points(paths[2]) if paths[2].is_file() else none)
     for camera in model.cameras.values():
         check_camera(root, camera)
     names: set[str] = set()
@@ -94,7 +99,9 @@ def check_camera(root: Path, camera: ModelCamera) -> None:
     """
     size = (camera.width, camera.height)
     whole = all(0 < side <= LARGEST_SIDE for side in size) and bool(np.isfinite(camera.params).all())
-    focal = camera.params[:2] if camera.model in _TWO_FOCALS else camera.params[:1]
+    if camera.model == "EQUIRECTANGULAR":
+        raise AwError(f"{root}: camera {camera.camera_id} is EQUIRECTANGULAR; {SPLIT_PANORAMAS}")
+    focal = camera.params[:1] if camera.model in ONE_FOCAL else camera.params[:2]
     if not whole or not all(FOCAL_RANGE[0] <= f / max(size) <= FOCAL_RANGE[1] for f in focal):
         raise AwError(
             f"{root}: camera {camera.camera_id} is {size[0]}x{size[1]} px with the parameters "
@@ -220,18 +227,25 @@ def _text_cameras(path: Path) -> dict[int, ModelCamera]:
         except (ValueError, IndexError) as error:
             raise _damaged(path, number) from error
         if model not in MODELS:
-            raise unknown(f"camera model in {path}", model, MODELS)
+            raise AwError(
+                f"{path}, line {number}: camera model {model[:40]!r} is not known; convert it with COLMAP's "
+                f"model_converter to one of {', '.join(MODELS)}"
+            )
         if len(params) != MODELS[model][1]:
-            raise _damaged(path, number)
+            told = f"{model} has {MODELS[model][1]} parameters, not {len(params)}"
+            raise AwError(f"{path}, line {number}: {told}; copy or build the model again")
         _add(path, cameras, camera_id, ModelCamera(camera_id, model, width, height, params))
     return cameras
 
 
 def _text_images(path: Path) -> dict[int, ModelImage]:
-    """images.txt: two lines an image; the second, of observations, may be empty."""
+    """images.txt: two lines an image; the second, of observations, may be empty, or absent from all."""
     lines = [(n, text) for n, text in enumerate(_lines(path), 1) if not text.startswith("#")]
     while lines and not lines[0][1].strip():
         lines.pop(0)
+    full = [line for line in lines if line[1].strip()]
+    if len(full) > 1 and all(_IMAGE_LINE.match(text) for _, text in full):
+        lines = [line for image in full for line in (image, (image[0], ""))]
     images: dict[int, ModelImage] = {}
     for i in range(0, len(lines), 2):
         number, text = lines[i]
@@ -280,7 +294,7 @@ def _text_points(path: Path) -> ModelPoints:
 
 
 def _lines(path: Path) -> list[str]:
-    return path.read_text(encoding="utf-8", errors="surrogateescape").split("\n")
+    return path.read_text(encoding="utf-8-sig", errors="surrogateescape").split("\n")
 
 
 def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:

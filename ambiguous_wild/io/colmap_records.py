@@ -23,11 +23,19 @@ MODELS = {
     "SIMPLE_RADIAL_FISHEYE": (8, 4),
     "RADIAL_FISHEYE": (9, 5),
     "THIN_PRISM_FISHEYE": (10, 12),
+    "RAD_TAN_THIN_PRISM_FISHEYE": (11, 16),  # from here on COLMAP 4
+    "SIMPLE_DIVISION": (12, 4),
+    "DIVISION": (13, 5),
+    "SIMPLE_FISHEYE": (14, 3),
+    "FISHEYE": (15, 4),
+    "EUCM": (16, 6),
+    "EQUIRECTANGULAR": (17, 2),  # named only, see `check_camera`
 }
 LARGEST_SIDE = 1_000_000  # px
 LARGEST_COORDINATE = 1e18  # world units; its square is finite in float32
 FOCAL_RANGE = (1e-3, 1e6)  # focal length over the longer side
-_TWO_FOCALS = {"PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE"}
+ONE_FOCAL = {name for name in MODELS if name.startswith(("SIMPLE_", "RADIAL"))}
+SPLIT_PANORAMAS = "split 360 degree photos into pinhole views first, as COLMAP's panorama_sfm.py does"
 _BY_ID = {number: (name, count) for name, (number, count) in MODELS.items()}
 
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.extras import install_command
+from ambiguous_wild.io.colmap_records import SPLIT_PANORAMAS
 from ambiguous_wild.io.images import MAX_PIXELS, pillow
 
 PHOTO_SUFFIXES = (
@@ -64,11 +65,6 @@ class Exif:
         return self.focal_35mm * math.hypot(width, height) / _DIAGONAL_35MM
 
 
-def is_utf8(name: str) -> bool:
-    """Whether lists and other programs can hold a file's name; Python keeps other bytes as surrogates."""
-    return not any("\ud800" <= c <= "\udfff" for c in name)
-
-
 class UnreadablePhoto(AwError):
     """A photo that cannot be used; `reason` is the message without the name."""
 
@@ -101,8 +97,6 @@ def read_photo(
     import OpenImageIO as oiio
 
     source = Path(path)
-    if not is_utf8(str(source)):
-        raise UnreadablePhoto(ascii(str(source)), "its name is not UTF-8; rename it")
     form = _sniff(source)
     if form == "heic":
         return _read_heic(source)
@@ -113,6 +107,8 @@ def read_photo(
     try:
         spec = reader.spec()
         _check_size(source, spec.width, spec.height)
+        if spec.getattribute("GPano:ProjectionType") == "equirectangular":
+            raise UnreadablePhoto(source, f"a 360 degree photo; {SPLIT_PANORAMAS}")
         if str(spec.format) not in ("uint8", "uint16"):
             raise UnreadablePhoto(
                 source, f"pixels of type {spec.format} are not supported; export 8 or 16 bits"
@@ -127,7 +123,7 @@ def read_photo(
     exif = exif_from_spec(spec)
     if exif.orientation != 1:
         notes.append(f"turned upright (EXIF orientation {exif.orientation})")
-        rgb = _upright(rgb, exif.orientation)
+        rgb = upright(rgb, exif.orientation)
     notes += _misnamed(source, form)
     height, width = rgb.shape[:2]
     plain = not notes and form in ("jpeg", "png")
@@ -315,7 +311,7 @@ def _three_channels(
     return pixels, ["CMYK converted to RGB without its profile"] if space == "CMYK" else []
 
 
-def _upright(image: np.ndarray, orientation: int) -> np.ndarray:
+def upright(image: np.ndarray, orientation: int) -> np.ndarray:
     """Apply EXIF orientation 1..8 (EXIF 2.32, tag 274)."""
     if orientation in (5, 6, 7, 8):
         image = image.transpose(1, 0, 2)

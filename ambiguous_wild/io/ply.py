@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import IO
@@ -97,21 +98,18 @@ def read_place(path: Path | str) -> Place:
     """Where the scene of a splat PLY of `write_splat_ply` lies; another tool's: where it is.
 
     Raises:
-        AwError: the file cannot be read, or its numbers are none.
+        AwError: its numbers are none.
     """
+    with open(path, "rb") as f:
+        words = re.findall(rb"^comment (?:offset|training_scale) (.+)$", f.read(_MAX_HEADER), re.MULTILINE)
+    if len(words) != 2:
+        return UNMOVED
     try:
-        with open(path, "rb") as f:
-            head = f.read(_MAX_HEADER).split(b"end_header")[0].decode("latin-1")
-        told = {w[1]: w[2:] for w in map(str.split, head.splitlines()) if w[:1] == ["comment"] and len(w) > 2}
-        if "training_scale" not in told:
-            return UNMOVED
-        x, y, z, scale = map(float, [*told["offset"], *told["training_scale"]])
-        if not (np.isfinite([x, y, z, scale]).all() and scale > 0):
-            raise ValueError
-    except OSError as error:
-        raise AwError(f"cannot read {path}: {error.strerror or error}") from None
-    except (KeyError, ValueError):
-        raise AwError(f"{path}: its comments offset and training_scale are damaged; train again") from None
+        x, y, z, scale = map(float, b" ".join(words).split())
+    except ValueError:
+        scale = np.nan
+    if not (scale > 0 and np.isfinite([x, y, z, scale]).all()):
+        raise AwError(f"{path}: its comments offset and training_scale are damaged; train again")
     return Place((x, y, z), scale)
 
 
@@ -182,7 +180,8 @@ def write_point_ply(
 ) -> None:
     """Write a point cloud, binary."""
     # Coordinates of a map have more digits than float32.
-    far = len(xyz) and np.abs(xyz).max() > 1e3 * np.ptp(xyz, axis=0).max()
+    middle = np.median(xyz, axis=0) if len(xyz) else np.zeros(3)
+    far = len(xyz) and np.abs(middle).max() > 100 * np.median(np.abs(xyz - middle))
     form, kind = ("<f8", "double") if far else ("<f4", "float")
     table = np.empty(len(xyz), [*((axis, form) for axis in "xyz"), *((c, "u1") for c in _COLOURS)])
     for names, values in (("xyz", xyz), (_COLOURS, rgb)):

@@ -13,6 +13,7 @@ from typing import Literal
 
 import numpy as np
 
+from ambiguous_wild.core import AwError
 from ambiguous_wild.splat.parts import Schedule
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, TrainData
 from ambiguous_wild.splat.watchdog import OnNonFinite
@@ -106,6 +107,10 @@ class TrainConfig:
     on_nonfinite: OnNonFinite = (
         "stop"  # or go back to the last checkpoint and leave the photo out, see watchdog.py
     )
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.iterations <= 100_000_000:  # months on a GPU
+            raise AwError(f"--iterations {self.iterations} is not from 1 to 100 000 000")
 
 
 class Pace:

@@ -33,6 +33,8 @@ from ambiguous_wild.splat.run import Probe, Run
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Shot, Step, TrainData
 from ambiguous_wild.splat.watchdog import Sentinel
 
+MOST_KEEP = 1e4  # methods weigh sure pixels by more than 1, none by so much
+
 
 class Trainer(Run):
     """Trains one model on one scene; stops and resumes at any iteration with the same bits."""
@@ -193,6 +195,12 @@ class Trainer(Run):
             raise AwError(
                 f"keep(step) of the method's mask policy gave a {type(keep).__name__}; it must give a torch "
                 "tensor [H, W], or None (docs/add-a-method.md)"
+            )
+        on_cpu = self.sentinel is None and keep is not None
+        if on_cpu and ((low := float(keep.min())) < -0.01 or float(keep.max()) > MOST_KEEP):
+            raise AwError(
+                f"keep(step) of the method's mask policy gave values from {low:.3g} to {keep.max():.3g}: "
+                f"weights of pixels are 0 where masked, 1 where kept, and at most {MOST_KEEP:g}"
             )
         user = self.data.user_keep[step.view]
         if user is None:

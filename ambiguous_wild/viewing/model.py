@@ -12,6 +12,7 @@ import numpy as np
 
 from ambiguous_wild.core import UNMOVED, AwError, Camera, Place, Scene, View
 from ambiguous_wild.core.errors import unknown
+from ambiguous_wild.core.scene import together
 from ambiguous_wild.io.atomic import sweep_killed
 from ambiguous_wild.io.images import read_png_rgb, to_uint8
 from ambiguous_wild.io.ply import read_place, read_splat_ply, rescaled, splat_count
@@ -31,7 +32,7 @@ class Space:
 
 def space_of(scene: Scene) -> Space:
     """Up is the mean of the photos' own up; the middle lies at the median depth of what each photo shows."""
-    views = scene.together
+    views = together(scene.train or scene.views)
     poses = np.array([v.camera.cam_from_world for v in views])
     up = -poses[:, 1, :3].mean(axis=0)
     size = np.linalg.norm(up)

@@ -6,7 +6,8 @@ import pytest
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.undistort import make_lens, undistort
 from ambiguous_wild.core import AwError
-from ambiguous_wild.io.colmap_model import read_model
+from ambiguous_wild.datasets.photos import resized
+from ambiguous_wild.io.colmap_model import read_model, write_model
 from ambiguous_wild.io.colmap_records import ModelCamera
 from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
 from ambiguous_wild.io.safe_pycolmap import pycolmap
@@ -48,6 +49,49 @@ def test_points_and_pixels_go_the_same_way():
         rows, columns = np.indices(flat.shape)
         seen = np.array([(flat * (columns + 0.5)).sum(), (flat * (rows + 0.5)).sum()]) / flat.sum()
         assert np.allclose(seen, lens.undistort_points(np.array([[x + 0.5, y + 0.5]]))[0], atol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("model", "more"),
+    [
+        ("SIMPLE_DIVISION", (0.1,)),
+        ("DIVISION", (0.1,)),
+        ("SIMPLE_FISHEYE", ()),
+        ("FISHEYE", ()),
+        ("EUCM", (0.5, 1.0)),
+        ("RAD_TAN_THIN_PRISM_FISHEYE", (0.0,) * 12),
+    ],
+)
+def test_lenses_of_colmap_4_are_read_and_bent_back(model, more, tmp_path):
+    """Oracle: pycolmap projects a ray through both cameras; the map joins the two pixels."""
+    focal = (150.0,) if model.startswith("SIMPLE") else (150.0, 150.0)
+    camera = ModelCamera(1, model, 320, 240, (*focal, 160.0, 120.0, *more))
+    known = make_model(["a.jpg"], 3)
+    write_model(tmp_path, dataclasses.replace(known, cameras={1: camera, **known.cameras}))
+    assert read_model(tmp_path).cameras[1] == camera
+    lens = make_lens(camera)
+    ray = np.array([[0.3, -0.2, 1.0]])
+    fx, fy, cx, cy = lens.pinhole.pinhole()
+    column, row = int(fx * 0.3 + cx), int(fy * -0.2 + cy)
+    ray = np.array([[(column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy, 1.0]])
+    seen = np.asarray(lens.camera.img_from_cam(ray))[0]
+    assert [m[row, column] + 0.5 for m in lens.map_xy] == pytest.approx(seen, abs=1e-3)
+    small = resized(camera, 160, 120)
+    assert small.params[: len(focal) + 2] == pytest.approx([v / 2 for v in camera.params[: len(focal) + 2]])
+
+
+def test_what_undistortion_leaves_is_measured_and_nonsense_refused():
+    """A fisheye of 171 degrees: the pinhole camera keeps the middle."""
+    wide = make_lens(ModelCamera(1, "FISHEYE", 320, 320, (107.0, 107.0, 160.0, 160.0)))
+    seen = np.stack(wide.map_xy).reshape(2, -1)
+    whole = (np.ptp(seen[0]) + 1) * (np.ptp(seen[1]) + 1) / 320**2  # of its bounding box: an upper limit
+    assert 0.1 < wide.share <= whole < 1
+    assert make_lens(CAMERA).share > 0.8
+    for k in (1e6, -1e6, -10.0):
+        with pytest.raises(
+            AwError, match=r"camera 1 .SIMPLE_RADIAL, .* % of its photo: check the parameters"
+        ):
+            make_lens(ModelCamera(1, "SIMPLE_RADIAL", 320, 240, (300.0, 160.0, 120.0, k)))
 
 
 def test_without_distortion_nothing_moves():

@@ -162,6 +162,24 @@ def test_unfinished_and_damaged_runs_are_listed(tmp_path: Path) -> None:
     assert len(runs.runs) == 1
 
 
+@pytest.mark.parametrize(
+    "odd", [{"ssim": 2.5}, {"psnr": -1.0}, {"cost": {"train_s": -5.0}}, {"masks": {"iou": 1.2}}]
+)
+def test_numbers_that_no_measurement_gives_are_left_out_and_named(
+    odd: dict[str, Any], tmp_path: Path
+) -> None:
+    save(tmp_path, fake_result("3dgs"), fake_result("b", seed=1))
+    path = next(tmp_path.rglob("b/seed1/metrics.json"))
+    data = json.loads(path.read_text())
+    (data if {"cost", "masks"} & set(odd) else data["per_image"][0]).update(
+        {k: {**(data[k] or {}), **v} if isinstance(v, dict) else v for k, v in odd.items()}
+    )
+    path.write_text(json.dumps(data))
+    runs = read_runs(tmp_path)
+    assert list(runs.runs["method"]) == ["3dgs"]
+    assert "such a number" in runs.incomplete[0].reason and str(path) in runs.incomplete[0].reason
+
+
 def test_a_failed_run_counts_unless_it_was_finished_since(tmp_path: Path) -> None:
     save(tmp_path, failed("a"), failed("b"), fake_result("b"))
     assert (tmp_path / "yard" / "a" / "seed0" / "failed.json").exists()

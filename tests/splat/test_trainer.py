@@ -13,13 +13,14 @@ import numpy as np
 import pytest
 import torch
 
+from ambiguous_wild.core import AwError
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import get_method
 from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.cpu import set_threads
 from ambiguous_wild.splat.data import shrink, shrink_keep
 from ambiguous_wild.splat.effects import with_effects
-from ambiguous_wild.splat.pace import Level, ceiling_at, coarse_to_fine, divisor_at
+from ambiguous_wild.splat.pace import Level, TrainConfig, ceiling_at, coarse_to_fine, divisor_at
 from ambiguous_wild.splat.parts import MaskPolicy, Parts
 from tests.splat.scenes import bits, trained, trainer_for
 from tests.tiny_scene import write_tiny_scene
@@ -192,6 +193,22 @@ def test_photos_that_are_all_masked_teach_nothing_and_are_named(scene, tmp_path)
     trainer.train()
     assert bits(trainer) == before
     assert trainer.skipped_views == [v.name for v in scene.train]
+
+
+@pytest.mark.parametrize("value", [-5.0, 1e30])
+def test_keep_maps_of_absurd_values_are_refused(scene, tmp_path, value):
+    class Absurd(MaskPolicy):
+        def keep(self, step):
+            return torch.full(step.photo.shape[:2], value)
+
+    with pytest.raises(AwError, match="gave values from"):
+        trainer_for(scene, tmp_path, parts=Parts(mask=Absurd())).step()
+
+
+def test_a_length_that_nobody_trains_is_refused():
+    for iterations in (0, 10**20 - 1):
+        with pytest.raises(AwError, match="--iterations"):
+            TrainConfig(iterations=iterations)
 
 
 class _Counting(MaskPolicy):

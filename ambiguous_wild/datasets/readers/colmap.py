@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 from ambiguous_wild.core.errors import AwError, shortlist, unknown
@@ -10,7 +11,7 @@ from ambiguous_wild.core.scene import Split
 from ambiguous_wild.datasets.foreign import SIDES, ForeignScene, every_nth, inside, split_by_lists
 from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.colmap_records import Model
-from ambiguous_wild.io.scene_folder import models_in, read_list, several_models
+from ambiguous_wild.io.scene_folder import models_in, read_list, registered, several_models
 
 LISTS: dict[Split, str] = {"train": "train_list.txt", "test": "test_list.txt"}
 KEYWORDS: dict[str, Split | None] = {"clutter": "train", "extra": "test", "clean": None}
@@ -26,8 +27,10 @@ def model_folder(root: Path, chosen: str = "") -> Path | None:
         AwError: none is called `chosen`.
     """
     models = models_in(root, MODEL_FOLDERS)
-    if not chosen or not models:
-        return models[0][0] if models else None
+    if not models:
+        return next((f for f in (root, root / "images") if registered(f)), None)  # beside the photos
+    if not chosen:
+        return models[0][0]
     by_name = {folder.name: folder for folder, _ in models}
     if chosen not in by_name:
         raise unknown("model", chosen, by_name)
@@ -37,7 +40,8 @@ def model_folder(root: Path, chosen: str = "") -> Path | None:
 def which_model(root: Path, chosen: str = "") -> str:
     """What is said where there are several models; empty for one."""
     folder = model_folder(root, chosen)
-    return "" if folder is None else several_models(models_in(root, MODEL_FOLDERS), folder)
+    models = models_in(root, MODEL_FOLDERS)
+    return several_models(models, folder) if folder is not None and models else ""
 
 
 def read_named_model(root: Path, chosen: str = "") -> Model:
@@ -53,7 +57,12 @@ def read_named_model(root: Path, chosen: str = "") -> Model:
             "with 'aw build-scene'"
         )
     model = read_model(folder)
-    for image in model.images.values():
+    for number, image in model.images.items():
+        if "\\" in image.name:  # written on Windows: below its folder of photos, or somewhere on its disk
+            name = image.name.replace("\\", "/")
+            name = f"/{name}".rpartition("/images/")[2].removeprefix("/")
+            name = name.rpartition("/")[2] if name[1:2] == ":" else name
+            model.images[number] = image = replace(image, name=name)
         inside(image.name, root)
     return model
 
@@ -68,6 +77,8 @@ def photo_folder(root: Path) -> Path:
     for folder in (root / "images", root / "dense" / "images"):
         if folder.is_dir():
             return folder
+    if registered(root):
+        return root
     return root / "images"  # absent where a release ships downsampled photos alone
 
 

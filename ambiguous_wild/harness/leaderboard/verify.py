@@ -36,7 +36,7 @@ from ambiguous_wild.harness.running.result_file import (
     metrics_of,
     read_result,
 )
-from ambiguous_wild.harness.running.store import read_config
+from ambiguous_wild.harness.running.store import impossible_values, read_config
 from ambiguous_wild.harness.running.timing import timing_of
 from ambiguous_wild.io.hashing import sha256_file
 from ambiguous_wild.io.images import read_png_rgb
@@ -44,7 +44,6 @@ from ambiguous_wild.io.images import read_png_rgb
 ENVIRONMENT = "env.json"
 RENDERS = Path("renders") / "test"
 REQUIRED = ("psnr", "ssim", "ssim_inria")  # no reason excuses it: they need nothing but the two pictures
-ROUNDING = 1e-9  # by which a share computed in floats may leave its range
 
 
 class Unfinished(AwError):
@@ -240,25 +239,17 @@ def _check_values(run: Path, result: RunResult, *, photos: bool) -> None:
         lacking = [row["name"] for row in rows if metrics_of(row).get(metric) is None]
         if lacking:
             _partial(run, f"no {metric} of {shortlist(lacking)}, which every run measures")
+    for impossible in impossible_values(result):
+        _impossible(run, *impossible)
     for row in rows:
         for metric, value in metrics_of(row).items():
             about = measure(metric)
             if value is None or not isinstance(about, Metric):
                 continue
-            if not about.low - ROUNDING <= value <= about.high + ROUNDING:
-                why = f"lies between {about.low:g} and {about.high:g}"
-                _impossible(run, f"{metric} of {row['name']}", value, why)
             if math.isinf(value) and not (about.infinite and photos):
                 why = "is infinite only where picture and photo are equal, and the photos are not at hand: "
                 why = f"{why}name them with --scene" if about.infinite else "is finite"
                 _impossible(run, f"{metric} of {row['name']}", value, why)
-    masks: Mapping[str, Any] = result["masks"] or {}
-    for name in MASK_LABELS:
-        if masks.get(name) is not None and not 0.0 <= masks[name] <= 1.0 + ROUNDING:
-            _impossible(run, f"masks.{name}", masks[name], "is a share, from 0 to 1")
-    for name, amount in result["cost"].items():
-        if isinstance(amount, (int, float)) and not (math.isfinite(amount) and amount >= 0):
-            _impossible(run, f"cost.{name}", amount, "is finite and not below 0")
 
 
 def _impossible(run: Path, what: str, value: float, why: str) -> NoReturn:

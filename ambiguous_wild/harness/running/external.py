@@ -13,7 +13,7 @@ from typing import Any, cast
 import numpy as np
 import torch
 
-from ambiguous_wild.core import UNMOVED, AwError, Camera, Place, Scene, View
+from ambiguous_wild.core import UNMOVED, AwError, Camera, Scene, View
 from ambiguous_wild.harness.running import evaluate
 from ambiguous_wild.harness.running.cell import Cell
 from ambiguous_wild.harness.running.choosing import NOT_OURS
@@ -70,13 +70,7 @@ def run_program(cell: Cell, folder: Path) -> RunResult:
         | ({"drawn_by": "ambiguous_wild"} if produced.drawn_by_us else {})
         | ({} if cell.protocol == "full" else {"protocol": cell.protocol}),
         cost=cast(
-            Cost,
-            {
-                "device": cell.device,
-                **produced.cost,
-                **time_cost,
-                **_model(produced, folder, cell.scene.place),
-            },
+            Cost, {"device": cell.device, **produced.cost, **time_cost, **_model(cell, produced, folder)}
         ),
     )
 
@@ -190,18 +184,18 @@ def _masks(scene: Scene, masks: Mapping[str, Path], folder: Path) -> MaskScores 
     return evaluate.write_keeps(scene, keeps(), folder)
 
 
-def _model(produced: Produced, folder: Path, place: Place) -> dict[str, float]:
+def _model(cell: Cell, produced: Produced, folder: Path) -> dict[str, float]:
     """Number and size of the splats, which become point_cloud.ply of the run."""
     if produced.ply is None:
         return {}
     target = folder / "point_cloud.ply"
     with atomic_path(target) as temporary:
-        if place != UNMOVED:
-            write_splat_ply(temporary, read_splat_ply(produced.ply), place)
-            return {"gaussians": splat_count(temporary), "model_mb": temporary.stat().st_size / 1e6}
         temporary.unlink()
         try:
-            os.link(produced.ply, temporary)
+            if cell.scene.place != UNMOVED:
+                write_splat_ply(temporary, read_splat_ply(produced.ply), cell.scene.place)
+            else:
+                os.link(produced.ply, temporary)
         except OSError:  # another file system, or one without hard links
             shutil.copyfile(produced.ply, temporary)
     return {"gaussians": splat_count(target), "model_mb": target.stat().st_size / 1e6}

@@ -15,7 +15,7 @@ import pandas as pd
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import flatten
 from ambiguous_wild.core.errors import counted
-from ambiguous_wild.harness.measures import MASK_LABELS, measure
+from ambiguous_wild.harness.measures import MASK_LABELS, Metric, measure
 from ambiguous_wild.harness.running.result_file import FAILED, RESULT, RunResult, metrics_of, read_result
 from ambiguous_wild.harness.running.timing import timing_of
 from ambiguous_wild.io import plain_yaml
@@ -110,13 +110,37 @@ def _read_folder(root: Path, incomplete: list[Incomplete]) -> list[FoundResult]:
                 raise AwError(
                     f"no {RESULT}: still running, or stopped; run the same command again to finish it"
                 )
-            results.append((run, read_result(paths[0])))
+            result = read_result(paths[0])
+            for what, value, why in impossible_values(result):
+                raise AwError(f"{paths[0]} was changed: {what} is {value:g}, and such a number {why}")
+            results.append((run, result))
         except AwError as error:
             incomplete.append(Incomplete(run, str(error), *_method_and_scene(run)))
     if not results and len(incomplete) == before:
         raise _no_run(root)
     _refuse_duplicates(results)
     return results
+
+
+ROUNDING = 1e-9  # by which a share computed in floats may leave its range
+
+
+def impossible_values(result: RunResult) -> Iterator[tuple[str, float, str]]:
+    """Numbers that no measurement can give: which, the value, and what such a number is instead."""
+    for row in result["per_image"]:
+        for metric, value in metrics_of(row).items():
+            about = measure(metric)
+            if value is None or not isinstance(about, Metric):
+                continue
+            if not about.low - ROUNDING <= value <= about.high + ROUNDING:
+                yield f"{metric} of {row['name']}", value, f"lies between {about.low:g} and {about.high:g}"
+    masks: Mapping[str, Any] = result["masks"] or {}
+    for name in MASK_LABELS:
+        if masks.get(name) is not None and not 0.0 <= masks[name] <= 1.0 + ROUNDING:
+            yield f"masks.{name}", masks[name], "is a share, from 0 to 1"
+    for name, amount in result["cost"].items():
+        if isinstance(amount, (int, float)) and not (math.isfinite(amount) and amount >= 0):
+            yield f"cost.{name}", amount, "is finite and not below 0"
 
 
 def _no_run(root: Path) -> AwError:

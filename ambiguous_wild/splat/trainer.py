@@ -196,12 +196,13 @@ class Trainer(Run):
                 f"keep(step) of the method's mask policy gave a {type(keep).__name__}; it must give a torch "
                 "tensor [H, W], or None (docs/add-a-method.md)"
             )
-        on_cpu = self.sentinel is None and keep is not None
-        if on_cpu and ((low := float(keep.min())) < -0.01 or float(keep.max()) > MOST_KEEP):
-            raise AwError(
-                f"keep(step) of the method's mask policy gave values from {low:.3g} to {keep.max():.3g}: "
-                f"weights of pixels are 0 where masked, 1 where kept, and at most {MOST_KEEP:g}"
-            )
+        if self.sentinel is None and keep is not None:  # on the CPU, where reading costs nothing
+            low, high = keep.min().item(), keep.max().item()
+            if low < -0.01 or high > MOST_KEEP:
+                raise AwError(
+                    f"keep(step) of the method's mask policy gave values from {low:.3g} to {high:.3g}: "
+                    f"weights of pixels are 0 where masked, 1 where kept, and at most {MOST_KEEP:g}"
+                )
         user = self.data.user_keep[step.view]
         if user is None:
             return keep

@@ -165,10 +165,16 @@ def centred(scene: Scene) -> Scene:
 
 def together(views: tuple[View, ...]) -> tuple[View, ...]:
     """The views without the few, if any, whose cameras lie far from the rest: their poses are wrong."""
-    away, usual = _away(np.array([v.camera.center for v in views]))
-    far = away > _FAR_CAMERA * usual
-    few = usual > 0.0 and 0 < far.sum() <= max(1, _FEW_CAMERAS * len(views))
-    return tuple(v for v, out in zip(views, far) if not out) if few else views
+    near = near_others(np.array([v.camera.center for v in views]))
+    return views if near.all() else tuple(v for v, inside in zip(views, near) if inside)
+
+
+def near_others(centers: np.ndarray) -> np.ndarray:
+    """[N] bool, positions [N, 3] of cameras that do not lie far from all others; all, unless few lie so."""
+    away, usual = _away(centers)
+    near = away <= _FAR_CAMERA * usual
+    few = usual > 0.0 and (~near).sum() <= max(1, _FEW_CAMERAS * len(centers))
+    return near if few else np.ones(len(centers), bool)
 
 
 def far_cameras(scene: Scene) -> list[str]:

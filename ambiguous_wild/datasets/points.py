@@ -19,7 +19,7 @@ from ambiguous_wild.builder.retrieval import MOTIONS
 from ambiguous_wild.builder.settings import BuildSettings, Effort, plans
 from ambiguous_wild.builder.sfm import DATABASE, MotionJob, TriangulationJob, extract_features, match, run_job
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.core.scene import Split
+from ambiguous_wild.core.scene import Split, near_others
 from ambiguous_wild.io.colmap_model import read_model, write_model
 from ambiguous_wild.io.colmap_records import MODELS, Model, ModelImage, ModelPoints, points_without_tracks
 
@@ -62,6 +62,7 @@ def random_points(model: Model, split: Mapping[str, Split], *, blender: bool, se
     if not blender:
         poses = [i.cam_from_world() for i in model.images.values() if split.get(i.name) == "train"]
         centres = np.array([-p[:3, :3].T @ p[:3, 3] for p in poses])
+        centres = centres[near_others(centres)]
         centre = centres.mean(axis=0)
         half = CAMERA_SIDE * float(np.linalg.norm(centres - centre, axis=1).max())
     xyz = centre + (half or 1.0) * generator.uniform(-1, 1, (RANDOM_POINTS, 3))

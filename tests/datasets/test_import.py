@@ -333,7 +333,7 @@ def _protocol(root):
         (_long_split, "they belong to two scenes"),
         (_outside, "outside itself"),
         (_matrix, "clutter000.png"),
-        (_turned, "clutter001.png (36x64, its camera 64x36)"),
+        (_turned, "clutter001.png (36x64, its camera 64x36, turned"),
         (lambda root: root.mkdir(), "no known layout"),
     ],
 )

@@ -12,7 +12,10 @@ def fake_result(
     method: str, scene: str = "yard", seed: int = 0, psnr: tuple[float, ...] = (20.0, 22.0), **changes: Any
 ) -> dict[str, Any]:
     """A finished result with one image for every PSNR; `changes` replace top-level fields."""
-    images = [{"name": f"{i}.png", "psnr": p, "ssim": p / 50, "lpips_alex": None} for i, p in enumerate(psnr)]
+    images = [
+        {"name": f"{i}.png", "psnr": p, "ssim": min(p / 50, 1.0), "lpips_alex": None}
+        for i, p in enumerate(psnr)
+    ]
     result: dict[str, Any] = {
         "schema": 1,
         "method": method,

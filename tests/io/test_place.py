@@ -12,6 +12,8 @@ import pytest
 
 from ambiguous_wild.core import Camera, Place
 from ambiguous_wild.datasets.export import export_scene
+from ambiguous_wild.datasets.points import random_points
+from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.ply import read_place, read_point_ply, read_splat_ply, write_splat_ply
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.viewing.model import FORMATS, Model, Renderer, export, space_of
@@ -150,6 +152,9 @@ def test_one_camera_far_away_is_named_and_changes_no_size(tmp_path: Path, side: 
     assert len(named) == (side == "train") and all(name in w for w in named)
     assert scene.place == Place() and scene.extent == pytest.approx(usual.extent, rel=0.3)
     assert space_of(scene).distance == pytest.approx(space_of(usual).distance, rel=0.2)
+    model_there = read_model(tmp_path / "far" / "sparse" / "0")
+    random = random_points(model_there, {v.name: v.split for v in scene.views}, blender=False)
+    assert np.abs(random.xyz).max() < 30
     for film in (orbit, through_views):
         if (film, side) != (through_views, "test"):  # one of two test cameras: no telling which is wrong
             centers = np.array([c.center for c in film(scene, 8, (64, 48))])

@@ -74,7 +74,7 @@ def test_colmap_binary_with_a_point_number_beyond_all_integers(tmp_path):
     write_model(tmp_path, make_model(["a.png"]))
     row = struct.pack("<QQ3d3BdQ", 1, 2**64 - 1, 0, 0, 0, 1, 2, 3, 0.5, 0)
     (tmp_path / "points3D.bin").write_bytes(row)
-    with pytest.raises(AwError, match="18446744073709551615"):
+    with pytest.raises(AwError, match="damaged"):
         read_model(tmp_path)
 
 

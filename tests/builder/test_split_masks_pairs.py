@@ -80,7 +80,7 @@ def test_masks_are_found_under_both_names(tmp_path):
     found = find_masks(tmp_path / "m", facts(3), "error")
     assert sorted(found) == ["p0", "p1", "p2"]
     (tmp_path / "out").mkdir()
-    shares = lay_out_masks(tmp_path / "out", found, facts(3))["kept_share"]
+    shares = lay_out_masks(tmp_path / "out", found, facts(3), {})["kept_share"]
     assert shares == {"p0": 1.0, "p1": 1.0, "p2": 0.0}
     assert read_gray(tmp_path / "out" / "masks" / "p0.jpg.png").min() == 255  # 200 counts as white
 
@@ -91,7 +91,7 @@ def test_missing_masks_are_named_or_the_photo_is_kept_whole(tmp_path):
         find_masks(tmp_path / "m", facts(3), "error")
     found = find_masks(tmp_path / "m", facts(3), "keep")
     (tmp_path / "out").mkdir()
-    lay_out_masks(tmp_path / "out", found, facts(3))
+    lay_out_masks(tmp_path / "out", found, facts(3), {})
     assert read_gray(tmp_path / "out" / "masks" / "p2.jpg.png").min() == 255
 
 

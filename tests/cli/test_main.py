@@ -88,9 +88,10 @@ def test_a_reader_that_leaves_is_no_error() -> None:
         ("methods > /dev/full", 2, "No space left on device; free space"),
     ],
 )
-def test_a_closed_or_full_output_is_no_traceback(line: str, code: int, expected: str) -> None:
+def test_a_closed_or_full_output_is_no_traceback(line: str, code: int, expected: str, tmp_path: Path) -> None:
     command = f"{sys.executable} -m ambiguous_wild.cli.main {line}"
-    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
+    env = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, cwd=tmp_path, env=env)
     assert done.returncode == code and expected in done.stderr and done.stderr.count("\n") <= 1, done.stderr
 
 

@@ -69,6 +69,15 @@ def find_file(name: str, files: tuple[str, ...]) -> Path | None:
     return next((path for path in paths if path.is_file()), None)
 
 
+def _fits(path: Path) -> bool:
+    """Whether memory holds a file twice: if it does, one that asked for too much is damaged."""
+    try:
+        bytearray(2 * path.stat().st_size)
+    except MemoryError:
+        return False
+    return True
+
+
 def read_tensors(path: Path, advice: str = "download it again") -> dict[str, Tensor]:
     """The tensors of a .safetensors file, or of a file of torch, read with ``weights_only``.
 
@@ -94,11 +103,12 @@ def read_tensors(path: Path, advice: str = "download it again") -> dict[str, Ten
             raise AwError(f"{path} holds no dictionary of tensors; {advice}")
         tensors = {str(key): value.detach() for key, value in data.items()}
         broken = not_finite(tensors)
-    except (AwError, MemoryError):
+    except AwError:
         raise
     except Exception as error:  # torch raises many undocumented types for a damaged file
-        if "allocate memory" in str(error):  # of the system, as OSError or RuntimeError
-            raise MemoryError from None
+        short = isinstance(error, MemoryError) or "allocate memory" in str(error)
+        if short and not _fits(path):
+            raise MemoryError(str(error)) from None
         raise AwError(f"{path} cannot be read as weights ({_reason(path, error)}); {advice}") from None
     if broken is not None:
         raise AwError(f"{path} holds values that are not finite, in tensor {broken}; {advice}")

@@ -14,6 +14,7 @@ import pytest
 
 from ambiguous_wild import __version__
 from ambiguous_wild.cli.main import COMMANDS, SECTIONS
+from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.weight_files import read_tensors
 from tests.command_line import aw
 
@@ -108,12 +109,18 @@ FULL = OSError(errno.ENOMEM, os.strerror(errno.ENOMEM))
 
 
 @pytest.mark.parametrize("error", [MemoryError(), FULL, ImportError("failed to map segment")])
-def test_too_little_memory_is_said_so(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_little_memory_is_said_so(
+    error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def fails(*_: object, **__: object) -> None:
         raise error
 
     monkeypatch.setattr("safetensors.torch.load_file", fails)
     if not isinstance(error, ImportError):
+        (tmp_path / "a.safetensors").touch()
+        with pytest.raises(AwError, match="cannot be read as weights"):  # it asks for more than it holds
+            read_tensors(tmp_path / "a.safetensors")
+        monkeypatch.setattr("ambiguous_wild.core.weight_files._fits", lambda path: False)
         with pytest.raises(MemoryError):  # the file of weights is whole
             read_tensors(Path("a.safetensors"))
     monkeypatch.setattr("ambiguous_wild.cli.main.cli.main", fails)

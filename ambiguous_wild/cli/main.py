@@ -10,14 +10,13 @@ import logging
 import os
 import re
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import click
 
 from ambiguous_wild import __version__
 from ambiguous_wild.cli.renamed import with_new_names
-from ambiguous_wild.core.errors import AwError, unknown
+from ambiguous_wild.core.errors import AwError, logged_to, unknown
 
 # command -> (module, one line of help); help is here so that `aw --help` imports no command.
 COMMANDS = {
@@ -132,22 +131,16 @@ def cli(ctx: click.Context, quiet: bool, verbose: bool) -> None:
     if quiet:  # errors are printed when the command has ended
         ctx.with_resource(contextlib.redirect_stderr(io.StringIO()))
     if verbose:
-        ctx.with_resource(_told())
+        ctx.with_resource(logged_to(_printed()))
 
 
-@contextlib.contextmanager
-def _told() -> Iterator[None]:
-    """Meanwhile what this package logs is printed, above a bar."""
+def _printed() -> logging.Handler:
+    """Prints records above a bar."""
     from tqdm import tqdm
 
-    logger, handler = logging.getLogger("ambiguous_wild"), logging.Handler()
+    handler = logging.Handler()
     handler.emit = lambda record: tqdm.write(f"  {record.getMessage()}", file=sys.stderr)  # type: ignore[method-assign]
-    logger.setLevel(logging.DEBUG)
-    logger.addHandler(handler)
-    try:
-        yield
-    finally:
-        logger.removeHandler(handler)
+    return handler
 
 
 def main() -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
-from collections.abc import Iterable
+import logging
+from collections.abc import Iterable, Iterator
 
 _LONGEST = 2000  # characters of a message; ours have fewer than 700
 
@@ -42,6 +44,19 @@ def unknown(kind: str, name: str, choices: Iterable[str], hint: str = "") -> AwE
         some = difflib.get_close_matches(name, known, n=3, cutoff=0.0)
         tail = f"the nearest of {len(known)}: {', '.join(some)}"
     return AwError(f"unknown {kind} {name!r}: {tail}" + (f" ({hint})" if hint else ""))
+
+
+@contextlib.contextmanager
+def logged_to(handler: logging.Handler) -> Iterator[None]:
+    """Meanwhile what this package logs, of any level, goes to the handler, which is closed at the end."""
+    logger = logging.getLogger("ambiguous_wild")
+    logger.setLevel(logging.DEBUG)
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        handler.close()
 
 
 def counted(number: int, noun: str) -> str:

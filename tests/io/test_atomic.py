@@ -171,7 +171,7 @@ def test_a_pipe_gets_the_bytes_and_stays(tmp_path):
     assert stat.S_ISFIFO(pipe.stat().st_mode) and os.listdir(tmp_path) == ["p"]
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root makes device nodes")
+@pytest.mark.skipif(getattr(os, "geteuid", lambda: 1)() != 0, reason="only root makes device nodes")
 def test_a_device_gets_the_bytes_and_stays(tmp_path):
     os.mknod(tmp_path / "n", stat.S_IFCHR | 0o666, os.makedev(1, 3))
     os.mknod(tmp_path / "full", stat.S_IFCHR | 0o666, os.makedev(1, 7))

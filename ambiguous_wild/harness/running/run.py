@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import os
 import shutil
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,6 +15,7 @@ import yaml
 from ambiguous_wild import __version__
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import flatten
+from ambiguous_wild.core.errors import logged_to
 from ambiguous_wild.harness.running.callbacks import outcome_line, run_name
 from ambiguous_wild.harness.running.cell import (
     IGNORED,
@@ -191,7 +191,7 @@ def _run(cell: Cell, folder: Path, options: RunOptions, tick: Tick | None) -> Ce
                 if is_finished(folder):
                     return CellReport(folder, "kept")
         _begin(cell, folder)
-        with _logged(folder / LOG_FILE):
+        with logged_to(_log_file(folder / LOG_FILE)):
             LOG.debug("%s, configuration %s, version %s", run_name(cell), cell.identity[:12], __version__)
             try:
                 if cell.method.program is not None:
@@ -211,18 +211,11 @@ def _run(cell: Cell, folder: Path, options: RunOptions, tick: Tick | None) -> Ce
     return report
 
 
-@contextlib.contextmanager
-def _logged(path: Path) -> Iterator[None]:
-    """Meanwhile what this package logs is added to a file, with the time."""
-    logger, handler = logging.getLogger("ambiguous_wild"), logging.FileHandler(path, encoding="utf-8")
+def _log_file(path: Path) -> logging.Handler:
+    """Adds records to a file, with the time."""
+    handler = logging.FileHandler(path, encoding="utf-8")
     handler.setFormatter(logging.Formatter("%(asctime)s %(message)s", "%Y-%m-%d %H:%M:%S"))
-    logger.setLevel(logging.DEBUG)
-    logger.addHandler(handler)
-    try:
-        yield
-    finally:
-        logger.removeHandler(handler)
-        handler.close()
+    return handler
 
 
 def _begin(cell: Cell, folder: Path) -> None:

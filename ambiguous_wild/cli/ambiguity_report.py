@@ -78,7 +78,8 @@ def command(
         sources.check_run(loaded, run)
     if masks is not None and keep_masks is not None:
         raise AwError("--distractor-masks and --keep-masks exclude each other: give one of them")
-    found = sources.find_masks(loaded, masks if keep_masks is None else keep_masks, run)
+    chosen = masks if keep_masks is None else str(keep_masks)
+    found = sources.find_masks(loaded, chosen, run, keep=keep_masks is not None)
     behind = sources.find_background(loaded, background, run, found)
     folder = output or scene.resolve().parent / f"{scene.resolve().name}-ambiguity"
     if folder.resolve().is_relative_to(scene.resolve()):

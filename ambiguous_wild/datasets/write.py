@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ambiguous_wild.builder.downsample import check_factor
+from ambiguous_wild.builder.masks import alpha_warning
 from ambiguous_wild.builder.package import list_files, nerfbaselines_info
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.report import point_checks
@@ -232,10 +233,7 @@ def _fill(
         placed = list(pool.map(one, plans))
     bar.finish()
     if hidden := sum(HIDDEN in p.notes for p in placed):
-        notes.append(
-            f"alpha of {counted(hidden, 'photo')} hides pixels: they are not learnt from, and psnr_valid of "
-            "test photos leaves them out"
-        )
+        notes.append(alpha_warning(hidden))
     if lost := [note for p in placed for note in p.notes if note.startswith("undistorted without")]:
         notes.append(f"{counted(len(lost), 'photo')} {max(lost)}: the lens sees more than a pinhole camera")
     sides = {p.image.name: foreign.split[plan.image.name] for plan, p in zip(plans, placed)}

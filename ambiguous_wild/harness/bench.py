@@ -372,7 +372,7 @@ def _rescorable(made: BenchReport, metrics: Sequence[Words] = ()) -> str:
     from ambiguous_wild.harness.rescore import could_be_measured
 
     names = could_be_measured(kept)
-    command = shlex.join(["aw", "rescore", str(made.output), *(f"--metric={file}" for file in metrics)])
+    command = shlex.join(["aw", "rescore", str(made.output), *(f"--metric-file={file}" for file in metrics)])
     return (
         f"runs that were kept lack {', '.join(names)}, which can be measured now: {command}" if names else ""
     )

@@ -40,14 +40,15 @@ class Masks:
         return ~white if self.keep else white
 
 
-def find_masks(scene: Scene, choice: str | Path | None, run: Path | None) -> Masks:
+def find_masks(scene: Scene, choice: str | None, run: Path | None, *, keep: bool = False) -> Masks:
     """Distractor masks of the train photos.
 
     Args:
         scene: whose photos.
-        choice: "truth", "scene" (masks/train), "run", or a folder: a Path, where white means keep, or a str,
-            where it means distractor; None takes the first of truth, run and scene that is there.
+        choice: "truth", "scene" (masks/train), "run" or a folder; None takes the first of truth, run and
+            scene that is there.
         run: folder of a run with masks/.
+        keep: the choice is a folder where white means keep; else it means distractor.
 
     Raises:
         AwError: there is none, or photos lack theirs.
@@ -66,16 +67,15 @@ def find_masks(scene: Scene, choice: str | Path | None, run: Path | None) -> Mas
                 "--distractor-masks or --keep-masks DIR (PNG of the photo's stem) or --run RUN of a method "
                 "that masks"
             )
-    if choice == "truth":
+    if choice == "truth" and not keep:
         return Masks("truth", _all(scene, truth, "add them (all black where there is no distractor)"), False)
-    if choice == "scene":
+    if choice == "scene" and not keep:
         folder = scene.root / "masks" / "train"
         return Masks("scene", _all(scene, folder, "add them (all white where there is no distractor)"), True)
-    if choice == "run":
+    if choice == "run" and not keep:
         if run is None:
             raise AwError("--distractor-masks run needs --run RUN, a folder of 'aw bench'")
         return Masks("run", _all(scene, run / "masks", "this method draws no masks; take another run"), True)
-    keep = isinstance(choice, Path)
     wanted = f"add them (all {'white' if keep else 'black'} where there is no distractor)"
     return Masks("folder", _all(scene, Path(choice), wanted), keep)
 
